@@ -53,8 +53,7 @@ def build_energy_growth_columns(
         growth: the energy growth and its first frame.
         by_frame: columns of the rows, by frame.
     """
-    times = f"{growth.max_ratio:,.0f}" if growth.max_ratio >= 10.0 else f"{growth.max_ratio:.1f}"
-    said = f"energy has grown {times} times without a source, from frame {growth.first_frame} on: "
+    said = f"{growth}: "
     step = by_frame[growth.first_frame]
     if step["stopped"] == "iterations" and step["iterations"] >= run.iterations and run.integrator != "own":
         said += f"{run.solver.name} leaves the step unsolved; take more iterations, a tolerance, or another solver"

@@ -211,12 +211,12 @@ def _run_error_controlled(
         )
         try:
             for k, p in enumerate(seen):
-                recorder.record_frame(RecordedFrame(k, found.scene.time(k), p, {}, float("nan"), 0))
+                recorder.record_frame(RecordedFrame(k, found.scene.compute_time(k), p, {}, float("nan"), 0))
             recorder.finish_recording({})
         finally:
             recorder.abandon_recording()
         chosen = sorted(FrameSamples(run.frames).frames)
-        due = {k: found.scene.time(k) for k in chosen}
+        due = {k: found.scene.compute_time(k) for k in chosen}
         last = {
             "recorded": require_recorded_frames(files.recording_path, recorder.info, due, {k: seen[k] for k in chosen})
         }

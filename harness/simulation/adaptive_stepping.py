@@ -62,6 +62,7 @@ class Trajectory:
 
     Attributes:
       positions: positions (k + 1, n, 3) [m] at the start and at the end of each of k frames.
+      velocities: velocities (k + 1, n, 3) [m/s] at the same times.
       num_accepted_steps: number of accepted steps.
       num_rejected_steps: number of rejected steps.
       num_factorisations: number of factorisations.
@@ -73,6 +74,7 @@ class Trajectory:
     """
 
     positions: Positions
+    velocities: Positions
     num_accepted_steps: int
     num_rejected_steps: int
     num_factorisations: int
@@ -207,7 +209,7 @@ class _AdaptiveIntegration:
         self._method, self._power = method, 1.0 + min(method.order, method.embedded_order)
         self._now, self._acceleration, self._ticks = build_initial_state(scene).motion, None, 0
         self._free, self._mass = scene.system.free_vertices, float(scene.system.mass[scene.system.free_vertices].mean())
-        self._seen, self._before = [self._now.positions], (1.0, scene.system.time_step)
+        self._seen, self._before = [self._now], (1.0, scene.system.time_step)
         self._accepted = self._rejected = self._iterations = 0
         self._lengths = inf, 0.0
         self._began, self._reached = perf_counter(), list[float]()
@@ -220,7 +222,7 @@ class _AdaptiveIntegration:
                 raise TimeBudgetExceeded
         counts = self._accepted, self._rejected, self._ladder.made, self._iterations
         shared, processor = share_frame_seconds(self._reached), thread_time() - self._cpu
-        return Trajectory(np.array(self._seen), *counts, self._lengths, self._reached[-1], shared, processor)
+        return Trajectory(*stack_motions(self._seen), *counts, self._lengths, self._reached[-1], shared, processor)
 
     def _try_step(self) -> None:
         """Try one step."""
@@ -315,8 +317,13 @@ def share_frame_seconds(reached: Sequence[float]) -> tuple[float, ...]:
     return tuple(float(gone[steps == step].mean()) for step in steps)
 
 
-def interpolate_hermite(before: Motion, after: Motion, h: float, part: float) -> Positions:
-    """Interpolate positions within a step by cubic Hermite polynomials of the motions at both ends.
+def stack_motions(motions: Sequence[Motion]) -> tuple[Positions, Positions]:
+    """Return the positions [m] and velocities [m/s] of motions, both (k, n, 3)."""
+    return np.array([p for p, _ in motions]), np.array([v for _, v in motions])
+
+
+def interpolate_hermite(before: Motion, after: Motion, h: float, part: float) -> Motion:
+    """Interpolate a motion within a step by cubic Hermite polynomials of the motions at both ends.
 
     Args:
       before: motion at the start.
@@ -324,10 +331,11 @@ def interpolate_hermite(before: Motion, after: Motion, h: float, part: float) ->
       h: step size [s].
       part: fraction of the step.
 
-    Returns: positions (n, 3) [m], accurate to order 3.
+    Returns: the motion, whose positions are accurate to order 3.
     """
     (p, v), (q, w), s = before, after, part
     if s == 1.0:
-        return q
+        return after
     d = q - p
-    return p + s * (h * v + s * (3.0 * d - h * (2.0 * v + w) + s * (h * (v + w) - 2.0 * d)))
+    quadratic, cubic = 3.0 * d - h * (2.0 * v + w), h * (v + w) - 2.0 * d
+    return Motion(p + s * (h * v + s * (quadratic + s * cubic)), v + s / h * (2.0 * quadratic + 3.0 * s * cubic))

@@ -21,21 +21,30 @@ a gain.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.scene_builder import Scene
-from springbench.harness.simulation.time_loop import SimulationStep, build_initial_state
+from springbench.harness.simulation.time_loop import MotionState, SimulationStep, build_initial_state, build_problem
 from springbench.solvers.model.energies.augmented_lagrangian import (
     compute_penalty_stiffness,
     concatenate_constraints,
     length_errors,
 )
+from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.rounding_bound import ROUNDOFF_FACTOR, gradient_roundoff
-from springbench.solvers.model.step_problem import Energy, Positions, ProjectiveEnergy, StepProblem, is_lagged
+from springbench.solvers.model.step_problem import (
+    Energy,
+    Positions,
+    ProjectiveEnergy,
+    Solution,
+    StepProblem,
+    StopRule,
+    is_lagged,
+)
 from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
 GROWTH_LIMIT = 1.0
@@ -65,6 +74,11 @@ class EnergyGain(NamedTuple):
     def __str__(self) -> str:
         return f"{self.gain:.2g} J more than its sources give, where {self.available_energy:.2g} J are available"
 
+    @property
+    def columns(self) -> dict[str, float]:
+        """Columns of the balance in the rows of a frame."""
+        return {"energy_gained": self.gain, "energy_available": self.available_energy}
+
 
 class EnergyGrowth(NamedTuple):
     """Energy growth without a source.
@@ -80,13 +94,23 @@ class EnergyGrowth(NamedTuple):
     @classmethod
     def from_rows(cls, by_frame: Mapping[int, Mapping[str, Any]]) -> EnergyGrowth | None:
         """Build from a run's columns by frame; None where its energy has not grown."""
-        balances = {frame: EnergyGain(row["energy_gained"], row["energy_available"]) for frame, row in by_frame.items()}
+        return cls.from_balances(
+            {frame: EnergyGain(row["energy_gained"], row["energy_available"]) for frame, row in by_frame.items()}
+        )
+
+    @classmethod
+    def from_balances(cls, balances: Mapping[int, EnergyGain]) -> EnergyGrowth | None:
+        """Build from the balances by frame; None where the energy has not grown."""
         grown = {frame: balance for frame, balance in balances.items() if balance.is_above(GROWTH_LIMIT)}
         if not grown:
             return None
         return cls(
             min(grown), max(b.gain / b.available_energy if b.available_energy else np.inf for b in grown.values())
         )
+
+    def __str__(self) -> str:
+        times = f"{self.max_ratio:,.0f}" if self.max_ratio >= 10.0 else f"{self.max_ratio:.1f}"
+        return f"energy has grown {times} times without a source, from frame {self.first_frame} on"
 
 
 class EnergyBalance:
@@ -225,6 +249,22 @@ class EnergyBalance:
         gradient = np.zeros_like(x)
         energy.add_gradient(x, gradient)
         return _dot(gradient[self._free], moved[self._free])
+
+
+def compute_frame_balances(scene: Scene, motions: Iterable[Motion]) -> Iterator[EnergyGain]:
+    """Yield the balance after each frame of a motion, however it was integrated.
+
+    Args:
+      scene: the scene with the integrator `own`, whose time step is the frame.
+      motions: motion after each frame.
+    """
+    balance, state = EnergyBalance(scene), build_initial_state(scene)
+    for motion in motions:
+        problem = build_problem(scene, state, "current")
+        solution = Solution(motion.positions, 1, np.nan, np.nan, "iterations", motion.velocity)
+        state = MotionState(motion, None, state.index + 1)
+        step = SimulationStep(problem, solution, state, (1,), ((problem, solution),), StopRule(1))
+        yield balance.add_step(step)
 
 
 def _pair_energies(step_problem: StepProblem) -> zip[tuple[Energy, Energy]]:

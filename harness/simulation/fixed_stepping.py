@@ -8,7 +8,6 @@ from math import ceil, inf
 from time import perf_counter, thread_time
 from typing import ClassVar
 
-import numpy as np
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import (
     MAX_SOLVE_ITERATIONS,
@@ -16,6 +15,7 @@ from springbench.harness.simulation.adaptive_stepping import (
     TimeBudgetExceeded,
     Trajectory,
     share_frame_seconds,
+    stack_motions,
 )
 from springbench.harness.simulation.auto_tolerance import AutoTolerance
 from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
@@ -51,7 +51,7 @@ class FixedImplicitStepper(Stepper):
         scene = self.build_scene(self.t_end / (self.frames * parts))
         ready, seen, reached, iterations = (
             prepare(scene, self.solver),
-            [build_initial_state(scene).motion.positions],
+            [build_initial_state(scene).motion],
             list[float](),
             0,
         )
@@ -61,10 +61,10 @@ class FixedImplicitStepper(Stepper):
         ):
             iterations += step.num_iterations
             if step.index % parts == 0:
-                seen.append(step.positions)
+                seen.append(step.state.motion)
                 reached.append(perf_counter() - began)
             if thread_time() - cpu > cpu_limit:
                 raise TimeBudgetExceeded
         h = scene.system.time_step
         shared, processor = share_frame_seconds(reached), thread_time() - cpu
-        return Trajectory(np.array(seen), steps, 0, 1, iterations, (h, h), reached[-1], shared, processor)
+        return Trajectory(*stack_motions(seen), steps, 0, 1, iterations, (h, h), reached[-1], shared, processor)

@@ -76,7 +76,7 @@ def observe_run(
         found[step.index] = told = build_solution_columns(scene, step, terms, residual) | (
             verify_step(step) if verify_step else {}
         )
-        told |= {"energy_gained": balance.gain, "energy_available": balance.available_energy}
+        told |= balance.columns
         if positions_out is not None:
             positions_out[step.index - 1] = step.positions
         if sample_frame:

@@ -20,6 +20,7 @@ from springbench.harness.simulation.adaptive_stepping import (
     TimeBudgetExceeded,
     Trajectory,
     share_frame_seconds,
+    stack_motions,
 )
 from springbench.harness.simulation.time_loop import MotionState, build_initial_state, build_problem
 from springbench.solvers.model.integrators import Motion
@@ -109,7 +110,7 @@ class AdaptiveSubstepper(Stepper):
         scene, ready, pieces = self._prepare_pieces(setting)
         state, began = build_initial_state(scene), perf_counter()
         reached = list[float]()
-        seen, h, told = [state.motion.positions], None, np.zeros((self.frames * pieces, 3))
+        seen, h, told = [state.motion], None, np.zeros((self.frames * pieces, 3))
         for k in range(len(told)):
             stated = build_problem(scene, state, "current")
             try:
@@ -121,7 +122,7 @@ class AdaptiveSubstepper(Stepper):
             told[k] = each[:3]
             h, state = float(told[k, 2]), MotionState(Motion(p, v), None, k + 1)
             if (k + 1) % pieces == 0:
-                seen.append(p)
+                seen.append(state.motion)
                 reached.append(perf_counter() - began)
             if thread_time() - cpu > cpu_limit:
                 raise TimeBudgetExceeded
@@ -130,7 +131,7 @@ class AdaptiveSubstepper(Stepper):
         mean = scene.system.time_step * len(told) / accepted
         counts = accepted, rejected, (accepted + rejected) * ready.num_factorisations, evaluations
         return Trajectory(
-            np.array(seen), *counts, (mean, mean), reached[-1], share_frame_seconds(reached), thread_time() - cpu
+            *stack_motions(seen), *counts, (mean, mean), reached[-1], share_frame_seconds(reached), thread_time() - cpu
         )
 
     def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from springbench.harness.cli.main import app
-from springbench.harness.config.config_loader import load_scene
+from springbench.harness.config.config_loader import load_config, load_scene
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget
@@ -25,7 +27,12 @@ from springbench.harness.experiments.error_control.stored_trials import (
 )
 from springbench.harness.experiments.error_control.third_party_integrators import THIRD_PARTY_INTEGRATORS
 from springbench.harness.experiments.provenance import build_provenance_columns
+from springbench.harness.experiments.run_pipeline import execute_run
+from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.recording.recording_reader import read_replay
 from springbench.harness.results import parquet_rows
+from springbench.harness.simulation.adaptive_stepping import Trajectory
+from springbench.harness.simulation.substepping import AdaptiveSubstepper
 from typer.testing import CliRunner
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
@@ -67,6 +74,47 @@ def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_pa
     assert row["accepted"] > 0
     assert (tmp_path / "chain" / row["recording"]).is_file()
     assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
+
+
+class Boosting(AdaptiveSubstepper):
+    """Its positions are right, and its velocities three times those of the motion."""
+
+    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+        found = super().integrate_motion(setting, cpu_limit=cpu_limit)
+        return replace(found, velocities=3.0 * found.velocities)
+
+
+def test_a_motion_that_gains_energy_says_so_in_its_row_and_its_exit_code(tmp_path, monkeypatch):
+    few = [("own", SolverSpec("dormand-prince-8", {}))]
+    module = "springbench.harness.experiments.error_control.candidate_methods"
+    monkeypatch.setattr(f"{module}.list_candidate_methods", lambda: few)
+    monkeypatch.setattr(f"{module}.AdaptiveSubstepper", Boosting)
+    given = ["run", str(SCENES / "single-spring.yaml"), "--error", "1e-3", "--t-end", "0.5"]
+    found = CliRunner().invoke(app, [*given, "--results", str(tmp_path)])
+    assert found.exit_code == 1, found.output
+    said = "energy has grown .* without a source, from frame 1 on: dormand-prince-8 does not follow the motion"
+    folder = tmp_path / "single-spring"
+    rows = parquet_rows.read_rows((folder / "accuracy").glob("*.parquet"), ACCURACY_SCHEMA).to_pylist()
+    assert rows[0]["status"] == "energy-growth"
+    assert re.match(said, rows[0]["reason"])
+    assert read_replay(folder / rows[0]["recording"]).properties["status"] == "energy-growth"
+
+
+def test_the_rows_of_a_sweep_to_an_error_have_the_energy_of_each_frame(tmp_path, monkeypatch):
+    (tmp_path / "scene.yaml").write_text((SCENES / "single-spring.yaml").read_text())
+    options = "options: {frames: 5, accuracy: 1e-3, record: %s, pictures: false, timing: shared}\n"
+    (tmp_path / "sweep.yaml").write_text(f"scenes: [scene.yaml]\nsolvers: [dormand-prince-8]\n{options % 'true'}")
+    (spec,) = load_config(tmp_path / "sweep.yaml").list_runs()
+    files = RunFiles.for_run(spec, tmp_path)
+    files.rows_path.parent.mkdir()
+    rows = execute_run(spec, files, lambda phase: None)
+    assert {row["status"] for row in rows} == {"ok"}, rows[0]
+    assert all(row["energy_gained"] <= 1e-3 * row["energy_available"] for row in rows)
+    assert all(row["energy_available"] > 0.0 for row in rows)
+    assert read_replay(files.recording_path).properties["status"] == "ok"
+    monkeypatch.setattr("springbench.harness.experiments.error_control.candidate_methods.AdaptiveSubstepper", Boosting)
+    rows = execute_run(spec.replace_options(record=False), files, lambda phase: None)
+    assert {row["status"] for row in rows} == {"energy-growth"}
 
 
 def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, monkeypatch):

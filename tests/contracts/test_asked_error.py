@@ -145,7 +145,8 @@ def test_hermites_cubic_is_exact_for_cubics():
 
     found = interpolate_hermite(at(0.5), at(2.0), 1.5, 0.3)
     # Some roundings of numbers near 10.
-    np.testing.assert_allclose(found, at(0.95).positions, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.positions, at(0.95).positions, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(found.velocity, at(0.95).velocity, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("error", [1e-2, 1e-3, 1e-4])

@@ -41,7 +41,9 @@ class Formula(Stepper):
             raise TimeBudgetExceeded
         positions = np.zeros((2, 2, 3))
         positions[1, :, 0] = 1.0 + self.error(steps)
-        return Trajectory(positions, steps, 0, 0, steps, (1.0, 1.0), 2.0 * took, (2.0 * took,), took)
+        return Trajectory(
+            positions, np.zeros_like(positions), steps, 0, 0, steps, (1.0, 1.0), 2.0 * took, (2.0 * took,), took
+        )
 
 
 class Tolerant(Formula):

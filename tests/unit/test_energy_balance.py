@@ -31,6 +31,7 @@ from springbench.harness.simulation.energy_balance import (
     EnergyBalance,
     EnergyGain,
     EnergyGrowth,
+    compute_frame_balances,
 )
 from springbench.harness.simulation.time_loop import SimulationStep, prepare, simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
@@ -174,6 +175,22 @@ def test_growth_names_its_first_frame_and_its_largest_ratio():
     rows = {n: {"energy_gained": float(gain), "energy_available": 2.0} for n, gain in enumerate((1, 2, 3, 9, 4), 1)}
     assert EnergyGrowth.from_rows(rows) == EnergyGrowth(first_frame=3, max_ratio=4.5)
     assert EnergyGrowth.from_rows({1: rows[1], 2: rows[2]}) is None
+
+
+def test_a_motion_at_frames_has_the_balance_of_its_velocities():
+    """Free fall with frames of a tenth of a second: as exact, it gains nothing; 1.5 times as fast, 1.25 times the
+    energy that was released."""
+    bound = replace(chain(GravityEffect()), integrator=integrators.find_integrator("own"))
+    for factor, gain in ((1.0, 0.0), (1.5, 1.25)):
+        motions = list[integrators.Motion]()
+        for t in (DT, 2.0 * DT, 3.0 * DT):
+            p, v = bound.mesh.rest_positions.copy(), np.zeros((2, 3))
+            p[:, 1] -= 0.5 * G * t**2
+            v[:, 1] = -factor * G * t
+            motions.append(integrators.Motion(p, v))
+        *_, last = compute_frame_balances(bound, motions)
+        assert last.gain == pytest.approx(gain * 0.5 * 2.0 * (0.3 * G) ** 2, abs=CLOSE)
+        assert last.available_energy == pytest.approx(0.5 * 2.0 * G**2 * (0.3**2 + DT**2), rel=1e-9)
 
 
 LIMIT = """

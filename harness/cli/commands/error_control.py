@@ -41,6 +41,7 @@ from springbench.harness.reference.perturbation_growth import PerturbationGrowth
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.folder_ownership import claim_folder
 from springbench.harness.results.solver_metadata import read_solver_metadata
+from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.solvers.model.step_problem import Positions
 
@@ -78,7 +79,7 @@ def run_error_control(
         rerun: whether to try all methods, even those that were expensive according to stored rows.
         rejected_options: other options on the command line, which are not supported here.
 
-    Returns: whether the verification passes; True without verification.
+    Returns: whether energy has grown only by its sources, and the verification passes if there is one.
 
     Raises:
         InputError: an option is invalid.
@@ -130,10 +131,14 @@ def _execute_error_control(
         + (f"; more exact than asked, for {answer.note}" if answer.note else "")
     )
     print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
+    scene = asked.build_scene(asked.frame_seconds, "own")
+    status = answer.build_status_columns(answer.compute_balances(scene))
+    if status["status"] != "ok":
+        print_message(f"{status['status']}: {status['reason']}")
     measured = _verify_error(asked, error, path.positions[-1], results, print_message) if verify else None
     label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.t_end:g}"
-    recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, answer)
-    row = _build_row(config.stem, asked, error, answer) | {
+    recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, scene, answer, status)
+    row = _build_row(config.stem, asked, error, answer, status) | {
         "error": measured,
         "recording": f"recordings/{recording.name}",
     }
@@ -147,7 +152,7 @@ def _execute_error_control(
     if positions:
         save_positions(positions, path.positions[1:])
     print_message(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
-    return not verify or (measured is not None and measured <= error)
+    return status["status"] == "ok" and (not verify or (measured is not None and measured <= error))
 
 
 def _search_method(
@@ -207,12 +212,17 @@ def _check_options(error: float, t_end: float | None, rejected_options: Mapping[
         raise InputError(mistakes)
 
 
-def _build_row(name: str, error_target: ErrorTarget, error: float, search_result: SearchResult) -> dict[str, Any]:
+def _build_row(
+    name: str,
+    error_target: ErrorTarget,
+    error: float,
+    search_result: SearchResult,
+    status_columns: Mapping[str, str | None],
+) -> dict[str, Any]:
     best, path = search_result.best_trial, search_result.best_trial.trajectory
     return {
         "kind": "asked",
-        "status": "ok",
-        "reason": search_result.note,
+        **status_columns,
         "sweep": name,
         "scene": name,
         "problem": format_problem_id(error_target),
@@ -260,13 +270,16 @@ def _build_third_party_rows(
     return found
 
 
-def _record_motion(path: Path, name: str, error_target: ErrorTarget, search_result: SearchResult) -> Path:
+def _record_motion(
+    path: Path,
+    name: str,
+    error_target: ErrorTarget,
+    scene: Scene,
+    search_result: SearchResult,
+    status_columns: Mapping[str, str | None],
+) -> Path:
     """Write the recording of the motion, with the requested error as a property."""
-    scene, best, here = (
-        error_target.build_scene(error_target.frame_seconds, "own"),
-        search_result.best_trial,
-        machine_info.describe_machine(),
-    )
+    best, here = search_result.best_trial, machine_info.describe_machine()
     properties = {
         "scene": name,
         "size": error_target.size,
@@ -287,7 +300,7 @@ def _record_motion(path: Path, name: str, error_target: ErrorTarget, search_resu
         ),
         properties={
             **properties,
-            "status": "ok",
+            **{column: value for column, value in status_columns.items() if value},
             "estimated": best.error_estimated,
             "cpu": here.cpu,
             "commit": machine_info.read_commit(),

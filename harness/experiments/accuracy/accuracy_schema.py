@@ -41,7 +41,8 @@ ACCURACY_COLUMNS = (
         "status",
         _TEXT,
         "",
-        "ok, saddle, unsupported, diverged, no-progress, time-limit, failed, killed or uncertified (the reference)",
+        "ok, saddle, unsupported, diverged, energy-growth, no-progress, time-limit, failed, killed or uncertified (the "
+        "reference)",
     ),
     *select_run_columns("reason"),
     ColumnSpec("problem", _TEXT, "", "digest of the frozen step, of the reference trajectory, or of what was asked"),

@@ -21,6 +21,7 @@ from springbench.harness.experiments.error_control.method_search import (
 from springbench.harness.results.quantities import compute_ms_per_step
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import Trajectory
+from springbench.harness.simulation.energy_balance import EnergyGain
 from springbench.harness.simulation.instrumentation_pass import compute_strain_columns, count_intersections
 from springbench.harness.simulation.timing_pass import hash_positions
 from springbench.solvers.model.step_problem import Positions
@@ -57,10 +58,10 @@ class ErrorControlledRun:
     def rows(self) -> list[dict[str, Any]]:
         """Build a row for each frame of each round."""
         best, scene = self.search_result.best_trial, self.scene
+        balances = self.search_result.compute_balances(scene)
         shared = {
             "phase": "step",
-            "status": "ok",
-            "reason": self.search_result.note or None,
+            **self.search_result.build_status_columns(balances),
             "vertices": scene.system.num_vertices,
             "springs": len(scene.all_springs.edges),
             "max_iterations": None,
@@ -70,7 +71,7 @@ class ErrorControlledRun:
             "estimate_seconds": self.search_result.search_seconds,
             "choice": "; ".join([f"{best.method} of {len(self.search_result.trials)} ways", *self.messages]),
         }
-        seen = [self._build_frame_columns(k, p) for k, p in enumerate(self.positions) if k]
+        seen = [self._build_frame_columns(k, self.positions[k], balance) for k, balance in balances.items()]
         return [
             shared
             | columns
@@ -84,10 +85,11 @@ class ErrorControlledRun:
             for columns, seconds in zip(seen, one.frame_seconds, strict=True)
         ]
 
-    def _build_frame_columns(self, frame: int, p: Positions) -> dict[str, Any]:
+    def _build_frame_columns(self, frame: int, p: Positions, balance: EnergyGain) -> dict[str, Any]:
         crossed = count_intersections(self.scene, p, self.scene.compute_time(frame))
         return {
             "frame": frame,
+            **balance.columns,
             **compute_strain_columns(self.scene, p),
             "intersections": crossed,
             "digest": hash_positions(p),

@@ -11,7 +11,7 @@ are compared by CPU seconds, including preparation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log, sqrt
 from time import perf_counter
@@ -27,7 +27,10 @@ from springbench.harness.experiments.error_control.candidate_methods import (
     prepare_candidate_methods,
 )
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth, estimate_growth
+from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import StepSizeUnderflow, TimeBudgetExceeded, Trajectory
+from springbench.harness.simulation.energy_balance import EnergyGain, EnergyGrowth, compute_frame_balances
+from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import Positions
 
 ERROR_AIM = 0.65
@@ -120,6 +123,19 @@ class SearchResult:
     reference_trial: Trial
     search_seconds: float
     note: str
+
+    def compute_balances(self, scene: Scene) -> dict[int, EnergyGain]:
+        """Return the energy balance after each frame; the scene has the integrator `own` and frames as time steps."""
+        path = self.best_trial.trajectory
+        motions = map(Motion, path.positions[1:], path.velocities[1:])
+        return dict(enumerate(compute_frame_balances(scene, motions), start=1))
+
+    def build_status_columns(self, balances: Mapping[int, EnergyGain]) -> dict[str, str | None]:
+        """Return `status` and `reason` of the best trial, whose energy may have grown without a source."""
+        if growth := EnergyGrowth.from_balances(balances):
+            reason = f"{growth}: {self.best_trial.method} does not follow the motion; ask for a smaller error"
+            return {"status": "energy-growth", "reason": reason}
+        return {"status": "ok", "reason": self.note or None}
 
     def compute_error(self, p: Positions, free_vertices: NDArray[np.int64]) -> float:
         """Return the error of end positions p (n, 3) [m] against the reference trial.
