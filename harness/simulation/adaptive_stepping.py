@@ -1,13 +1,13 @@
 """Adaptive time stepping: the error estimate of each step determines the next step size.
 
     ratio = error/tolerance,   error = rms over free coordinates of (dp, span dv);   a step is accepted where ratio <= 1
-    h' = 0.9 h min(ratio^(-1/k), h/h_before (ratio_before/ratio^2)^(1/k)),   k one more than the pair's lower order
 
-The second argument of min is the predictive controller, which also uses the previous step (Gustafsson 1994; Hairer and
-Wanner, Solving Ordinary Differential Equations II, section IV.8). The step size of an implicit step is 2^-level of the
-end time, and the step starts at a multiple of its size. Few factors are therefore needed, the last ones used are cached
-(`MAX_FACTOR_BYTES`), and the end time is met exactly. The step size is doubled where h' is at least twice as large. The
-proportional-integral controller of the explicit methods would not reach that threshold.
+The next step size h' is the smaller one of the elementary and the predictive controller
+(`springbench.solvers.model.integrators.step_size_controller`), as in Hairer and Wanner's RADAU5. The step size of an
+implicit step is 2^-level of the end time, and the step starts at a multiple of its size. Few factors are therefore
+needed, the last ones used are cached (`MAX_FACTOR_BYTES`), and the end time is met exactly. The step size is doubled
+where h' is at least twice as large. The proportional-integral controller of the explicit methods would not reach that
+threshold.
 
 The algebraic error of a step's solve is limited to a share of the tolerance (`ALGEBRAIC_ERROR_SHARE`). Positions
 between steps are interpolated by cubic Hermite polynomials. Substepping solvers choose their step sizes within a frame
@@ -29,11 +29,15 @@ from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.step_stages import StageSequence, StepResult
 from springbench.harness.simulation.time_loop import INITIAL_GUESSES, build_initial_state, prepare
 from springbench.solvers.model.integrators import Motion, RungeKutta
+from springbench.solvers.model.integrators.step_size_controller import (
+    StepSizeController,
+    compute_rejection_factor,
+    filter_error,
+)
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, Solver, StopRule, Unsupported
 
-STEP_SAFETY, MIN_STEP_FACTOR, MIN_ERROR_RATIO = 0.9, 0.1, 1e-10
-"""Safety factor on the step size; smallest factor by which one rejected step shrinks it; lower bound on error
-ratios."""
+MIN_STEP_FACTOR, MAX_REJECTION_FACTOR = 0.1, 0.5
+"""Bounds of the change of the step size after a rejected step."""
 ALGEBRAIC_ERROR_SHARE = 0.1
 """Share of the tolerance that the residuals of the stages may add to a step's error estimate."""
 MAX_FACTOR_BYTES = 2**28
@@ -206,7 +210,9 @@ class _AdaptiveIntegration:
             raise Unsupported("the integrator tells no error of its steps")
         if scene.velocity_filters:
             raise Unsupported("a filter of the velocity acts once a step, and no error tells of it")
-        self._method, self._power = method, 1.0 + min(method.order, method.embedded_order)
+        self._method, error_order = method, 1.0 + min(method.order, method.embedded_order)
+        self._elementary = StepSizeController(error_order, min_factor=MIN_STEP_FACTOR)
+        self._predictive = StepSizeController(error_order, beta_1=2.0, beta_2=-1.0, alpha=-1.0)
         self._now, self._acceleration, self._ticks = build_initial_state(scene).motion, None, 0
         self._free, self._mass = scene.system.free_vertices, float(scene.system.mass[scene.system.free_vertices].mean())
         self._seen, self._before = [self._now], (1.0, scene.system.time_step)
@@ -235,8 +241,8 @@ class _AdaptiveIntegration:
         ratio = self._error_ratio(done)
         if not ratio <= 1.0:
             self._rejected += 1
-            allowed = STEP_SAFETY * ratio ** (-1.0 / self._power) if isfinite(ratio) else 0.5
-            self._level += ceil(log2(1.0 / min(0.5, max(MIN_STEP_FACTOR, allowed))))
+            change = min(MAX_REJECTION_FACTOR, compute_rejection_factor(self._elementary, ratio))
+            self._level += ceil(log2(1.0 / change))
             if self._ladder.compute_step_size(self._level) < MIN_RELATIVE_STEP:
                 raise self._build_underflow_error(ratio, time)
             return
@@ -245,12 +251,15 @@ class _AdaptiveIntegration:
         self._ticks += 1 << (_MAX_LEVEL - self._level)
         self._add_frames(done.end.motion, time, h)
         self._now, self._acceleration = done.end.motion, done.end.acceleration
-        self._choose_step_size(max(ratio, MIN_ERROR_RATIO), h)
+        self._choose_step_size(ratio, h)
 
     def _choose_step_size(self, ratio: float, h: float) -> None:
         """Choose the next step's level after a step of size h [s]."""
-        (before, other), power = self._before, self._power
-        change = STEP_SAFETY * min(ratio ** (-1.0 / power), h / other * (before / ratio**2) ** (1.0 / power))
+        previous_ratio, previous_h = self._before
+        change = min(
+            filter_error(control, ratio, previous_ratio, h / previous_h)
+            for control in (self._elementary, self._predictive)
+        )
         self._before = ratio, h
         if change < 0.6:
             self._level += 1

@@ -5,6 +5,8 @@ from __future__ import annotations
 from tests.mutations.base import Mutation
 
 _SEARCH, _GROWTH = "harness/experiments/error_control/method_search.py", "harness/reference/perturbation_growth.py"
+_CONTROLLER = "solvers/model/integrators/step_size_controller.py"
+_CONTROLLERS = "tests/unit/test_step_size_controller.py"
 _FORMULAS = "tests/contracts/test_search.py"
 _ASKED = "tests/contracts/test_asked_error.py"
 _GROWS = f"{_ASKED}::test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known"
@@ -17,6 +19,8 @@ _TABLE = (
         "setting * ratio ** (order / (order + 1.0))",
         f"{_ASKED}::test_a_tolerance_is_changed_by_the_order_of_a_step",
     ),
+    ("control-history", _CONTROLLER, "** (-control.beta_2 / power)", "** (control.beta_2 / power)", _CONTROLLERS),
+    ("control-limits", _CONTROLLER, "min(control.max_factor, max(control.min_factor, change))", "change", _CONTROLLERS),
     (
         "control-measured",
         _SEARCH,

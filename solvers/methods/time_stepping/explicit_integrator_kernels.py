@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.spring_local_step import SpringPackets, add_descent
 from springbench.solvers.linalg.memory import allocate_aligned
+from springbench.solvers.model.integrators.step_size_controller import (
+    StepSizeController,
+    choose_next_step_size,
+    compute_rejection_factor,
+)
 from springbench.solvers.model.step_problem import Positions
-
-FACTORMIN, FACTORMAX, SAFETY = 0.2, 5.0, 0.9
-"""Limits of the change of the step size, and the safety factor."""
 
 MIN_STEP_FRACTION = 1e-10
 """Smallest step size relative to the frame; below it the integration is abandoned."""
@@ -146,22 +148,29 @@ class TableauCoefficients(NamedTuple):
         a: rows of the tableau (s, s); the last one ends the step.
         stage_times: c (s,).
         error_weights: weights of the error (1 or 2, s); the second, of lower order, moderates the first.
-        error_exponent: exponent of h in the error; 0 fixes h.
     """
 
     a: FloatArray
     stage_times: FloatArray
     error_weights: FloatArray
-    error_exponent: float
 
 
 class AdaptiveSteps(NamedTuple):
-    """The steps of a frame [s]: rms error tolerance of a step [m], maximum number of tried steps, first step [s]."""
+    """The steps of a frame.
+
+    Attributes:
+        frame_length: length of the frame [s].
+        tolerance: rms error tolerance of a step [m].
+        max_steps: maximum number of attempted steps.
+        initial_step: size of the first step [s].
+        controller: chooses the step sizes; an error order of 0 fixes them.
+    """
 
     frame_length: float
     tolerance: float
     max_steps: float
     initial_step: float
+    controller: StepSizeController
 
 
 class StageScratch(NamedTuple):
@@ -243,7 +252,7 @@ def integrate_adaptive(forces, stages, steps, p, v, at, step_stats):
     free = 0
     for i in range(0, len(forces.inverse_mass), 4):
         free += 3 * (forces.inverse_mass[i] != 0.0)
-    frame, power, end = steps.frame_length, stages.error_exponent, len(stages.a) - 1
+    frame, control, end = steps.frame_length, steps.controller, len(stages.a) - 1
     t, before, h = 0.0, 1.0, steps.initial_step
     step_stats[0] = step_stats[1] = 0.0
     _evaluate_stage(forces, 0, p, v, at)
@@ -264,14 +273,12 @@ def integrate_adaptive(forces, stages, steps, p, v, at, step_stats):
                     at.stage_accelerations[end, i],
                 )
             step_stats[0] += 1.0
-            if power > 0.0:  # by proportion and integral (Hairer and Wanner, section IV.2)
-                change = SAFETY * max(error, 1e-10) ** (-0.7 / power) * before ** (0.4 / power)
-                before = max(error, 1e-4)
-                h = max(h, step * change) if last else step * min(FACTORMAX, max(FACTORMIN, change))
-        else:  # and where it is no number
+            if control.error_order > 0.0:
+                h = choose_next_step_size(control, step, h, last, error, before)
+                before = error
+        else:  # also if the error is nan
             step_stats[1] += 1.0
-            known = power > 0.0 and error < np.inf
-            h = step * (max(FACTORMIN, SAFETY * error ** (-1.0 / power)) if known else FACTORMIN)
+            h = step * compute_rejection_factor(control, error)
         if h < MIN_STEP_FRACTION * frame or step_stats[0] + step_stats[1] >= steps.max_steps:
             break
     step_stats[2], step_stats[3] = h, t

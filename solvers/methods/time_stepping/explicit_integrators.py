@@ -46,7 +46,11 @@ from springbench.solvers.methods.time_stepping.explicit_tableaus import (
     integrate_drag,
 )
 from springbench.solvers.methods.time_stepping.substep_choice import PreparedSubstepping, SubstepChoice
+from springbench.solvers.model.integrators.step_size_controller import build_pi_controller
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
+
+_MAX_STEP_FACTOR, _FAILURE_FACTOR = 5.0, 0.2
+"""Largest increase of the step size after one step; its decrease after a step that is not finite."""
 
 _STABILITY_SAFETY = 0.95
 """Fraction of the stability limit: at the limit a vibration neither grows nor decays, and springs are nonlinear."""
@@ -324,8 +328,9 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
         )
         errors = np.zeros((1, len(method.a))) if fixed else method.error_weights
         most = float(compute_max_steps(taken.num_substeps, taken.tolerance))
-        steps = AdaptiveSteps(frame, taken.tolerance or 1.0, most, first)
-        stages = TableauCoefficients(method.a, method.stage_times, errors, method.error_exponent)
+        controller = build_pi_controller(method.error_exponent, _MAX_STEP_FACTOR, _FAILURE_FACTOR)
+        steps = AdaptiveSteps(frame, taken.tolerance or 1.0, most, first, controller)
+        stages = TableauCoefficients(method.a, method.stage_times, errors)
         integrate_adaptive(forces, stages, steps, p, v, StageScratch.from_sizes(len(method.a), len(p)), step_stats)
         if step_stats[3] < frame:
             raise RuntimeError(

@@ -32,6 +32,11 @@ from springbench.solvers.methods.time_stepping.rosenbrock_tableaus import (
 )
 from springbench.solvers.model.barrier_energy import is_barrier_energy
 from springbench.solvers.model.energies.quadratic_energy import drag_of_vertices
+from springbench.solvers.model.integrators.step_size_controller import (
+    build_pi_controller,
+    choose_next_step_size,
+    compute_rejection_factor,
+)
 from springbench.solvers.model.step_problem import (
     NotPositiveDefinite,
     Positions,
@@ -44,8 +49,8 @@ from springbench.solvers.model.step_problem import (
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
-_STEP_SAFETY, _MIN_STEP_FACTOR, _MAX_STEP_FACTOR = 0.9, 0.2, 6.0
-"""Safety factor of the step size; bounds of its decrease and increase from one step to the next."""
+_MAX_STEP_FACTOR, _FAILURE_FACTOR = 6.0, 0.5
+"""Largest increase of the step size after one step; its decrease after a step without a factor or finite error."""
 _MIN_STEP_FRACTION, _MAX_STEPS = 1e-9, 100_000
 """Shortest step, relative to a frame; maximum number of attempted steps in a frame."""
 
@@ -238,7 +243,8 @@ class PreparedRosenbrock(IterativeSolver):
                 )
             return within.apply_pins(p, 1.0), v, AdaptiveStepStats(self.refine, 0, frame / self.refine, frame)
         t, accepted, rejected, h, before = 0.0, 0, 0, min(frame, h or frame), 1.0
-        power = 1.0 + min(self.coefficients.order, self.coefficients.embedded_order)
+        error_order = 1.0 + min(self.coefficients.order, self.coefficients.embedded_order)
+        control = build_pi_controller(error_order, _MAX_STEP_FACTOR, _FAILURE_FACTOR)
         while t < frame:
             last = t + 1.0000001 * h >= frame
             length = frame - t if last else h
@@ -247,12 +253,11 @@ class PreparedRosenbrock(IterativeSolver):
             if ratio <= 1.0 and made:
                 accepted, t = accepted + 1, frame if last else t + length
                 p, v = within.apply_pins(made.positions, t / frame), made.velocity
-                change = _STEP_SAFETY * max(ratio, 1e-10) ** (-0.7 / power) * before ** (0.4 / power)
-                before = max(ratio, 1e-4)
-                h = max(h, length * change) if last else length * min(_MAX_STEP_FACTOR, max(_MIN_STEP_FACTOR, change))
+                h = choose_next_step_size(control, length, h, last, ratio, before)
+                before = ratio
             else:
                 rejected += 1
-                h = length * (max(_MIN_STEP_FACTOR, _STEP_SAFETY * ratio ** (-1.0 / power)) if ratio < np.inf else 0.5)
+                h = length * compute_rejection_factor(control, ratio)
             if h < _MIN_STEP_FRACTION * frame or accepted + rejected >= _MAX_STEPS:
                 raise RuntimeError(
                     f"the error of {self.error_tolerance:.3g} m was not kept within "
