@@ -27,7 +27,6 @@ from springbench.harness.cli.commands.regress import regress
 from springbench.harness.cli.commands.regress_history import regress_history
 from springbench.harness.cli.commands.regress_study import regress_study
 from springbench.harness.cli.commands.roofline import roofline
-from springbench.harness.cli.commands.targets import targets
 from springbench.harness.cli.shared_options import (
     CompareOption,
     EndTimeOption,
@@ -254,7 +253,6 @@ app.command("list")(list_command)
 app.command()(roofline)
 app.command()(recommend)
 app.command()(export_script)
-app.command()(targets)
 app.command()(compact)
 app.command()(merge)
 app.command()(publish)

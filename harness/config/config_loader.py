@@ -113,8 +113,6 @@ def _load_any(
     document.user_code = policy
     if {"curves", "work"} & set(document.data):
         raise InputError(InputMistake("is an accuracy config; run it with `springbench accuracy`", path))
-    if "goals" in document.data:
-        raise InputError(InputMistake("has goals; run it with `springbench targets`", path))
     if "scenes" in document.data:
         if solvers or sizes or asked:
             raise InputError(InputMistake("is a sweep, which says itself what to run; change the file instead", path))

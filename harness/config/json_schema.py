@@ -1,6 +1,6 @@
 """JSON Schema (draft 2020-12) of all configs, generated from their models.
 
-Configs are scenes, sweeps, accuracy configs and performance targets. Editors use it for completion and validation.
+Configs are scenes, sweeps and accuracy configs. Editors use it for completion and validation.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field, create_model
 from pydantic.json_schema import models_json_schema
 from springbench.harness.config.accuracy_config import AccuracyConfig
-from springbench.harness.config.performance_targets import TargetsConfig
 from springbench.harness.config.solver_parameters import build_parameter_model
 from springbench.harness.config.sweep_config import SweepConfig
 from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
@@ -43,7 +42,7 @@ def build_json_schema() -> dict[str, Any]:
         create_model(name, __base__=base, solvers=(listed, ...))
         for name, base in (("Sweep", SweepConfig), ("Accuracy", AccuracyConfig))
     ]
-    models = (scene, *others, TargetsConfig)
+    models = (scene, *others)
     _, document = models_json_schema([(model, "validation") for model in models])
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -16,7 +16,6 @@ from math import inf, sqrt
 from time import thread_time
 
 import numpy as np
-from springbench.harness.config.performance_targets import PerformanceTarget, TargetCase
 from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget
 from springbench.harness.experiments.error_control.method_search import SearchResult
@@ -25,6 +24,8 @@ from springbench.harness.simulation.auto_tolerance import StopCriterion, build_s
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, Solver, Unsupported
 from springbench.solvers.registry import SOLVER_TABLE, find_solver_info, load_target
+
+from tests.bench.target_config import PerformanceTarget, TargetCase
 
 MAX_SIMULATION_SECONDS = 20.0
 """CPU time limit of one simulation [s]."""
@@ -91,7 +92,7 @@ def find_baseline(
     """
     return (
         _measure_third_party(performance_target, error_target, search_result)
-        if performance_target.target.peer
+        if performance_target.target.third_party
         else _find_fixed_steps(performance_target, error_target, error, print_message)
     )
 
@@ -99,12 +100,12 @@ def find_baseline(
 def _measure_third_party(
     performance_target: TargetCase, error_target: ErrorTarget, search_result: SearchResult
 ) -> TargetBaseline:
-    (peer,) = compare_third_party(
-        error_target, performance_target.error, search_result, [performance_target.target.peer or ""]
+    (other,) = compare_third_party(
+        error_target, performance_target.error, search_result, [performance_target.target.third_party or ""]
     )
-    if peer.reason:
-        raise RunFailed(f"{peer.name}: {peer.reason}")
-    return TargetBaseline(peer.name, peer.error_estimated, peer.cpu_seconds)
+    if other.reason:
+        raise RunFailed(f"{other.name}: {other.reason}")
+    return TargetBaseline(other.name, other.error_estimated, other.cpu_seconds)
 
 
 def _find_fixed_steps(
@@ -141,13 +142,11 @@ def _find_fixed_steps(
             nearest = found
     if again is None:
         if not bounds:
-            raise RunFailed(
-                f"no steps of one length keep to the error within {MAX_SIMULATION_SECONDS:g} s of processor time"
-            )
+            raise RunFailed(f"no fixed step size reaches the error within {MAX_SIMULATION_SECONDS:g} s of CPU time")
         least = min(bounds, key=lambda bound: bound.seconds)
-        print_message(f"  held against {least.name}")
+        print_message(f"  baseline: {least.name}")
         return least
-    print_message(f"  held against {best.name}")
+    print_message(f"  baseline: {best.name}")
     return replace(best, rerun_timed=lambda: _simulate_fixed_steps(error_target, error, again, inf).seconds)
 
 
@@ -173,8 +172,8 @@ def _build_lower_bound(
     fixed_steps: _FixedSteps, trial: TargetBaseline, nearest: TargetBaseline | None
 ) -> TargetBaseline:
     """Build the lower bound from steps that were still too long at the time limit."""
-    reached = f"; {nearest.name} err by {nearest.error:.2g}" if nearest else ""
-    name = f"{fixed_steps}, given up after {trial.seconds:.3g} s{reached}"
+    reached = f"; error {nearest.error:.2g} with {nearest.name}" if nearest else ""
+    name = f"{fixed_steps}, stopped after {trial.seconds:.3g} s{reached}"
     return TargetBaseline(name, nearest.error if nearest else inf, trial.seconds, is_lower_bound=True)
 
 

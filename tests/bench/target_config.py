@@ -1,4 +1,4 @@
-"""Performance targets of `springbench targets`: errors, baselines and target ratios of cost."""
+"""Configs of performance targets: errors, baselines and target ratios of cost."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from pydantic import Field, PositiveFloat, model_validator
 from springbench.harness.config.config_loader import check_file_name, read_scenes
 from springbench.harness.config.run_options import IterationLimit, RelativeTolerance
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.experiments.error_control.third_party_integrators import THIRD_PARTY_INTEGRATORS
 from springbench.harness.scenes.scene_spec import IntegratorName, MeshSize, SceneSpec
 from springbench.harness.schema.base_model import ConfigModel, OneOrMany
 from springbench.harness.schema.yaml_loader import read_yaml
+from springbench.solvers.registry import SOLVER_TABLE
 
 
 class PerformanceTarget(ConfigModel):
@@ -27,29 +29,29 @@ class PerformanceTarget(ConfigModel):
     """Names of scenes, the stems of their files."""
     size: OneOrMany[MeshSize] | None = None
     """Mesh sizes; each scene's default if left out."""
-    horizon: Annotated[float, Field(gt=0, le=1e4)]
+    t_end: Annotated[float, Field(gt=0, le=1e4)]
     """Simulated time [s]."""
     error: OneOrMany[Annotated[float, Field(gt=0, lt=1)]]
     """Error relative to the displacement at the end; each of several values is a target of its own."""
-    peer: str | None = None
+    third_party: str | None = None
     """Baseline: a third-party integrator, by name (`springbench run SCENE --error E --compare` lists them)."""
     integrator: OneOrMany[IntegratorName] | None = None
-    """Baseline instead of `peer`: fixed step sizes by these integrators ..."""
+    """Baseline instead of `third_party`: fixed step sizes by these integrators ..."""
     solver: OneOrMany[str] = ()
     """... these solvers ..."""
     tolerance: OneOrMany[RelativeTolerance] = (1e-1, 1e-2, 1e-4)
     """... and these tolerances; the step size is reduced until the error is the requested one."""
     iterations: IterationLimit = 500
     """Iteration limit of such a step."""
-    graded: bool = False
+    verify: bool = False
     """Whether errors are measured against the reference solution; then the requested error must be met, too."""
-    wanted: PositiveFloat
+    target_ratio: PositiveFloat
     """Target ratio of processor time to that of the baseline."""
 
     @model_validator(mode="after")
     def _check_alternatives(self) -> Self:
-        if (self.peer is None) == (self.integrator is None) or (self.integrator is None) != (not self.solver):
-            raise ValueError("wants either a `peer`, or `integrator` and `solver`, to be held against")
+        if (self.third_party is None) == (self.integrator is None) or (self.integrator is None) != (not self.solver):
+            raise ValueError("expected a baseline: either `third_party`, or `integrator` and `solver`")
         return self
 
 
@@ -60,7 +62,7 @@ class TargetsConfig(ConfigModel):
     """One sentence about the question that the config answers."""
     scenes: tuple[str, ...] = Field(min_length=1)
     """Scene files (*.yaml, or *.json of the assignment), relative to the config."""
-    goals: tuple[PerformanceTarget, ...] = Field(min_length=1)
+    targets: tuple[PerformanceTarget, ...] = Field(min_length=1)
     """The targets, in the order of their execution."""
 
 
@@ -75,40 +77,41 @@ class TargetCase(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TargetPlan:
-    """A validated config: its name, its scenes, and its individual targets."""
+    """A validated config: its name, its scenes, and its targets, one by one."""
 
     name: str
     scenes: dict[str, SceneSpec]
-    goals: Sequence[TargetCase]
+    cases: Sequence[TargetCase]
 
 
-def load_targets(path: Path, libraries: Sequence[str], solvers: Sequence[str]) -> TargetPlan:
+def load_targets(path: Path) -> TargetPlan:
     """Load performance targets from a YAML file.
 
-    Args:
-        path: the file.
-        libraries: names of available third-party integrators.
-        solvers: names of available solvers.
     Raises:
         InputError: for all mistakes.
     """
     document = read_yaml(path)
-    if "goals" not in document.data:
-        raise InputError(InputMistake("has no `goals`; `springbench run` does scenes and sweeps", path))
+    if "targets" not in document.data:
+        raise InputError(InputMistake("has no `targets`; `springbench run` runs scenes and sweeps", path))
     check_file_name(document)
     fields, scenes = document.validate_data(TargetsConfig, document.data), read_scenes(document)
-    for i, goal in enumerate(fields.goals if fields else ()):
+    for i, target in enumerate(fields.targets if fields else ()):
+        third_party = (target.third_party,) if target.third_party else ()
         for key, names, known in (
-            ("scene", goal.scene, list(scenes)),
-            ("solver", goal.solver, solvers),
-            ("peer", (goal.peer,) if goal.peer else (), libraries),
+            ("scene", target.scene, scenes),
+            ("solver", target.solver, SOLVER_TABLE),
+            ("third_party", third_party, THIRD_PARTY_INTEGRATORS),
         ):
             for name in names:
                 if name not in known:
-                    document.add_mistake(f"came {name!r}; wanted one of {', '.join(known)}", ("goals", i, key))
+                    document.add_mistake(
+                        f"unknown name {name!r}; expected one of {', '.join(known)}", ("targets", i, key)
+                    )
     if fields is None or document.mistakes:
         raise document.build_error()
-    every = [
-        TargetCase(goal, *one) for goal in fields.goals for one in product(goal.scene, goal.size or (None,), goal.error)
+    cases = [
+        TargetCase(target, *values)
+        for target in fields.targets
+        for values in product(target.scene, target.size or (None,), target.error)
     ]
-    return TargetPlan(path.stem, scenes, every)
+    return TargetPlan(path.stem, scenes, cases)

@@ -21,7 +21,7 @@ from springbench.harness.scenes.scene_builder import build_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSIGNMENT = ROOT.parent / "shared" / "scenes"
-OTHERS = {"curves:", "work:", "goals:"}
+OTHERS = {"curves:", "work:"}
 CONFIGS = [p for p in sorted((ROOT / "configs").glob("*.yaml")) if not OTHERS & {*p.read_text().splitlines()}]
 CONFIGS += [*sorted((ROOT / "configs" / "scenes").glob("*.yaml"))]
 

@@ -10,7 +10,6 @@ One table contains all kinds of rows; the column `kind` distinguishes them:
     asked     a simulation to a requested error (`springbench run SCENE --error`)
     way       a method that was tried for it, at its first setting
     peer      a simulation to the same error by a third-party integrator (`--compare`), whose name is `solver`
-    goal      the CPU time of the cheapest method for an error, compared with a baseline (`springbench targets`)
 
 Rows contain energies and errors of positions, never gaps. Gaps are computed on reading from `g`, `g0` and the lowest
 `g` of the minima, so that a better minimum needs no new measurement.
@@ -30,7 +29,7 @@ from springbench.harness.results.run_schema import (
 _TEXT, _INT, _REAL, _BOOL = pa.string(), pa.int64(), pa.float64(), pa.bool_()
 
 ACCURACY_COLUMNS = (
-    ColumnSpec("kind", _TEXT, "", "problem, minimum, prepare, curve, work, asked, way, peer or goal"),
+    ColumnSpec("kind", _TEXT, "", "problem, minimum, prepare, curve, work, asked, way or peer"),
     ColumnSpec("unit", _TEXT, "", "hash of all that determines the unit's result and timing"),
     *select_run_columns(
         "sweep", "scene", "size", "vertices", "springs", "solver", "parameters", "integrator", "time_step"
@@ -92,10 +91,6 @@ ACCURACY_COLUMNS = (
         "asked", "estimated", "local_tolerance_m", "accepted", "rejected", "factorisations", "estimate_seconds"
     ),
     ColumnSpec("promised", _REAL, "s", "of a way: processor time that it would take to the error asked, by its order"),
-    ColumnSpec("against", _TEXT, "", "of a goal: what was held against it, the best of its kind"),
-    ColumnSpec("against_error", _REAL, "", "its error, estimated as that of the goal"),
-    ColumnSpec("against_seconds", _REAL, "s", "its processor time, in the process of the goal's (`cpu_seconds`)"),
-    ColumnSpec("wanted", _REAL, "", "the part of that which is wanted"),
     *select_run_columns("device", "device_memory_gib", "device_driver", "device_versions"),
     *PROVENANCE_COLUMN_SPECS,
 )

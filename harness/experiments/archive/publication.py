@@ -145,7 +145,7 @@ def _is_config(path: Path) -> bool:
     return False
 
 
-_CONFIG_KEYS = {"scenes", "mesh", "curves", "work", "goals"}
+_CONFIG_KEYS = {"scenes", "mesh", "curves", "work"}
 """A required key of each kind of config."""
 
 

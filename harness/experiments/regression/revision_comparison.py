@@ -1,4 +1,4 @@
-"""Comparison of this checkout with a git revision.
+"""Comparison of this checkout with a git revision, the baseline.
 
 `springbench regress --against REVISION` runs it, in one run on one machine. Both must give the same answer before
 anything is timed. Deterministic counts (iterations, entries, bytes) are compared exactly. Then two processes are
