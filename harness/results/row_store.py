@@ -35,7 +35,7 @@ def packed_path(folder: Path) -> Path:
 
     It may not exist.
     """
-    return folder.with_name(f"{folder.name}.parquet")
+    return folder.parent / f"{folder.name}.parquet"  # with_name rejects "."
 
 
 def find_row_folders(above: Path, name: str, depth: str = "**/") -> list[Path]:
