@@ -25,7 +25,6 @@ from springbench.harness.cli.commands.preview import preview
 from springbench.harness.cli.commands.recommend import recommend
 from springbench.harness.cli.commands.regress import regress
 from springbench.harness.cli.commands.regress_history import regress_history
-from springbench.harness.cli.commands.regress_study import regress_study
 from springbench.harness.cli.commands.roofline import roofline
 from springbench.harness.cli.shared_options import (
     CompareOption,
@@ -262,7 +261,6 @@ app.command()(gallery)
 app.command()(preview)
 app.command()(regress)
 app.command()(regress_history)
-app.add_typer(regress_study, name="regress-study")
 
 
 @app.command()

@@ -41,7 +41,7 @@ NOUNS = _split_words(
 )
 """The classes that everything else is described by."""
 COMMANDS = _split_words(
-    "ablate compact merge publish figure gallery preview recommend regress record live replay roofline accuracy report "
+    "ablate compact merge publish figure gallery preview recommend regress roofline accuracy report "
     "query schema inspect view"
 )
 """Commands of the command line."""

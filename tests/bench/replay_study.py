@@ -40,16 +40,14 @@ from springbench.harness.experiments.regression.revision_process import GitRevis
 from springbench.harness.results import parquet_rows, run_schema
 
 RECORD_COLUMNS = (
-    run_schema.ColumnSpec("gate", pa.string(), "", "what takes turns"),
-    run_schema.ColumnSpec("condition", pa.string(), "", "what was run beside it: nothing, busy or bursty"),
-    run_schema.ColumnSpec("start", pa.int64(), "", "which pair of processes, from 0"),
+    run_schema.ColumnSpec("gate", pa.string(), "", "the benchmarked work"),
+    run_schema.ColumnSpec("condition", pa.string(), "", "background load: nothing, busy or bursty"),
+    run_schema.ColumnSpec("start", pa.int64(), "", "number of the process pair, from 0"),
     run_schema.ColumnSpec("order", pa.string(), "", "ABBA or BAAB"),
-    *(run_schema.ColumnSpec(f"call_{k}", pa.float64(), "s", f"time of the turn's call {k}") for k in range(4)),
-    run_schema.ColumnSpec(
-        "wall", pa.float64(), "s", "wall time of the whole turn, and of making the work anew after it"
-    ),
+    *(run_schema.ColumnSpec(f"call_{k}", pa.float64(), "s", f"time of call {k} of the block") for k in range(4)),
+    run_schema.ColumnSpec("wall", pa.float64(), "s", "wall time of the block, and of rebuilding the work after it"),
     run_schema.ColumnSpec("load", pa.float64(), "", "load average over a minute"),
-    run_schema.ColumnSpec("planted", pa.float64(), "", "extra work of A, as a part of its iterations"),
+    run_schema.ColumnSpec("planted", pa.float64(), "", "extra work of A, as a fraction of its iterations"),
 )
 RECORD_SCHEMA = run_schema.build_schema(RECORD_COLUMNS)
 
@@ -143,7 +141,7 @@ def run_background_load(background_load: str) -> Generator[None]:
     It is constant (busy), intermittent (bursty) or absent (nothing).
     """
     if background_load not in BACKGROUND_LOADS:
-        raise InputError(f"--condition: came {background_load}; wanted one of {', '.join(BACKGROUND_LOADS)}")
+        raise InputError(f"--condition: got {background_load}; expected one of {', '.join(BACKGROUND_LOADS)}")
     with ExitStack() as cleanup:
         for core in os.sched_getaffinity(0) if background_load != "nothing" else ():
             process = get_context("spawn").Process(
@@ -211,7 +209,7 @@ def replay_tests(
     rng, answers, seconds = np.random.default_rng(seed), list[SequentialVerdict](), list[float]()
     for _ in range(num_replays):
         answer, spent = _replay_test(rng, recorded_blocks, slowdown, sequential_test, budget)
-        if answer is SequentialVerdict.FAIL:  # which is believed when it comes twice
+        if answer is SequentialVerdict.FAIL:
             again, more = _replay_test(
                 rng, recorded_blocks, slowdown, replace(sequential_test, alpha=CONFIRMATION_ALPHA), budget - spent
             )

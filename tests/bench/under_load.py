@@ -20,11 +20,11 @@ from springbench.harness.execution.machine_info import limit_threads
 from springbench.harness.experiments.regression.abba_benchmark import BenchmarkResult, ProgramPair, run_paired_benchmark
 from springbench.harness.experiments.regression.answer_agreement import describe_difference
 from springbench.harness.experiments.regression.confidence_sequence import SequentialTest, SequentialVerdict
-from springbench.harness.experiments.regression.replay_study import run_background_load
 from springbench.harness.experiments.regression.solver_pair import build_timer, choose_num_calls
 
 from tests.bench.contact import CONTACT
 from tests.bench.gates import GATES, THREADS, Gate
+from tests.bench.replay_study import run_background_load
 
 NAMED = {gate.name: gate for gate in (*GATES, *CONTACT)}
 ASKED = ("harness-against-bare-solver-64", "numba-against-sparse-64", "idle-contact-against-none-64")

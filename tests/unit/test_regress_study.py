@@ -1,13 +1,16 @@
-"""The study of gates: what is recorded, and that a replay asks the gates' own rule."""
+"""The study of regression tests: recorded blocks, replayed tests, and real ones."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
-from springbench.harness.cli.main import app
 from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
-from springbench.harness.experiments.regression.live_study import summarise_live_study
-from springbench.harness.experiments.regression.replay_study import (
+from springbench.harness.results import parquet_rows
+from typer.testing import CliRunner
+
+from tests.bench.live_study import summarise_live_study
+from tests.bench.regress_study import app
+from tests.bench.replay_study import (
     OTHER_COMPARISONS,
     RECORD_SCHEMA,
     RecordedBlocks,
@@ -15,9 +18,6 @@ from springbench.harness.experiments.regression.replay_study import (
     replay_comparison,
     replay_tests,
 )
-from springbench.harness.results import parquet_rows
-from typer.testing import CliRunner
-
 from tests.scene_builders import CLOTH_SCENE_YAML
 
 
@@ -46,7 +46,7 @@ def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, tur
         (1.1, 1.03, (0.99, 1.0), (0.0, 0.0)),
     ],
 )
-def test_a_replay_finds_slowdowns_and_raises_no_alarm(
+def test_a_replay_finds_slowdowns_without_false_alarms(
     slower: float, limit: float, fails: tuple[float, float], holds: tuple[float, float]
 ):
     found = replay_tests(starts(), slower, SequentialTest(limit), budget=120.0, num_replays=1000)
@@ -56,24 +56,24 @@ def test_a_replay_finds_slowdowns_and_raises_no_alarm(
     assert 1.6 <= found.median_seconds <= 120  # 16 turns of .1 s, the fewest that decide
 
 
-def test_a_start_that_lies_badly_alone_hardly_makes_an_alarm():
+def test_one_deviating_process_pair_hardly_causes_a_false_alarm():
     # One of ten pairs of processes is 5 % apart: a tenth of first races fails, a tenth of those a second time.
     found = replay_tests(starts((1.05, *([1.0] * 9))), 1.0, SequentialTest(1.03), budget=120.0, num_replays=2000)
     assert 0.0 < found.fail_rate < 0.02
     assert found.inconclusive_rate > 0.05
 
 
-def test_pairs_that_differ_all_their_lives_are_drawn_again_in_a_long_race(monkeypatch: pytest.MonkeyPatch):
+def test_process_pairs_are_drawn_again_in_a_long_test(monkeypatch: pytest.MonkeyPatch):
     # A third of the pairs is .8 % apart: alone it does not show that the code is 2 % slower and not 1 %.
     recorded = starts((1.0, 1.0, 0.992), noise=0.04)
     several = replay_tests(recorded, 1.02, SequentialTest(1.01), budget=300.0, num_replays=300)
-    monkeypatch.setattr("springbench.harness.experiments.regression.replay_study.RESTART_SECONDS", 300.0)
+    monkeypatch.setattr("tests.bench.replay_study.RESTART_SECONDS", 300.0)
     alone = replay_tests(recorded, 1.02, SequentialTest(1.01), budget=300.0, num_replays=300)
     assert several.pass_rate == 0.0
     assert several.fail_rate > alone.fail_rate + 0.2  # .90 and .54
 
 
-def test_others_compare_one_session_with_the_next():
+def test_other_tools_compare_successive_sessions():
     same = starts()
     for rule in OTHER_COMPARISONS.values():
         assert replay_comparison(rule, same, 1.5, duration=20.0, num_replays=100) > 0.9
@@ -81,34 +81,33 @@ def test_others_compare_one_session_with_the_next():
 
 
 @pytest.mark.long
-def test_turns_are_recorded_and_replayed_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_blocks_are_recorded_and_replayed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     (tmp_path / ".git").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
     samples = tmp_path / "samples.parquet"
-    given = ["record", str(samples), "cloth.yaml", "--solver", "sparse", "--seconds", "1", "--planted", "0.1"]
+    given = ["record", str(samples), "cloth.yaml", "--solver", "sparse", "--seconds", "1", "--injected-slowdown", "0.1"]
     for starts in ("2", "1"):  # what is stored already is kept
-        done = CliRunner().invoke(app, ["regress-study", *given, "--starts", starts])
+        done = CliRunner().invoke(app, [*given, "--starts", starts])
         assert done.exit_code == 0, done.output
     recorded = parquet_rows.read_rows([samples], RECORD_SCHEMA).to_pylist()
     assert {row["start"] for row in recorded} == {0, 1, 2}
     assert {row["planted"] for row in recorded} == {0.1}
     ((key, found),) = read_recorded_blocks([samples]).items()
-    assert key == ("cloth, size 4, sparse, 50 iterations, implicit-euler, dt 0.03333", "nothing")
+    assert key == ("cloth, size 4, sparse, 500 iterations, implicit-euler, dt 0.03333", "nothing")
     assert sum(len(start.log_ratios) for start in found) == len(recorded)
-    done = CliRunner().invoke(app, ["regress-study", "replay", str(samples), "--replays", "20"])
+    done = CliRunner().invoke(app, ["replay", str(samples), "--replays", "20"])
     assert done.exit_code == 0, done.output
     assert "asv continuous" in done.output
 
 
 @pytest.mark.long
-def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_real_tests_are_counted_and_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
     given = [
-        "regress-study",
         "live",
         "held.parquet",
         "cloth.yaml",
@@ -116,14 +115,14 @@ def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: p
         "sparse",
         "--budget",
         "20",
-        "--limit",
+        "--max-ratio",
         "2",
     ]
-    assert CliRunner().invoke(app, [*given, "--gates", "2"]).exit_code == 0
-    done = CliRunner().invoke(app, [*given, "--gates", "1", "--planted", "4"])
+    assert CliRunner().invoke(app, [*given, "--repeats", "2"]).exit_code == 0
+    done = CliRunner().invoke(app, [*given, "--repeats", "1", "--injected-slowdown", "4"])
     assert done.exit_code == 0, done.output
     (same, slower) = summarise_live_study(tmp_path / "held.parquet")
-    # A machine that is too busy lets a gate say that it cannot tell, and nothing else.
+    # On a busy machine a test may be inconclusive, and nothing else.
     assert same[3:7] == ("0%", "100%", "2", "0")
     assert int(same[7]) + int(same[8]) == 2
     assert slower[3:6] == ("400%", "100%", "1")
@@ -135,9 +134,9 @@ def test_real_gates_are_held_and_counted_and_kept(tmp_path: Path, monkeypatch: p
     [
         (
             ("record", "new.parquet", "cloth.yaml", "--condition", "windy"),
-            "--condition: came windy; wanted one of nothing",
+            "--condition: got windy; expected one of nothing",
         ),
-        (("replay", "nowhere.parquet"), "nowhere.parquet: no such file; `springbench regress-study record` makes one"),
+        (("replay", "nowhere.parquet"), "nowhere.parquet: no such file; `record` writes one"),
     ],
 )
 def test_a_mistake_is_one_message(
@@ -146,6 +145,6 @@ def test_a_mistake_is_one_message(
     (tmp_path / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
-    done = CliRunner().invoke(app, ["regress-study", *arguments])
+    done = CliRunner().invoke(app, list(arguments))
     assert done.exit_code == 2, done.output
     assert said in " ".join(done.output.split())
