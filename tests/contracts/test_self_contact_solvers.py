@@ -176,7 +176,7 @@ def test_a_start_that_is_not_free_is_refused_with_the_pairs(name):
     made = build_test_scene(StackMesh(apart=0.2), SpringsEffect(stretch=100.0), APART, size=3)
     (check,) = APART.build_contribution(made.mesh, made.system.mass, 1 / 30).scene_checks
     with pytest.raises(InputError, match=words):
-        check(begin.positions(made.mesh.rest_positions), ())
+        check(begin.compute_positions(made.mesh.rest_positions), ())
     check(build_initial_state(made).motion.positions, ())
 
 

@@ -66,11 +66,11 @@ def test_what_a_killed_command_had_claimed_is_done_by_the_other(tmp_path: Path):
     assert not list((tmp_path / "r").rglob(".*partial*"))
 
 
-CLAIM = "from pathlib import Path; from springbench.harness.execution.folder_locks import Claims; import sys\n"
+CLAIM = "from pathlib import Path; from springbench.harness.execution.folder_locks import UnitClaims; import sys\n"
 
 
 def claimed_elsewhere(folder: Path, unit: Path) -> subprocess.Popen[str]:
-    code = f"{CLAIM}c = Claims(Path(sys.argv[1]), [u := Path(sys.argv[2])]); print(c.take(u), flush=True); input()"
+    code = f"{CLAIM}c = UnitClaims(Path(sys.argv[1]), [u := Path(sys.argv[2])]); print(c.try_claim(u), flush=True); input()"
     other = subprocess.Popen([sys.executable, "-c", code, str(folder), str(unit)], stdin=-1, stdout=-1, text=True)
     assert other.stdout
     assert other.stdout.readline() == "\n"

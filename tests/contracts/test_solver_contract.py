@@ -143,14 +143,14 @@ def test_phases_may_run_at_any_time_and_leave_the_solver_as_it_was(solver, probl
 @over(LOCAL_GLOBAL)
 def test_local_global_has_a_local_and_a_global_phase(solver):
     problem = build_random_problem(0)
-    assert set(solver.prepare(problem.system).phases(problem)) == {"local", "global"}
+    assert set(solver.prepare(problem.system).iteration_phases(problem)) == {"local", "global"}
 
 
 @solvers
 @problems
 def test_each_phase_does_what_it_returns(solver, problem):
     """What it returned is erased, and is there again when it is done once more."""
-    for call in solver.prepare(problem.system).phases(problem).values():
+    for call in solver.prepare(problem.system).iteration_phases(problem).values():
         first = call()
         assert first is not None
         if isinstance(first, np.ndarray):

@@ -54,7 +54,7 @@ def none_is_built(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("the mesh is built")
 
     for kind in (GridMesh, NetMesh, BlockMesh):
-        monkeypatch.setattr(kind, "generate", generate)
+        monkeypatch.setattr(kind, "generate_mesh", generate)
 
 
 def refusal(config: Path, command: str) -> str:

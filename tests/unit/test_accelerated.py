@@ -94,7 +94,7 @@ def test_a_run_tells_its_gradient_and_by_how_much_the_objective_fell(method, nam
     run.run_iterations(iteration_limit(0))
     # Of a gradient some units in the last place of stiffness times position: at a pin of its weight times that.
     pins, exact = problem.system.pins, problem.system.pins.exact_mask
-    stiffness = np.full(len(problem.inertial_target), prepared.base.trace)
+    stiffness = np.full(len(problem.inertial_target), prepared.local_global.unpinned_trace)
     stiffness[pins.vertices[~exact]] += pins.weight[~exact]
     start, size = problem.value(run.positions), problem.value_scale(run.positions)
     for _ in range(2):

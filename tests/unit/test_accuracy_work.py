@@ -96,7 +96,7 @@ def test_seconds_that_another_clock_does_not_bear_out_are_a_failure(
 
 
 LOST = [
-    ({"how": replace(UNIT.measurement, time_limit=1e-9)}, "time-limit", "was reached in frame"),
+    ({"measurement": replace(UNIT.measurement, time_limit=1e-9)}, "time-limit", "was reached in frame"),
     ({"solver": SolverSpec("symplectic-euler", {}), "case": replace(UNIT.case, integrator="bdf2")}, "unsupported", ""),
 ]
 

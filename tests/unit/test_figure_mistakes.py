@@ -38,7 +38,7 @@ BAD = {
     ),
     "nothing of that kind": (["convergence"], "holds no accuracy rows; run `springbench accuracy CONFIG`", ""),
     "no ablation": (["ablation"], "wanted the rows of `springbench ablate SCENE`", ""),
-    "no speed": (["roofline"], "wanted the rows of `springbench roofline CONFIG`", ""),
+    "no speed": (["speed"], "wanted the rows of `springbench roofline CONFIG`", ""),
     "no recordings": (["run"], "holds no recordings; run a sweep with `record: true`", ""),
     "type that does not fit": (["timing", "--width", "40mm", "--font-size", "20"], "wanted a wider figure", "is cut"),
     "a report without panels": (["medians"], "KIND: came 'medians'; wanted one of", ""),

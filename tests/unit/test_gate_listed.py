@@ -23,8 +23,8 @@ def test_the_gates_of_a_table_share_its_error_and_each_may_have_a_budget_of_its_
     (tmp_path / "gates.yaml").write_text(TABLE)
     asked: list[tuple[SequentialTest, float]] = []
 
-    def confirmed(start: Any, rule: SequentialTest, *, budget: float) -> str:
-        asked.append((rule, budget))
+    def confirmed(start: Any, rule: SequentialTest, *, time_budget: float) -> str:
+        asked.append((rule, time_budget))
         return "holds"
 
     monkeypatch.setattr(regression_table, "run_confirmed_benchmark", confirmed)

@@ -64,7 +64,7 @@ def test_the_id_depends_on_processor_cores_and_memory_alone():
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system has no affinity of processes")
 def test_the_cores_are_those_that_the_process_may_use():
     code = "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]); "
-    code += "from springbench.harness.execution import machine; print(machine.describe().cores)"
+    code += "from springbench.harness.execution import machine_info; print(machine_info.describe_machine().cores)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout == b"1\n"
 
 

@@ -125,7 +125,7 @@ def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatc
     assert 1e-6 < found["machine_step"] < 10.0
     (kept,) = user_cache_dir("machine").iterdir()
     assert kept.stem == compute_node_id()
-    for name in ("bandwidth", "flops", "step"):
+    for name in ("measure_copy_bandwidth", "measure_flops", "measure_step_seconds"):
         monkeypatch.delattr(machine_calibration, name)  # what is kept is not found again
     monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
     assert machine_calibration.calibrate_machine(lambda said: None) == found

@@ -96,7 +96,7 @@ def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
     page = (tmp_path / "site" / "data" / "made" / "runs.js").read_text()
     columns = json.loads(page.partition(", ")[2].strip().removesuffix(");"))["columns"]
     assert columns["step"] == [1.25, 3.5]
-    assert columns["largest_strain"] == [0.389, 0.389]
+    assert columns["max_strain"] == [0.389, 0.389]
     index = (tmp_path / "site" / "data" / "index.js").read_text()
     assert "numba, 1.25 ms a step; sparse 2.8 times as long" in index
 

@@ -37,7 +37,7 @@ def solved(scene) -> list[tuple[StepProblem, Solution]]:
 def test_it_finds_the_minima_of_newtons_method_alone_in_less_than_half_of_the_iterations(scene, solved):
     alone = NewtonSolver().prepare(scene.system)
     assert isinstance(alone, PreparedDescent)
-    alone.method._settling = None  # pyright: ignore[reportAttributeAccessIssue]
+    alone.method._friction_search = None  # pyright: ignore[reportAttributeAccessIssue]
     iterations = 0
     for problem, solution in solved[20:]:
         wanted = alone.solve(problem, STOP)

@@ -86,7 +86,7 @@ class AggregatedJacobi:
         """
         if without_vertex_contact(system) is not system:
             raise Unsupported(
-                "a-jacobi: its matrix is computed once from Q, which does not include contact of vertices (Contact); "
+                "a-jacobi: its matrix is computed once from Q, which does not include contact of vertices (HalfSpaceContact); "
                 "use numba, chebyshev or vbd"
             )
         energies = require_projective(system, "a-jacobi")
