@@ -20,14 +20,6 @@ from springbench.solvers.cuda.device_step import DeviceStep, UploadedNetwork
 from springbench.solvers.iteration.descent_method import ResidualMetric
 from springbench.solvers.iteration.device_interface import SolveEvents
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
-from springbench.solvers.kernels.iteration_loop import (
-    REASON_ITERATIONS,
-    REASON_STALLED,
-    RESIDUAL_EACH,
-    RESIDUAL_LAST,
-    LoopLimits,
-    check_residual,
-)
 from springbench.solvers.model.step_problem import Positions, Solution, StepProblem, StopRule
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
@@ -120,25 +112,9 @@ class DeviceSolverState(SolverState):
         """Return the residual; computed on the host from a copy of the positions."""
         return self.residual_of_positions(self.positions)
 
-    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Run iterations within the limits; evaluate the residual at intervals if it can end the solve."""
-        count, found, ended = 0, float("nan"), REASON_ITERATIONS
-        while count < limits.max_iterations and ended == REASON_ITERATIONS:
-            some = limits.max_iterations - count
-            some = (
-                min(ITERATIONS_PER_RESIDUAL - self._num_iterations % ITERATIONS_PER_RESIDUAL, some)
-                if limits.residual_mode == RESIDUAL_EACH
-                else some
-            )
-            count += self.run_unchecked(some)
-            if limits.residual_mode == RESIDUAL_EACH:
-                found = self.residual()
-                ended = check_residual(found, limits)
-            if ended == REASON_ITERATIONS and self.stalled:
-                ended = REASON_STALLED
-        if limits.residual_mode == RESIDUAL_LAST or (limits.residual_mode == RESIDUAL_EACH and count == 0):
-            found = self.residual()
-        return count, found, ended
+    def iterations_until_residual(self) -> int:
+        """Return the number of iterations up to the next multiple of ITERATIONS_PER_RESIDUAL."""
+        return ITERATIONS_PER_RESIDUAL - self._num_iterations % ITERATIONS_PER_RESIDUAL
 
     def solve_events(self) -> SolveEvents | None:
         """Events up to the last copy of positions, already synchronised.

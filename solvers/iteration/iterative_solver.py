@@ -3,8 +3,8 @@
     run = init_state(problem, guess);  step_state(run), step_state(run), ...  while residual(run) > rtol * residual_0
 
 A method supplies these three functions: an `IterativeSolver` has `init_state`, and a `SolverState` has `step_state` and
-`residual`. A method with a compiled loop overrides `run_iterations` and uses the kernel version in
-`springbench.solvers.kernels.iteration_loop`.
+`residual`. A method that does several iterations in one call overrides `run_unchecked`. A method with a compiled loop
+overrides `run_iterations` and uses the kernel version in `springbench.solvers.kernels.iteration_loop`.
 """
 
 from __future__ import annotations
@@ -53,9 +53,6 @@ EXACT_LENGTHS_UNSUPPORTED = (
 """Reason, after the method's name, why a method without length constraints does not support the scene."""
 
 
-_interpreted_loop = iteration_loop.build_loop(methodcaller("step_state"), methodcaller("residual"))
-
-
 class SolverState(ABC):
     """The state of a solve.
 
@@ -88,10 +85,33 @@ class SolverState(ABC):
         """Return whether the iterate may be a minimum if it is stationary; a saddle point returns False."""
         return True
 
+    def run_unchecked(self, num_iterations: int) -> int:
+        """Do iterations without a residual, up to the first that fails; return how many succeeded."""
+        for count in range(num_iterations):
+            if not self.step_state():
+                return count
+        return num_iterations
+
+    def iterations_until_residual(self) -> int:
+        """Return the number of iterations up to the next residual that may end the solve."""
+        return 1
+
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate up to the limits; return count, residual and reason, see
         `springbench.solvers.kernels.iteration_loop`."""
         return _interpreted_loop(self, limits)
+
+
+def _choose_batch_size(state: SolverState, limits: LoopLimits, remaining: int) -> int:
+    """Return the number of iterations up to the next residual; all remaining ones if no residual can end the solve."""
+    if limits.residual_mode != iteration_loop.RESIDUAL_EACH:
+        return remaining
+    return min(state.iterations_until_residual(), remaining)
+
+
+_interpreted_loop = iteration_loop.build_loop(
+    lambda state, count: state.run_unchecked(count), methodcaller("residual"), _choose_batch_size
+)
 
 
 class IterativeSolver(ABC):
@@ -222,14 +242,13 @@ class SubsteppingState(SolverState):
 
     def step_state(self) -> bool:
         """Integrate the step with one more substep."""
-        self.run_iterations(iteration_loop.ONE_ITERATION)
-        return True
+        return self.run_unchecked(1) == 1
 
-    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Integrate the step once, with as many more substeps as the limit has iterations."""
-        self._num_substeps += limits.max_iterations
+    def run_unchecked(self, num_iterations: int) -> int:
+        """Integrate the step once, with as many more substeps as iterations."""
+        self._num_substeps += num_iterations
         self.positions, self.velocity = self._step_in_substeps(self._problem, self._num_substeps)
-        return limits.max_iterations, float("nan"), iteration_loop.REASON_ITERATIONS
+        return num_iterations
 
 
 def is_far_from_origin(p: Positions) -> bool:

@@ -3,6 +3,8 @@
     iterate until  residual <= limit  or  residual <= floor  or no step descends  or all iterations are done
 
 `build_loop` builds the loop from functions that advance and measure a state, `build_compiled_loop` that for kernels.
+The threads of `springbench.solvers.kernels.local_global_iteration` interleave the iterations with the substitutions of
+a factor; they have the same limits and `check_residual`.
 """
 
 from __future__ import annotations
@@ -56,13 +58,17 @@ def check_residual(residual, limits):
     return REASON_FLOOR if residual <= limits.residual_floor else REASON_ITERATIONS
 
 
-def build_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> Callable[..., Any]:
+def build_loop(
+    run_unchecked: Callable[..., Any], residual: Callable[..., Any], batch_size: Callable[..., Any]
+) -> Callable[..., Any]:
     """Build the iteration loop of a state.
 
     Args:
-        step_state: function of the state that does an iteration and returns whether it succeeded; a failed one does not
-            count.
+        run_unchecked: function of the state and a number of iterations that does them and returns how many succeeded;
+            after the first failed one it does no more.
         residual: function of the state that returns the residual [J^(1/2)].
+        batch_size: function of the state, the limits and the number of remaining iterations that returns the number of
+            iterations up to the next residual.
 
     Returns:
         A function (state, limits) that returns the number of iterations, the last residual (nan if none was computed)
@@ -72,13 +78,13 @@ def build_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> 
     def iterate(state: Any, limits: Any) -> Any:
         count, found, ended = 0, np.nan, REASON_ITERATIONS
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
-            moved = step_state(state)
-            if moved:
-                count += 1
+            requested = batch_size(state, limits, limits.max_iterations - count)
+            done = run_unchecked(state, requested)
+            count += done
             if limits.residual_mode == RESIDUAL_EACH:
                 found = residual(state)
                 ended = check_residual(found, limits)
-            if ended == REASON_ITERATIONS and not moved:
+            if ended == REASON_ITERATIONS and done < requested:
                 ended = REASON_STALLED
         if limits.residual_mode == RESIDUAL_LAST or (limits.residual_mode == RESIDUAL_EACH and count == 0):
             found = residual(state)
@@ -88,5 +94,19 @@ def build_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> 
 
 
 def build_compiled_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> Any:
-    """Build the loop for kernels from inner functions."""
-    return jit_closure(build_loop(step_state, residual))
+    """Build the loop for kernels from inner functions of the state.
+
+    Args:
+        step_state: does an iteration and returns whether it succeeded.
+        residual: returns the residual [J^(1/2)].
+    """
+
+    @jit_closure
+    def run_one(state, requested):
+        return 1 if step_state(state) else 0
+
+    @jit_closure
+    def one_iteration(state, limits, remaining):
+        return 1
+
+    return jit_closure(build_loop(run_one, residual, one_iteration))

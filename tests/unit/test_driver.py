@@ -19,7 +19,6 @@ from springbench.solvers.kernels.iteration_loop import (
     RESIDUAL_LAST,
     RESIDUAL_NEVER,
     LoopLimits,
-    build_loop,
 )
 from springbench.solvers.methods.local_global.prefactored import require_only_springs
 from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule, System
@@ -87,7 +86,7 @@ def test_without_a_tolerance_only_the_last_residual_is_asked_for(monkeypatch):
     assert (solution.num_iterations, solution.termination_reason, len(asked)) == (6, "iterations", 1)
 
 
-class Table:
+class Table(SolverState):
     """Residuals that are given; None where the state cannot advance."""
 
     def __init__(self, *residuals: float | None) -> None:
@@ -136,8 +135,40 @@ LOOPS = {
 def test_a_loop_ends_by(what):
     residuals, limits, wanted, asked = LOOPS[what]
     state = Table(*residuals)
-    np.testing.assert_equal(build_loop(Table.step_state, Table.residual)(state, limits), wanted)
+    np.testing.assert_equal(state.run_iterations(limits), wanted)
     assert state.asked == asked
+
+
+class Batched(SolverState):
+    """Does several iterations in one call, all but those after the first `able`."""
+
+    def __init__(self, able: int) -> None:
+        self.able, self.batches = able, list[int]()
+
+    def step_state(self) -> bool:
+        return self.run_unchecked(1) == 1
+
+    def run_unchecked(self, num_iterations: int) -> int:
+        self.batches.append(num_iterations)
+        return min(num_iterations, self.able - sum(self.batches[:-1]))
+
+    def iterations_until_residual(self) -> int:
+        return 4
+
+    def residual(self) -> float:
+        return 1.0
+
+
+def test_iterations_between_residuals_are_one_call():
+    for able, mode, batches, wanted in (
+        (99, RESIDUAL_EACH, [4, 4, 2], (10, 1.0, REASON_ITERATIONS)),
+        (99, RESIDUAL_LAST, [10], (10, 1.0, REASON_ITERATIONS)),
+        (6, RESIDUAL_EACH, [4, 4], (6, 1.0, REASON_STALLED)),
+        (6, RESIDUAL_NEVER, [10], (6, np.nan, REASON_STALLED)),
+    ):
+        state = Batched(able)
+        np.testing.assert_equal(state.run_iterations(LoopLimits(10, 0.5, 0.0, mode)), wanted)
+        assert state.batches == batches
 
 
 class Stepping(SolverState):

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from springbench.solvers.iteration.solver_info import LIU_2013, LOCAL_GLOBAL_FAMILY, SolverInfo
-from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, LoopLimits
 from springbench.solvers.methods.local_global import cpp_backend
 from springbench.solvers.methods.local_global.prefactored import (
     LocalGlobalState,
@@ -56,13 +55,12 @@ class PreparedCholmod(PreparedLocalGlobal):
 
 
 class _CholmodState(LocalGlobalState):
-    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Run iterations within the limits; return their number, the residual and the reason of the end."""
-        if limits.residual_mode == RESIDUAL_EACH or limits.max_iterations < 2:
-            return super().run_iterations(limits)
+    def run_unchecked(self, num_iterations: int) -> int:
+        """Do all iterations but the last one in C++; return their number."""
+        if num_iterations < 2:
+            return super().run_unchecked(num_iterations)
         compiled = self.base.factor
         assert isinstance(compiled, cpp_backend.CppBackend)
         given = map(cpp_backend.array_address, (self.positions, self.right_hand_side))
-        compiled.library.iterate(compiled.handle, c_int64(limits.max_iterations - 1), *given)
-        count, residual, _ = super().run_iterations(limits._replace(max_iterations=1))
-        return limits.max_iterations - 1 + count, residual, REASON_ITERATIONS
+        compiled.library.iterate(compiled.handle, c_int64(num_iterations - 1), *given)
+        return num_iterations - 1 + super().run_unchecked(1)

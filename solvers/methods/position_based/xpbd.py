@@ -28,7 +28,6 @@ from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.device_interface import PrecisionOptions
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, SubsteppingState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
-from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, REASON_ITERATIONS, LoopLimits
 from springbench.solvers.methods.local_global.prefactored import require_only_springs
 from springbench.solvers.methods.position_based import xpbd_projection as kernels
 from springbench.solvers.methods.vertex_block import colouring
@@ -137,11 +136,10 @@ class XpbdState(SolverState):
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        self.run_iterations(ONE_ITERATION)
-        return True
+        return self.run_unchecked(1) == 1
 
-    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Run iterations within the limits; return their number, the residual and the reason of the end."""
+    def run_unchecked(self, num_iterations: int) -> int:
+        """Do iterations in one call; return their number."""
         made = self._prepared
         kernels.run_projections(
             made.coloured_constraints,
@@ -149,9 +147,9 @@ class XpbdState(SolverState):
             made.vertex_compliance,
             self.spring_tensions,
             self.positions,
-            limits.max_iterations,
+            num_iterations,
         )
-        return limits.max_iterations, float("nan"), REASON_ITERATIONS
+        return num_iterations
 
 
 @dataclass(frozen=True, eq=False)

@@ -282,14 +282,15 @@ class AugmentedSweepState(SweepState):
             some = min(1 + since // 2, limits.max_iterations - count)
             if some == 0:
                 return count, residual, iteration_loop.REASON_ITERATIONS
-            self.run_sweeps(some)
+            self.run_unchecked(some)
             count, since, residual = count + some, since + some, self.constrained_residual()
         return count, residual, ended
 
-    def run_sweeps(self, num_iterations: int) -> None:
-        """Run sweeps, each followed by a dual update."""
+    def run_unchecked(self, num_iterations: int) -> int:
+        """Run sweeps, each followed by a dual update; return their number."""
         self._kernel(
             self._colour_packets, self._half_spaces, self._element_data, self._right_hand_side,
             self._sweep_scratch, self._rows, num_iterations, self._constraint_elements, self._duals,
         )  # fmt: skip
         self.positions = self._rows.reshape(-1, 4)[self._prepared.row_of_vertex, :3].copy()
+        return num_iterations

@@ -36,7 +36,6 @@ from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.device_interface import PrecisionOptions
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
-from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, RESIDUAL_LAST, LoopLimits
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
@@ -233,8 +232,7 @@ class SweepState(SolverState):
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        self.run_sweeps(1)
-        return True
+        return self.run_unchecked(1) == 1
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
@@ -244,7 +242,7 @@ class SweepState(SolverState):
         """Return the positions (n, 3) after a sweep from p without contact planes."""
         if p is not self.positions:
             self._restart_at(p)
-        self.run_sweeps(1)
+        self.run_unchecked(1)
         return self.positions
 
     def sweep_with_planes(self, p: Positions, planes: ContactPlanes) -> Positions:
@@ -262,7 +260,7 @@ class SweepState(SolverState):
             made.colour_packets.num_free,
             is_two_sided=True,
         )
-        self.run_sweeps(1)
+        self.run_unchecked(1)
         self._half_spaces = touched
         return self.positions
 
@@ -271,19 +269,8 @@ class SweepState(SolverState):
         self._rows.reshape(-1, 4)[self._prepared.row_of_vertex, :3] = p
         self._sweep_scratch.omega[0], self._sweep_scratch.objective_value[0] = 0.0, np.nan
 
-    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Run iterations within the limits, in one call if no residual can end them."""
-        if limits.residual_mode == RESIDUAL_EACH:
-            return super().run_iterations(limits)
-        self.run_sweeps(limits.max_iterations)
-        return (
-            limits.max_iterations,
-            self.residual() if limits.residual_mode == RESIDUAL_LAST else float("nan"),
-            REASON_ITERATIONS,
-        )
-
-    def run_sweeps(self, num_iterations: int) -> None:
-        """Run sweeps over all vertices."""
+    def run_unchecked(self, num_iterations: int) -> int:
+        """Run sweeps over all vertices in one call; return their number."""
         made = self._prepared
         made.vertex_elements.iteration_kernel(
             self._colour_packets,
@@ -296,3 +283,4 @@ class SweepState(SolverState):
             num_iterations,
         )
         self.positions = self._rows.reshape(-1, 4)[made.row_of_vertex, :3].copy()
+        return num_iterations
