@@ -17,7 +17,7 @@ from springbench.harness.config.run_options import STEP_OPTIONS, ThreadCount, bu
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.scenes.scene_spec import FrameCount, InitialGuess, IntegratorName, MeshSize, SceneSpec
 from springbench.harness.schema.base_model import ConfigModel, OneOrMany
-from springbench.solvers.plugins.plugin_discovery import identify_code
+from springbench.solvers.plugins.plugin_discovery import PluginName, identify_code, select_plugins
 
 SnapshotName = Literal["early", "middle", "violent"] | FrameCount
 """A snapshot of the scene that is found from its own run, or the number of a frame."""
@@ -95,6 +95,10 @@ class BenchmarkCase:
         """Build plain data that determines the motion."""
         return [self.scene.scene_digest, self.size, identify_code(self.integrator)]
 
+    def find_plugins(self) -> list[PluginName]:
+        """Find the user code of the case: integrator, mesh and effects."""
+        return select_plugins([self.integrator, *self.scene.find_plugins()])
+
     @property
     def title(self) -> str:
         """Description of the case."""
@@ -131,6 +135,10 @@ class CurveSpec:
             identify_code(self.solver.name),
             dict(self.solver.parameters),
         ]
+
+    def find_plugins(self) -> list[PluginName]:
+        """Find the user code that is measured: that of the case, and the solver."""
+        return [*self.case.find_plugins(), *select_plugins([self.solver.name])]
 
     def compute_unit_id(self, machine: str) -> str:
         """Compute 12 hex digits from everything that determines result and timing."""
@@ -169,6 +177,10 @@ class WorkSpec:
         stop = [*self.options.values(), self.measurement.threads]
         solver = [identify_code(self.solver.name), dict(self.solver.parameters)]
         return ["work", *self.case.build_identity(), self.horizon, *solver, *stop]
+
+    def find_plugins(self) -> list[PluginName]:
+        """Find the user code that is measured: that of the case, and the solver."""
+        return [*self.case.find_plugins(), *select_plugins([self.solver.name])]
 
     def compute_unit_id(self, machine: str) -> str:
         """Compute 12 hex digits from everything that determines result and timing."""

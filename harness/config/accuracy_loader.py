@@ -38,7 +38,7 @@ from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, UserCodePolicy, quote_value
 from springbench.harness.schema.yaml_loader import read_yaml
-from springbench.solvers.plugins.plugin_discovery import PluginName, select_plugins
+from springbench.solvers.plugins.plugin_discovery import PluginName
 
 MAX_UNITS = 20_000
 
@@ -63,9 +63,7 @@ def load_accuracy(path: Path) -> AccuracyPlan:
 
 
 def _find_plugins(accuracy: AccuracyPlan) -> list[PluginName]:
-    units = (*accuracy.curves, *accuracy.work)
-    named = [name for unit in units for name in (unit.solver.name, unit.case.integrator)]
-    return select_plugins([*named, *(plugin for unit in units for plugin, _ in unit.case.scene.own.values())])
+    return [plugin for unit in (*accuracy.curves, *accuracy.work) for plugin in unit.find_plugins()]
 
 
 def _read_metadata(accuracy: AccuracyPlan) -> dict[str, Any]:

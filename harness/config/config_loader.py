@@ -168,7 +168,7 @@ def load_scene(path: Path) -> SceneSpec:
     """
     return load_in_sandbox(
         partial(_load_scene, path),
-        lambda scene: [plugin for plugin, _ in scene.own.values()],
+        SceneSpec.find_plugins,
         _check_binding,
         lambda scene: DEFAULT_LOAD_LIMITS,
     )

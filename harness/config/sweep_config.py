@@ -216,4 +216,4 @@ class RunSpec(FixedOptions, RunOptions):
 
     def find_plugins(self) -> list[PluginName]:
         """Find the user code of the run: solver, integrator, mesh and effects."""
-        return select_plugins([self.solver.name, self.integrator, *(plugin for plugin, _ in self.scene.own.values())])
+        return select_plugins([self.solver.name, self.integrator, *self.scene.find_plugins()])

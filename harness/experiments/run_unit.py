@@ -16,6 +16,7 @@ from springbench.harness.experiments.source_fingerprint import collect_source_pa
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.quantities import compute_ms_per_step
+from springbench.solvers.plugins.plugin_discovery import identify_plugins
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +67,7 @@ class RunUnit:
     @property
     def user_code(self) -> frozenset[Hashable]:
         """Identity of the user code that the run executes."""
-        return frozenset(tuple(plugin.identify_code()) for plugin in self.run.find_plugins())
+        return identify_plugins(self.run.find_plugins())
 
     @property
     def affinity_group(self) -> Hashable:

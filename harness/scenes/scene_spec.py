@@ -168,6 +168,10 @@ class SceneSpec(SceneFields):
         own |= {places[place]: told for place, told in self.own.items() if place in places}
         return {"effects": tuple(self.effects[i] for i in effect_indices), "own": own}
 
+    def find_plugins(self) -> list[PluginName]:
+        """Find the user code of the scene: mesh and effects."""
+        return [plugin for plugin, _ in self.own.values()]
+
     def load_plugins(self) -> SceneSpec:
         """Return the scene with plug-ins loaded, which imports their code; raise InputError on failure."""
         parts = (self.mesh, *self.effects)

@@ -129,6 +129,11 @@ def identify_code(name: str) -> str | list[str]:
     return name.identify_code() if isinstance(name, PluginName) else name
 
 
+def identify_plugins(plugins: Iterable[PluginName]) -> frozenset[tuple[str, ...]]:
+    """Return the identities of third-party code."""
+    return frozenset(tuple(plugin.identify_code()) for plugin in plugins)
+
+
 def select_plugins(names: Iterable[str]) -> list[PluginName]:
     """Return the names that refer to third-party code."""
     return [name for name in names if isinstance(name, PluginName)]

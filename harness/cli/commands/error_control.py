@@ -99,9 +99,7 @@ def run_error_control(
         positions,
         rerun,
     )
-    return run_isolated(
-        partial(_execute_error_control, *given), [plugin for plugin, _ in scene.own.values()], print_message
-    )
+    return run_isolated(partial(_execute_error_control, *given), scene.find_plugins(), print_message)
 
 
 def _execute_error_control(

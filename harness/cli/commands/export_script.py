@@ -5,15 +5,18 @@ The simulation is a point of an accuracy config.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from springbench.harness.console import format_plain_table, print_message
 from springbench.harness.errors import InputError, InputMistake, RunFailed
+from springbench.harness.execution.isolated_call import run_isolated
 
 if TYPE_CHECKING:
     from springbench.harness.config.accuracy_config import WorkSpec
+    from springbench.harness.execution.worker_process import ProgressCallback
     from springbench.harness.scenes.scene_builder import Scene
 
 
@@ -24,13 +27,13 @@ def export_script(
 ) -> None:
     """Export a script that repeats one simulation with an external engine alone."""
     from springbench.harness.config.accuracy_loader import load_accuracy
-    from springbench.solvers.registry import SOLVER_TABLE, load_target
+    from springbench.solvers.registry import SOLVERS, load_target
 
     engines = {spec.build_file_stem(): spec for spec in load_accuracy(config).work}
     engines = {
         label: spec
         for label, spec in engines.items()
-        if hasattr(load_target(SOLVER_TABLE[spec.solver.name]), "write_script")
+        if spec.solver.name in SOLVERS and hasattr(load_target(SOLVERS[spec.solver.name]), "write_script")
     }
     if not point:
         for line in format_plain_table(
@@ -49,7 +52,8 @@ def export_script(
         raise InputError(
             InputMistake(f"{output} is a file; expected a folder, which is made if it is missing", key="--output")
         )
-    texts = _write_script(found[0], engines[found[0]], output)
+    spec = engines[found[0]]
+    texts = run_isolated(partial(_write_script, found[0], spec, output), spec.find_plugins())
     print(texts[f"{found[0]}.py"], end="")
     print_message(f"{', '.join(texts)} and {found[0]}.npz are in {output.resolve()}: run `python {found[0]}.py` there")
 
@@ -59,7 +63,7 @@ def _format_point(spec: WorkSpec) -> tuple[str, ...]:
     return spec.build_file_stem(), spec.case.title, spec.case.integrator, str(spec.options["iterations"]), words
 
 
-def _write_script(name: str, spec: WorkSpec, folder: Path) -> dict[str, str]:
+def _write_script(name: str, spec: WorkSpec, folder: Path, tick: ProgressCallback) -> dict[str, str]:
     """Write the script's files next to their data, and return their texts by name."""
     import numpy as np
     from springbench.harness.execution import machine_info

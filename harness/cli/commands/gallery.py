@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from springbench.harness.console import print_message
 from springbench.harness.errors import InputError
+from springbench.harness.execution.isolated_call import run_isolated
+
+if TYPE_CHECKING:
+    from springbench.harness.config.sweep_config import RunSpec
+    from springbench.harness.execution.worker_process import ProgressCallback
 
 _SOLVER, _TOLERANCE = "hybrid", "1e-4"
 
@@ -39,8 +45,14 @@ def _format_strain_range(tiles: list[Any]) -> list[str]:
 
 def _build_tile(path: Path) -> Any:
     """Simulate a scene and build its tile."""
-    import numpy as np
     from springbench.harness.config.config_loader import load_config
+
+    run = load_config(path, solvers=[_SOLVER]).list_runs()[0]
+    return run_isolated(partial(_simulate_tile, run), run.find_plugins())
+
+
+def _simulate_tile(run: RunSpec, tick: ProgressCallback) -> Any:
+    import numpy as np
     from springbench.harness.execution import machine_info
     from springbench.harness.recording.local_origin import compute_local_origin, store_relative
     from springbench.harness.recording.obstacle_shapes import build_obstacles_property, list_obstacles
@@ -53,7 +65,6 @@ def _build_tile(path: Path) -> Any:
     from springbench.solvers.model.step_problem import StopRule
     from springbench.solvers.registry import SOLVERS, load_target
 
-    run = load_config(path, solvers=[_SOLVER]).list_runs()[0]
     scene = build_scene(run.scene, run.size)
     solver = load_target(SOLVERS[_SOLVER])()
     first = p = build_initial_state(scene).motion.positions

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.experiments.ablation.motion_difference import compute_mean_rest_length
 from springbench.harness.scenes.effects.effect_interface import ObservedMotion
-from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES, EFFECT_TABLE
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.solvers.registry import load_target
 
@@ -68,4 +68,4 @@ def suggest_effects(evidence: ObservedMotion, effect_kinds: Collection[str]) -> 
 
 
 def _load_effect_class(kind: str) -> Any:
-    return load_target(EFFECT_CLASSES[kind])
+    return load_target(EFFECT_TABLE[kind])

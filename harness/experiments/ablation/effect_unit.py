@@ -6,6 +6,7 @@ One run of a scene yields a file of rows under `<folder>/ablation`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from springbench.harness.experiments.ablation.ablation_schema import ABLATION_SC
 from springbench.harness.experiments.completion_status import CompletionStatus, read_completion_statuses
 from springbench.harness.experiments.failure_columns import build_failure_columns
 from springbench.harness.results import parquet_rows
+from springbench.solvers.plugins.plugin_discovery import identify_plugins
 
 ResultRow = dict[str, Any]
 
@@ -54,6 +56,11 @@ class EffectUnit(ABC):
     def task_limits(self) -> TaskLimits:
         """Limits of the run."""
         return TaskLimits(self.run.time_limit, self.run.memory_limit)
+
+    @property
+    def user_code(self) -> frozenset[Hashable]:
+        """Identity of the user code that the unit executes."""
+        return identify_plugins(self.run.find_plugins())
 
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Measure, write the rows and return the outcome as text."""

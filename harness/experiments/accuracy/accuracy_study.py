@@ -14,10 +14,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from springbench.harness.config.accuracy_config import CurveSpec, WorkSpec
+from springbench.harness.config.accuracy_config import BenchmarkCase, CurveSpec, WorkSpec
 from springbench.harness.config.accuracy_loader import AccuracyPlan
+from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
 from springbench.harness.execution import folder_locks, machine_info
-from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure
+from springbench.harness.execution.isolated_call import run_isolated
+from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure, TaskLimits
 from springbench.harness.execution.progress_display import ProgressDisplay, RunCost
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import (
@@ -84,9 +86,9 @@ def run_accuracy_study(
         CannotWrite: the rows cannot be written.
     """
     home = AccuracyResults(accuracy.name, folder)
-    for name, case in {spec.case.scene_name: spec.case for spec in reversed(accuracy.work)}.items():
-        if has_contact(build_exact_scene(case.scene, case.size).system):
-            print_message(describe_self_convergence(name))
+    cases = {spec.case.scene_name: spec.case for spec in reversed(accuracy.work)}
+    plugins = [plugin for case in cases.values() for plugin in case.scene.find_plugins()] if isolated else []
+    run_isolated(partial(_report_contact, cases), plugins, print_message, TaskLimits(*DEFAULT_LOAD_LIMITS))
     require_threads({spec.measurement.threads for spec in (*accuracy.curves, *accuracy.work)})
     (folder / "accuracy").mkdir(parents=True, exist_ok=True)
     with folder_locks.lock_folder_exclusive(folder):
@@ -100,6 +102,13 @@ def run_accuracy_study(
         execute_units([p.unit for p in todo], display, isolated=isolated)
     paths = [home.rows_path(label) for p in planned for label in _list_labels(p.unit.spec)]
     return list(dict.fromkeys(paths))
+
+
+def _report_contact(cases: Mapping[str, BenchmarkCase], print_message: Callable[[str], None]) -> None:
+    """Report the scenes by name whose contact has no certified reference; binds their user code."""
+    for name, case in cases.items():
+        if has_contact(build_exact_scene(case.scene, case.size).system):
+            print_message(describe_self_convergence(name))
 
 
 @contextmanager

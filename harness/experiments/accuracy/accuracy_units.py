@@ -8,7 +8,7 @@ the whole unit is measured.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -27,6 +27,7 @@ from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import ReferenceTrajectory
 from springbench.harness.results import parquet_rows
+from springbench.solvers.plugins.plugin_discovery import identify_plugins
 
 ResultRow = dict[str, Any]
 
@@ -89,6 +90,11 @@ class SnapshotUnit:
     def task_limits(self) -> TaskLimits:
         """Wall-time limit, proportional to the number of snapshots."""
         return TaskLimits(EXTRA_WALL_SECONDS * len(self.curve_specs))
+
+    @property
+    def user_code(self) -> frozenset[Hashable]:
+        """Identity of the user code that the unit executes."""
+        return identify_plugins(self.curve_specs[0].case.find_plugins())
 
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Find the snapshots, write their rows and return the outcome as text."""
@@ -170,6 +176,11 @@ class CurveUnit:
             EXTRA_WALL_SECONDS + WALL_TIME_FACTOR * how.time_limit * (how.rounds + 2) * self.num_progress_steps
         )
 
+    @property
+    def user_code(self) -> frozenset[Hashable]:
+        """Identity of the user code that the unit executes."""
+        return identify_plugins(self.spec.find_plugins())
+
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Measure the curves, write their rows and return the outcome as text."""
         return _write_unit_rows(self.results, self.spec, self._measure_rows(tick))
@@ -227,6 +238,11 @@ class WorkPrecisionUnit:
             EXTRA_WALL_SECONDS
             + WALL_TIME_FACTOR * self.spec.measurement.time_limit * (self.spec.measurement.rounds + 1)
         )
+
+    @property
+    def user_code(self) -> frozenset[Hashable]:
+        """Identity of the user code that the unit executes."""
+        return identify_plugins(self.spec.find_plugins())
 
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Measure the simulation, write its row and return the outcome as text."""

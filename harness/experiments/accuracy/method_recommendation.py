@@ -15,6 +15,7 @@ import math
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -27,10 +28,16 @@ from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
+from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.progress_display import ProgressDisplay
+from springbench.harness.execution.worker_process import TaskLimits
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_study import measuring
-from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
+from springbench.harness.experiments.accuracy.accuracy_units import (
+    EXTRA_WALL_SECONDS,
+    load_reference_trajectory,
+    open_reference_store,
+)
 from springbench.harness.experiments.accuracy.best_first import SLOWER, Omitted, search
 from springbench.harness.experiments.accuracy.work_precision import build_work_rows
 from springbench.harness.reference.reference_store import ReferenceStore
@@ -193,14 +200,15 @@ def recommend_method(
     scene = load_scene(path)
     scene.require_fixed_time_step()
     size = (size or scene.default_size or 0) if isinstance(scene.mesh, MeshGenerator) else 0
+    isolated = partial(
+        run_isolated,
+        user_code=scene.find_plugins(),
+        print_message=print_message,
+        limits=TaskLimits(EXTRA_WALL_SECONDS),
+    )
     store = open_reference_store(results)
-    if t_end is None:
-        t_end = _find_longest_t_end(path, scene, size, max_error, store, print_message)
-    try:
-        asked = _build_study(path, scene, size, t_end, time_limit)
-    except InputError as refused:  # the studies are ours; what is wrong came with an option
-        raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
-    _compute_reference(scene, size, max_error, t_end, store, print_message)
+    asked: AccuracyPlan = isolated(partial(_plan_study, path, scene, size, max_error, t_end, time_limit, store))
+    t_end = asked.work[0].horizon
     ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
     omitted: Omitted | None = None
     if not any(way.error <= max_error and way.sweep != asked.name for way in ways):
@@ -213,8 +221,28 @@ def recommend_method(
     if not within:
         raise RunFailed(_explain_no_method(ways, reasons, max_error, t_end, omitted))
     best = within[0]
-    print_message(f"checking {best}")
-    return MethodRecommendation(tuple(ways), best, _check_method(best, store))
+    return MethodRecommendation(tuple(ways), best, isolated(partial(_check_method, best, store)))
+
+
+def _plan_study(
+    path: Path,
+    scene: SceneSpec,
+    size: int,
+    max_error: float,
+    t_end: float | None,
+    time_limit: float,
+    reference_store: ReferenceStore,
+    print_message: Callable[[str], None],
+) -> AccuracyPlan:
+    """Return the study that may be measured, and compute its reference. Raises InputError, RunFailed."""
+    if t_end is None:
+        t_end = _find_longest_t_end(path, scene, size, max_error, reference_store, print_message)
+    try:
+        study = _build_study(path, scene, size, t_end, time_limit)
+    except InputError as refused:  # the studies are ours; what is wrong came with an option
+        raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
+    _compute_reference(scene, size, max_error, t_end, reference_store, print_message)
+    return study
 
 
 def _find_longest_t_end(
@@ -353,8 +381,11 @@ def _build_work_spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSp
     return WorkSpec(case, row["horizon"], solver, {name: row[name] for name in STEP_OPTIONS}, how)
 
 
-def _check_method(best: MeasuredMethod, reference_store: ReferenceStore) -> MeasuredMethod:
+def _check_method(
+    best: MeasuredMethod, reference_store: ReferenceStore, print_message: Callable[[str], None]
+) -> MeasuredMethod:
     """Repeat the measurement of a method."""
+    print_message(f"checking {best}")
     row = build_work_rows(best.work_spec, load_reference_trajectory(best.work_spec, reference_store), lambda: None)[0]
     if row["status"] != "ok":
         raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")

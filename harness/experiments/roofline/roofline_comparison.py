@@ -6,7 +6,7 @@ each from the same first step of its scene.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,6 +48,7 @@ from springbench.harness.results.run_schema import RUN_SCHEMA
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.time_loop import build_initial_state, build_problem
 from springbench.solvers.model.step_problem import PreparedSolver
+from springbench.solvers.plugins.plugin_discovery import identify_plugins
 
 MALLOC_SETTINGS = {"default": "", "cheap": cpp_baseline.MALLOC_TUNABLES}
 """Memory settings of the C++ baseline: the defaults, or those that make temporaries cheapest."""
@@ -109,6 +110,11 @@ class RooflineUnit:
         )
         missing = next((one for one in found if one.status == NOT_STARTED), None)
         return missing or found[0]._replace(is_stale=any(one.is_stale for one in found))
+
+    @property
+    def user_code(self) -> frozenset[Hashable]:
+        """Identity of the user code that the unit executes."""
+        return identify_plugins(plugin for run in self.candidate_runs for plugin in run.find_plugins())
 
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Time all candidates, write their rows and return the outcome as text."""

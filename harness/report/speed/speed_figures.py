@@ -168,7 +168,14 @@ def compute_speed_figures(table: pa.Table) -> list[SpeedFigures]:
         groups[found[0]["scene"], found[0]["size"]][labels[found[0]["run_id"]]] = found
     out: list[SpeedFigures] = []
     for group in groups.values():
-        limits = MachineLimits([row for found in group.values() for row in found if row["solver"] == MACHINE_SOLVER])
+        limits = MachineLimits(
+            [
+                row
+                for found in group.values()
+                for row in found
+                if row["solver"] == MACHINE_SOLVER and row["status"] == "ok"
+            ]
+        )
         for label, found in group.items():
             if found[0]["solver"] != MACHINE_SOLVER:
                 out.append(_compute_candidate(label, found, group, limits))

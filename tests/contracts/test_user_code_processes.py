@@ -1,0 +1,122 @@
+"""User code runs in processes of its own: whatever it does there, every command says so and ends by its exit code."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from springbench.harness.cli.main import app
+from typer.testing import CliRunner
+
+USER_CODE = """
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from springbench.harness.scenes.effects.effect_interface import EffectContribution, build_constant_force
+from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.schema.base_model import ConfigModel
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+
+
+def note(what):
+    if os.getpid() == {command}:
+        (Path(__file__).parent / "in-the-command").write_text(what)
+
+
+note("import")
+
+
+@dataclass(frozen=True)
+class Mine:
+    def prepare(self, system):
+        note("prepare")
+        return SparseLocalGlobal().prepare(system)
+
+
+class Hum(ConfigModel):
+    kind: Literal["hum"] = "hum"
+
+    def build_contribution(self, mesh, mass, time_step):
+        note("bind")
+        with (Path(__file__).parent / "count").open("a") as count:
+            count.write(".")
+            if count.tell() >= {exits_at}:
+                os._exit(0)
+        force = 0.0 * mesh.rest_positions
+        force[:, 0] = 0.1
+        return EffectContribution(forces=build_constant_force(force))
+
+
+class Cord(ChainMesh):
+    kind: Literal["cord"] = "cord"
+
+    def generate_mesh(self, size):
+        note("mesh")
+        return super().generate_mesh(size)
+"""
+FILES = {
+    "odd.yaml": """
+mesh: {kind: "./mine.py:Cord", length: 1.0}
+mass: 1.0
+time_step: 1/30
+frames: 3
+default_size: 3
+effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, at: [first]}, {kind: "./mine.py:Hum"}]
+""",
+    "accuracy.yaml": """
+scenes: [odd.yaml]
+solvers: ["./mine.py:Mine", sparse]
+work: [{horizon: 0.1, iterations: 20}]
+""",
+    "sweep.yaml": """
+scenes: [odd.yaml]
+sizes: [3]
+solvers: ["./mine.py:Mine", sparse]
+options: {frames: 2, rounds: 2}
+""",
+}
+COMMANDS = {
+    "accuracy": "accuracy accuracy.yaml",
+    "recommend": "recommend odd.yaml --error 0.9 --t-end 0.1 --budget 10",
+    "roofline": "roofline sweep.yaml --budget 0.1",
+    "ablate": "ablate odd.yaml --tolerance 0.1",
+    "gallery": "gallery odd.yaml -o sheet.png",
+    "run to an error": "run odd.yaml --error 0.1 --t-end 0.1",
+    "preview": "preview odd.yaml -o picture.png",
+}
+
+DRAWING = ("accuracy", "roofline", "gallery")
+"""Commands that draw pictures even so, or that import what draws them."""
+
+
+def command(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, exits_at: float) -> tuple[int, str]:
+    """Exit code and output of a command, whose effect ends its process in one of its bindings."""
+    (folder / "mine.py").write_text(USER_CODE.format(command=os.getpid(), exits_at=exits_at))
+    for file, text in FILES.items():
+        (folder / file).write_text(text)
+    monkeypatch.chdir(folder)
+    found = CliRunner().invoke(app, COMMANDS[name].split())
+    assert found.exception is None or isinstance(found.exception, SystemExit), found.output
+    assert "Traceback" not in found.output
+    assert (folder / "count").stat().st_size > 1, found.output[-3000:]
+    assert not (folder / "in-the-command").exists(), (folder / "in-the-command").read_text()
+    return found.exit_code, " ".join(found.output.split())
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in DRAWING else name for name in COMMANDS]
+)
+def test_user_code_that_exits_after_its_trial_ends_no_command(name: str, tmp_path: Path, monkeypatch):
+    code, said = command(tmp_path, monkeypatch, name, exits_at=2)
+    assert code in (1, 2)
+    assert "exit code 0" in said
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", COMMANDS)
+def test_user_code_that_works_never_runs_in_the_command(name: str, tmp_path: Path, monkeypatch):
+    code, said = command(tmp_path, monkeypatch, name, exits_at=1e9)
+    assert code == 0, said
