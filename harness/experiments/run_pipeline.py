@@ -47,6 +47,7 @@ from springbench.harness.recording.recorder_interface import (
 from springbench.harness.recording.recording_check import require_recorded_frames
 from springbench.harness.recording.rerun_recorder import RerunRecorder
 from springbench.harness.recording.strain_shading import compute_strain_range
+from springbench.harness.reference.gradient_check import measure_gradient_errors
 from springbench.harness.reference.residual_audit import AuditedSolver
 from springbench.harness.reference.step_verifier import StepVerifier, compute_reference_positions
 from springbench.harness.results import parquet_rows
@@ -149,10 +150,9 @@ def _run_passes(
             measured, told = _measure_rows(scene, _build_solver(run), settings, tick)
         where = device_columns(measured.prepared)
     timing_session.finish_timing()
-    by_frame = _run_instrumentation_pass(run, files, scene, measured, settings, tick, positions)
+    by_frame, stands = _run_instrumentation_pass(run, files, scene, measured, settings, tick, positions)
     told = told or timing_rows.build_timing_rows(measured)
     require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.tolerance, float))
-    stands = _build_status_columns(run, by_frame)
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.stats.items()}
     facts |= {"choice": measured.prepared.description, "modulus_exponent": _find_modulus_exponent(run, scene)}
     facts |= where | stands | how
@@ -169,16 +169,21 @@ def _find_modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
     return found.pop() if len(found) == 1 else None
 
 
-def _build_status_columns(run: RunSpec, by_frame: Mapping[int, Mapping[str, Any]]) -> dict[str, str]:
-    stands = {"status": "ok"}
-    if run.judge:
-        from springbench.harness.experiments.verification_status import (
-            build_verification_columns,
-        )  # for which those whom nobody judges need not wait
-
-        stands = build_verification_columns(run)
+def _build_status_columns(run: RunSpec, scene: Scene, by_frame: Mapping[int, Mapping[str, Any]]) -> dict[str, str]:
+    stands = _build_formula_check_columns(scene, run.frames) if run.judge else {"status": "ok"}
     growth = EnergyGrowth.from_rows(by_frame) if stands["status"] == "ok" else None
     return stands | (build_energy_growth_columns(run, growth, by_frame) if growth else {})
+
+
+def _build_formula_check_columns(scene: Scene, frames: int) -> dict[str, str]:
+    """Return `status` and `formula_check` of a finished run, and `reason` if a gradient is wrong."""
+    errors = measure_gradient_errors(scene, frames)
+    check = f"gradient: {', '.join(sorted(errors))}" if errors else "release"
+    wrong = [f"that of {name} by {error:.2g} of its size" for name, error in sorted(errors.items()) if error]
+    if not wrong:
+        return {"status": "ok", "formula_check": check}
+    reason = f"a gradient differs from the derivative of its energy's value: {', '.join(wrong)}"
+    return {"status": "wrong-gradient", "formula_check": check, "reason": f"{reason}; mend `add_gradient` or `value`"}
 
 
 @retry_on_mismatch
@@ -242,8 +247,11 @@ def _run_instrumentation_pass(
     settings: SteppingSettings,
     tick: ProgressCallback,
     positions: Path | None,
-) -> dict[int, dict[str, Any]]:
-    """Repeat the simulation and observe energies, convergence, positions and the recording."""
+) -> tuple[dict[int, dict[str, Any]], dict[str, str]]:
+    """Repeat the simulation and observe energies, convergence, positions and the recording.
+
+    Returns: the columns of each frame, and the status columns of the run.
+    """
     stored = np.empty((run.frames, len(scene.mesh.rest_positions), 3)) if positions else None
     samples = FrameSamples(run.frames)
     with ExitStack() as cleanup:
@@ -273,8 +281,8 @@ def _run_instrumentation_pass(
             measured.final_positions
         ):
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
+        stands = _build_status_columns(run, scene, found)
         if recorder and measured.final_positions is not None:
-            stands = _build_status_columns(run, found)
             ended = {name: stands[name] for name in ("status", "reason")} if stands["status"] != "ok" else None
             recorder.finish_recording(timing_rows.compute_milliseconds(measured, run.frames), ended)
             due = {frame: scene.compute_time(frame) for frame in samples.frames}
@@ -282,7 +290,7 @@ def _run_instrumentation_pass(
             found[run.frames]["recorded"] = require_recorded_frames(files.recording_path, recorder.info, due, motion)
     if positions and stored is not None:
         save_positions(positions, stored)
-    return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}
+    return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}, stands
 
 
 def _find_first_diverged_frame(

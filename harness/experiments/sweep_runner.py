@@ -115,8 +115,6 @@ def run_sweep(
             import_module(
                 "springbench.harness.experiments.run_pipeline"
             )  # here, for workers that are forks of this process
-            if any(p.run.judge for p in todo):
-                import_module("springbench.harness.experiments.verification_status")
         many = min(num_workers or choose_num_workers(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
         if away:

@@ -74,8 +74,8 @@ DIVERGED = RunOutcome("diverged", "#d1495b", "not finite any more, or far beyond
 ENERGY_GROWTH = RunOutcome("energy growth", "#c98ba6", "finite, with more energy than the scene can have given it")
 TIMED_OUT = RunOutcome("too slow", "#7b7f87", "did not end within its time limit")
 FAILED = RunOutcome("failed", "#23262b", "ended with an error")
-FORMULA_MISMATCH = RunOutcome(
-    "disputed", "#8a6d4b", "the second opinion finds the formulas of the steps themselves wrong"
+WRONG_GRADIENT = RunOutcome(
+    "wrong gradient", "#8a6d4b", "an energy from user code whose gradient is not the derivative of its value"
 )
 UNSUPPORTED = RunOutcome("refused", "#d9d9d6", "refused before it began, with a reason")
 RUN_OUTCOMES = (
@@ -89,7 +89,7 @@ RUN_OUTCOMES = (
     DIVERGED,
     TIMED_OUT,
     FAILED,
-    FORMULA_MISMATCH,
+    WRONG_GRADIENT,
     UNSUPPORTED,
 )
 
@@ -102,10 +102,10 @@ _OUTCOME_OF_STATUS = {
     "energy-growth": ENERGY_GROWTH,
     "failed": FAILED,
     "killed": FAILED,
-    "disputed": FORMULA_MISMATCH,
+    "wrong-gradient": WRONG_GRADIENT,
 }
 
-_COMPLETED_STATUSES = ("disputed", "energy-growth")
+_COMPLETED_STATUSES = ("wrong-gradient", "energy-growth")
 """Statuses of runs that were completed and have a row for each step."""
 
 

@@ -177,11 +177,12 @@ RUN_COLUMNS = (
         "frame, over the size at rest of the component it belongs to; null from where that is lost",
     ),
     ColumnSpec(
-        "second_opinion",
+        "formula_check",
         _TEXT,
         "",
-        "where judged: whether the step's formulas, written once more, agree at random points: agrees, disagrees (in "
-        "what, and by how much), or single opinion (effects from outside, held against themselves)",
+        "where judged: how the energies are checked: release (all are shipped; tests of each release compare them with "
+        "independently written formulas) or gradient (those from user code, by class: each gradient against the "
+        "derivative of its energy's value at random points)",
     ),
     ColumnSpec("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
     ColumnSpec("energy_inertia", _REAL, "J", "inertia term of the step's objective"),
@@ -270,7 +271,7 @@ RUN_COLUMNS = (
         "status",
         _TEXT,
         "",
-        "ok, unsupported, diverged, energy-growth (without a source), disputed (by the second opinion), failed (an "
+        "ok, unsupported, diverged, energy-growth (without a source), wrong-gradient (see formula_check), failed (an "
         "error, or a crash), time-limit, killed (from outside) or skipped",
     ),
     ColumnSpec("reason", _TEXT, "", "why the status is not ok"),

@@ -41,3 +41,8 @@ def load_file_module(path: Path) -> ModuleType:
         sys.modules.pop(name, None)
     _LOADED_CONTENT[name] = content
     return import_module(name)
+
+
+def is_file_module(name: str) -> bool:
+    """Return whether a module's name is that of a file next to a config."""
+    return name.startswith(_MODULE_PREFIX)

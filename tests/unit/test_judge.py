@@ -19,12 +19,12 @@ from springbench.harness.report.robustness import (
     CORRECT,
     DEGENERATE_MINIMUM,
     DIVERGED,
-    FORMULA_MISMATCH,
     NOT_CONVERGED,
     OTHER_MINIMUM,
     SADDLE_POINT,
     SILENTLY_WRONG,
     UNSUPPORTED,
+    WRONG_GRADIENT,
     VerifiedRun,
     build_score_table,
     classify_run,
@@ -139,7 +139,7 @@ GRADES = {
     ),
     "a motion without a reference": ([OK | {"stationarity": None, "distance": None}], NOT_CONVERGED),
     "diverged": ([OK | {"status": "diverged", "reason": "not finite"}], DIVERGED),
-    "disputed": ([OK | {"status": "disputed", "reason": "the second opinion disagrees: forces"}], FORMULA_MISMATCH),
+    "wrong gradient": ([OK | {"status": "wrong-gradient", "reason": "a gradient differs"}], WRONG_GRADIENT),
     "refused": ([OK | {"status": "unsupported", "frame": None, "reason": "no mass"}], UNSUPPORTED),
 }
 

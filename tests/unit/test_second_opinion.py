@@ -13,16 +13,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from springbench.harness.config.config_loader import load_config, load_scene
-from springbench.harness.experiments import run_pipeline as runs
-from springbench.harness.experiments import verification_status
-from springbench.harness.report.robustness import CORRECT, FORMULA_MISMATCH, classify_run
+from springbench.harness.config.config_loader import load_scene
 from springbench.harness.scenes.effects.effect_interface import EffectContribution, PinGroup
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.schema.base_model import ConfigModel
-from springbench.harness.verification.verify_scene import verify_terms
-from springbench.solvers.model.energies.bending_energy import Bending
 from springbench.solvers.model.energies.quadratic_energy import Quadratic
 from springbench.solvers.model.integrators import INTEGRATORS
 from springbench.solvers.model.step_problem import Energy, Positions
@@ -46,10 +41,8 @@ from tests.formula_mutations import (
     SPRINGS_SPEC,
     STRAIN_LIMITS_SPEC,
     build_scene_spec,
-    mutate_energy,
     patch_attribute,
     run_reference_check,
-    scale_fields,
 )
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -226,56 +219,3 @@ def test_damping_of_what_comes_from_outside_has_no_second_opinion():
     spec = build_scene_spec(SPRINGS_SPEC, RAYLEIGH_SPEC)
     spec = spec.model_copy(update={"effects": (*spec.effects, Outside())})
     assert run_reference_check(spec, 4) == "single opinion: effects[1] rayleigh, effects[2] magnet"
-
-
-SCENE = """mesh: {kind: grid}
-mass: 1
-time_step: 0.03
-frames: 2
-default_size: 4
-effects: [{kind: gravity}, {kind: springs, stretch: 100}, {kind: bending, stiffness: 0.1}, {kind: pins, at: [left]}]
-"""
-
-
-def test_a_run_that_is_disputed_is_not_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    asked = {"tolerance": 1e-6, "rounds": 1, "judge": True, "record": False, "iterations": 200}
-    newton, sparse = load_config(tmp_path / "scene.yaml", solvers=["newton", "sparse"], **asked).list_runs()
-    times: list[str] = []
-
-    def counted(*given: Any) -> str:
-        times.append(verify_terms(*given))
-        return times[-1]
-
-    monkeypatch.setattr(verification_status, "verify_terms", counted)
-
-    def rows_of(run: Any) -> list[dict[str, Any]]:
-        files = runs.RunFiles.for_run(run, tmp_path)
-        files.rows_path.parent.mkdir(exist_ok=True)
-        done = runs.execute_run(run, files, lambda phase: None)
-        named = {"distance": None, "stationarity": None, "frame": None, "reason": None, "minimum": None}
-        return [named | row for row in done if row["phase"] == "step"]
-
-    verification_status.verify_formulas.cache_clear()
-    for run in (newton, sparse):
-        done = rows_of(run)
-        assert {(row["status"], row["second_opinion"]) for row in done} == {("ok", "agrees")}
-    assert classify_run(rows_of(newton))[0] is CORRECT
-    assert times == ["agrees"]  # once for the scene
-    mutate_energy(Bending, scale_fields(weight=2.0))(monkeypatch)
-    verification_status.verify_formulas.cache_clear()
-    done = rows_of(newton)
-    assert {row["status"] for row in done} == {"disputed"}
-    outcome, _, _, reason = classify_run(done)
-    assert outcome is FORMULA_MISMATCH
-    assert reason.startswith("the second opinion disagrees: effects[2] bending")
-    verification_status.verify_formulas.cache_clear()
-
-
-def test_a_run_that_is_not_judged_asks_for_no_second_opinion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    monkeypatch.setattr(verification_status, "verify_terms", lambda *given: pytest.fail("was asked"))
-    (run,) = load_config(tmp_path / "scene.yaml", solvers=["sparse"], rounds=1, record=False).list_runs()
-    files = runs.RunFiles.for_run(run, tmp_path)
-    files.rows_path.parent.mkdir()
-    assert {row["status"] for row in runs.execute_run(run, files, lambda phase: None)} == {"ok"}

@@ -26,7 +26,7 @@ COUNT = 12
 def sweep(tmp_path: Path) -> Path:
     """A sweep of so many runs: of two schemas, one with a column of somebody's own."""
     units = write_dummy_runs(tmp_path / "sweep", COUNT)
-    older = pq.read_table(units[3]).drop_columns(["graded", "second_opinion"])
+    older = pq.read_table(units[3]).drop_columns(["graded", "formula_check"])
     pq.write_table(older, units[3])
     pq.write_table(pq.read_table(units[5]).append_column("colour", pa.array(["red", "blue"])), units[5])
     return tmp_path / "sweep"

@@ -239,7 +239,7 @@ def load_published_runs(
     return runs, claims
 
 
-_REPRODUCIBLE_STATUSES = ("ok", "unsupported", "diverged", "disputed")
+_REPRODUCIBLE_STATUSES = ("ok", "unsupported", "diverged", "wrong-gradient")
 """Statuses that depend on the config of a run only."""
 
 
