@@ -233,8 +233,8 @@ def test_a_run_that_fails_keeps_and_marks_its_recording_up_to_there(tmp_path: Pa
     assert before[0]["status"] == "ok"
     assert read_replay(files.recording_path).properties["status"] == "ok"
 
-    def burst(scene, prepared, stop, *, first_guess, frames):
-        for step in simulate_scene(scene, prepared, stop, initial_guess=first_guess, frames=frames):
+    def burst(scene, prepared, stop, *, initial_guess, frames):
+        for step in simulate_scene(scene, prepared, stop, initial_guess=initial_guess, frames=frames):
             if step.index == 3:
                 step.positions[1] = np.inf
             yield step
