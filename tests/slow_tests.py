@@ -19,7 +19,12 @@ SLOW_NAME_PARTS = (
     *("float16", "float32", "eigen", "cholmod"),  # kernels of their own, and programs in C++
     "cuda/",  # in a simulator, which is Python
     *("newton, absolute", "newton, trust-region", "newton, progressive"),  # what `newton, clamp` does, but for a rule
-    *("bench/test_exact.py", "unit/test_speed.py", "unit/test_second_opinion_"),
+    *(
+        "bench/test_exact.py",
+        "unit/test_speed.py",
+        "oracles/test_planted_errors.py",
+        "oracles/test_obstacle_surfaces.py",
+    ),
     *(
         "unit/test_vbd_elements.py",
         "refuse_by_name[vbd-",

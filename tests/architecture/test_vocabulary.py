@@ -46,13 +46,13 @@ COMMANDS = _split_words(
 )
 """Commands of the command line."""
 REQUIRED = _split_words(
-    "invoke emit filter finalize codegen enable disable flush load store shuffle transform save again search "
+    "invoke emit filter finalize codegen enable disable flush load store shuffle save again search "
     "dot3 cross3 subtract3"
 )
 """Methods whose names a base class of a library prescribes, and operations of vector registers and of LLVM."""
 NOUN_PROPERTIES = _split_words(
     "packages complete left drop measuring Omitted verdict scene rows columns kill info lowest winner speedup expected "
-    "motion rest"
+    "motion"
 )
 """Attributes of small classes, whose class name says the rest."""
 ONE_WORD = SYMBOLS | PROPER | NOUNS | COMMANDS | REQUIRED | NOUN_PROPERTIES

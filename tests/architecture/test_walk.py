@@ -15,7 +15,7 @@ ROWS = (
     "experiments",
     "report",
     "config",
-    "reference verification",
+    "reference",
     "simulation",
     "recording",
     "scenes",

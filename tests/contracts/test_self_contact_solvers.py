@@ -31,13 +31,13 @@ from springbench.harness.simulation.time_loop import (
     prepare,
     simulate_scene,
 )
-from springbench.harness.verification.verify_scene import verify_terms
 from springbench.solvers.contact.contact_potential import SelfContact as Energy
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model import integrators
 from springbench.solvers.model.step_problem import StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
+from tests.oracles.verify_scene import verify_terms
 from tests.scene_builders import build_test_scene
 
 SOON = ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "anderson")

@@ -22,7 +22,6 @@ from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.delegating_solver import DelegatingSolver
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
-from springbench.harness.verification.verify_scene import verify_terms
 from springbench.solvers import registry
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.methods.vertex_block.avbd import AugmentedVertexBlockDescent as Avbd
@@ -33,6 +32,7 @@ from springbench.solvers.model.energies import spring_energy
 from springbench.solvers.model.energies.augmented_lagrangian import concatenate_constraints, length_errors
 from springbench.solvers.model.step_problem import Solution, StepProblem, StopRule, Unsupported
 
+from tests.oracles.verify_scene import verify_terms
 from tests.scene_builders import build_first_problem, build_test_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "exact"

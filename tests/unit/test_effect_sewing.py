@@ -18,10 +18,11 @@ from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.scenes.vertex_selectors import VertexSelection
 from springbench.harness.simulation.instrumentation_pass import count_intersections
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
-from springbench.harness.verification.verify_scene import verify_terms
 from springbench.solvers.model.energies.sewing_energy import Sewing as Energy
 from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.registry import SOLVERS, load_target
+
+from tests.oracles.verify_scene import verify_terms
 
 ROWS = tuple(VertexSelection(indices=tuple(range(first, first + 5))) for first in (0, 25))
 SEWN = SewingEffect(first=ROWS[0], second=ROWS[1], stiffness=2e4, begin=0.02, end=0.2, gap=0.05)

@@ -19,11 +19,11 @@ from springbench.harness.scenes.effects.wind_effect import WindEffect
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from springbench.harness.scenes.spring_stiffness import compute_spring_stiffness
-from springbench.harness.verification.scene_declaration import SceneDeclaration
-from springbench.harness.verification.vertex_selection import select_vertices as opinion_of
 from springbench.solvers.model.energies.spring_energy import Springs as SpringsEnergy
 from springbench.solvers.registry import load_target
 
+from tests.oracles.scene_declaration import SceneDeclaration
+from tests.oracles.vertex_selection import select_vertices as opinion_of
 from tests.scene_builders import build_test_scene
 
 MESH = GridMesh(width=2.0, height=1.0, skip_one=True).build_mesh(5)

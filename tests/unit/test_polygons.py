@@ -16,7 +16,8 @@ from springbench.harness.scenes.mesh.polygon_triangulation import (
     triangulate_polygons,
 )
 from springbench.harness.scenes.scene_builder import build_scene
-from springbench.harness.verification.verify_scene import verify_terms
+
+from tests.oracles.verify_scene import verify_terms
 
 ROUND_OFF = 1e-12
 """A few hundred additions of numbers of order one in float64."""

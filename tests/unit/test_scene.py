@@ -17,8 +17,8 @@ from springbench.harness.scenes.mesh.surface_meshes import SkirtMesh
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.instrumentation_pass import compute_penetration
-from springbench.harness.verification.verify_scene import verify_terms
 
+from tests.oracles.verify_scene import verify_terms
 from tests.scene_builders import build_test_scene
 
 

@@ -37,7 +37,6 @@ from springbench.harness.simulation.time_loop import (
     prepare,
     simulate_scene,
 )
-from springbench.harness.verification.verify_scene import verify_terms
 from springbench.solvers.contact.contact_potential import ObstacleContact
 from springbench.solvers.contact.obstacle_advancement import NoClearance
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
@@ -45,6 +44,7 @@ from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import Positions, StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
+from tests.oracles.verify_scene import verify_terms
 from tests.scene_builders import build_test_scene
 from tests.self_contact_scenes import random_displacement
 

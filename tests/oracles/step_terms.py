@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from springbench.harness.verification.complex_step import to_extended
-from springbench.harness.verification.scene_declaration import Array, EffectTerms, SceneDeclaration, StepMoment
+
+from tests.oracles.complex_step import to_extended
+from tests.oracles.scene_declaration import Array, EffectTerms, SceneDeclaration, StepMoment
 
 MotionArrays = Sequence[Array]
 """Positions (n, 3) [m] and velocities (n, 3) [m/s]."""

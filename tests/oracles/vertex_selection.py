@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 from springbench.harness.scenes.mesh.mesh import Mesh
-from springbench.harness.verification.scene_declaration import SceneDeclaration
+
+from tests.oracles.scene_declaration import SceneDeclaration
 
 
 def select_vertices(declared: SceneDeclaration, selection: Any) -> list[int]:

@@ -22,7 +22,7 @@ from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
 from springbench.solvers.model.integrators import SingleStageIntegrator
 from springbench.solvers.model.step_problem import StepProblem, System
 
-from tests.formula_mutations import (
+from tests.oracles.planted_errors import (
     AIR_DRAG_SPEC,
     ATTACHMENTS_SPEC,
     BALLOON_SPEC,

@@ -16,7 +16,9 @@ import numpy as np
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.time_loop import simulate_scene
-from springbench.harness.verification.compare_terms import (
+from springbench.solvers.model.step_problem import Solution, StepProblem, StopRule
+
+from tests.oracles.compare_terms import (
     ComparisonPoint,
     TermMismatch,
     compare_arrays,
@@ -24,12 +26,11 @@ from springbench.harness.verification.compare_terms import (
     compare_steps,
     with_friction_at,
 )
-from springbench.harness.verification.sample_points import SamplePoint, sample_points
-from springbench.harness.verification.scene_declaration import Array
-from springbench.harness.verification.scene_terms import SceneTerms, build_scene_terms
-from springbench.harness.verification.stage_terms import STAGED_INTEGRATORS, solve_stages
-from springbench.harness.verification.step_terms import build_reference_step
-from springbench.solvers.model.step_problem import Solution, StepProblem, StopRule
+from tests.oracles.sample_points import SamplePoint, sample_points
+from tests.oracles.scene_declaration import Array
+from tests.oracles.scene_terms import SceneTerms, build_scene_terms
+from tests.oracles.stage_terms import STAGED_INTEGRATORS, solve_stages
+from tests.oracles.step_terms import build_reference_step
 
 MATCH, MISMATCH, SELF_CHECK = "agrees", "disagrees", "single opinion"
 

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.time_loop import MotionState, build_initial_state
-from springbench.harness.verification.complex_step import to_extended
-from springbench.harness.verification.half_space_terms import find_nearest, obstacle_radius
-from springbench.harness.verification.key_frame_motion import place_at
-from springbench.harness.verification.obstacle_terms import build_obstacle_pairs, sample_contact_positions
-from springbench.harness.verification.scene_declaration import Array, SceneDeclaration
-from springbench.harness.verification.self_contact_terms import contract_to_contact
+
+from tests.oracles.complex_step import to_extended
+from tests.oracles.half_space_terms import find_nearest, obstacle_radius
+from tests.oracles.key_frame_motion import place_at
+from tests.oracles.obstacle_terms import build_obstacle_pairs, sample_contact_positions
+from tests.oracles.scene_declaration import Array, SceneDeclaration
+from tests.oracles.self_contact_terms import contract_to_contact
 
 NUM_POINTS = 20
 SPACING_FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)

@@ -22,9 +22,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from springbench.harness.verification.complex_step import ExtendedArray, to_extended
-from springbench.harness.verification.scene_declaration import Array, EffectTerms, SceneDeclaration, StepMoment
-from springbench.harness.verification.step_terms import MotionArrays, ReferenceStep, filter_motion, sum_forces
+
+from tests.oracles.complex_step import ExtendedArray, to_extended
+from tests.oracles.scene_declaration import Array, EffectTerms, SceneDeclaration, StepMoment
+from tests.oracles.step_terms import MotionArrays, ReferenceStep, filter_motion, sum_forces
 
 AnswerFunction = Callable[[float], Array]
 """Maps the time [s] of a stage to the solution (n, 3) [m] that the solver returns."""

@@ -14,11 +14,12 @@ from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
 from springbench.harness.scenes.mesh.mesh_table import MESH_CLASSES
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.verification.verify_scene import verify_terms
 from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact
 from springbench.solvers.model.integrators import INTEGRATORS, SingleStageIntegrator
 from springbench.solvers.model.step_problem import Positions, System
 from springbench.solvers.registry import load_target
+
+from tests.oracles.verify_scene import verify_terms
 
 INTEGRATOR_NAMES = ("implicit-euler", "bdf2", "midpoint")
 

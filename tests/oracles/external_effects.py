@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 from springbench.harness.scenes.effects.effect_interface import EffectContribution, PinGroup
-from springbench.harness.verification import per_vertex_terms
-from springbench.harness.verification.complex_step import EPS, ROUNDOFF_MULTIPLE, DirectionalDerivatives, to_extended
-from springbench.harness.verification.scene_declaration import Array, EffectTerms
 from springbench.solvers.model.step_problem import Energy, ProjectiveEnergy, StepStart, is_lagged
+
+from tests.oracles import per_vertex_terms
+from tests.oracles.complex_step import EPS, ROUNDOFF_MULTIPLE, DirectionalDerivatives, to_extended
+from tests.oracles.scene_declaration import Array, EffectTerms
 
 _COMPLEX_STEP = 1e-100
 

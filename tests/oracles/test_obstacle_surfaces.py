@@ -17,8 +17,9 @@ from springbench.harness.scenes.primitive_obstacles import BoxObstacle, CapsuleO
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.scenes.surface_obstacles import MeshObstacle
-from springbench.harness.verification.verify_scene import verify_terms
 from springbench.solvers.contact.contact_potential import ObstacleContact
+
+from tests.oracles.verify_scene import verify_terms
 
 TURNS = KeyFrameMotion(
     keys=(KeyFrame(time=0.0), KeyFrame(time=0.1, offset=(0.01, 0.02, 0.0), turn=20.0)), axis=(0.1, 1.0, 0.2)

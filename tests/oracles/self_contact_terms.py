@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from springbench.harness.verification.complex_step import ExtendedArray, ValueFunction, row_norms, to_extended
-from springbench.harness.verification.scene_declaration import (
+
+from tests.oracles.complex_step import ExtendedArray, ValueFunction, row_norms, to_extended
+from tests.oracles.scene_declaration import (
     Array,
     BeginFunction,
     EffectTerms,

@@ -14,8 +14,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from springbench.harness.verification.scene_declaration import Array, EffectTerms, SceneDeclaration
-from springbench.harness.verification.surface_terms import compute_triangle_areas
+
+from tests.oracles.scene_declaration import Array, EffectTerms, SceneDeclaration
+from tests.oracles.surface_terms import compute_triangle_areas
 
 FieldFunction = Callable[[Array, float], Array]
 

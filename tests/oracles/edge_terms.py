@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 from springbench.harness.scenes.mesh.mesh import Mesh
-from springbench.harness.verification.complex_step import ExtendedArray, ValueFunction, row_norms, to_extended
-from springbench.harness.verification.scene_declaration import (
+
+from tests.oracles.complex_step import ExtendedArray, ValueFunction, row_norms, to_extended
+from tests.oracles.scene_declaration import (
     Array,
     BeginFunction,
     EffectTerms,
@@ -23,7 +24,7 @@ from springbench.harness.verification.scene_declaration import (
     StepMoment,
     sum_edge_weights,
 )
-from springbench.harness.verification.vertex_selection import select_vertices
+from tests.oracles.vertex_selection import select_vertices
 
 
 def compute_edge_stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, bend: float) -> Array:

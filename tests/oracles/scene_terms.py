@@ -11,7 +11,8 @@ from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.verification import (
+
+from tests.oracles import (
     edge_terms,
     force_terms,
     half_space_terms,
@@ -20,8 +21,8 @@ from springbench.harness.verification import (
     self_contact_terms,
     surface_terms,
 )
-from springbench.harness.verification.external_effects import build_external_effect, sum_diagonals
-from springbench.harness.verification.scene_declaration import Array, BeginFunction, EffectTerms, SceneDeclaration
+from tests.oracles.external_effects import build_external_effect, sum_diagonals
+from tests.oracles.scene_declaration import Array, BeginFunction, EffectTerms, SceneDeclaration
 
 _EFFECT_BUILDERS: dict[str, Callable[[Any, SceneDeclaration], EffectTerms]] = {
     "air-drag": per_vertex_terms.build_air_drag_terms,

@@ -12,7 +12,8 @@ import math
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from springbench.harness.verification.complex_step import EPS, ExtendedArray, to_extended
+
+from tests.oracles.complex_step import EPS, ExtendedArray, to_extended
 
 _PI = 4 * np.arctan(np.longdouble(1))
 

@@ -16,8 +16,9 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-from springbench.harness.verification.complex_step import ExtendedArray, ValueFunction, to_extended
-from springbench.harness.verification.scene_declaration import Array, EffectTerms, SceneDeclaration, StepMoment
+
+from tests.oracles.complex_step import ExtendedArray, ValueFunction, to_extended
+from tests.oracles.scene_declaration import Array, EffectTerms, SceneDeclaration, StepMoment
 
 Triangle = frozenset[int]
 _RECTANGLE_RTOL = 1e-6

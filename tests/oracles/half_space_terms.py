@@ -18,9 +18,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from springbench.harness.verification.complex_step import ExtendedArray, ValueFunction, row_norms, to_extended
-from springbench.harness.verification.key_frame_motion import place_at
-from springbench.harness.verification.scene_declaration import (
+
+from tests.oracles.complex_step import ExtendedArray, ValueFunction, row_norms, to_extended
+from tests.oracles.key_frame_motion import place_at
+from tests.oracles.scene_declaration import (
     Array,
     BeginFunction,
     EffectTerms,

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.scenes.mesh.mesh import Mesh
-from springbench.harness.verification.complex_step import ExtendedArray, ValueFunction, to_extended
+
+from tests.oracles.complex_step import ExtendedArray, ValueFunction, to_extended
 
 Array = NDArray[np.float64]
 

@@ -14,10 +14,11 @@ import math
 from typing import Any
 
 import numpy as np
-from springbench.harness.verification.complex_step import ExtendedArray, ValueFunction, to_extended
-from springbench.harness.verification.edge_terms import build_edge_damping, compute_reference_stiffness, select_finite
-from springbench.harness.verification.key_frame_motion import place_at, velocity_at
-from springbench.harness.verification.scene_declaration import (
+
+from tests.oracles.complex_step import ExtendedArray, ValueFunction, to_extended
+from tests.oracles.edge_terms import build_edge_damping, compute_reference_stiffness, select_finite
+from tests.oracles.key_frame_motion import place_at, velocity_at
+from tests.oracles.scene_declaration import (
     Array,
     BeginFunction,
     EffectTerms,
@@ -25,8 +26,8 @@ from springbench.harness.verification.scene_declaration import (
     SceneDeclaration,
     StepMoment,
 )
-from springbench.harness.verification.surface_terms import build_bending_damping
-from springbench.harness.verification.vertex_selection import select_vertices
+from tests.oracles.surface_terms import build_bending_damping
+from tests.oracles.vertex_selection import select_vertices
 
 
 def build_attachments_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:

@@ -11,19 +11,20 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from springbench.harness.verification.complex_step import (
+from springbench.solvers.model.step_problem import Energy, StepProblem
+
+from tests.oracles.complex_step import (
     EPS,
     ROUNDOFF_MULTIPLE,
     DirectionalDerivatives,
     differentiate_along,
     to_extended,
 )
-from springbench.harness.verification.external_effects import check_own_gradient
-from springbench.harness.verification.key_frame_motion import bound_roundoff
-from springbench.harness.verification.scene_declaration import Array
-from springbench.harness.verification.scene_terms import SceneTerms
-from springbench.harness.verification.step_terms import ReferenceStep
-from springbench.solvers.model.step_problem import Energy, StepProblem
+from tests.oracles.external_effects import check_own_gradient
+from tests.oracles.key_frame_motion import bound_roundoff
+from tests.oracles.scene_declaration import Array
+from tests.oracles.scene_terms import SceneTerms
+from tests.oracles.step_terms import ReferenceStep
 
 _SETTLED_SLOPE_SHARE = 1e-3
 """Relative change of a slope allowed by friction's normal forces once the friction rounds have ended."""

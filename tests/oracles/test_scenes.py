@@ -22,7 +22,7 @@ from springbench.solvers.model.energies.quadratic_energy import Quadratic
 from springbench.solvers.model.integrators import INTEGRATORS
 from springbench.solvers.model.step_problem import Energy, Positions
 
-from tests.formula_mutations import (
+from tests.oracles.planted_errors import (
     AIR_DRAG_SPEC,
     ATTACHMENTS_SPEC,
     BALLOON_SPEC,

@@ -14,10 +14,11 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from springbench.harness.verification.complex_step import ExtendedArray, to_extended
-from springbench.harness.verification.key_frame_motion import place_at
-from springbench.harness.verification.scene_declaration import Array, EffectTerms, SceneDeclaration
-from springbench.harness.verification.self_contact_terms import (
+
+from tests.oracles.complex_step import ExtendedArray, to_extended
+from tests.oracles.key_frame_motion import place_at
+from tests.oracles.scene_declaration import Array, EffectTerms, SceneDeclaration
+from tests.oracles.self_contact_terms import (
     ContactPairs,
     IndexArray,
     build_barriers,
