@@ -70,7 +70,7 @@ class DummyWorker:
     def run_task(self, function: Any, tick: object, limits: object) -> str:
         unit = function.args[0]
         same = build_run_columns(unit.run) | {
-            "code": _cached_fingerprint(collect_source_parts(unit.run)),
+            "source_fingerprint": _cached_fingerprint(collect_source_parts(unit.run)),
             "phase": "step",
             "status": "ok",
             "seconds": 1e-3,

@@ -103,5 +103,5 @@ def compute_rest_shape(
         "current",
     )
     solution = (solver or NewtonSolver()).prepare(long.system).solve(stated, StopRule(iterations, rtol))
-    assert solution.termination_reason != "iterations", "the static solve has not converged"
+    assert solution.termination_reason != "max-iter", "the static solve has not converged"
     return solution.positions

@@ -17,6 +17,6 @@ def retry_if_preempted(
     differ by as much, and a lie about them is told by the mark alone. Raises AssertionError for a machine too busy."""
     for _ in range(MAX_ATTEMPTS):
         found = run()
-        if not any(row.get("interrupted") for row in found[0]):
+        if not any(row.get("preempted") for row in found[0]):
             return found
     raise AssertionError(f"interrupted in each of {MAX_ATTEMPTS} attempts: another process took this one's time")

@@ -30,7 +30,7 @@ SYNTHETIC_METHODS = {
     "hybrid": {"rate": 0.6, "cost": 1.3e-7, "setup": 2e-6},
 }
 RECORDED_ITERATIONS = tuple(sorted({round(10 ** (k / 12)) for k in range(37)} | {0}))
-MACHINE_COLUMNS = {"machine": "abc", "cpu": "A processor", "cores": 2, "threads": 1, "commit": "0" * 40}
+MACHINE_COLUMNS = {"machine_id": "abc", "cpu": "A processor", "cores": 2, "threads": 1, "commit": "0" * 40}
 LOWEST_ENERGY, ENERGY_DROP = 0.25, 2.0  # g* and g0 - g* [J]
 ROUNDOFF_GAP = 1e-12  # the least gap that a method reaches
 
@@ -56,20 +56,26 @@ def build_snapshot_rows(
 ) -> list[dict[str, Any]]:
     """A frozen step, and its minima 0.1 J apart."""
     digest = f"{scene}-{size}-{snapshot}"
-    row = build_shared_columns(scene, size, problem=digest, moment=snapshot, frame=7)
+    row = build_shared_columns(scene, size, problem_digest=digest, snapshot=snapshot, frame=7)
     facts = {
         "stiffness_ratio": 6.4e4,
         "mean_rest_length": 1 / size,
-        "g0": LOWEST_ENERGY + ENERGY_DROP,
-        "g0_inertial": LOWEST_ENERGY + 0.5 * ENERGY_DROP,
+        "objective_initial": LOWEST_ENERGY + ENERGY_DROP,
+        "objective_inertial": LOWEST_ENERGY + 0.5 * ENERGY_DROP,
     }
     minima = [
         row
-        | {"kind": "minimum", "branch": k, "minimum": f"m{k}", "g": LOWEST_ENERGY + 0.1 * k, "stationarity": 1e-14}
-        | {"smallest_eigenvalue": 0.1, "certified": certified}
+        | {
+            "kind": "minimum",
+            "minimum_index": k,
+            "minimum_id": f"m{k}",
+            "objective": LOWEST_ENERGY + 0.1 * k,
+            "stationarity": 1e-14,
+        }
+        | {"min_eigenvalue": 0.1, "is_certified": certified}
         for k in range(minima_count)
     ]
-    return [row | facts | {"kind": "problem", "magnitude": 40.0}, *minima]
+    return [row | facts | {"kind": "snapshot", "objective_magnitude": 40.0}, *minima]
 
 
 def compute_gaps(rate: float | None, iterations: Sequence[int], start: float) -> np.ndarray:
@@ -91,19 +97,29 @@ def build_curve_rows(
     """The rows of a solve: of preparing, then each iterate that is kept, down to round-off."""
     method = SYNTHETIC_METHODS[solver]
     row = build_shared_columns(
-        scene, size, solver=solver, parameters="{}", problem=f"{scene}-{size}-{snapshot}", moment=snapshot
+        scene, size, solver=solver, parameters="{}", problem_digest=f"{scene}-{size}-{snapshot}", snapshot=snapshot
     )
-    row |= {"frame": 7, "first_guess": initial_guess, **more}
-    yield row | {"kind": "prepare", "seconds": [method["setup"] * size**2] * 3, "cold": 1.0}
+    row |= {"frame": 7, "initial_guess": initial_guess, **more}
+    yield row | {"kind": "prepare", "seconds": [method["setup"] * size**2] * 3, "cold_seconds": 1.0}
     start = {"current": 1.0, "inertial": 0.2}[initial_guess]
     floor = 0.1 * minimum_index / ENERGY_DROP
     for k, gap in zip(RECORDED_ITERATIONS, compute_gaps(method["rate"], RECORDED_ITERATIONS, start), strict=True):
         g, stamp = LOWEST_ENERGY + ENERGY_DROP * (gap + floor), method["cost"] * size**2 * k
         yield (
             row
-            | {"kind": "curve", "iteration": k, "g": g, "branch": minimum_index, "minimum": f"m{minimum_index}"}
-            | {"largest_error": 0.3 * np.sqrt(gap), "rms_error": 0.1 * np.sqrt(gap), "stationarity": np.sqrt(gap)}
-            | {"seconds": [stamp * factor for factor in (0.97, 1.0, 1.1)], "iterations": 1000}
+            | {
+                "kind": "curve",
+                "iteration": k,
+                "objective": g,
+                "minimum_index": minimum_index,
+                "minimum_id": f"m{minimum_index}",
+            }
+            | {
+                "position_error_max_m": 0.3 * np.sqrt(gap),
+                "position_error_rms_m": 0.1 * np.sqrt(gap),
+                "stationarity": np.sqrt(gap),
+            }
+            | {"seconds": [stamp * factor for factor in (0.97, 1.0, 1.1)], "max_iterations": 1000}
         )
         if gap <= ROUNDOFF_GAP:
             return
@@ -111,9 +127,9 @@ def build_curve_rows(
 
 def build_failure_row(scene: str, size: int, snapshot: str, solver: str, status: str, reason: str) -> dict[str, Any]:
     row = build_shared_columns(
-        scene, size, solver=solver, parameters="{}", problem=f"{scene}-{size}-{snapshot}", moment=snapshot
+        scene, size, solver=solver, parameters="{}", problem_digest=f"{scene}-{size}-{snapshot}", snapshot=snapshot
     )
-    return row | {"kind": "curve", "first_guess": "current", "status": status, "reason": reason}
+    return row | {"kind": "curve", "initial_guess": "current", "status": status, "reason": reason}
 
 
 INTEGRATOR_ORDERS = {"implicit-euler": (1, 8.0), "bdf2": (2, 20.0), "midpoint": (2, 6.0)}
@@ -132,11 +148,18 @@ def build_work_rows(
                     cost = {None: 50, 1e-2: 20, 1e-4: 90}[tolerance] * 5e-8 * size**2 / dt
                     cost *= {"hybrid": 0.5, "xpbd": 0.3}.get(solver, 1.0)
                     yield (
-                        build_shared_columns(scene, size, solver=solver, parameters="{}", kind="work", problem="t")
-                        | {"integrator": integrator, "time_step": dt, "tolerance": tolerance, "iterations": iterations}
-                        | {"horizon": 1.0, "seconds": [cost] * 3, "seconds_per_simulated": cost, "error": error}
+                        build_shared_columns(
+                            scene, size, solver=solver, parameters="{}", kind="work", problem_digest="t"
+                        )
+                        | {
+                            "integrator": integrator,
+                            "time_step": dt,
+                            "residual_rtol": tolerance,
+                            "max_iterations": iterations,
+                        }
+                        | {"t_end": 1.0, "seconds": [cost] * 3, "seconds_per_simulated_second": cost, "error": error}
                         | {"cpu_seconds": 0.9 * cost, "stiffness_ratio": 1e3 * dt**2, "vertices": size**2}
-                        | {"error_rms_m": 0.1 * error, "first_guess": "assignment", "iterations_done": 1500}
+                        | {"end_error_rms_m": 0.1 * error, "initial_guess": "assignment", "num_iterations": 1500}
                     )
 
 
@@ -185,20 +208,20 @@ def build_liu2013_rows(times: float = 1.0) -> list[dict[str, Any]]:
             if long:  # the step of figure 2
                 points = [(0, 1.0), *((n, error) for n, (error, _) in LIU2013_FIGURE_2.items()), (50, 0.06)]
             same = build_shared_columns(
-                "curtain", side, solver="numba", parameters="{}", first_guess="inertial", kind="curve"
+                "curtain", side, solver="numba", parameters="{}", initial_guess="inertial", kind="curve"
             )
             found += [
                 same
-                | {"moment": f"frame-{frame}", "frame": frame, "iteration": n, "branch": 0, "minimum": "m0"}
+                | {"snapshot": f"frame-{frame}", "frame": frame, "iteration": n, "minimum_index": 0, "minimum_id": "m0"}
                 | {
-                    "g": LOWEST_ENERGY + 0.5 * ENERGY_DROP * (times * error if n else 1.0),
+                    "objective": LOWEST_ENERGY + 0.5 * ENERGY_DROP * (times * error if n else 1.0),
                     "stationarity": error,
-                    "iterations": 1000,
+                    "max_iterations": 1000,
                 }
-                | {"largest_error": error, "rms_error": error, "seconds": [1e-6 * n * side**2] * 2}
+                | {"position_error_max_m": error, "position_error_rms_m": error, "seconds": [1e-6 * n * side**2] * 2}
                 for n, error in points
             ]
             dt = found[0]["time_step"]
-            changed = {"problem": name, "sweep": "liu2013"}
+            changed = {"problem_digest": name, "sweep": "liu2013"}
             rows += [row | changed | {"stiffness_ratio": 1.03 * k * side**2 * dt**2} for row in found]
     return rows

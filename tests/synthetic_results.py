@@ -16,11 +16,11 @@ from tests import synthetic_benchmarks
 from tests.synthetic_recordings import build_recording_info, write_recording
 
 SHARED_COLUMNS = {
-    "machine": "abc",
+    "machine_id": "abc",
     "cpu": "A processor",
     "threads": 1,
     "commit": "0" * 40,
-    "code": "abc",
+    "source_fingerprint": "abc",
     "status": "ok",
 }
 SOLVER_NAMES = ("dense", "sparse", "numba", "newton", "hybrid", "xpbd")
@@ -65,9 +65,17 @@ def write_winner_results(folder: Path) -> Path:
                     row = made.build_shared_columns(
                         f"sway-{stiffness}", size, solver=solver, parameters="{}", kind="work"
                     )
-                    row |= {"integrator": integrator, "time_step": 1.0 / steps, "iterations": 50, "horizon": 1.0}
-                    row |= {"minimises": integrator != "own", "family": "explicit" if integrator == "own" else "other"}
-                    row |= {"seconds": [cost], "seconds_per_simulated": cost, "cpu_seconds": cost, "vertices": size**2}
+                    row |= {"integrator": integrator, "time_step": 1.0 / steps, "max_iterations": 50, "t_end": 1.0}
+                    row |= {
+                        "is_minimiser": integrator != "own",
+                        "family": "explicit" if integrator == "own" else "other",
+                    }
+                    row |= {
+                        "seconds": [cost],
+                        "seconds_per_simulated_second": cost,
+                        "cpu_seconds": cost,
+                        "vertices": size**2,
+                    }
                     row |= {"error": (0.3 / steps) ** order, "stiffness_ratio": 900.0 * number / steps**2}
                     rows.append(row)
     return made.write_accuracy_rows(folder, rows)
@@ -84,12 +92,16 @@ def write_engine_results(folder: Path) -> Path:
                 row |= {
                     "integrator": "own",
                     "time_step": 1 / 30,
-                    "iterations": steps,
-                    "horizon": 0.5,
-                    "own_steps": True,
+                    "max_iterations": steps,
+                    "t_end": 0.5,
+                    "is_substepping": True,
                 }
-                row |= {"minimises": False, "family": "engine" if solver in ("mujoco", "pypbd") else "explicit"}
-                row |= {"seconds_per_simulated": price * steps * 1e-4, "error": (1.0 / steps) ** order, "vertices": 81}
+                row |= {"is_minimiser": False, "family": "engine" if solver in ("mujoco", "pypbd") else "explicit"}
+                row |= {
+                    "seconds_per_simulated_second": price * steps * 1e-4,
+                    "error": (1.0 / steps) ** order,
+                    "vertices": 81,
+                }
                 if (mesh, solver) == ("stiff", "pypbd"):
                     row |= {"status": "unsupported", "reason": "expresses no such gravity", "error": None}
                 rows.append(row)
@@ -114,15 +126,20 @@ def _build_run_rows(case: str, solver: str, place: int, size: int) -> list[dict[
         "parameters": "{}",
         "vertices": size**2,
         "springs": 4 * size**2,
-        "started": "2026",
+        "started_at": "2026",
         "frame": 1,
         "round": 0,
     }
     if (case, solver) == ("numbers-large", "xpbd"):
         return [known | {"phase": "run", "status": "diverged", "reason": "not finite", "frame": None}]
     second = 1e-7 * (place + 1) * size ** (2.0 + place / 4)
-    judged = {"stationarity": 1e-7, "beyond": 10.0 ** (place - 8), "minimum": place != 3, "flat": False}
-    judged |= {"distance": 1e-5, "stopped": "iterations"}
+    judged = {
+        "stationarity": 1e-7,
+        "stationarity_above_roundoff": 10.0 ** (place - 8),
+        "is_local_minimum": place != 3,
+        "is_degenerate": False,
+    }
+    judged |= {"reference_distance": 1e-5, "termination_reason": "max-iter"}
     steps = [
         known | judged | {"phase": "step", "seconds": second * f, "frame": k + 1} for k, f in enumerate((0.9, 1, 1.2))
     ]
@@ -140,16 +157,26 @@ def write_ablation_results(folder: Path) -> Path:
         "rounds": 5,
     }
     whole |= {"time_step": 0.01, "seconds": 1.0}
-    rows: list[dict[str, Any]] = [whole | {"kind": "whole", "name": ""}]
+    rows: list[dict[str, Any]] = [whole | {"kind": "full-scene", "name": ""}]
     for k, name in enumerate(EFFECT_NAMES):
-        cost = {"cost": 0.05 * k, "cost_low": 0.05 * k - 0.04, "cost_high": 0.05 * k + 0.03}
-        rows.append(whole | cost | {"kind": "without", "name": name, "largest": 10.0 ** (1 - k), "extent": 20.0})
-    rows += [whole | {"kind": "error", "name": n, "largest": e} for n, e in (("solver", 3e-5), ("time-step", 2e-2))]
+        cost = {"added_seconds": 0.05 * k, "added_seconds_low": 0.05 * k - 0.04, "added_seconds_high": 0.05 * k + 0.03}
+        rows.append(
+            whole
+            | cost
+            | {"kind": "ablated", "name": name, "displacement_max": 10.0 ** (1 - k), "bounding_box_diagonal": 20.0}
+        )
+    rows += [
+        whole | {"kind": "error", "name": n, "displacement_max": e} for n, e in (("solver", 3e-5), ("time-step", 2e-2))
+    ]
     for solver in ("numba", "newton"):
         for k, name in enumerate(EFFECT_NAMES):
-            price = {"price": 1.0 + 0.2 * k, "price_low": 1.0 + 0.18 * k, "price_high": 1.0 + 0.25 * k}
-            rows.append(whole | price | {"kind": "price", "name": name, "solver": solver})
-    refused = {"kind": "price", "solver": "dense", "status": "unsupported"}
+            price = {
+                "overhead_ratio": 1.0 + 0.2 * k,
+                "overhead_ratio_low": 1.0 + 0.18 * k,
+                "overhead_ratio_high": 1.0 + 0.25 * k,
+            }
+            rows.append(whole | price | {"kind": "overhead", "name": name, "solver": solver})
+    refused = {"kind": "overhead", "solver": "dense", "status": "unsupported"}
     rows += [whole | refused | {"name": name} for name in EFFECT_NAMES[3:]]
     write_result_rows(folder / "ablation" / "cloth.parquet", rows, ABLATION)
     return folder
@@ -163,22 +190,31 @@ def write_speed_results(folder: Path) -> Path:
             "size": size,
             "vertices": size**2,
             "springs": 4 * size**2,
-            "load": 0.5,
+            "load_average": 0.5,
         }
-        machine = known | {"run_id": f"m{size}", "solver": "machine", "parameters": "{}", "phase": "read", "bytes": 1e3}
-        limits = [machine | {"seconds": 1e-6, "working_set": 1e3, "flops": None}]
+        machine = known | {
+            "run_id": f"m{size}",
+            "solver": "machine",
+            "parameters": "{}",
+            "phase": "read",
+            "bytes_moved": 1e3,
+        }
+        limits = [machine | {"seconds": 1e-6, "working_set_bytes": 1e3, "flops": None}]
         limits += [
-            machine | {"phase": f"fma {k}", "seconds": 1e-6, "bytes": None, "flops": 1e4}
+            machine | {"phase": f"fma {k}", "seconds": 1e-6, "bytes_moved": None, "flops": 1e4}
             for k in ("float64", "float32")
         ]
-        limits = [row | {"working_set": row.get("working_set") or 0.0} for row in limits]
+        limits = [row | {"working_set_bytes": row.get("working_set_bytes") or 0.0} for row in limits]
         write_result_rows(folder / "rows" / f"machine-{size}.parquet", limits)
         for place, (solver, linear) in enumerate((("sparse", None), ("numba", "auto"), ("numba", "supernodal"))):
             parameters = json.dumps({"linear": linear} if linear else {})
             one = known | {"run_id": f"{solver}{linear}{size}", "solver": solver, "parameters": parameters}
-            one |= {"started": "2025"} if linear == "supernodal" else {"started": "2026", "code": None}
+            one |= (
+                {"started_at": "2025"} if linear == "supernodal" else {"started_at": "2026", "source_fingerprint": None}
+            )
             rows = [
-                one | {"phase": phase, "round": k, "seconds": share * 1e-6 * (4 - place) * size**2, "iterations": 10}
+                one
+                | {"phase": phase, "round": k, "seconds": share * 1e-6 * (4 - place) * size**2, "num_iterations": 10}
                 for phase, share in (("prepare", 5.0), ("local", 0.3), ("global", 0.7), ("step", 1.0))
                 for k in range(3)
             ]

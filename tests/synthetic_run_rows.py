@@ -16,13 +16,19 @@ def build_dummy_rows(number: int, *, frames: int = 2) -> list[dict[str, Any]]:
     shared = {"run_id": f"{number:012x}", "sweep": "dummy", "scene": f"scene{number % 50}", "size": 8 + number % 9}
     shared |= {"solver": SOLVER_NAMES[number % 5], "parameters": "{}", "family": "local-global", "vertices": 64}
     shared |= {"springs": 210, "time_step": 1 / 30, "integrator": "implicit-euler", "max_iterations": 50, "threads": 1}
-    shared |= {"machine": "00000000", "cpu": "a processor", "cores": 2, "memory_gib": 16.0, "system": "Linux"}
-    shared |= {"versions": '{"numpy": "2.4"}', "commit": "0" * 40, "code": "0" * 12, "status": "ok"}
-    shared |= {"started": "2026-01-01T00:00:00+00:00", "minimises": True, "own_steps": False}
+    shared |= {
+        "machine_id": "00000000",
+        "cpu": "a processor",
+        "cores": 2,
+        "memory_gib": 16.0,
+        "operating_system": "Linux",
+    }
+    shared |= {"versions": '{"numpy": "2.4"}', "commit": "0" * 40, "source_fingerprint": "0" * 12, "status": "ok"}
+    shared |= {"started_at": "2026-01-01T00:00:00+00:00", "is_minimiser": True, "is_substepping": False}
     return [
         shared
-        | {"phase": "step", "frame": frame, "round": 0, "seconds": 1e-3 * (number % 7 + frame), "iterations": 50}
-        | {"residual": float("nan") if frame == 1 else 1e-3, "digest": f"{1000 * number + frame:064x}"}
+        | {"phase": "step", "frame": frame, "round": 0, "seconds": 1e-3 * (number % 7 + frame), "num_iterations": 50}
+        | {"residual": float("nan") if frame == 1 else 1e-3, "positions_digest": f"{1000 * number + frame:064x}"}
         for frame in range(1, frames + 1)
     ]
 

@@ -20,8 +20,8 @@ SCENE_NAMES = ("hanging-cloth", "flag-in-wind", "curtain")
 FRAME_COUNT = 6
 UNSUPPORTED_REASON = "knows springs </script> alone, and the scene has wind"
 _MACHINE_COLUMNS = {
-    "machine": "0123456789ab", "node": "ab", "cpu": "A processor of 3 GHz", "cores": 8, "memory_gib": 31.2,
-    "system": "Linux 6.1 x86_64", "versions": json.dumps({"numpy": "2.4"}), "commit": "1" * 40,
+    "machine_id": "0123456789ab", "node_id": "ab", "cpu": "A processor of 3 GHz", "cores": 8, "memory_gib": 31.2,
+    "operating_system": "Linux 6.1 x86_64", "versions": json.dumps({"numpy": "2.4"}), "commit": "1" * 40,
 }  # fmt: skip
 
 
@@ -33,9 +33,10 @@ def build_run_columns(number: int) -> dict[str, Any]:
     return {
         "run_id": f"{number:012x}", FILE_COLUMN: label, "sweep": "made", "scene": scene, "size": size, "solver": solver,
         "parameters": "{}", "vertices": size * size, "springs": 4 * size * size, "time_step": step,
-        "integrator": "implicit-euler", "first_guess": "current", "max_iterations": 50, "threads": 1,
-        "code": "old" if number == 1 else "new", "status": "ok",
-        "started": f"2026-11-{1 + number % 20:02d}T10:00:00+00:00", **_MACHINE_COLUMNS, **read_solver_metadata(solver),
+        "integrator": "implicit-euler", "initial_guess": "current", "max_iterations": 50, "threads": 1,
+        "source_fingerprint": "old" if number == 1 else "new", "status": "ok",
+        "started_at": f"2026-11-{1 + number % 20:02d}T10:00:00+00:00", **_MACHINE_COLUMNS,
+        **read_solver_metadata(solver),
     }  # fmt: skip
 
 
@@ -57,8 +58,13 @@ def build_run_rows(number: int) -> list[dict[str, Any]]:
     steps = [
         same
         | {"phase": "step", "frame": frame, "round": k, "seconds": 1e-3 * ms * (1 + 0.1 * k + 0.02 * frame)}
-        | {"iterations": 50, "stopped": "iterations", "residual": 1e-3 / frame, "largest_strain": 0.05 * frame}
-        | {"objective": 1.0 / frame, "digest": f"{same['scene']}{same['size']}{frame}"}
+        | {
+            "num_iterations": 50,
+            "termination_reason": "max-iter",
+            "residual": 1e-3 / frame,
+            "max_strain": 0.05 * frame,
+        }
+        | {"objective": 1.0 / frame, "positions_digest": f"{same['scene']}{same['size']}{frame}"}
         for frame in range(1, FRAME_COUNT + 1)
         for k in range(2)
     ]

@@ -42,7 +42,7 @@ class RunOptions(ConfigModel):
 
     iterations: Annotated[IterationLimit, RunOption("{} it.", "max_iterations")] = 50
     """Iteration limit of a step."""
-    tolerance: Annotated[RelativeTolerance | Literal["auto"], RunOption("tol. {}", "tolerance")] = None
+    tolerance: Annotated[RelativeTolerance | Literal["auto"], RunOption("tol. {}", "residual_rtol")] = None
     """Relative tolerance of a step's iterations; null performs all of them. auto: the remaining residual adds at most a
     tenth to the step's own local error, estimated by an embedded method or by differences of the velocity.
     """
@@ -54,7 +54,7 @@ class RunOptions(ConfigModel):
         InitialGuess,
         RunOption(
             "{}",
-            "first_guess",
+            "initial_guess",
             "null is `assignment` for JSON scenes, `motion` (extrapolated positions) for integrators that evaluate "
             "forces at their stages, else `current`",
         ),
@@ -68,7 +68,7 @@ class RunOptions(ConfigModel):
     """Number of steps."""
     rounds: Annotated[RoundCount, RunOption("{} rounds")] = 2
     """Number of repetitions of the timed part."""
-    accuracy: Annotated[RelativeError, RunOption("error {}", "asked")] = None
+    accuracy: Annotated[RelativeError, RunOption("error {}", "error_requested")] = None
     """Target for the relative error of the final positions. It selects integrator, steps and tolerance for the solver;
     null uses the given values.
     """

@@ -147,7 +147,9 @@ class SolverSpec:
     def is_minimiser(self) -> bool:
         """Whether the solver's iterates tend to a minimum, as in `springbench.solvers.registry.is_minimiser`."""
         own = isinstance(self.name, PluginName)
-        return bool(self.metadata.get("minimises", True)) if own else is_minimiser(load_target(SOLVER_TABLE[self.name]))
+        return (
+            bool(self.metadata.get("is_minimiser", True)) if own else is_minimiser(load_target(SOLVER_TABLE[self.name]))
+        )
 
     @property
     def packages(self) -> tuple[str, ...]:

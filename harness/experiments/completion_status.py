@@ -67,7 +67,7 @@ def read_completion_statuses(
     )
 
     heads, today = (
-        parquet_rows.read_first_rows(matches_request, [*columns, "code"], schema),
+        parquet_rows.read_first_rows(matches_request, [*columns, "source_fingerprint"], schema),
         machine_info.hash_sources(),
     )
     found: dict[Path, CompletionStatus] = {}
@@ -78,7 +78,7 @@ def read_completion_statuses(
         elif there is None or not as_asked(there):
             found[path] = CompletionStatus(NOT_STARTED)
         else:
-            found[path] = CompletionStatus(COMPLETED, is_stale=there["code"] != today)
+            found[path] = CompletionStatus(COMPLETED, is_stale=there["source_fingerprint"] != today)
     return found
 
 

@@ -55,7 +55,11 @@ def build_energy_growth_columns(
     """
     said = f"{growth}: "
     step = by_frame[growth.first_frame]
-    if step["stopped"] == "iterations" and step["iterations"] >= run.iterations and run.integrator != "own":
+    if (
+        step["termination_reason"] == "max-iter"
+        and step["num_iterations"] >= run.iterations
+        and run.integrator != "own"
+    ):
         said += f"{run.solver.name} leaves the step unsolved; take more iterations, a tolerance, or another solver"
     else:
         integrates = run.integrator == "own" or not is_minimiser(

@@ -26,7 +26,7 @@ from springbench.harness.execution import machine_info
 from springbench.harness.execution.progress_events import ProgressCallback
 from springbench.harness.execution.timing_lock import lock_timing_exclusive
 
-CALIBRATION_COLUMNS: tuple[str, ...] = ("machine_bandwidth", "machine_flops", "machine_step")
+CALIBRATION_COLUMNS: tuple[str, ...] = ("machine_bandwidth", "machine_flops_per_second", "machine_step_seconds")
 """Names of the columns."""
 
 _CACHE_SECONDS = 86_400.0

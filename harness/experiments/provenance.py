@@ -32,10 +32,12 @@ def build_specification_columns(run: RunSpec) -> dict[str, Any]:
         "size": run.size,
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
-        "own": json.dumps([plugin.identify_code() for plugin in run.find_plugins()]) if run.find_plugins() else None,
+        "plugins": json.dumps([plugin.identify_code() for plugin in run.find_plugins()])
+        if run.find_plugins()
+        else None,
         **run.solver.metadata_columns,
         **{option.column: getattr(run, name) for name, option in RUN_OPTIONS.items() if option.column},
-        "tolerance": convert_tolerance(run.tolerance),
+        "residual_rtol": convert_tolerance(run.tolerance),
         "threads": machine_info.choose_threads(run.threads).count,
     }
 
@@ -53,14 +55,14 @@ def build_provenance_columns(solver: SolverSpec | None = None) -> dict[str, Any]
     """
     here = machine_info.describe_machine()
     return {
-        "machine": here.machine_id,
-        "node": machine_info.compute_node_id(),
+        "machine_id": here.machine_id,
+        "node_id": machine_info.compute_node_id(),
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,
-        "system": here.operating_system,
+        "operating_system": here.operating_system,
         "versions": json.dumps(machine_info.collect_versions(*(solver.packages if solver else ())), sort_keys=True),
         "commit": machine_info.read_commit(),
-        "code": machine_info.hash_sources(),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "source_fingerprint": machine_info.hash_sources(),
+        "started_at": datetime.now(UTC).isoformat(timespec="seconds"),
     }

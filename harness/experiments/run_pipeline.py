@@ -98,11 +98,13 @@ def execute_run(
         InputError: the input is invalid, and the run has no user code.
         CannotWrite: the files cannot be written; there are then no rows.
     """
-    shared: dict[str, Any] = {"at_once": num_concurrent_runs, **calibrate_machine(tick)}
+    shared: dict[str, Any] = {"num_concurrent_runs": num_concurrent_runs, **calibrate_machine(tick)}
     threads = machine_info.choose_threads(run.threads)
     with machine_info.limit_threads(threads.count), TimingSession(tick, exclusive=run.timing == "exclusive") as turn:
         with turn.lock_for_preparation():
-            shared |= build_run_columns(run) | {"code": compute_source_fingerprint(collect_source_parts(run))}
+            shared |= build_run_columns(run) | {
+                "source_fingerprint": compute_source_fingerprint(collect_source_parts(run))
+            }
         try:
             run = run.replace_options(scene=run.scene.load_plugins())
             found = _run_passes(run, files, tick, positions, turn)
@@ -121,7 +123,7 @@ def execute_run(
                 _record_before_failure(run, files, found[0])
         if threads.reason:
             for row in found:
-                row["choice"] = "; ".join(filter(None, [row.get("choice"), threads.reason]))
+                row["solver_description"] = "; ".join(filter(None, [row.get("solver_description"), threads.reason]))
         result = [shared | row for row in found]
         content = parquet_rows.encode_rows(result)
     parquet_rows.write_durably(
@@ -154,7 +156,10 @@ def _run_passes(
     told = told or timing_rows.build_timing_rows(measured)
     require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.tolerance, float))
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.stats.items()}
-    facts |= {"choice": measured.prepared.description, "modulus_exponent": _find_modulus_exponent(run, scene)}
+    facts |= {
+        "solver_description": measured.prepared.description,
+        "modulus_exponent": _find_modulus_exponent(run, scene),
+    }
     facts |= where | stands | how
     return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
 
@@ -210,7 +215,7 @@ def _run_error_controlled(
     if positions:
         save_positions(positions, seen[1:])
     if run.record:
-        chosen = {name: told[0][name] for name in ("status", "integrator", "estimated")}
+        chosen = {name: told[0][name] for name in ("status", "integrator", "error_estimated")}
         recorder = _open_recorder(
             run, files, found.scene, chosen | {"milliseconds_per_step": found.ms_per_step}, seen[-1]
         )
@@ -223,7 +228,9 @@ def _run_error_controlled(
         chosen = sorted(FrameSamples(run.frames).frames)
         due = {k: found.scene.compute_time(k) for k in chosen}
         last = {
-            "recorded": require_recorded_frames(files.recording_path, recorder.info, due, {k: seen[k] for k in chosen})
+            "recording_digest": require_recorded_frames(
+                files.recording_path, recorder.info, due, {k: seen[k] for k in chosen}
+            )
         }
     return [how | row | (last if row["frame"] == run.frames else {}) for row in told]
 
@@ -236,7 +243,7 @@ def _hold_timing_lock(run: RunSpec, tick: ProgressCallback) -> Generator[dict[st
             yield {}
     else:
         with reserve_cores(machine_info.choose_threads(run.threads).count, tick) as cores:
-            yield {"pinned": " ".join(map(str, cores))}
+            yield {"pinned_cores": " ".join(map(str, cores))}
 
 
 def _run_instrumentation_pass(
@@ -277,7 +284,7 @@ def _run_instrumentation_pass(
             tick=lambda: tick("second pass"),
             clock=measured.clock,
         )
-        if measured.final_positions is not None and found[run.frames]["digest"] != hash_positions(
+        if measured.final_positions is not None and found[run.frames]["positions_digest"] != hash_positions(
             measured.final_positions
         ):
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
@@ -287,7 +294,9 @@ def _run_instrumentation_pass(
             recorder.finish_recording(timing_rows.compute_milliseconds(measured, run.frames), ended)
             due = {frame: scene.compute_time(frame) for frame in samples.frames}
             motion = samples.positions | {run.frames: measured.final_positions}
-            found[run.frames]["recorded"] = require_recorded_frames(files.recording_path, recorder.info, due, motion)
+            found[run.frames]["recording_digest"] = require_recorded_frames(
+                files.recording_path, recorder.info, due, motion
+            )
     if positions and stored is not None:
         save_positions(positions, stored)
     return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}, stands
@@ -408,7 +417,7 @@ def _open_recorder(
         **{
             name: value for name, value in build_specification_columns(run).items() if value is not None
         },  # a property has no null
-        "tolerance": convert_tolerance(run.tolerance) or 0.0,
+        "residual_rtol": convert_tolerance(run.tolerance) or 0.0,
         "vertices": len(scene.mesh.rest_positions),
         "springs": len(scene.all_springs.edges),
         "frames": run.frames,
@@ -417,7 +426,7 @@ def _open_recorder(
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,
-        "system": here.operating_system,
+        "operating_system": here.operating_system,
         "commit": machine_info.read_commit(),
         **{f"version_{name}": version for name, version in machine_info.collect_versions().items()},
     }

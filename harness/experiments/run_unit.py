@@ -99,7 +99,7 @@ def _write_lost_rows(run: RunSpec, files: RunFiles, status: str, reason: str) ->
             half.unlink(missing_ok=True)
     found = [
         build_run_columns(run)
-        | {"code": compute_source_fingerprint(collect_source_parts(run))}
+        | {"source_fingerprint": compute_source_fingerprint(collect_source_parts(run))}
         | {"phase": "run", "status": status, "reason": reason}
     ]
     parquet_rows.write_rows(files.rows_path, found)

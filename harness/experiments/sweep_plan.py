@@ -24,10 +24,10 @@ from springbench.harness.results import row_store
 if TYPE_CHECKING:
     import pyarrow as pa
 
-REQUIRED_COLUMNS = ("run_id", "scene", "size", "solver", "status", "code")
+REQUIRED_COLUMNS = ("run_id", "scene", "size", "solver", "status", "source_fingerprint")
 """Columns that are required to identify a run and its status."""
 
-_STATUS_COLUMNS = ("status", "code", "time_limit", "memory_limit")
+_STATUS_COLUMNS = ("status", "source_fingerprint", "time_limit", "memory_limit")
 """Columns that determine the completion status."""
 
 _LIMIT_STATUSES = ("failed", "time-limit", "killed")
@@ -104,7 +104,7 @@ def plan_runs(runs: Iterable[RunSpec], folder: Path, machine_ids: Sequence[str |
             limits = there["time_limit"], there["memory_limit"]
             if state in _LIMIT_STATUSES and limits != (run.time_limit, run.memory_limit):
                 state = NOT_STARTED  # who failed within other limits has said nothing of these
-            older = there["code"] != code_of(run)
+            older = there["source_fingerprint"] != code_of(run)
         if state == COMPLETED and run.record:
             damage = _describe_damage(files.recording_path)
             state = NOT_STARTED if damage or not files.recording_path.exists() else COMPLETED
@@ -142,6 +142,6 @@ def find_stale_run_ids(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
     code_of = _cached_fingerprint()
     here, made = (
         machine_info.describe_machine().machine_id,
-        dict(zip(*(table[c].to_pylist() for c in ("run_id", "code")), strict=True)),
+        dict(zip(*(table[c].to_pylist() for c in ("run_id", "source_fingerprint")), strict=True)),
     )
     return {name for run in runs if made.get(name := run.compute_run_id(here)) != code_of(run)}

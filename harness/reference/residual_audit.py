@@ -54,20 +54,22 @@ class AuditedSolver(DelegatingSolver):
             self._done, self._begun = self._done + 1, problem.step_start.time
         if self._done in self._frames and np.isfinite(found.positions).all():
             graded = self._audit_solution(problem, found, stop)
-            self.found[self._done] = max(graded, self.found.get(self._done, graded), key=lambda row: row["graded"])
+            self.found[self._done] = max(
+                graded, self.found.get(self._done, graded), key=lambda row: row["stationarity_audit"]
+            )
         return found
 
     def _audit_solution(self, problem: StepProblem, found: Solution, stop: StopRule) -> dict[str, Any]:
         reached, round_off, _ = self._stationarity(problem, found.positions)
         if not self._claims:
-            return {"graded": reached}
+            return {"stationarity_audit": reached}
         yardstick = self._stationarity.compute_initial_residual(problem)
         told, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
         if np.isnan(found.residual) and found.num_iterations:
             raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {truth:.3g} (or `minimises = False`)")
         claimed = RESIDUAL_SLACK * found.residual / yardstick + round_off
         enough = RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / yardstick if yardstick else 0.0) + round_off
-        if found.termination_reason != "tolerance":
+        if found.termination_reason != "converged":
             enough = np.inf
         if claimed < reached or enough < reached:  # it may be the residual of the iterate before
             before = [self._stationarity(problem, p).stationarity for p in self._find_previous_iterate(problem, found)]
@@ -78,7 +80,7 @@ class AuditedSolver(DelegatingSolver):
                 raise RunFailed(
                     f"{told} and says that it reached the tolerance, where {least:.3g} of the start's is left"
                 )
-        return {"graded": reached}
+        return {"stationarity_audit": reached}
 
     def _find_previous_iterate(self, problem: StepProblem, found: Solution) -> list[Positions]:
         """Return the iterate before the solution, if the iterates lead to that solution."""

@@ -116,7 +116,7 @@ def run_reference(
         initial_state=initial_state,
     )
     for step in run:
-        if step.solution.termination_reason == "iterations" or not np.isfinite(step.positions).all():
+        if step.solution.termination_reason == "max-iter" or not np.isfinite(step.positions).all():
             raise RunFailed(f"step {step.index} of the reference run does not converge")
         stated = step.problem
         violence[step.index - 1] = stated.value(stated.current_positions) - stated.value(step.solution.positions)

@@ -54,12 +54,17 @@ class StepVerifier:
         row: dict[str, Any] = {}
         if self._reference is not None:
             away = np.linalg.norm(step.positions - self._reference[step.index - 1], axis=1) / self._sizes
-            row["distance"] = float(away.max()) if np.isfinite(away).all() else None
+            row["reference_distance"] = float(away.max()) if np.isfinite(away).all() else None
         if self._minimises:
             readings = [self.measure_stationarity(stated, solution.positions) for stated, solution in step.stages]
-            row["stationarity"], row["attainable"], row["beyond"] = max(readings, key=_rank_reading)
+            row["stationarity"], row["stationarity_roundoff_bound"], row["stationarity_above_roundoff"] = max(
+                readings, key=_rank_reading
+            )
             found = [self.measure_curvature(stated, solution.positions) for stated, solution in step.stages]
-            row["minimum"], row["flat"] = all(one.is_convex for one in found), any(one.is_degenerate for one in found)
+            row["is_local_minimum"], row["is_degenerate"] = (
+                all(one.is_convex for one in found),
+                any(one.is_degenerate for one in found),
+            )
         return row
 
     def measure_stationarity(self, problem: StepProblem, p: Positions) -> StationarityReading:

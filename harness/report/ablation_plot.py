@@ -51,8 +51,8 @@ def draw_ablation_plot(rows: Sequence[ResultRow], path: Path) -> None:
         rows: all rows of the ablation.
         path: target file.
     """
-    (whole,) = select_kind(rows, "whole")
-    points = [row for row in select_kind(rows, "without") if row["status"] == "ok"]
+    (whole,) = select_kind(rows, "full-scene")
+    points = [row for row in select_kind(rows, "ablated") if row["status"] == "ok"]
     with matplotlib.rc_context(PAGE_RC):
         page = new_page()
         facts = [
@@ -63,9 +63,9 @@ def draw_ablation_plot(rows: Sequence[ResultRow], path: Path) -> None:
         draw_header(page, f"{whole['scene']}: what its effects cost and change", facts)
         ax = add_axes(page, 130, 138, 1380, 630)
         _draw_error_lines(ax, rows, points)
-        older = whole["code"] not in (None, machine_info.hash_sources())
+        older = whole["source_fingerprint"] not in (None, machine_info.hash_sources())
         _draw_effects(ax, points, whole["seconds"], is_stale=older)
-        gone = [row["name"] for row in select_kind(rows, "without") if row["status"] != "ok"]
+        gone = [row["name"] for row in select_kind(rows, "ablated") if row["status"] != "ok"]
         called = [row["name"] for row in select_kind(rows, "suggestion")]
         below = [f"impossible without {', '.join(gone)}"] if gone else []
         below += ["hollow: measured by other code than today's"] if older else []
@@ -81,7 +81,7 @@ def _draw_error_lines(ax: Axes, rows: Sequence[ResultRow], points: Sequence[Resu
     The limits of the y-axis contain all errors and points.
     """
     known = [row for row in select_kind(rows, "error") if row["status"] == "ok"]
-    values = [max(row["largest"], _MIN_DISPLACEMENT) for row in (*known, *points)]
+    values = [max(row["displacement_max"], _MIN_DISPLACEMENT) for row in (*known, *points)]
     low, high = min(values, default=1e-3) / 4.0, max(values, default=1.0) * 4.0
     ax.set_yscale("log")
     ax.set_ylim(low, high)
@@ -95,7 +95,7 @@ def _draw_error_lines(ax: Axes, rows: Sequence[ResultRow], points: Sequence[Resu
     if np.isfinite(error):
         ax.axhspan(low, max(error, low), color=RULE_COLOUR, alpha=0.45, linewidth=0)
     for row in known:
-        y = max(row["largest"], _MIN_DISPLACEMENT)
+        y = max(row["displacement_max"], _MIN_DISPLACEMENT)
         ax.axhline(y, color=MUTED_COLOUR, linewidth=1.0, linestyle=(0, (5, 3)))
         place: Any = {"xycoords": ("axes fraction", "data"), "xytext": (-4, 3), "textcoords": "offset points"}
         ax.annotate(_ERROR_LABELS[row["name"]], (1.0, y), ha="right", fontsize=11.5, color=MUTED_COLOUR, **place)
@@ -109,9 +109,11 @@ def _draw_effects(ax: Axes, points: Sequence[ResultRow], full_run: float, *, is_
     """
     taken: list[tuple[float, float]] = []
     face: Any = {"mfc": BACKGROUND_COLOUR, "mew": 1.8} if is_stale else {}
-    for i, row in enumerate(sorted(points, key=lambda row: -row["largest"])):
-        look, y = indexed_style(i), max(row["largest"], _MIN_DISPLACEMENT)
-        x, low, high = (100.0 * row[key] / full_run for key in ("cost", "cost_low", "cost_high"))
+    for i, row in enumerate(sorted(points, key=lambda row: -row["displacement_max"])):
+        look, y = indexed_style(i), max(row["displacement_max"], _MIN_DISPLACEMENT)
+        x, low, high = (
+            100.0 * row[key] / full_run for key in ("added_seconds", "added_seconds_low", "added_seconds_high")
+        )
         ax.plot([low, high], [y, y], color=look.color, linewidth=1.6, alpha=0.6, solid_capstyle="butt")
         ax.plot([x], [y], marker=look.marker, color=look.color, markersize=9, linestyle="none", **face)
         taken.append((x, y))
@@ -119,7 +121,7 @@ def _draw_effects(ax: Axes, points: Sequence[ResultRow], full_run: float, *, is_
     ax.margins(x=0.12)
     ax.figure.canvas.draw()
     used: list[tuple[float, float]] = []
-    for (x, y), row in zip(taken, sorted(points, key=lambda row: -row["largest"]), strict=True):
+    for (x, y), row in zip(taken, sorted(points, key=lambda row: -row["displacement_max"]), strict=True):
         across, up = ax.transData.transform((x, y))
         lift = 9.0
         while any(abs(across - a) < 150 and abs(up + lift - b) < _LABEL_GAP for a, b in used):

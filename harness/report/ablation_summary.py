@@ -45,7 +45,7 @@ def largest_known_error(rows: Sequence[ResultRow]) -> tuple[float, str]:
     Returns: the displacement error [mean rest lengths] and a phrase that names its source; (nan, "") if no error is
     known.
     """
-    known = [(row["largest"], row["name"]) for row in select_kind(rows, "error") if row["status"] == "ok"]
+    known = [(row["displacement_max"], row["name"]) for row in select_kind(rows, "error") if row["status"] == "ok"]
     size, name = max(known, default=(float("nan"), ""))
     return size, {"solver": "the solver's own error", "time-step": "the time step's error", "": ""}[name]
 
@@ -57,14 +57,14 @@ def describe_effect(row: ResultRow, rows: Sequence[ResultRow]) -> str:
         row: row of the effect, of kind `without`.
         rows: all rows of the ablation.
     """
-    if row["status"] == "impossible":
+    if row["status"] == "unsolvable":
         return f"the scene is impossible without it ({row['reason']})"
-    (whole,) = select_kind(rows, "whole")
-    price, moved = _describe_cost(row, whole["seconds"]), row["largest"]
+    (whole,) = select_kind(rows, "full-scene")
+    price, moved = _describe_cost(row, whole["seconds"]), row["displacement_max"]
     if not moved:
         return f"{price}, changes nothing at all: leave it out"
     moves = f"{price}, moves vertices by {_format_two_digits(moved)} rest lengths"
-    if moved > row["extent"]:
+    if moved > row["bounding_box_diagonal"]:
         return f"{moves}, further than the mesh is large: without it this is another scene"
     error, whose = largest_known_error(rows)
     if not whose:
@@ -78,7 +78,7 @@ def describe_effect(row: ResultRow, rows: Sequence[ResultRow]) -> str:
 
 
 def _describe_cost(row: ResultRow, full_run: float) -> str:
-    share, low, high = (row[key] / full_run for key in ("cost", "cost_low", "cost_high"))
+    share, low, high = (row[key] / full_run for key in ("added_seconds", "added_seconds_low", "added_seconds_high"))
     if low <= 0.0 <= high:
         return f"no time that could be measured ({100 * low:+.1f} to {100 * high:+.1f} %)"
     if share < 0.0:
@@ -97,7 +97,7 @@ def _format_energy_change(value: float) -> str:
 
 def build_ablation_table(rows: Sequence[ResultRow]) -> Table:
     """Build a table with one row per effect: its cost, and what changes without it."""
-    (whole,) = select_kind(rows, "whole")
+    (whole,) = select_kind(rows, "full-scene")
     headings = (
         "without",
         "CPU ms a step",
@@ -105,41 +105,43 @@ def build_ablation_table(rows: Sequence[ResultRow]) -> Table:
         "95 %",
         "KiB",
         "nnz(L)",
-        "largest",
+        "displacement_max",
         "RMS",
-        "energy",
-        "centre",
+        "energy_difference",
+        "centroid_displacement",
     )
     table = Table(box=SIMPLE_HEAD, caption=ABLATION_CAPTION)
     for i, heading in enumerate(headings):
         table.add_column(heading, justify="right" if i else "left")
-    size = f"{whole['bytes'] / 1024:,.0f}"
+    size = f"{whole['memory_bytes'] / 1024:,.0f}"
     table.add_row("nothing", f"{1e3 * whole['seconds']:.3g}", "100", "", size, _format_count(whole["nnz_factor"], ""))
-    for row in select_kind(rows, "without"):
+    for row in select_kind(rows, "ablated"):
         if row["status"] != "ok":
             table.add_row(escape(row["name"]), row["status"])
             continue
-        share = [100 * row[key] / whole["seconds"] for key in ("cost", "cost_low", "cost_high")]
+        share = [
+            100 * row[key] / whole["seconds"] for key in ("added_seconds", "added_seconds_low", "added_seconds_high")
+        ]
         fill = "" if row["nnz_factor"] is None else _format_count(whole["nnz_factor"] - row["nnz_factor"], "+")
         table.add_row(
             escape(row["name"]),
-            f"{1e3 * row['cost']:.3g}",
+            f"{1e3 * row['added_seconds']:.3g}",
             f"{share[0]:.1f}",
             f"{share[1]:.1f} to {share[2]:.1f}",
-            f"{(whole['bytes'] - row['bytes']) / 1024:+,.0f}",
+            f"{(whole['memory_bytes'] - row['memory_bytes']) / 1024:+,.0f}",
             fill,
-            _format_two_digits(row["largest"]),
-            _format_two_digits(row["rms"]),
-            _format_energy_change(row["energy"]),
-            _format_two_digits(row["centre"]),
+            _format_two_digits(row["displacement_max"]),
+            _format_two_digits(row["displacement_rms"]),
+            _format_energy_change(row["energy_difference"]),
+            _format_two_digits(row["centroid_displacement"]),
         )
     for row in select_kind(rows, "error"):
         ok = row["status"] == "ok"
         found = (
-            _format_two_digits(row["largest"]),
-            _format_two_digits(row["rms"]),
-            _format_energy_change(row["energy"]),
-            _format_two_digits(row["centre"]),
+            _format_two_digits(row["displacement_max"]),
+            _format_two_digits(row["displacement_rms"]),
+            _format_energy_change(row["energy_difference"]),
+            _format_two_digits(row["centroid_displacement"]),
         )
         table.add_row(f"error of the {row['name']}", *[""] * 5, *found) if ok else table.add_row(
             f"error of the {row['name']}", row["status"]
@@ -152,7 +154,7 @@ def build_overhead_table(rows: Sequence[ResultRow]) -> Table:
 
     Each overhead is followed by its lower bound.
     """
-    found = {(row["name"], row["solver"]): row for row in select_kind(rows, "price")}
+    found = {(row["name"], row["solver"]): row for row in select_kind(rows, "overhead")}
     effects, solvers = (list(dict.fromkeys(key[k] for key in found)) for k in (0, 1))
     table = Table(box=SIMPLE_HEAD, title="an iteration with the effect over one without", caption=OVERHEAD_CAPTION)
     for i, heading in enumerate(("effect", *solvers)):
@@ -166,12 +168,12 @@ def build_overhead_table(rows: Sequence[ResultRow]) -> Table:
 
 
 def _format_overhead(row: ResultRow) -> str:
-    return f"{row['price']:.2f} ≥{row['price_bound']:.2f}"
+    return f"{row['overhead_ratio']:.2f} ≥{row['overhead_ratio_bound']:.2f}"
 
 
 def summarise_ablation(rows: Sequence[ResultRow]) -> list[str]:
     """Return sentences on all effects, on suggested effects, and on errors that are unknown."""
-    said = [f"{row['name']}: {describe_effect(row, rows)}" for row in select_kind(rows, "without")]
+    said = [f"{row['name']}: {describe_effect(row, rows)}" for row in select_kind(rows, "ablated")]
     said += [f"not listed: {row['name']}: {row['reason']}" for row in select_kind(rows, "suggestion")]
     unknown = [row for row in select_kind(rows, "error") if row["status"] != "ok"]
     return said + [f"error of the {row['name']}: unknown ({row['reason']})" for row in unknown]

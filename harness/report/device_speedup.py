@@ -55,12 +55,12 @@ class DeviceRun(NamedTuple):
 
 
 _RUNS_QUERY = """
-select coalesce(any_value(machine), '') || coalesce(any_value(node), ''), any_value(scene), any_value("size"),
-    any_value(tolerance), any_value(solver), coalesce(any_value(parameters) like '%"device": "cuda"%', false),
+select coalesce(any_value(machine_id), '') || coalesce(any_value(node_id), ''), any_value(scene), any_value("size"),
+    any_value(residual_rtol), any_value(solver), coalesce(any_value(parameters) like '%"device": "cuda"%', false),
     any_value(device), any_value(vertices),
     coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
     median(seconds) filter (phase = 'step'),
-    bool_and(coalesce(stopped in ('tolerance', 'floor'), false)) filter (phase = 'step')
+    bool_and(coalesce(termination_reason in ('converged', 'roundoff'), false)) filter (phase = 'step')
 from rows_of group by run_id order by any_value("size"), any_value(solver), run_id
 """
 

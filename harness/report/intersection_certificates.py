@@ -16,11 +16,13 @@ from springbench.harness.atomic_files import atomic_write
 from springbench.harness.report.table_queries import query_records
 
 _CERTIFICATE_QUERY = """
-select scene, size, max(vertices) as vertices, solver, parameters, any_value(status) as status, max(frame) as frames,
-    count(distinct frame) filter (phase = 'step' and intersections = 0) as free,
-    count(distinct frame) filter (phase = 'step' and stopped in ('tolerance', 'floor')) as converged,
-    avg(iterations) filter (phase = 'step') as iterations, any_value(reason) as reason
-from rows_of group by run_id, scene, size, solver, parameters order by scene, size, solver, parameters, frames"""
+select scene, size, max(vertices) as vertices, solver, parameters, any_value(status) as status,
+    max(frame) as num_frames,
+    count(distinct frame) filter (phase = 'step' and num_intersections = 0) as num_intersection_free_frames,
+    count(distinct frame) filter (phase = 'step' and termination_reason in ('converged', 'roundoff'))
+        as num_converged_steps,
+    avg(num_iterations) filter (phase = 'step') as mean_iterations, any_value(reason) as reason
+from rows_of group by run_id, scene, size, solver, parameters order by scene, size, solver, parameters, num_frames"""
 
 
 def write_certificates(rows: pa.Table, folder: Path) -> list[Path]:

@@ -19,10 +19,10 @@ COMPARISON_NOTE = (
 _MAX_LISTED = 8
 """Maximum number of machines with a line of their own."""
 
-MACHINE_COLUMNS = ("cpu", "cores", "machine_bandwidth", "machine_flops", "machine_step")
+MACHINE_COLUMNS = ("cpu", "cores", "machine_bandwidth", "machine_flops_per_second", "machine_step_seconds")
 """Columns that describe a machine."""
 
-FOOTER_COLUMNS = ("machine", "node", *MACHINE_COLUMNS)
+FOOTER_COLUMNS = ("machine_id", "node_id", *MACHINE_COLUMNS)
 """All columns that the footer of a table needs."""
 
 MachineKey = tuple[str | None, str | None]
@@ -45,7 +45,9 @@ def machine_footer(table: pa.Table) -> list[str]:
     They list its machines, and which numbers may be compared.
     """
     able = ", ".join(f'any_value("{name}")' for name in MACHINE_COLUMNS)
-    found = query_table(f"select machine, node, {able} from rows_of where machine is not null group by all", table)
+    found = query_table(
+        f"select machine_id, node_id, {able} from rows_of where machine_id is not null group by all", table
+    )
     known = assign_machine_names((machine, node) for machine, node, *_ in found)
     told = sorted(f"machine {known[machine, node]}: {_describe_machine(*about)}" for machine, node, *about in found)
     more = [f"and {len(told) - _MAX_LISTED} more machines"] if len(told) > _MAX_LISTED else []

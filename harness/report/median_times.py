@@ -15,17 +15,19 @@ from springbench.harness.results.quantities import SQL_EXPRESSIONS
 
 _MEDIAN_QUERY = f"""
 select any_value(scene) as scene, any_value("size") as "size", any_value(solver) as solver, run_id,
-    any_value(machine) as machine, any_value(node) as node, {SQL_EXPRESSIONS["step"]} / 1e3 as median_seconds,
-    count(*) filter (phase = 'step') as steps
-from rows_of where status = 'ok' group by run_id having steps > 0 order by scene, "size", solver, machine, node, run_id
+    any_value(machine_id) as machine_id, any_value(node_id) as node_id,
+    {SQL_EXPRESSIONS["step"]} / 1e3 as median_seconds,
+    count(*) filter (phase = 'step') as num_steps
+from rows_of where status = 'ok' group by run_id having num_steps > 0
+order by scene, "size", solver, machine_id, node_id, run_id
 """
 
 
 def write_medians(rows: pa.Table, folder: Path) -> list[Path]:
     """Write medians.csv, one line per run, and return its path.
 
-    The columns are scene, size, solver, run_id, machine, node, median time of a step [s], number of steps, and the
-    solver with the settings in which its runs differ. Times of different machines must not be compared.
+    The columns are scene, size, solver, run_id, machine_id, node_id, median time of a step [s], number of steps, and
+    the solver with the settings in which its runs differ. Times of different machines must not be compared.
 
     Args:
         rows: rows of a sweep.
@@ -33,7 +35,7 @@ def write_medians(rows: pa.Table, folder: Path) -> list[Path]:
     """
     label = label_runs(read_run_times(rows))
     found = [(*row, label[row[3]]) for row in query_table(_MEDIAN_QUERY, rows)]
-    names = ("scene", "size", "solver", "run_id", "machine", "node", "median_seconds", "steps", "label")
+    names = ("scene", "size", "solver", "run_id", "machine_id", "node_id", "median_seconds", "num_steps", "label")
     columns = [[row[k] for row in found] for k in range(len(names))]
     path = folder / "medians.csv"
     with atomic_write(path) as partial:

@@ -11,7 +11,7 @@ from springbench.harness.report.page_layout import draw_text, shorten_words
 from springbench.harness.report.plot_style import MUTED_COLOUR, PAGE_WIDTH
 
 _DIRTY_SUFFIX = "-dirty"
-PROVENANCE_COLUMNS = ("cpu", "threads", "commit", "code")
+PROVENANCE_COLUMNS = ("cpu", "threads", "commit", "source_fingerprint")
 """The columns that `describe_provenance` reads."""
 
 
@@ -45,7 +45,7 @@ def describe_machine_and_commit(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def describe_provenance(rows: Sequence[Mapping[str, Any]]) -> str:
     """Describe processor, threads, commit and source fingerprint of rows."""
-    threads, codes = (sorted({row[key] for row in rows if row.get(key)}) for key in ("threads", "code"))
+    threads, codes = (sorted({row[key] for row in rows if row.get(key)}) for key in ("threads", "source_fingerprint"))
     words = [*describe_processors(row.get("cpu") for row in rows)]
     words += [f"{', '.join(map(str, threads))} thread{'s' if threads != [1] else ''}"] if threads else []
     words += describe_commits(row.get("commit") for row in rows)

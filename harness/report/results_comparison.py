@@ -38,8 +38,8 @@ others.
 """
 
 PAIRING_COLUMNS = (
-    *("scene", "size", "solver", "parameters", "time_step", "integrator", "first_guess", "max_iterations"),
-    *("tolerance", "threads"),
+    *("scene", "size", "solver", "parameters", "time_step", "integrator", "initial_guess", "max_iterations"),
+    *("residual_rtol", "threads"),
 )
 """Columns that identify the same run in two results."""
 
@@ -209,13 +209,13 @@ def _build_stored_run(run_rows: Sequence[ResultRow]) -> StoredRun:
     steps = [row for row in run_rows if row["phase"] == "step" and row["frame"] is not None]
     once = {row["frame"]: row for row in steps}
     last: ResultRow = once[max(once)] if once else {}
-    counted = [row["iterations"] for row in once.values() if row["iterations"] is not None]
+    counted = [row["num_iterations"] for row in once.values() if row["num_iterations"] is not None]
     return StoredRun(
         run_rows[0],
         next((row["status"] for row in run_rows if row["status"] != "ok"), "ok"),
         bootstrap_statistics.compute_min_seconds((row["frame"], row["seconds"]) for row in steps),
         sum(counted) if counted else None,
-        *(last.get(name) for name in ("residual", "stationarity", "digest")),
+        *(last.get(name) for name in ("residual", "stationarity", "positions_digest")),
     )
 
 
@@ -223,7 +223,7 @@ def _incomparable_reason(old: StoredRun, new: StoredRun, baseline: str | None) -
     """Return why two times are not comparable; empty if they are."""
     if old.status != "ok":
         return f"there is no old time: {old.status}"
-    if old.row["machine"] != new.row["machine"] and baseline is None:
+    if old.row["machine_id"] != new.row["machine_id"] and baseline is None:
         where = [f"{run.row['cpu']}, {run.row['cores']} cores" for run in (old, new)]
         return f"other machines ({where[0]}; {where[1]}); --yardstick SOLVER compares ratios to one that both ran"
     return ""

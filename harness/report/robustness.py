@@ -93,7 +93,7 @@ RUN_OUTCOMES = (
     UNSUPPORTED,
 )
 
-_CONVERGED_REASONS = ("tolerance", "floor")
+_CONVERGED_REASONS = ("converged", "roundoff")
 """Termination reasons with which a solver claims convergence."""
 _OUTCOME_OF_STATUS = {
     "time-limit": TIMED_OUT,
@@ -162,22 +162,22 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
         InputError: if no run was verified.
     """
     files = row_store.list_units(folder / "rows")
-    needed = "run_id", "scene", "size", "solver", "phase", "status", "started"
+    needed = "run_id", "scene", "size", "solver", "phase", "status", "started_at"
     table = parquet_rows.read_rows(files, required_columns=needed, on_invalid=lambda mistake: None).to_pylist()
     runs: dict[str, list[dict[str, Any]]] = {}
     for row in table:
         if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
             runs.setdefault(row["run_id"], []).append(row)
-    if not any(row["stationarity"] is not None or row["distance"] is not None for row in table):
+    if not any(row["stationarity"] is not None or row["reference_distance"] is not None for row in table):
         raise InputError(f"{folder}: holds no runs that were judged; run a sweep with `judge: true`")
-    if any(row["stationarity"] is not None and row["beyond"] is None for row in table):
+    if any(row["stationarity"] is not None and row["stationarity_above_roundoff"] is None for row in table):
         raise InputError(f"{folder}: holds runs that another version judged; run the sweep again")
     firsts = [run[0] for run in runs.values()]
     cells: dict[tuple[str, str], VerifiedRun] = {}
-    for run in sorted(runs.values(), key=lambda run: run[0]["started"]):
+    for run in sorted(runs.values(), key=lambda run: run[0]["started_at"]):
         case, solver = _case_name(run[0], firsts), _solver_label(run[0], firsts)
         outcome, worst, graded, reason = classify_run(run)
-        run_id, reference = run[0]["run_id"], run[0]["reference"] or ""
+        run_id, reference = run[0]["run_id"], run[0]["citation"] or ""
         made = run[0]["cpu"] or "", run[0]["commit"] or ""
         named = *made, run[0]["solver"]
         cells[case, solver] = VerifiedRun(case, solver, outcome, worst, graded, reason, reference, run_id, *named)
@@ -201,27 +201,29 @@ def classify_run(run: Sequence[dict[str, Any]]) -> tuple[RunOutcome, float | Non
     if first["status"] != "ok":
         where = f"frame {first['frame']}: " if first["frame"] and first["status"] not in _COMPLETED_STATUSES else ""
         return _OUTCOME_OF_STATUS.get(first["status"], FAILED), None, "", where + (first["reason"] or first["status"])
-    farthest = max((away for row in run if (away := row["distance"]) is not None), default=None)
-    lost = any(row["distance"] is None for row in run)
+    farthest = max((away for row in run if (away := row["reference_distance"]) is not None), default=None)
+    lost = any(row["reference_distance"] is None for row in run)
     if all(row["stationarity"] is None for row in run):
         near = farthest is not None and not lost and farthest <= CLOSE_MOTION_DISTANCE
         why = "" if near else "there is no reference" if lost else "away from the reference"
         return (CORRECT if near else NOT_CONVERGED), farthest, "distance", why
-    beyond = [math.nan if row["beyond"] is None else row["beyond"] for row in run]
+    beyond = [
+        math.nan if row["stationarity_above_roundoff"] is None else row["stationarity_above_roundoff"] for row in run
+    ]
     worst = max(beyond, key=lambda value: (math.isnan(value), value))
     missed = [
         row
         for row, by in zip(run, beyond, strict=True)
-        if not by <= TOLERANCE_SLACK * (row["tolerance"] or DEFAULT_RTOL)
+        if not by <= TOLERANCE_SLACK * (row["residual_rtol"] or DEFAULT_RTOL)
     ]
     if missed:
-        claimed = sum(row["stopped"] in _CONVERGED_REASONS for row in missed)
+        claimed = sum(row["termination_reason"] in _CONVERGED_REASONS for row in missed)
         said = f", {claimed} of which said they had met it" if claimed else ""
         why = f"{len(missed)} of {len(run)} steps missed the tolerance{said}"
         return (SILENTLY_WRONG if claimed else NOT_CONVERGED), worst, "stationarity", why
-    none = [row for row in run if not row["minimum"]]
+    none = [row for row in run if not row["is_local_minimum"]]
     if none:
-        if all(row["flat"] for row in none):
+        if all(row["is_degenerate"] for row in none):
             return (
                 DEGENERATE_MINIMUM,
                 worst,

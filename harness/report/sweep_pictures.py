@@ -51,7 +51,7 @@ def draw_sweep_pictures(
         num_concurrent: number of drawing processes.
         stale_ids: ids of runs that were executed by other code than the current version.
     """
-    write_bibtex(folder / "references.bib", table["reference"].to_pylist())
+    write_bibtex(folder / "references.bib", table["citation"].to_pylist())
     drawn = [p for p in jobs if p.run.record and p.recording_path.exists()]
     wanting = [p for p in drawn if p.run.pictures and _is_outdated(p.picture_path, [p.recording_path])]
     groups = [group for group in group_by_scene(drawn, folder) if group.needs_recording or group.needs_picture]

@@ -82,7 +82,7 @@ def _describe_fastest(timed_runs: Sequence[RunTimes], names: Mapping[str, str]) 
 
 def _describe_iteration_limits(ok_runs: Sequence[RunTimes]) -> Iterator[str]:
     """Describe how many runs the iteration limit stopped above round-off."""
-    limited = [run for run in ok_runs if run.termination_reason == "iterations" and not _is_at_roundoff(run)]
+    limited = [run for run in ok_runs if run.termination_reason == "max-iter" and not _is_at_roundoff(run)]
     if limited:
         many = f"All {len(ok_runs)} runs" if len(limited) == len(ok_runs) else f"{len(limited)} of {len(ok_runs)} runs"
         yield f"{many} stopped at the limit of iterations, at no tolerance: where they agree, all may be wrong alike."
@@ -114,7 +114,7 @@ def _describe_strain_growth(ok_runs: Sequence[RunTimes], names: Mapping[str, str
     """
     sizes: dict[str, dict[str, dict[int, RunTimes]]] = defaultdict(lambda: defaultdict(dict))
     for run in ok_runs:
-        solved = run.termination_reason in ("tolerance", "floor") or _is_at_roundoff(run)
+        solved = run.termination_reason in ("converged", "roundoff") or _is_at_roundoff(run)
         if solved and run.max_strain is not None and run.strain_p99:
             sizes[run.scene][names[run.run_id]][run.size] = run
     for scene, by_name in sizes.items():

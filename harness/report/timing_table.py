@@ -92,15 +92,15 @@ It is the round-off of 1e-16, amplified by the matrix.
 """
 
 _ENERGY_COLUMNS = ", ".join(
-    ["yardstick", *(f"sqrt(abs({name}))" for name in RUN_SCHEMA.names if name.startswith("energy_")), "0.0"]
+    ["residual_initial", *(f"sqrt(abs({name}))" for name in RUN_SCHEMA.names if name.startswith("energy_")), "0.0"]
 )
 
 _SUMMARY_QUERY = f"""
-select run_id, any_value(scene), any_value("size"), any_value(solver), any_value(machine), any_value(node),
+select run_id, any_value(scene), any_value("size"), any_value(solver), any_value(machine_id), any_value(node_id),
     any_value(vertices), any_value(springs),
     coalesce(any_value(status) filter (status <> 'ok'), 'ok'), any_value(reason) filter (status <> 'ok'),
-    any_value(to_json({{'integrator': integrator, 'dt': time_step, 'guess': first_guess, 'iterations': max_iterations,
-                       'tolerance': tolerance, 'threads': threads, 'asked': asked}})),
+    any_value(to_json({{'integrator': integrator, 'dt': time_step, 'guess': initial_guess, 'iterations': max_iterations,
+                       'rtol': residual_rtol, 'threads': threads, 'error': error_requested}})),
     any_value(parameters),
     1e3 * min(seconds) filter (phase = 'prepare' and round = 0),
     1e3 * median(seconds) filter (phase = 'prepare' and round > 0),
@@ -108,14 +108,17 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     1e3 * median(seconds) filter (phase = 'local'),
     1e3 * median(seconds) filter (phase = 'global'),
     {SQL_EXPRESSIONS["num_iterations"]},
-    arg_min(stopped, list_position(['iterations', 'stalled', 'tolerance', 'floor'], stopped)) filter (
-        stopped <> 'iterations' or not coalesce(own_steps, false) and coalesce(iterations >= max_iterations, true)),
+    arg_min(termination_reason, list_position(['max-iter', 'stalled', 'converged', 'roundoff'],
+                                              termination_reason)) filter (
+        termination_reason <> 'max-iter'
+        or not coalesce(is_substepping, false) and coalesce(num_iterations >= max_iterations, true)),
     {SQL_EXPRESSIONS["residual"]}, {SQL_EXPRESSIONS["max_strain"]}, {SQL_EXPRESSIONS["strain_p99"]},
-    bool_or(interrupted) filter (phase = 'step'), bool_and(adds_up),
-    max(frame), any_value(integrator), any_value(time_step), any_value(asked), {SQL_EXPRESSIONS["worst_residual"]},
+    bool_or(preempted) filter (phase = 'step'), bool_and(phases_consistent),
+    max(frame), any_value(integrator), any_value(time_step), any_value(error_requested),
+    {SQL_EXPRESSIONS["worst_residual"]},
     {ROUNDOFF_RATIO} * max(greatest({_ENERGY_COLUMNS})),
-    case when bool_and(distance is not null) filter (phase = 'step') then max(distance) end,
-    any_value(modulus_exponent), max(graded) filter (not minimises)
+    case when bool_and(reference_distance is not null) filter (phase = 'step') then max(reference_distance) end,
+    any_value(modulus_exponent), max(stationarity_audit) filter (not is_minimiser)
 from rows_of group by run_id order by min(place)
 """
 
@@ -135,7 +138,7 @@ def _effective_options(run: RunTimes) -> dict[str, Any]:
     With a requested error, these are only that error and the options that were set.
     """
     options = json.loads(run.options_json)
-    return {key: value for key, value in options.items() if value is not None or options["asked"] is None}
+    return {key: value for key, value in options.items() if value is not None or options["error"] is None}
 
 
 def label_runs(timed_runs: Sequence[RunTimes]) -> dict[str, str]:
@@ -255,7 +258,9 @@ def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Tab
         INCONSISTENT_NOTE: any(_inconsistency_mark(run, run.local) for run in found),
     }
     shared = [
-        n for how, n in zip(*(table[c].to_pylist() for c in ("timing", "at_once")), strict=True) if how == "shared"
+        n
+        for how, n in zip(*(table[c].to_pylist() for c in ("timing", "num_concurrent_runs")), strict=True)
+        if how == "shared"
     ]
     marks[STALE_MARK_NOTE] = any(run.run_id in stale_ids for run in found)
     marks[SHARED_TIMING_NOTE.format(max(shared, default=0))] = bool(shared)
@@ -283,7 +288,7 @@ def _inconsistency_mark(run: RunTimes, value: float | None) -> str:
 
 def _describe_methods(table: pa.Table) -> list[str]:
     """Return the citation of each solver."""
-    known = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
+    known = dict(zip(*(table[name].to_pylist() for name in ("solver", "citation")), strict=True))
     solvers: dict[str, list[str]] = defaultdict(list)
     for solver, reference in known.items():
         if reference:

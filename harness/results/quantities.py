@@ -27,11 +27,11 @@ SQL_EXPRESSIONS = {
     "lower": "1e3 * quantile_cont(seconds, 0.25) filter (phase = 'step')",
     "upper": "1e3 * quantile_cont(seconds, 0.75) filter (phase = 'step')",
     "least": "1e3 * min(seconds) filter (phase = 'step')",
-    "num_iterations": "median(iterations) filter (phase = 'step')",
+    "num_iterations": "median(num_iterations) filter (phase = 'step')",
     "residual": "arg_max(residual, frame) filter (phase = 'step')",
     "worst_residual": "case when bool_and(residual is not null) filter (phase = 'step') then max(residual) end",
-    "max_strain": "max(largest_strain)",
-    "strain_p99": "max(strain_99)",
+    "max_strain": "max(max_strain)",
+    "strain_p99": "max(strain_p99)",
 }
 """Aggregates over the rows of a run, by the names of the fields of
 `springbench.harness.report.timing_table.RunTimes`."""

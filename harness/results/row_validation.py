@@ -88,13 +88,13 @@ def _is_citation(text: str) -> bool:
 
 
 TEXT_RULES: dict[str, TextRule] = {
-    **dict.fromkeys(("run_id", "unit"), TextRule(_is_id, "letters, digits, spaces and any of `._-`, at most 128")),
+    **dict.fromkeys(("run_id", "unit_id"), TextRule(_is_id, "letters, digits, spaces and any of `._-`, at most 128")),
     **dict.fromkeys(("scene", "sweep"), TextRule(is_file_name, "the stem of a file's name")),
     **dict.fromkeys(("solver", "integrator", "phase"), TextRule(_is_line, "one line of at most 300 characters")),
     **dict.fromkeys(("status", "kind"), TextRule(_is_word, "a word in small letters")),
     "parameters": TextRule(_is_object, "a JSON object"),
-    "reference": TextRule(_is_citation, "a JSON object with authors, year, title and doi"),
-    "recording": TextRule(is_path_below, "a path in the folder of the results"),
+    "citation": TextRule(_is_citation, "a JSON object with authors, year, title and doi"),
+    "recording_path": TextRule(is_path_below, "a path in the folder of the results"),
 }
 """Rules of text columns, by column name."""
 
@@ -107,14 +107,16 @@ _LENGTH_RULE = TextRule(_is_short, f"at most {MAX_TEXT_LENGTH:,} characters")
 
 VALUE_RANGES: dict[str, ValueRange] = {
     **dict.fromkeys(("size", "frame", "round", "vertices", "springs"), ValueRange(0, 1e12)),
-    **dict.fromkeys(("iterations", "max_iterations", "stages", "rounds", "frames"), ValueRange(0, 1e12)),
-    **dict.fromkeys(("threads", "at_once", "cores"), ValueRange(0, 1e6)),
-    **dict.fromkeys(("seconds", "cpu_seconds", "cold", "horizon", "seconds_per_simulated"), ValueRange(0, 1e12)),
-    **dict.fromkeys(("cost", "cost_low", "cost_high"), ValueRange(-1e12, 1e12)),
-    **dict.fromkeys(("tolerance", "asked", "estimated", "memory_gib"), ValueRange(0, 1e12)),
+    **dict.fromkeys(("num_iterations", "max_iterations", "num_stages", "rounds", "frames"), ValueRange(0, 1e12)),
+    **dict.fromkeys(("threads", "num_concurrent_runs", "cores"), ValueRange(0, 1e6)),
+    **dict.fromkeys(
+        ("seconds", "cpu_seconds", "cold_seconds", "t_end", "seconds_per_simulated_second"), ValueRange(0, 1e12)
+    ),
+    **dict.fromkeys(("added_seconds", "added_seconds_low", "added_seconds_high"), ValueRange(-1e12, 1e12)),
+    **dict.fromkeys(("residual_rtol", "error_requested", "error_estimated", "memory_gib"), ValueRange(0, 1e12)),
     "time_step": ValueRange(1e-12, 1e9),
     "mean_rest_length": ValueRange(1e-300, 1e300),
-    **dict.fromkeys(("machine_bandwidth", "machine_flops", "machine_step"), ValueRange(0, 1e30)),
+    **dict.fromkeys(("machine_bandwidth", "machine_flops_per_second", "machine_step_seconds"), ValueRange(0, 1e30)),
 }
 """Ranges of numeric columns, by column name."""
 

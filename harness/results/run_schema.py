@@ -23,285 +23,372 @@ class ColumnSpec(NamedTuple):
 _TEXT, _INT, _REAL = pa.string(), pa.int64(), pa.float64()
 
 RUN_COLUMNS = (
-    ColumnSpec("run_id", _TEXT, "", "hash of all that determines the run's result and timing"),
+    ColumnSpec("run_id", _TEXT, "", "hash of everything that determines the run's result and timing"),
     ColumnSpec("sweep", _TEXT, "", "name of the sweep, the stem of its file"),
     ColumnSpec("scene", _TEXT, "", "name of the scene, the stem of its file"),
-    ColumnSpec("size", _INT, "", "mesh size of the sweep; 0 where the mesh comes from a file"),
+    ColumnSpec("size", _INT, "", "mesh size of the sweep; 0 if the mesh comes from a file"),
     ColumnSpec("solver", _TEXT, "", "name of the solver"),
-    ColumnSpec("parameters", _TEXT, "", "the solver's parameters, as JSON"),
-    ColumnSpec("family", _TEXT, "", "what the solver has in common with others; `local-global` is the paper's method"),
-    ColumnSpec("reference", _TEXT, "", "where the solver's method comes from: authors, year, title and doi, as JSON"),
-    ColumnSpec("minimises", pa.bool_(), "", "whether the solver's iterates tend to a minimum of the step's objective"),
-    ColumnSpec("own_steps", pa.bool_(), "", "whether the solver integrates time in substeps of its own"),
-    ColumnSpec("vertices", _INT, "", "vertices of the mesh"),
-    ColumnSpec("springs", _INT, "", "springs of the mesh"),
+    ColumnSpec("parameters", _TEXT, "", "parameters of the solver, as JSON"),
+    ColumnSpec("family", _TEXT, "", "family of methods; `local-global` is the paper's method"),
+    ColumnSpec("citation", _TEXT, "", "source of the method: authors, year, title and doi, as JSON"),
+    ColumnSpec("is_minimiser", pa.bool_(), "", "whether the iterates tend to a minimum of the step's objective"),
+    ColumnSpec("is_substepping", pa.bool_(), "", "whether the solver integrates time in substeps of its own"),
+    ColumnSpec("vertices", _INT, "", "number of vertices of the mesh"),
+    ColumnSpec("springs", _INT, "", "number of springs of the mesh"),
     ColumnSpec(
         "modulus_exponent",
         _INT,
         "",
-        "power of the mesh's spacing that the material's modulus (EA, E t or E) is proportional to, by the springs' "
-        "rule; 0: every size is the same material; null: no rule, or several",
+        "exponent of the mesh spacing to which the material's modulus (EA, E t or E) is proportional by the "
+        "springs' scaling rule; 0: the same material at every size; null: no rule, or several",
     ),
-    ColumnSpec("time_step", _REAL, "s", "the time step dt"),
+    ColumnSpec("time_step", _REAL, "s", "time step dt"),
+    ColumnSpec("integrator", _TEXT, "", "time integrator: implicit-euler, bdf2, midpoint, sdirk-4, ..."),
     ColumnSpec(
-        "integrator", _TEXT, "", "how time is integrated, by name: implicit-euler, bdf2, midpoint, sdirk-4, ..."
+        "initial_guess",
+        _TEXT,
+        "",
+        "initial guess of each step's iteration: assignment, current, inertial, motion or coarse",
     ),
+    ColumnSpec("max_iterations", _INT, "", "iteration limit of a step"),
     ColumnSpec(
-        "first_guess", _TEXT, "", "where each step's iteration starts: assignment, current, inertial, motion or coarse"
-    ),
-    ColumnSpec("max_iterations", _INT, "", "the iteration limit of a step"),
-    ColumnSpec(
-        "tolerance",
+        "residual_rtol",
         _REAL,
         "",
-        "relative tolerance of the stop rule; null: all iterations are done; 0: auto",
+        "relative tolerance of the residual in the stop rule; null: all iterations are performed; 0: auto",
     ),
     ColumnSpec("threads", _INT, "", "threads of Numba and of BLAS"),
-    ColumnSpec("asked", _REAL, "", "the relative error at the end that was asked for; null: steps as they are stated"),
-    ColumnSpec("estimated", _REAL, "", "where one was: that error, estimated by a motion to a closer tolerance"),
     ColumnSpec(
-        "local_tolerance_m",
+        "error_requested",
+        _REAL,
+        "",
+        "requested relative error of the final positions; null: the given steps are used",
+    ),
+    ColumnSpec(
+        "error_estimated",
+        _REAL,
+        "",
+        "with a requested error: estimate of that error from a run with a tighter tolerance",
+    ),
+    ColumnSpec(
+        "step_atol_m",
         _REAL,
         "m",
-        "what each step may err by, root mean square over the free coordinates; null: steps of one length",
+        "absolute tolerance of a step's local error, root mean square over the free coordinates; null: fixed step size",
     ),
-    ColumnSpec("accepted", _INT, "", "steps that kept to it"),
-    ColumnSpec("rejected", _INT, "", "steps that did not, and were done again"),
+    ColumnSpec("num_accepted_steps", _INT, "", "steps whose estimated error is within the tolerance"),
+    ColumnSpec("num_rejected_steps", _INT, "", "steps that were repeated with a smaller size"),
     ColumnSpec(
-        "factorisations", _INT, "", "factors made: one a length of steps, or one a linearly implicit step tried"
+        "num_factorisations",
+        _INT,
+        "",
+        "matrix factorisations: one per step size, or one per attempted linearly implicit step",
     ),
-    ColumnSpec("estimate_seconds", _REAL, "s", "wall time of all that was simulated to choose and to estimate"),
+    ColumnSpec(
+        "search_seconds",
+        _REAL,
+        "s",
+        "wall time of all simulations that select the method and estimate its error",
+    ),
     ColumnSpec(
         "phase",
         _TEXT,
         "",
-        "prepare, step, local, global, iteration or run (the run as a whole), and what else a solver times; of a "
-        "machine its kernel",
+        "timed phase: prepare, step, local, global, iteration, run (the run as a whole), or another phase of "
+        "the solver; for a machine its microbenchmark",
     ),
-    ColumnSpec("frame", _INT, "", "the step, from 1; null where the phase has none"),
-    ColumnSpec("round", _INT, "", "repetition of the measurement, from 0; prepare: 0 is cold, later ones are warm"),
+    ColumnSpec("frame", _INT, "", "step, from 1; null for phases outside steps"),
+    ColumnSpec(
+        "round",
+        _INT,
+        "",
+        "repetition of the measurement, from 0; prepare: 0 is the first call, later rounds are warm",
+    ),
     ColumnSpec(
         "seconds",
         _REAL,
         "s",
-        "wall time of the phase; local and global: of one such step; iteration: of a whole solve next to these, over "
-        "its iterations",
+        "wall time of the phase; local, global: of one such step; iteration: of a whole solve, measured next "
+        "to them, divided by its iterations",
     ),
     ColumnSpec(
-        "pass_seconds", _REAL, "s", "wall time, by another clock, of all of the phase in the run; of steps in the round"
+        "wall_seconds_check",
+        _REAL,
+        "s",
+        "wall time of all calls of the phase by another clock: in the run, for steps in the round",
     ),
-    ColumnSpec("summed_seconds", _REAL, "s", "what the rows' times add up to in it"),
-    ColumnSpec("cpu_seconds", _REAL, "s", "CPU time of the process in it"),
+    ColumnSpec("wall_seconds_sum", _REAL, "s", "sum of the rows' times in the same interval"),
+    ColumnSpec("cpu_seconds", _REAL, "s", "CPU time of the process in the same interval"),
     ColumnSpec(
-        "interrupted",
+        "preempted",
         pa.bool_(),
         "",
-        "whether more than 3 % and 1 ms of it went by without computing: stopped, or others had the processor",
+        "whether more than 3 % and 1 ms of that interval passed without computing: the process was suspended "
+        "or preempted",
     ),
     ColumnSpec(
-        "adds_up",
+        "phases_consistent",
         pa.bool_(),
         "",
-        "of the parts of an iteration: whether they add up to one within 15 %, by the medians over the frames",
+        "for phases of an iteration: whether their medians over the frames sum to that of an iteration within 15 %",
     ),
-    ColumnSpec("iterations", _INT, "", "iterations done in the step, for all of its unknowns"),
+    ColumnSpec("num_iterations", _INT, "", "iterations of the step, over all of its stages"),
     ColumnSpec(
-        "stages", _INT, "", "unknowns of the step that were solved for, one after the other; energies are the last's"
-    ),
-    ColumnSpec(
-        "friction_rounds",
+        "num_stages",
         _INT,
         "",
-        "solves of the step, each with friction's normal forces from the one before; the most of its unknowns; null "
+        "stages of the step, solved one after the other; energies are those of the last",
+    ),
+    ColumnSpec(
+        "friction_iterations",
+        _INT,
+        "",
+        "solves of the step, each with the normal forces of the previous one; maximum over its stages; null "
         "without friction",
     ),
     ColumnSpec(
-        "friction_change",
+        "friction_relative_change",
         _REAL,
         "",
-        "by what part of its largest force friction would change in a further round; the largest of its unknowns",
+        "change of friction in one more iteration, relative to its largest force; maximum over the stages",
     ),
     ColumnSpec(
-        "stopped",
+        "termination_reason",
         _TEXT,
         "",
-        "what ended the step's iterations: iterations, tolerance, floor or stalled; the least welcome of its unknowns",
+        "why the step's iteration ended: max-iter, stalled, converged or roundoff; the least favourable of its stages",
     ),
     ColumnSpec(
         "residual",
         _REAL,
         "J^(1/2)",
-        "|Q^-1 grad g|_Q over the unpinned vertices at the positions that the step's solve returned; taken in the "
-        "untimed pass where the solver knows that of the iterate before alone; null where it does not minimise",
+        "|Q^-1 grad g|_Q over the unpinned vertices at the returned positions; from the untimed pass if the "
+        "solver computes only that of the previous iterate; null if it does not minimise",
     ),
     ColumnSpec(
-        "last_residual",
+        "residual_last",
         _REAL,
         "J^(1/2)",
-        "the last one that the solve computed, by which the stop rule judged; null as the residual is",
+        "last residual that the solve computed and the stop rule tested; null where residual is",
     ),
-    ColumnSpec("residual_of", _TEXT, "", "the iterate that last_residual belongs to: returned, previous or none"),
-    ColumnSpec("within", _REAL, "J^(1/2)", "of `tolerance: auto`: the residual that was enough in the step"),
-    ColumnSpec("yardstick", _REAL, "J^(1/2)", "the residual at the step's start, which the tolerance refers to"),
+    ColumnSpec("residual_iterate", _TEXT, "", "iterate of residual_last: returned, previous or none"),
+    ColumnSpec(
+        "residual_atol",
+        _REAL,
+        "J^(1/2)",
+        "with the tolerance `auto`: absolute tolerance of the residual in the step",
+    ),
+    ColumnSpec(
+        "residual_initial",
+        _REAL,
+        "J^(1/2)",
+        "residual at the start of the step, to which residual_rtol refers",
+    ),
     ColumnSpec(
         "stationarity",
         _REAL,
         "",
-        "where judged, and the solver minimises: |Q^-1 grad g|_Q at the answer, by the oracle, over the larger of "
-        "its value at the current positions and round-off; of a step of several unknowns that of the worst",
+        "verified runs of a minimiser: |Q^-1 grad g|_Q at the solution, by the reference evaluator, over the "
+        "larger of its value at the current positions and round-off; the largest of the stages",
     ),
-    ColumnSpec("attainable", _REAL, "", "where judged: of the stationarity, what round-off may make at the answer"),
     ColumnSpec(
-        "beyond",
+        "stationarity_roundoff_bound",
         _REAL,
         "",
-        "where judged: the stationarity of what round-off does not explain of the gradient, vertex by vertex; by this "
-        "a step is graded",
-    ),
-    ColumnSpec("minimum", pa.bool_(), "", "where judged: whether the answer curves upwards beyond round-off"),
-    ColumnSpec(
-        "flat", pa.bool_(), "", "where judged: whether its smallest curvature cannot be told from zero: a valley"
+        "verified runs: part of the stationarity that round-off can cause at the solution",
     ),
     ColumnSpec(
-        "graded",
+        "stationarity_above_roundoff",
         _REAL,
         "",
-        "in the first, middle and last frame, but for solvers with steps of their own: the stationarity by the oracle, "
-        "judged or not",
+        "verified runs: stationarity of the part of the gradient that round-off does not explain, vertex by "
+        "vertex; it decides whether a step is correct",
     ),
     ColumnSpec(
-        "distance",
+        "is_local_minimum",
+        pa.bool_(),
+        "",
+        "verified runs: whether the Hessian at the solution is positive definite beyond round-off",
+    ),
+    ColumnSpec(
+        "is_degenerate",
+        pa.bool_(),
+        "",
+        "verified runs: whether the smallest eigenvalue of that Hessian is zero within round-off",
+    ),
+    ColumnSpec(
+        "stationarity_audit",
         _REAL,
         "",
-        "where judged: largest distance of a vertex from where a run of Newton's method to round-off has it in that "
-        "frame, over the size at rest of the component it belongs to; null from where that is lost",
+        "in the first, middle and last frame, except of substepping solvers: stationarity by the reference "
+        "evaluator, also of runs that are not verified",
+    ),
+    ColumnSpec(
+        "reference_distance",
+        _REAL,
+        "",
+        "verified runs: largest distance of a vertex from the reference solution (Newton's method to "
+        "round-off) in that frame, over the rest size of its connected component; null once the reference is "
+        "lost",
     ),
     ColumnSpec(
         "formula_check",
         _TEXT,
         "",
-        "where judged: how the energies are checked: release (all are shipped; tests of each release compare them with "
-        "independently written formulas) or gradient (those from user code, by class: each gradient against the "
+        "verified runs: how the energies are checked: release (all are shipped; tests of each release compare them "
+        "with independently written formulas) or gradient (those from user code, by class: each gradient against the "
         "derivative of its energy's value at random points)",
     ),
     ColumnSpec("energy_springs", _REAL, "J", "elastic energy of the springs after the step"),
     ColumnSpec("energy_inertia", _REAL, "J", "inertia term of the step's objective"),
-    ColumnSpec("energy_force", _REAL, "J", "external forces' term of the step's objective"),
-    ColumnSpec("energy_pins", _REAL, "J", "pin penalty of the step's objective"),
+    ColumnSpec("energy_force", _REAL, "J", "term of external forces in the step's objective"),
+    ColumnSpec("energy_pins", _REAL, "J", "pin penalty in the step's objective"),
     ColumnSpec(
-        "energy_effects", _REAL, "J", "all other energies of the step's objective: bending, gas, damping and so on"
-    ),
-    ColumnSpec("objective", _REAL, "J", "the step's objective, the sum of all terms"),
-    ColumnSpec(
-        "energy_gained",
+        "energy_effects",
         _REAL,
         "J",
-        "kinetic energy and potentials after the step, less those of the start and the work of sources; at most zero "
-        "where nothing makes energy",
+        "all other energies of the step's objective: bending, gas, damping and so on",
+    ),
+    ColumnSpec("objective", _REAL, "J", "objective of the step, the sum of all terms"),
+    ColumnSpec(
+        "energy_gain",
+        _REAL,
+        "J",
+        "kinetic energy and potentials after the step, minus those of the start and the work of sources; at "
+        "most zero if nothing adds energy",
     ),
     ColumnSpec(
         "energy_available",
         _REAL,
         "J",
-        "energy of the start, released potentials, work of sources, and what the load gives in one step; a larger gain "
-        "is energy growth",
+        "energy of the start, released potentials, work of sources, and what the load gives in one step; a "
+        "larger gain is energy growth",
     ),
-    ColumnSpec("largest_strain", _REAL, "", "largest |length / rest length - 1| of a spring after the step"),
+    ColumnSpec("max_strain", _REAL, "", "maximum over the springs of |length / rest length - 1| after the step"),
     ColumnSpec(
-        "strain_99",
+        "strain_p99",
         _REAL,
         "",
-        "what 99 % of the springs stay below of it; the largest grows with the mesh where a single vertex bears a load",
+        "99th percentile of the same; the maximum grows with the mesh where a single vertex bears a load",
     ),
     ColumnSpec(
-        "off",
+        "max_length_error",
         _REAL,
         "",
-        "where lengths are exact: the largest error of one after the step, over the longest that is allowed",
+        "with inextensible springs: maximum error of a length after the step, over the largest allowed length",
     ),
     ColumnSpec(
-        "penetration",
+        "penetration_depth",
         _REAL,
         "m",
-        "how deep the deepest vertex is inside an obstacle after the step, 0 where none is; null without obstacles",
+        "depth of the deepest vertex inside an obstacle after the step, 0 if none is inside; null without obstacles",
     ),
     ColumnSpec(
-        "intersections",
+        "num_intersections",
         _INT,
         "",
-        "edges that pass through triangles of the mesh, or of what it may not pass through, after the step, told "
-        "exactly by code that no solver shares; null where no effect sees to that",
+        "edges that intersect triangles of the mesh or of obstacles after the step, by an exact test that no "
+        "solver shares; null without contact that prevents it",
     ),
-    ColumnSpec("digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
+    ColumnSpec("positions_digest", _TEXT, "", "SHA-256 of the positions after the step (float64 bytes)"),
     ColumnSpec(
-        "recorded",
+        "recording_digest",
         _TEXT,
         "",
-        "SHA-256 of the positions that the recording ends with, read back from its file (float32 bytes, relative to "
+        "SHA-256 of the last positions in the recording, read back from its file (float32 bytes, relative to "
         "its origin)",
     ),
     ColumnSpec("nnz_system", _INT, "", "stored entries of the system matrix Q"),
-    ColumnSpec("nnz_factor", _INT, "", "stored entries of its triangular factor, null where the library hides it"),
+    ColumnSpec("nnz_factor", _INT, "", "stored entries of its triangular factor; null if the library hides it"),
     ColumnSpec("nnz_hessian_factor", _INT, "", "stored entries of the triangular factor of Newton's Hessian"),
-    ColumnSpec("panel_bytes", _INT, "", "bytes in which the prepared factor is stored"),
-    ColumnSpec("flops_per_solve", _INT, "", "additions and multiplications of one global step, padding included"),
-    ColumnSpec("choice", _TEXT, "", "what the solver chose by itself, and why"),
-    ColumnSpec("device", _TEXT, "", "the device that the solver computed on, by name; null: the processor"),
+    ColumnSpec("factor_bytes", _INT, "", "bytes of the stored factor"),
+    ColumnSpec("flops_per_solve", _INT, "", "floating-point operations of one global step, padding included"),
+    ColumnSpec("solver_description", _TEXT, "", "automatic choices of the solver and their reasons"),
+    ColumnSpec("device", _TEXT, "", "name of the device of the solver; null: the CPU"),
     ColumnSpec("device_memory_gib", _REAL, "GiB", "memory of that device"),
     ColumnSpec("device_driver", _TEXT, "", "version of its driver"),
-    ColumnSpec("device_versions", _TEXT, "", "versions of the libraries that reach it, as JSON"),
+    ColumnSpec("device_versions", _TEXT, "", "versions of the libraries for the device, as JSON"),
     ColumnSpec(
-        "sm_clock_mhz", _REAL, "MHz", "clock of its processors after the round; null, as the next five: not told"
+        "sm_clock_mhz",
+        _REAL,
+        "MHz",
+        "clock of the device's processors after the round; null, like the next five, if unknown",
     ),
-    ColumnSpec("memory_clock_mhz", _REAL, "MHz", "clock of its memory then"),
-    ColumnSpec("power_w", _REAL, "W", "what it took then"),
-    ColumnSpec("power_limit_w", _REAL, "W", "what it may take"),
-    ColumnSpec("performance_state", _REAL, "", "its state then, 0 the fastest"),
-    ColumnSpec("temperature_c", _REAL, "°C", "its temperature then"),
-    ColumnSpec("kernel_seconds", _REAL, "s", "of the step's kernels on the device, by events on its stream"),
-    ColumnSpec("transfer_seconds", _REAL, "s", "of what the step brings to the device and back, by events"),
+    ColumnSpec("memory_clock_mhz", _REAL, "MHz", "clock of its memory at that time"),
+    ColumnSpec("power_w", _REAL, "W", "its power draw at that time"),
+    ColumnSpec("power_limit_w", _REAL, "W", "its power limit"),
+    ColumnSpec("performance_state", _REAL, "", "its performance state at that time, 0 is the fastest"),
+    ColumnSpec("temperature_c", _REAL, "°C", "its temperature at that time"),
+    ColumnSpec("kernel_seconds", _REAL, "s", "time of the step's kernels on the device, by events on its stream"),
+    ColumnSpec("transfer_seconds", _REAL, "s", "time of the step's transfers to the device and back, by events"),
     ColumnSpec(
-        "apart", _REAL, "", "how far the precision of the factor moves converged positions, in the scene's size"
+        "precision_error",
+        _REAL,
+        "",
+        "displacement of converged positions by the precision of the factor, relative to the scene's size",
     ),
-    ColumnSpec("bytes", _REAL, "", "bytes that the phase touches, vectors and springs included, by count"),
-    ColumnSpec("flops", _REAL, "", "additions and multiplications of the phase, by count"),
-    ColumnSpec("working_set", _REAL, "", "bytes that the phase goes through again and again"),
-    ColumnSpec("load", _REAL, "", "load average over a minute when the phase was timed"),
+    ColumnSpec(
+        "bytes_moved",
+        _REAL,
+        "",
+        "bytes that the phase reads and writes, vectors and springs included, by count",
+    ),
+    ColumnSpec("flops", _REAL, "", "floating-point operations of the phase, by count"),
+    ColumnSpec("working_set_bytes", _REAL, "", "bytes that the phase accesses repeatedly"),
+    ColumnSpec("load_average", _REAL, "", "load average over a minute when the phase was timed"),
     ColumnSpec(
         "status",
         _TEXT,
         "",
         "ok, unsupported, diverged, energy-growth (without a source), wrong-gradient (see formula_check), failed (an "
-        "error, or a crash), time-limit, killed (from outside) or skipped",
+        "error or a crash), time-limit, killed (from outside) or skipped",
     ),
     ColumnSpec("reason", _TEXT, "", "why the status is not ok"),
-    ColumnSpec("time_limit", _REAL, "s", "wall time that the run might take; null: any"),
-    ColumnSpec("memory_limit", _REAL, "GiB", "memory that the run might take; null: any"),
+    ColumnSpec("time_limit", _REAL, "s", "limit of the run's wall time; null: none"),
+    ColumnSpec("memory_limit", _REAL, "GiB", "limit of the run's memory; null: none"),
     ColumnSpec(
         "timing",
         _TEXT,
         "",
-        "exclusive: timed alone on the machine; shared: on cores of its own, beside others; rough: in the pass that "
-        "looks at it, beside others",
+        "exclusive: timed alone on the machine; shared: on cores of its own, concurrently with others; rough: "
+        "in the instrumentation pass, concurrently with others",
     ),
-    ColumnSpec("at_once", _INT, "", "how many runs may have been timed at once"),
-    ColumnSpec("pinned", _TEXT, "", "of shared timing: the cores' numbers"),
-    ColumnSpec("machine", _TEXT, "", "id of the machine: hash of its processor, cores and memory"),
-    ColumnSpec("node", _TEXT, "", "id of the computer among others like it: hash of its name"),
+    ColumnSpec("num_concurrent_runs", _INT, "", "maximum number of runs timed concurrently"),
+    ColumnSpec("pinned_cores", _TEXT, "", "with shared timing: the numbers of the cores"),
+    ColumnSpec("machine_id", _TEXT, "", "id of the machine model: hash of its processor, cores and memory"),
+    ColumnSpec("node_id", _TEXT, "", "id of the computer among those of one model: hash of its name"),
     ColumnSpec("cpu", _TEXT, "", "name of the processor"),
-    ColumnSpec("cores", _INT, "", "cores this process may use"),
+    ColumnSpec("cores", _INT, "", "cores available to the process"),
     ColumnSpec("memory_gib", _REAL, "GiB", "memory of the machine"),
     ColumnSpec(
-        "machine_bandwidth", _REAL, "B/s", "bytes a second that one thread reads and writes where it copies 64 MiB"
+        "machine_bandwidth",
+        _REAL,
+        "B/s",
+        "memory bandwidth of one thread that copies 64 MiB, reads and writes",
     ),
-    ColumnSpec("machine_flops", _REAL, "1/s", "operations a second of one thread in a product of matrices, float64"),
-    ColumnSpec("machine_step", _REAL, "s", "a fixed step there: ten iterations of local-global by NumPy and SciPy"),
-    ColumnSpec("system", _TEXT, "", "operating system and its release"),
+    ColumnSpec(
+        "machine_flops_per_second",
+        _REAL,
+        "1/s",
+        "floating-point rate of one thread in a matrix product, float64",
+    ),
+    ColumnSpec(
+        "machine_step_seconds",
+        _REAL,
+        "s",
+        "time of a fixed step on the machine: ten iterations of local-global with NumPy and SciPy",
+    ),
+    ColumnSpec("operating_system", _TEXT, "", "operating system and its release"),
     ColumnSpec("versions", _TEXT, "", "versions of Python and the libraries, as JSON"),
-    ColumnSpec("commit", _TEXT, "", "commit of the code, with -dirty where files differed from it"),
-    ColumnSpec("code", _TEXT, "", "hash of all sources that the run depends on: rows made by other code differ"),
-    ColumnSpec("own", _TEXT, "", "somebody's own code in the run: names, modules, versions, as JSON; null without"),
-    ColumnSpec("started", _TEXT, "", "when the run started, UTC, ISO 8601"),
+    ColumnSpec("commit", _TEXT, "", "commit of the code, with -dirty if files differed from it"),
+    ColumnSpec(
+        "source_fingerprint",
+        _TEXT,
+        "",
+        "hash of all sources that the run depends on; rows of other code have another one",
+    ),
+    ColumnSpec("plugins", _TEXT, "", "user code in the run: names, modules, versions, as JSON; null without"),
+    ColumnSpec("started_at", _TEXT, "", "start of the run, UTC, ISO 8601"),
 )
 
 
@@ -320,10 +407,21 @@ def select_run_columns(*names: str) -> tuple[ColumnSpec, ...]:
     return tuple(_COLUMN_BY_NAME[name] for name in names)
 
 
-SOLVER_COLUMN_SPECS = select_run_columns("family", "reference", "minimises", "own_steps")
+SOLVER_COLUMN_SPECS = select_run_columns("family", "citation", "is_minimiser", "is_substepping")
 """Metadata of a solver."""
 
 PROVENANCE_COLUMN_SPECS = select_run_columns(
-    *("machine", "node", "cpu", "cores", "memory_gib", "system", "versions", "commit", "code", "started"),
+    *(
+        "machine_id",
+        "node_id",
+        "cpu",
+        "cores",
+        "memory_gib",
+        "operating_system",
+        "versions",
+        "commit",
+        "source_fingerprint",
+        "started_at",
+    ),
 )
 """Machine, time and code version of a measurement."""

@@ -31,7 +31,7 @@ def read_solver_metadata(solver: str) -> dict[str, Any]:
     told = find_solver_info(method, solver)
     return {
         "family": told.family,
-        "reference": json.dumps(asdict(told.citation), ensure_ascii=False) if told.citation else None,
-        "minimises": is_minimiser(method),
-        "own_steps": told.is_substepping,
+        "citation": json.dumps(asdict(told.citation), ensure_ascii=False) if told.citation else None,
+        "is_minimiser": is_minimiser(method),
+        "is_substepping": told.is_substepping,
     }

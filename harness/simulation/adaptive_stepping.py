@@ -313,7 +313,7 @@ def _is_solved(solution: Solution, atol: float) -> bool:
     """
     if solution.termination_reason == "stalled":
         return solution.residual <= _STALL_FACTOR * atol
-    return solution.termination_reason != "iterations"
+    return solution.termination_reason != "max-iter"
 
 
 def share_frame_seconds(reached: Sequence[float]) -> tuple[float, ...]:

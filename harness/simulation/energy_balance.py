@@ -77,7 +77,7 @@ class EnergyGain(NamedTuple):
     @property
     def columns(self) -> dict[str, float]:
         """Columns of the balance in the rows of a frame."""
-        return {"energy_gained": self.gain, "energy_available": self.available_energy}
+        return {"energy_gain": self.gain, "energy_available": self.available_energy}
 
 
 class EnergyGrowth(NamedTuple):
@@ -95,7 +95,7 @@ class EnergyGrowth(NamedTuple):
     def from_rows(cls, by_frame: Mapping[int, Mapping[str, Any]]) -> EnergyGrowth | None:
         """Build from a run's columns by frame; None where its energy has not grown."""
         return cls.from_balances(
-            {frame: EnergyGain(row["energy_gained"], row["energy_available"]) for frame, row in by_frame.items()}
+            {frame: EnergyGain(row["energy_gain"], row["energy_available"]) for frame, row in by_frame.items()}
         )
 
     @classmethod
@@ -261,7 +261,7 @@ def compute_frame_balances(scene: Scene, motions: Iterable[Motion]) -> Iterator[
     balance, state = EnergyBalance(scene), build_initial_state(scene)
     for motion in motions:
         problem = build_problem(scene, state, "current")
-        solution = Solution(motion.positions, 1, np.nan, np.nan, "iterations", motion.velocity)
+        solution = Solution(motion.positions, 1, np.nan, np.nan, "max-iter", motion.velocity)
         state = MotionState(motion, None, state.index + 1)
         step = SimulationStep(problem, solution, state, (1,), ((problem, solution),), StopRule(1))
         yield balance.add_step(step)

@@ -34,7 +34,7 @@ from springbench.solvers.model.step_problem import Positions, PreparedSolver
 _ENERGY_TERMS = ("springs", "inertia", "force", "pins")
 """Terms of the objective that have their own columns."""
 
-_REASON_ORDER = ("iterations", "stalled", "tolerance", "floor")
+_REASON_ORDER = ("max-iter", "stalled", "converged", "roundoff")
 """Termination reasons of a solve, least desirable first."""
 
 
@@ -82,7 +82,7 @@ def observe_run(
         if sample_frame:
             sample_frame(step.index, step.positions)
         if recorder:
-            drawn = terms, residual, step.num_iterations, collect_forces(step), told["intersections"]
+            drawn = terms, residual, step.num_iterations, collect_forces(step), told["num_intersections"]
             recorder.record_frame(RecordedFrame(step.index, scene.compute_time(step.index), step.positions, *drawn))
 
     with ThreadPoolExecutor(1) as beside:
@@ -130,20 +130,20 @@ def build_solution_columns(
         "energy_effects": sum(value for name, value in terms.items() if name not in _ENERGY_TERMS),
         "objective": sum(terms.values()),
         **compute_strain_columns(scene, p),
-        "off": compute_max_length_error(scene, p),
-        "penetration": compute_penetration(scene, p, scene.compute_time(step.index)),
-        "intersections": count_intersections(scene, p, scene.compute_time(step.index)),
-        "iterations": step.num_iterations,
-        "stages": len(step.stages),
-        "friction_rounds": step.friction_rounds.num_iterations if step.friction_rounds else None,
-        "friction_change": step.friction_rounds.relative_change if step.friction_rounds else None,
-        "stopped": find_termination_reason(step),
+        "max_length_error": compute_max_length_error(scene, p),
+        "penetration_depth": compute_penetration(scene, p, scene.compute_time(step.index)),
+        "num_intersections": count_intersections(scene, p, scene.compute_time(step.index)),
+        "num_iterations": step.num_iterations,
+        "num_stages": len(step.stages),
+        "friction_iterations": step.friction_rounds.num_iterations if step.friction_rounds else None,
+        "friction_relative_change": step.friction_rounds.relative_change if step.friction_rounds else None,
+        "termination_reason": find_termination_reason(step),
         "residual": residual,
-        "last_residual": s.residual,
-        "residual_of": s.residual_iterate,
-        "yardstick": s.initial_residual,
-        "within": step.stop_rule.atol or None,
-        "digest": hash_positions(p),
+        "residual_last": s.residual,
+        "residual_iterate": s.residual_iterate,
+        "residual_initial": s.initial_residual,
+        "residual_atol": step.stop_rule.atol or None,
+        "positions_digest": hash_positions(p),
     }
 
 
@@ -213,7 +213,7 @@ def compute_strain_columns(scene: Scene, p: Positions) -> dict[str, float]:
     of_spring, _ = compute_strains(p, scene.all_springs.edges, scene.all_springs.rest_length)
     strain = np.abs(of_spring)
     percentile = float(np.percentile(strain, 99)) if len(strain) else 0.0
-    return {"largest_strain": float(strain.max(initial=0.0)), "strain_99": percentile}
+    return {"max_strain": float(strain.max(initial=0.0)), "strain_p99": percentile}
 
 
 def compute_max_length_error(scene: Scene, p: Positions) -> float | None:
@@ -243,7 +243,7 @@ def require_finite(columns_by_frame: Mapping[int, dict[str, Any]], *, is_minimis
     Raises:
       StepError: caused by DivergenceError, where a column is infinite or NaN.
     """
-    known = {"residual": is_minimiser, "last_residual": is_minimiser, "yardstick": is_minimiser and has_rtol}
+    known = {"residual": is_minimiser, "residual_last": is_minimiser, "residual_initial": is_minimiser and has_rtol}
     for frame, columns in columns_by_frame.items():
         columns.update({name: None for name, has in known.items() if name in columns and not has})
         for name, value in columns.items():

@@ -108,10 +108,10 @@ class PhaseWatch:
                 "of the two does not measure what it says"
             )
         return {
-            "pass_seconds": self.wall_seconds,
-            "summed_seconds": told,
+            "wall_seconds_check": self.wall_seconds,
+            "wall_seconds_sum": told,
             "cpu_seconds": self.process_seconds,
-            "interrupted": self.preempted_seconds > max(CLOCK_RTOL * self.wall_seconds, CLOCK_ATOL_SECONDS),
+            "preempted": self.preempted_seconds > max(CLOCK_RTOL * self.wall_seconds, CLOCK_ATOL_SECONDS),
         }
 
 

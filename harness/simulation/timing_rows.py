@@ -23,7 +23,13 @@ def build_timing_rows(measured: RunMeasurement) -> list[dict[str, Any]]:
     adds_up, found = _check_phase_sums(measured.timings), list[dict[str, Any]]()
     for (phase, _), timings in groups.items():
         told: list[dict[str, Any]] = [
-            {"phase": phase, "frame": t.frame, "round": t.round, "seconds": t.seconds, "adds_up": adds_up.get(phase)}
+            {
+                "phase": phase,
+                "frame": t.frame,
+                "round": t.round,
+                "seconds": t.seconds,
+                "phases_consistent": adds_up.get(phase),
+            }
             | t.device_columns
             for t in timings
         ]

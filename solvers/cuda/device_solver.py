@@ -175,7 +175,7 @@ class DeviceSolver(IterativeSolver):
             run = self.init_state(problem, problem.initial_guess)
             run.run_unchecked(iterations)
             p, nan = run.positions, float("nan")
-            found = Solution(p, iterations, nan, nan, "iterations", run.velocity, self.residual_iterate)
+            found = Solution(p, iterations, nan, nan, "max-iter", run.velocity, self.residual_iterate)
             return found, run.solve_events()
 
 

@@ -29,9 +29,9 @@ from springbench.solvers.model.step_problem import (
 )
 
 _TERMINATION_REASONS = {
-    iteration_loop.REASON_ITERATIONS: "iterations",
-    iteration_loop.REASON_TOLERANCE: "tolerance",
-    iteration_loop.REASON_FLOOR: "floor",
+    iteration_loop.REASON_ITERATIONS: "max-iter",
+    iteration_loop.REASON_TOLERANCE: "converged",
+    iteration_loop.REASON_FLOOR: "roundoff",
     iteration_loop.REASON_STALLED: "stalled",
 }
 

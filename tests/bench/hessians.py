@@ -87,7 +87,7 @@ def measured(path: Path) -> dict[IndefiniteStrategy, Tally]:
             tally.looked += sum(looked)
             tally.iterations += solution.num_iterations
             tally.elements += solution.num_iterations * edges
-            tally.ended &= solution.termination_reason != "iterations"
+            tally.ended &= solution.termination_reason != "max-iter"
     return tallies
 
 

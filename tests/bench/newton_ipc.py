@@ -216,7 +216,7 @@ def ours(problem: StepProblem, name: str) -> Callable[[], Solved | None]:
 
     def solve() -> Solved | None:
         found = prepared.solve(problem, StopRule(MOST, TOLERANCE))
-        return (found.positions, found.num_iterations) if found.termination_reason == "tolerance" else None
+        return (found.positions, found.num_iterations) if found.termination_reason == "converged" else None
 
     return solve
 

@@ -48,7 +48,7 @@ def told(path: Path, solver: Solver) -> str:
     with patch.object(Hessian, "matvec", counting), patch.object(newton_cg, "_compiled_factor", lambda metric: None):
         for step in simulate_scene(made, prepare(made, solver), STOP, initial_guess="current", frames=spec.frames):
             iterations += step.solution.num_iterations
-            ended &= step.solution.termination_reason != "iterations"
+            ended &= step.solution.termination_reason != "max-iter"
     took = f"{'' if ended else '>'}{iterations}"
     return took if isinstance(solver, NonlinearCG) else f"{took}, {products[0]}"
 

@@ -100,7 +100,14 @@ def repeated_text(count: int, length: int) -> bytes:
     """A few kB that claim as many texts of that length."""
     texts = pa.DictionaryArray.from_arrays(pa.array([0] * count, pa.int32()), pa.array(["x" * length]))
     file = io.BytesIO()
-    columns = {"run_id": texts, "status": texts, "started": texts, "code": texts, "scene": texts, "solver": texts}
+    columns = {
+        "run_id": texts,
+        "status": texts,
+        "started_at": texts,
+        "source_fingerprint": texts,
+        "scene": texts,
+        "solver": texts,
+    }
     pq.write_table(pa.table(columns), file, compression="zstd", store_schema=False)
     return file.getvalue()
 
@@ -117,7 +124,7 @@ def cut(name: str, length: int) -> Callable[[Content], None]:
     return lambda content: content.update({name: content[name][:length]})
 
 
-ONE = {"run_id": ["a"], "status": ["ok"], "started": ["2026"], "phase": ["step"]}
+ONE = {"run_id": ["a"], "status": ["ok"], "started_at": ["2026"], "phase": ["step"]}
 
 CHANGES: dict[str, Callable[[Content], None]] = {
     "no sums": lambda content: None,  # see `archive`
@@ -154,12 +161,12 @@ CHANGES: dict[str, Callable[[Content], None]] = {
     "seconds that are null": rewritten(seconds=None),
     "seconds of NaN": rewritten(seconds=float("nan")),
     "seconds below zero": rewritten(seconds=-1.0),
-    "no digest": rewritten(digest=None),
-    "a machine that is null": rewritten(machine=None),
+    "no digest": rewritten(positions_digest=None),
+    "a machine that is null": rewritten(machine_id=None),
     "threads of 2**62": rewritten(threads=2**62),
     "a time step of NaN": rewritten(time_step=float("nan")),
-    "a tolerance of infinity": rewritten(tolerance=float("inf")),
-    "an error asked for of -1": rewritten(asked=-1.0),
+    "a tolerance of infinity": rewritten(residual_rtol=float("inf")),
+    "an error asked for of -1": rewritten(error_requested=-1.0),
     "parameters that are no JSON": rewritten(parameters="{" * 10_000),
     "a solver of markup": rewritten(solver="[bold]\x1b[2J<script>\n"),
     "a scene of 10 MB": rewritten(scene="x" * 10_000_000),
@@ -314,7 +321,7 @@ def moved(name: bytes) -> Callable[[Path], None]:
 
 def other_type(folder: Path) -> None:
     unit = folder / "results" / "sweep" / "rows" / "b.parquet"
-    unit.write_bytes(table(run_id=["b"], status=["ok"], started=["2026"], size=["large"]))
+    unit.write_bytes(table(run_id=["b"], status=["ok"], started_at=["2026"], size=["large"]))
 
 
 FOLDERS: dict[str, Callable[[Path], None]] = {

@@ -41,7 +41,16 @@ work:
   - {size: 4, horizon: 0.2, time_step: [1/30, 1/60], iterations: 20, rounds: 2, time_limit: 100}
 """
 UNITS = 2 * 2 + 2 * 3
-TIMES = ("seconds", "cpu_seconds", "interrupted", "cold", "seconds_per_simulated", "started", "commit", "code")
+TIMES = (
+    "seconds",
+    "cpu_seconds",
+    "preempted",
+    "cold_seconds",
+    "seconds_per_simulated_second",
+    "started_at",
+    "commit",
+    "source_fingerprint",
+)
 """Columns that tell how long something took, and when and by which state of the code it was done."""
 
 
@@ -77,7 +86,7 @@ class Home:
 
     def units(self) -> Iterator[Path]:
         for path in sorted((self.folder / "accuracy").glob("*.parquet")):
-            if parquet_rows.read_rows([path], ACCURACY_SCHEMA)["kind"][0].as_py() != "problem":
+            if parquet_rows.read_rows([path], ACCURACY_SCHEMA)["kind"][0].as_py() != "snapshot":
                 yield path
 
 
@@ -89,42 +98,42 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
 
 
 def test_each_curve_is_of_a_problem_whose_minimum_is_certified(home: Home) -> None:
-    problems = {row["problem"]: row for row in home.rows("problem")}
-    assert {row["moment"] for row in problems.values()} == {"early", "violent"}
-    minima = {(row["problem"], row["minimum"]): row for row in home.rows("minimum")}
+    problems = {row["problem_digest"]: row for row in home.rows("snapshot")}
+    assert {row["snapshot"] for row in problems.values()} == {"early", "violent"}
+    minima = {(row["problem_digest"], row["minimum_id"]): row for row in home.rows("minimum")}
     curves = home.rows("curve")
-    assert {(row["solver"], row["first_guess"]) for row in curves} == {
+    assert {(row["solver"], row["initial_guess"]) for row in curves} == {
         (solver, guess) for solver in ("sparse", "newton") for guess in ("current", "inertial")
     }
     for row in curves:
-        minimum = minima[row["problem"], row["minimum"]]
-        assert minimum["certified"]
-        assert minimum["smallest_eigenvalue"] > 0.0
+        minimum = minima[row["problem_digest"], row["minimum_id"]]
+        assert minimum["is_certified"]
+        assert minimum["min_eigenvalue"] > 0.0
         assert len(row["seconds"]) == 2
-        assert row["largest_error"] >= row["rms_error"]
+        assert row["position_error_max_m"] >= row["position_error_rms_m"]
 
 
 def test_newton_s_method_reaches_the_minimum_by_energy_and_by_position(home: Home) -> None:
-    lowest = {row["problem"]: row["g"] for row in home.rows("minimum", branch=0)}
-    start = {row["problem"]: row["g0"] for row in home.rows("problem")}
-    length = {row["problem"]: row["mean_rest_length"] for row in home.rows("problem")}
+    lowest = {row["problem_digest"]: row["objective"] for row in home.rows("minimum", minimum_index=0)}
+    start = {row["problem_digest"]: row["objective_initial"] for row in home.rows("snapshot")}
+    length = {row["problem_digest"]: row["mean_rest_length"] for row in home.rows("snapshot")}
     for guess in ("current", "inertial"):
         for problem, g in lowest.items():
-            curve = home.rows("curve", solver="newton", first_guess=guess, problem=problem)
+            curve = home.rows("curve", solver="newton", initial_guess=guess, problem_digest=problem)
             first, last = curve[0], curve[-1]
             assert last["status"] == "ok"
-            assert last["branch"] == 0
-            assert last["g"] - g <= 1e-9 * (start[problem] - g)  # where a curve ends
+            assert last["minimum_index"] == 0
+            assert last["objective"] - g <= 1e-9 * (start[problem] - g)  # where a curve ends
             # An energy gap of 1e-9 is an error of its root, 3e-5 of the way that is to go.
-            assert last["largest_error"] < 1e-3 * length[problem]
+            assert last["position_error_max_m"] < 1e-3 * length[problem]
             if guess == "current":
-                assert (first["iteration"], first["g"]) == (0, start[problem])
+                assert (first["iteration"], first["objective"]) == (0, start[problem])
                 assert first["stationarity"] == pytest.approx(1.0, rel=1e-12)  # by its definition, but for round-off
 
 
 def test_a_recording_shows_the_mesh_at_each_graded_iterate(home: Home) -> None:
-    curve = home.rows("curve", solver="sparse", first_guess="current", moment="violent")
-    replay = read_replay(home.folder / curve[0]["recording"])
+    curve = home.rows("curve", solver="sparse", initial_guess="current", snapshot="violent")
+    replay = read_replay(home.folder / curve[0]["recording_path"])
     assert replay.frames.tolist() == [row["iteration"] for row in curve]
     assert np.isfinite(replay.positions).all()
 
@@ -176,17 +185,17 @@ def test_what_is_not_asked_for_any_more_stays_and_is_not_counted(tmp_path: Path)
         load_accuracy(made.config), made.folder, SilentDisplay(), lambda line: None, isolated=False
     )
     assert set(made.written()) == before
-    moments = parquet_rows.read_rows(files, ACCURACY_SCHEMA)["moment"].to_pylist()
+    moments = parquet_rows.read_rows(files, ACCURACY_SCHEMA)["snapshot"].to_pylist()
     assert set(moments) == {"early"}
-    assert "problem" in parquet_rows.read_rows(files, ACCURACY_SCHEMA)["kind"].to_pylist()
+    assert "snapshot" in parquet_rows.read_rows(files, ACCURACY_SCHEMA)["kind"].to_pylist()
 
 
 def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "[2, early, middle]"))
     (tmp_path / "cloth.yaml").write_text(SCENE.replace("frames: 8", "frames: 2"))
     made.run()
-    assert {row["moment"] for row in made.rows("curve")} == {"frame-2"}
-    assert len(made.rows("problem")) == 1
+    assert {row["snapshot"] for row in made.rows("curve")} == {"frame-2"}
+    assert len(made.rows("snapshot")) == 1
 
 
 def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
@@ -200,11 +209,11 @@ def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
     )
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
     made.run()
-    (problem,) = made.rows("problem")
+    (problem,) = made.rows("snapshot")
     assert (problem["status"], problem["reason"]) == ("uncertified", "it ended on a saddle")
     ended = made.rows("curve", solver="sparse")
     assert {row["status"] for row in ended} == {"uncertified"}
-    assert all(row["largest_error"] is None and row["g"] is not None for row in ended)
+    assert all(row["position_error_max_m"] is None and row["objective"] is not None for row in ended)
 
 
 @dataclass(frozen=True)
@@ -255,10 +264,10 @@ def test_a_solver_that_crashes_is_a_row_and_the_others_are_measured(
     config = CONFIG.partition("work:")[0].replace("[sparse,", "[crashing,").replace("[early, violent]", "early")
     made = Home(tmp_path, config)
     assert made.run(isolated=True) == 2
-    (problem,) = made.rows("problem")
+    (problem,) = made.rows("snapshot")
     lost = made.rows("curve", solver="crashing")
-    assert [(row["problem"], row["first_guess"]) for row in lost] == [
-        (problem["problem"], guess) for guess in ("current", "inertial")
+    assert [(row["problem_digest"], row["initial_guess"]) for row in lost] == [
+        (problem["problem_digest"], guess) for guess in ("current", "inertial")
     ]
     for row in lost:
         assert row["status"] == "failed"

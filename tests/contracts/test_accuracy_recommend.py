@@ -77,10 +77,10 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
     table = parquet_rows.read_rows(measured(scene), ACCURACY_SCHEMA).to_pylist()
     within = [row for row in table if row["error"] <= 0.1]
     assert 0 < len(within) < len(table), "the error separates nothing"
-    cheapest = min(within, key=lambda row: row["seconds_per_simulated"])
+    cheapest = min(within, key=lambda row: row["seconds_per_simulated_second"])
     assert (found.best_method.error, found.best_method.seconds_per_simulated_second) == (
         cheapest["error"],
-        cheapest["seconds_per_simulated"],
+        cheapest["seconds_per_simulated_second"],
     )
     assert found.best_method.work_spec.case.scene.time_step == cheapest["time_step"]
     assert found.checked_method.error == found.best_method.error  # the same simulation gives the same positions
@@ -111,7 +111,7 @@ def test_what_was_measured_of_another_scene_or_on_another_machine_is_no_answer(s
     assert asked(scene, 0.1)[1] > 0
     for path in measured(scene):
         table = pq.read_table(path)
-        for column, value in (("machine", "0" * 12), ("unit", "measured there")):
+        for column, value in (("machine_id", "0" * 12), ("unit_id", "measured there")):
             k = table.schema.get_field_index(column)
             table = table.set_column(k, column, pa.array([value] * len(table)))
         pq.write_table(table, path)

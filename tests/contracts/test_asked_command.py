@@ -67,12 +67,12 @@ def rows_of(folder: Path, *options: str) -> list[dict[str, Any]]:
 
 def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_path):
     row, *tried = rows_of(tmp_path, "--verify", "--positions", str(tmp_path / "p.npz"))
-    assert row["kind"] == "asked"
-    assert {"way"} == {one["kind"] for one in tried}
-    assert all(one["promised"] > 0.0 for one in tried)
-    assert row["error"] <= row["estimated"] <= row["asked"] == 1e-3
-    assert row["accepted"] > 0
-    assert (tmp_path / "chain" / row["recording"]).is_file()
+    assert row["kind"] == "error-control"
+    assert {"method"} == {one["kind"] for one in tried}
+    assert all(one["predicted_seconds"] > 0.0 for one in tried)
+    assert row["error"] <= row["error_estimated"] <= row["error_requested"] == 1e-3
+    assert row["num_accepted_steps"] > 0
+    assert (tmp_path / "chain" / row["recording_path"]).is_file()
     assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
 
 
@@ -97,7 +97,7 @@ def test_a_motion_that_gains_energy_says_so_in_its_row_and_its_exit_code(tmp_pat
     rows = parquet_rows.read_rows((folder / "accuracy").glob("*.parquet"), ACCURACY_SCHEMA).to_pylist()
     assert rows[0]["status"] == "energy-growth"
     assert re.match(said, rows[0]["reason"])
-    assert read_replay(folder / rows[0]["recording"]).properties["status"] == "energy-growth"
+    assert read_replay(folder / rows[0]["recording_path"]).properties["status"] == "energy-growth"
 
 
 def test_the_rows_of_a_sweep_to_an_error_have_the_energy_of_each_frame(tmp_path, monkeypatch):
@@ -109,7 +109,7 @@ def test_the_rows_of_a_sweep_to_an_error_have_the_energy_of_each_frame(tmp_path,
     files.rows_path.parent.mkdir()
     rows = execute_run(spec, files, lambda phase: None)
     assert {row["status"] for row in rows} == {"ok"}, rows[0]
-    assert all(row["energy_gained"] <= 1e-3 * row["energy_available"] for row in rows)
+    assert all(row["energy_gain"] <= 1e-3 * row["energy_available"] for row in rows)
     assert all(row["energy_available"] > 0.0 for row in rows)
     assert read_replay(files.recording_path).properties["status"] == "ok"
     monkeypatch.setattr("springbench.harness.experiments.error_control.candidate_methods.AdaptiveSubstepper", Boosting)
@@ -130,7 +130,7 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
     answer = search_cheapest_method(asked, 1e-3, seen, lambda line: None)
     promises: dict[str, float] = {"velocity-verlet": 1.0, "blanes-moan-4": 1.9, "rodas": 2.1}
     answer = replace(answer, trials=tuple((one, promises[one.method.solver]) for one, _ in answer.trials))
-    shared = {"problem": format_problem_id(asked), "asked": 1e-3} | build_provenance_columns()
+    shared = {"problem_digest": format_problem_id(asked), "error_requested": 1e-3} | build_provenance_columns()
     parquet_rows.write_rows(
         tmp_path / "s-2-asked-0.001.parquet",
         [shared | row for row in build_trial_rows(answer, [], 1e-3)],
@@ -150,7 +150,7 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
 
 @pytest.mark.long
 def test_peers_have_rows_beside_it(tmp_path):
-    beside = [row for row in rows_of(tmp_path, "--compare") if row["kind"] == "peer"]
+    beside = [row for row in rows_of(tmp_path, "--compare") if row["kind"] == "third-party"]
     assert [peer["solver"] for peer in beside] == list(THIRD_PARTY_INTEGRATORS)
-    assert all(peer["reason"] or peer["estimated"] <= 1e-3 for peer in beside)
+    assert all(peer["reason"] or peer["error_estimated"] <= 1e-3 for peer in beside)
     assert [peer["status"] for peer in beside][:2] == ["ok", "ok"]

@@ -43,7 +43,7 @@ def test_runs_are_done_by_workers_and_a_crash_is_a_row(tmp_path: Path, monkeypat
     assert first["sparse"]["status"] == "ok", first["sparse"]["reason"]
     assert first["mine"]["status"] == "failed"
     assert "ended its process with exit code 3" in first["mine"]["reason"]
-    assert {row["node"] for row in first.values()} == {compute_node_id()}
+    assert {row["node_id"] for row in first.values()} == {compute_node_id()}
     assert not [*(tmp_path / "r").rglob("*partial*")]
 
 
@@ -142,7 +142,7 @@ def test_of_four_workers_of_a_machine_one_is_timed_at_a_time(tmp_path: Path, sha
 MANY, EVERY = 200, 10.0
 """Runs, and seconds between two kills."""
 
-TIMES = {"started", "seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", *MACHINE}
+TIMES = {"started_at", "seconds", "wall_seconds_check", "wall_seconds_sum", "cpu_seconds", "preempted", *MACHINE}
 """Columns that differ from run to run."""
 
 SOLVE = 0.03

@@ -72,10 +72,10 @@ def test_three_clicks_lead_to_the_fastest_solver_its_last_frame_and_the_command_
         taken.value.save_as(tmp_path / "taken.rrd")
     replay = read_replay(tmp_path / "taken.rrd")
     assert len(replay.positions) == 4, "three steps, and the start"
-    assert hashlib.sha256(replay.positions[-1].tobytes()).hexdigest() == row["recorded"]
+    assert hashlib.sha256(replay.positions[-1].tobytes()).hexdigest() == row["recording_digest"]
 
     program, *words = shlex.split(command)
     assert program == "springbench"
     did(*words)
     (again,) = ends(tmp_path / "results" / "hanging-cloth" / "rows").values()
-    assert (again["solver"], again["digest"]) == (fastest, row["digest"])
+    assert (again["solver"], again["positions_digest"]) == (fastest, row["positions_digest"])

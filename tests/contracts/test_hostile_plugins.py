@@ -81,10 +81,10 @@ def require_rows(folder: Path, case: Hostile) -> None:
     files = (folder / "results" / "sweep" / "rows").glob("*.parquet")
     rows = [pq.read_table(path).to_pylist()[0] for path in files]
     assert len(rows) == (1 if case.part == "report" else 2)
-    others = [row for row in rows if row["own"] is None]
+    others = [row for row in rows if row["plugins"] is None]
     assert len(others) == 1
     assert [row["status"] for row in others] == ["ok"], others[0]["reason"]
     if case.code == FAILED and case.part != "report":
-        assert [row["status"] == "ok" for row in rows if row["own"]] == [False]
+        assert [row["status"] == "ok" for row in rows if row["plugins"]] == [False]
     if case.code == FINE:
         assert {row["status"] for row in rows} == {"ok"}

@@ -111,10 +111,10 @@ def test_a_recording_is_looked_for_below_its_folder(tmp_path: Path, recording: s
     )
     for row in told:
         if row["kind"] == "curve":
-            row["recording"] = recording
+            row["recording_path"] = recording
     synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
     found = reported(tmp_path)
-    assert "recording: came" in " ".join(found.said.split())
+    assert "recording_path: came" in " ".join(found.said.split())
 
 
 def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path):
@@ -122,7 +122,7 @@ def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path
         synthetic_accuracy_rows.build_curve_rows("net", 6, "early", "numba")
     )
     for row in told:
-        row["g0"] = row["time_step"] = None
+        row["objective_initial"] = row["time_step"] = None
     synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
     assert reported(tmp_path).code in (0, 2)
 

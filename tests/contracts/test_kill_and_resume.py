@@ -24,8 +24,8 @@ from springbench.harness.results import parquet_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 8
-TIMES = ("seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", "adds_up")
-WRITTEN_BY = (*TIMES, *MACHINE, "started", "commit", "code")
+TIMES = ("seconds", "wall_seconds_check", "wall_seconds_sum", "cpu_seconds", "preempted", "phases_consistent")
+WRITTEN_BY = (*TIMES, *MACHINE, "started_at", "commit", "source_fingerprint")
 """Columns that tell how long a run took, and when and by which state of the code it was done."""
 
 CLOTH = f"""

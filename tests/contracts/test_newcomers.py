@@ -129,8 +129,8 @@ def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):
     for run in load_config(configs / "sweep.yaml").list_runs():
         found += execute_run(run, RunFiles.for_run(run, configs), lambda phase: None)
     mine = next(row for row in found if row["solver"] == "mine")
-    assert (mine["status"], mine["family"], mine["minimises"]) == ("ok", "of my own", True)
-    assert json.loads(mine["reference"])["year"] == 1918
+    assert (mine["status"], mine["family"], mine["is_minimiser"]) == ("ok", "of my own", True)
+    assert json.loads(mine["citation"])["year"] == 1918
     cells = {cell.solver: cell for cell in read_verified_runs(configs)}
     assert cells["mine"].outcome == cells["sparse"].outcome == CORRECT
     table = pa.Table.from_pylist(found, schema=RUN_SCHEMA)

@@ -163,7 +163,7 @@ def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, beside: Path, inst
     row = pq.read_table(rows).to_pylist()[0]
     assert row["status"] == "ok", row["reason"]
     assert (row["solver"], row["integrator"]) == (WAYS[way]["solver"], WAYS[way]["integrator"])
-    own = {name: (module, version) for name, module, version in json.loads(row["own"])}
+    own = {name: (module, version) for name, module, version in json.loads(row["plugins"])}
     assert set(own) == {name for part, name in WAYS[way].items() if part != "report"}
     for module, version in own.values():
         if way in ("beside", "below"):
@@ -179,7 +179,7 @@ def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, beside: Path, inst
     if way in ("below", "module"):
         return  # their rows are like the others'
     springbench(beside, "schema")
-    springbench(beside, "query", "select own from rows")
+    springbench(beside, "query", "select plugins from rows")
     springbench(beside, "report", "results/sweep")
     assert not ran(), "rows are read without the code that they are of"
 
@@ -196,7 +196,7 @@ def test_a_fresh_environment_takes_both_packages_and_sweeps_with_them(tmp_path: 
     (rows,) = (tmp_path / "results" / "sweep" / "rows").glob("*.parquet")
     row = pq.read_table(rows).to_pylist()[0]
     assert (row["status"], row["solver"], row["integrator"]) == ("ok", "mine", "euler"), row["reason"]
-    assert {module for _, module, _ in json.loads(row["own"])} == {"somebodys"}
+    assert {module for _, module, _ in json.loads(row["plugins"])} == {"somebodys"}
     assert (tmp_path / "results" / "sweep" / "told.txt").exists()
 
 

@@ -55,7 +55,7 @@ def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: s
     rows = read_ablation(
         run_ablation(sweep, tmp_path, SilentDisplay(), lambda line: None, with_pairs=False, isolated=False)
     )
-    told = {row["name"]: describe_effect(row, rows) for row in select_kind(rows, "without")}
+    told = {row["name"]: describe_effect(row, rows) for row in select_kind(rows, "ablated")}
     assert {name: words for name, words in told.items() if not any(called in words for called in CALLED)} == {}
     # Scenes that all solvers take leave out contact of a mesh with itself, which few solvers know.
     assert {

@@ -37,7 +37,8 @@ def study(folder: Path) -> str:
             folder / "study" / name, replace(build_recording_info(), is_solve=True), frame_count=8, amplitude=amplitude
         )
         rows += [
-            row | {"recording": name} for row in synthetic_accuracy_rows.build_curve_rows("net", 6, "early", solver)
+            row | {"recording_path": name}
+            for row in synthetic_accuracy_rows.build_curve_rows("net", 6, "early", solver)
         ]
     synthetic_accuracy_rows.write_accuracy_rows(folder / "study", rows)
     return update_page(folder, with_recordings=True).as_uri()

@@ -65,8 +65,8 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
     assert phases == {"prepare": 2, "step": 2}
     steps = [row for row in here if row["phase"] == "step"]
     assert all((row["power_w"] is None) == cuda_device.is_simulated() for row in steps)
-    assert {row["stopped"] for row in steps} == {"tolerance"}
-    assert timed == [(row["iterations"], 0) for row in steps]
+    assert {row["termination_reason"] for row in steps} == {"converged"}
+    assert timed == [(row["num_iterations"], 0) for row in steps]
     assert all(count % device_solver.ITERATIONS_PER_RESIDUAL == 0 for count, _ in timed)
     assert asked
     assert "vbd, device cuda" in " ".join(told.output.split())

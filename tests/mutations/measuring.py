@@ -88,8 +88,8 @@ MEASURING = (
     Mutation(
         "never-interrupted",
         "harness/simulation/stopwatch.py",
-        '"interrupted": self.preempted_seconds >',
-        '"interrupted": 0.0 >',
+        '"preempted": self.preempted_seconds >',
+        '"preempted": 0.0 >',
         (_UNIT_CLOCK,),
     ),
     Mutation(
@@ -165,7 +165,7 @@ MEASURING = (
     Mutation(
         "passes-not-compared",
         "harness/experiments/run_pipeline.py",
-        'if measured.final_positions is not None and found[run.frames]["digest"] != '
+        'if measured.final_positions is not None and found[run.frames]["positions_digest"] != '
         "hash_positions(\n            measured.final_positions\n        ):",
         "if False:",
         (_LIES,),

@@ -20,8 +20,8 @@ PAGE = (
     Mutation(
         "ablation-share-of-variant",
         "harness/report/ablation_summary.py",
-        'share = [100 * row[key] / whole["seconds"] for key',
-        'share = [100 * row[key] / (whole["seconds"] - row["cost"]) for key',
+        '100 * row[key] / whole["seconds"] for key in ("added_seconds"',
+        '100 * row[key] / (whole["seconds"] - row["added_seconds"]) for key in ("added_seconds"',
         (_STATED,),
     ),
     Mutation(

@@ -78,7 +78,7 @@ class _FixedAnswer:
         """Return the given solution of any step."""
         x = self.x(problem.step_start.stage_time)
         v = problem.step_start.velocity_at(x) if self._moves else None
-        return Solution(x, 0, float("nan"), float("nan"), "iterations", v)
+        return Solution(x, 0, float("nan"), float("nan"), "max-iter", v)
 
 
 def _compare_single_stage(

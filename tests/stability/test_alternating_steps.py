@@ -70,7 +70,7 @@ def test_each_step_is_judged_by_the_matrix_of_its_length():
         scene, prepare(scene, NewtonSolver()), StopRule(100), initial_guess="current", frames=FRAMES
     ):
         found = judge(step)
-        assert found["beyond"] == 0.0
+        assert found["stationarity_above_roundoff"] == 0.0
 
 
 def test_a_run_is_recorded_by_its_own_clock(tmp_path: Path):

@@ -60,7 +60,7 @@ def rows_of(scene: str, tmp_path: Path, *, pairs: bool = False, **options: Any) 
     )
 
 
-def by_name(rows: Sequence[dict[str, Any]], kind: str = "without") -> dict[str, dict[str, Any]]:
+def by_name(rows: Sequence[dict[str, Any]], kind: str = "ablated") -> dict[str, dict[str, Any]]:
     return {row["name"]: row for row in rows if row["kind"] == kind}
 
 
@@ -89,39 +89,44 @@ def test_every_effect_is_left_out_once_and_every_pair_on_request(tmp_path: Path)
 
 
 def test_an_effect_that_does_nothing_costs_no_entry_and_moves_nothing(told):
-    (whole,), row = by_name(told, "whole").values(), by_name(told)["air-drag"]
-    assert (row["largest"], row["rms"], row["energy"], row["centre"]) == (0.0, 0.0, 0.0, 0.0)
+    (whole,), row = by_name(told, "full-scene").values(), by_name(told)["air-drag"]
+    assert (
+        row["displacement_max"],
+        row["displacement_rms"],
+        row["energy_difference"],
+        row["centroid_displacement"],
+    ) == (0.0, 0.0, 0.0, 0.0)
     assert row["nnz_factor"] == whole["nnz_factor"]
     assert "changes nothing at all" in describe_effect(row, told)
 
 
 def test_fill_in_and_memory_are_those_that_bending_brings(told):
-    (whole,), row = by_name(told, "whole").values(), by_name(told)["bending"]
+    (whole,), row = by_name(told, "full-scene").values(), by_name(told)["bending"]
     assert row["nnz_system"] < whole["nnz_system"]
     assert row["nnz_factor"] < whole["nnz_factor"]
-    assert row["bytes"] < whole["bytes"]
+    assert row["memory_bytes"] < whole["memory_bytes"]
 
 
 def test_without_gravity_the_centre_of_mass_stays_where_it_was(told):
     row = by_name(told)["gravity"]
-    (whole,) = by_name(told, "whole").values()
+    (whole,) = by_name(told, "full-scene").values()
     # It cannot fall further than freely, by g t^2/2 and the first order of implicit Euler: g t dt/2.
     t, spacing = 8 / 30, 0.25
-    assert 0.0 < row["centre"] <= 9.81 * t * (t + 1 / 30) / 2 / spacing
-    assert row["largest"] <= whole["extent"]
-    assert row["energy"] == pytest.approx(1.0)  # a scene without gravity and at rest has no energy at all
+    assert 0.0 < row["centroid_displacement"] <= 9.81 * t * (t + 1 / 30) / 2 / spacing
+    assert row["displacement_max"] <= whole["bounding_box_diagonal"]
+    assert row["energy_difference"] == pytest.approx(1.0)  # a scene without gravity and at rest has no energy at all
 
 
 def test_pairs_are_told_of_under_both_names(told):
     assert {"gravity+bending", "springs+pins"} <= set(by_name(told))
     # Without gravity nothing moves, and so bending has nothing to do.
-    both, one = (by_name(told)[name]["largest"] for name in ("gravity+bending", "gravity"))
+    both, one = (by_name(told)[name]["displacement_max"] for name in ("gravity+bending", "gravity"))
     assert both == pytest.approx(one, rel=1e-9)  # round-off of a step at rest
 
 
 def test_a_scene_that_cannot_be_without_an_effect_says_so(tmp_path: Path):
     told = rows_of(HELD, tmp_path, iterations=5)
-    assert by_name(told)["springs"]["status"] == "impossible"
+    assert by_name(told)["springs"]["status"] == "unsolvable"
     assert "impossible without it (" in describe_effect(by_name(told)["springs"], told)
     assert by_name(told)["gravity"]["status"] == "ok"
 
@@ -129,9 +134,11 @@ def test_a_scene_that_cannot_be_without_an_effect_says_so(tmp_path: Path):
 def test_the_error_of_the_solver_falls_with_its_iterations_and_that_of_the_step_does_not(tmp_path: Path):
     few, many = (rows_of(CLOTH, tmp_path, iterations=count) for count in (2, 500))
     before, after = (by_name(told, "error") for told in (few, many))
-    assert after["solver"]["largest"] < 1e-3 * before["solver"]["largest"]
-    assert after["time-step"]["largest"] == pytest.approx(before["time-step"]["largest"], rel=1e-6)  # both of Newton
-    assert after["time-step"]["largest"] > 0.01
+    assert after["solver"]["displacement_max"] < 1e-3 * before["solver"]["displacement_max"]
+    assert after["time-step"]["displacement_max"] == pytest.approx(
+        before["time-step"]["displacement_max"], rel=1e-6
+    )  # both of Newton
+    assert after["time-step"]["displacement_max"] > 0.01
 
 
 def test_the_cost_is_the_difference_of_frames_that_were_timed_together():
@@ -147,13 +154,13 @@ def test_the_cost_is_the_difference_of_frames_that_were_timed_together():
     assert middle == pytest.approx(0.3, abs=0.03)
 
 
-WHOLE = {"kind": "whole", "name": "", "seconds": 1.0}
+WHOLE = {"kind": "full-scene", "name": "", "seconds": 1.0}
 ERRORS = [
-    {"kind": "error", "name": name, "status": "ok", "largest": size}
+    {"kind": "error", "name": name, "status": "ok", "displacement_max": size}
     for name, size in (("solver", 0.3), ("time-step", 0.1))
 ]
-ROW = {"kind": "without", "name": "bending", "status": "ok", "extent": 100.0, "largest": 0.02}
-ROW |= {"cost": 0.11, "cost_low": 0.1, "cost_high": 0.12}
+ROW = {"kind": "ablated", "name": "bending", "status": "ok", "bounding_box_diagonal": 100.0, "displacement_max": 0.02}
+ROW |= {"added_seconds": 0.11, "added_seconds_low": 0.1, "added_seconds_high": 0.12}
 
 
 @pytest.mark.parametrize(
@@ -165,21 +172,21 @@ ROW |= {"cost": 0.11, "cost_low": 0.1, "cost_high": 0.12}
             "this scene does not call for it at this accuracy",
         ),
         (
-            {"largest": 0.5},
+            {"displacement_max": 0.5},
             "11 % of the time, moves vertices by 0.5 rest lengths, more than the solver's own error of 0.3: "
             "this scene calls for it",
         ),
-        ({"largest": 0.0}, "11 % of the time, changes nothing at all: leave it out"),
+        ({"displacement_max": 0.0}, "11 % of the time, changes nothing at all: leave it out"),
         (
-            {"largest": 500.0},
+            {"displacement_max": 500.0},
             "11 % of the time, moves vertices by 500 rest lengths, further than the mesh is large: "
             "without it this is another scene",
         ),
         (
-            {"largest": 0.0, "cost": 0.001, "cost_low": -0.002, "cost_high": 0.004},
+            {"displacement_max": 0.0, "added_seconds": 0.001, "added_seconds_low": -0.002, "added_seconds_high": 0.004},
             "no time that could be measured (-0.2 to +0.4 %), changes nothing at all: leave it out",
         ),
-        ({"status": "impossible", "reason": "loose"}, "the scene is impossible without it (loose)"),
+        ({"status": "unsolvable", "reason": "loose"}, "the scene is impossible without it (loose)"),
     ],
 )
 def test_the_verdict_follows_from_the_numbers(change: dict, said: str):
@@ -187,7 +194,7 @@ def test_the_verdict_follows_from_the_numbers(change: dict, said: str):
 
 
 def test_where_no_error_is_known_the_verdict_does_not_judge():
-    unknown = [row | {"status": "unknown", "reason": "lost", "largest": None} for row in ERRORS]
+    unknown = [row | {"status": "failed", "reason": "lost", "displacement_max": None} for row in ERRORS]
     assert describe_effect(ROW, [WHOLE, *unknown]).endswith("by how much the scene is wrong anyway is not known")
     assert "error of the solver: unknown (lost)" in summarise_ablation([WHOLE, *unknown])
 

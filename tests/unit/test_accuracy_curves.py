@@ -149,7 +149,7 @@ def test_stamps_that_another_clock_does_not_bear_out_are_a_failure(
     monkeypatch.setattr(convergence_curves, "perf_counter", lambda: scale * perf_counter())
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     with pytest.raises(RunFailed, match="the times of iterates add up to"):
-        retry_if_preempted(lambda: ([{"interrupted": curve(prepared, max_iterations=120).preempted}], None))
+        retry_if_preempted(lambda: ([{"preempted": curve(prepared, max_iterations=120).preempted}], None))
 
 
 def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:

@@ -69,7 +69,10 @@ def test_gaps_are_relative_to_the_best_minimum_and_the_current_positions(tmp_pat
 def test_a_lower_minimum_mends_all_gaps_without_a_new_run(tmp_path: Path) -> None:
     rows = list(made.build_curve_rows("net", 10, "early", "numba"))
     before = table(tmp_path / "a", [*made.build_snapshot_rows("net", 10, "early"), *rows])
-    lower = made.build_snapshot_rows("net", 10, "early")[1] | {"g": made.LOWEST_ENERGY - 0.5, "minimum": "deeper"}
+    lower = made.build_snapshot_rows("net", 10, "early")[1] | {
+        "objective": made.LOWEST_ENERGY - 0.5,
+        "minimum_id": "deeper",
+    }
     after = table(tmp_path / "b", [*made.build_snapshot_rows("net", 10, "early"), lower, *rows])
     assert before.curves[0].minimum_index == 0
     assert after.curves[0].minimum_index == 1, "the minimum that the rows called the lowest is the second now"
@@ -124,9 +127,9 @@ def test_a_solver_in_another_minimum_never_reaches_the_gaps_below_it(tmp_path: P
 @pytest.mark.parametrize(
     ("change", "doubt"),
     [
-        pytest.param({"certified": False}, "not certified", id="not certified"),
-        pytest.param({"g": None}, "no minimum is known", id="none known"),
-        pytest.param({"g": made.LOWEST_ENERGY + 0.3}, "went below", id="a solver went below"),
+        pytest.param({"is_certified": False}, "not certified", id="not certified"),
+        pytest.param({"objective": None}, "no minimum is known", id="none known"),
+        pytest.param({"objective": made.LOWEST_ENERGY + 0.3}, "went below", id="a solver went below"),
         pytest.param({}, "", id="certified"),
     ],
 )

@@ -127,8 +127,13 @@ def test_what_other_code_measured_is_hollow_in_every_picture_and_told(
     for size in (6, 12, 24):
         rows += made.build_snapshot_rows("net", size, "early")
         for solver in ("numba", "newton"):
-            rows += made.build_curve_rows("net", size, "early", solver, code="before" if solver == "newton" else None)
-    rows += [row | {"code": "before" if row["solver"] == "hybrid" else None} for row in made.build_work_rows("net", 6)]
+            rows += made.build_curve_rows(
+                "net", size, "early", solver, source_fingerprint="before" if solver == "newton" else None
+            )
+    rows += [
+        row | {"source_fingerprint": "before" if row["solver"] == "hybrid" else None}
+        for row in made.build_work_rows("net", 6)
+    ]
     pages: dict[str, Figure] = {}
     monkeypatch.setattr(plot_sheet, "save_page", lambda drawn, path: pages.setdefault(path.parent.name, drawn))
     table = read_accuracy(made.write_accuracy_rows(tmp_path, rows))

@@ -69,6 +69,6 @@ def test_differences_that_depend_on_each_other_do_no_harm():
     """One free vertex has three coordinates: five differences are never independent."""
     problem = build_random_problem(6, n=3, m=6, weights=(np.inf, np.inf))
     solution = Anderson(8).prepare(problem.system).solve(problem, StopRule(500, 1e-12))
-    assert solution.termination_reason in ("tolerance", "floor")
+    assert solution.termination_reason in ("converged", "roundoff")
     begun = np.abs(problem.gradient(problem.current_positions)).max()
     assert np.abs(problem.gradient(solution.positions)).max() <= 1e-10 * begun  # as asked, by the condition of one row

@@ -56,7 +56,7 @@ def test_what_is_told_falsely_once_is_measured_again_and_twice_is_a_failure(lies
 
     @retry_on_mismatch
     def measure(what: str) -> float:
-        return SECOND.build_columns(what, [next(times)])["summed_seconds"]
+        return SECOND.build_columns(what, [next(times)])["wall_seconds_sum"]
 
     if lies == 2:
         with pytest.raises(ClockMismatch, match="the times of step"):
@@ -89,17 +89,17 @@ HONEST = {
 def test_times_that_another_clock_saw_are_believed_and_both_are_told(watch: PhaseWatch, told: float) -> None:
     columns = watch.build_columns("step", [told / 2] * 2)
     assert columns == {
-        "pass_seconds": watch.wall_seconds,
-        "summed_seconds": told,
+        "wall_seconds_check": watch.wall_seconds,
+        "wall_seconds_sum": told,
         "cpu_seconds": watch.process_seconds,
-        "interrupted": watch is HALF_LOST,
+        "preempted": watch is HALF_LOST,
     }
 
 
 def test_both_of_two_threads_that_were_stopped_for_half_the_time_are_found_out() -> None:
     assert PhaseWatch(num_threads=2, wall_seconds=1.0, process_seconds=1.0, thread_seconds=0.5).build_columns(
         "step", [1.0]
-    )["interrupted"]
+    )["preempted"]
 
 
 def test_a_watch_adds_up_what_is_done_within_it_and_nothing_in_between() -> None:

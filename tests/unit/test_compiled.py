@@ -255,5 +255,5 @@ def test_a_prepared_solver_says_what_it_chose_and_counts_it():
     for solver in DIRECT:
         prepared = solver.prepare(system)
         assert prepared.description.startswith(solver.linear)
-        assert prepared.stats["panel_bytes"] > 0
+        assert prepared.stats["factor_bytes"] > 0
         assert prepared.stats["flops_per_solve"] > 0

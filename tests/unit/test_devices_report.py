@@ -29,9 +29,21 @@ def made(
 ) -> list[dict[str, Any]]:
     """The rows of a run of two steps; more: columns that differ."""
     told = {"run_id": f"{number:012x}", "sweep": "gpu", "scene": "cloth", "size": round(vertices**0.5), "phase": "step"}
-    told |= {"solver": solver, "parameters": ON if on else "{}", "vertices": vertices, "tolerance": tolerance}
-    told |= {"status": "ok", "stopped": "tolerance", "machine": "m", "node": "n", "iterations": 10, "round": 0}
-    told |= {"integrator": "implicit-euler", "time_step": 1 / 30, "minimises": True, "started": "2026-01-01T00:00:00"}
+    told |= {"solver": solver, "parameters": ON if on else "{}", "vertices": vertices, "residual_rtol": tolerance}
+    told |= {
+        "status": "ok",
+        "termination_reason": "converged",
+        "machine_id": "m",
+        "node_id": "n",
+        "num_iterations": 10,
+        "round": 0,
+    }
+    told |= {
+        "integrator": "implicit-euler",
+        "time_step": 1 / 30,
+        "is_minimiser": True,
+        "started_at": "2026-01-01T00:00:00",
+    }
     if on:
         told |= {"device": "a device", "kernel_seconds": 0.01}
     return [told | {"frame": frame, "seconds": seconds} | more for frame in (1, 2)]
@@ -39,7 +51,7 @@ def made(
 
 def refused(number: int, reason: str) -> dict[str, Any]:
     told = made(number, "vbd", 0, 0.0, on=True)[0]
-    gone = ("vertices", "seconds", "stopped", "frame", "device", "kernel_seconds")
+    gone = ("vertices", "seconds", "termination_reason", "frame", "device", "kernel_seconds")
     return told | dict.fromkeys(gone) | {"phase": "run", "status": "unsupported", "reason": reason}
 
 
@@ -49,8 +61,8 @@ MEASURED = [
     *(made(5, "vbd", 1_000_000, 0.1, on=True) + made(6, "numba", 1_000_000, 3.0)),
     *made(7, "vbd", 4_000_000, 0.4, on=True),
     *(made(8, "vbd", 10_000, 1.0, on=True, tolerance=1e-4) + made(9, "hybrid", 10_000, 0.1, tolerance=1e-4)),
-    *made(10, "numba", 10_000, 1e-9, stopped="iterations"),  # it did not get there
-    *made(11, "hybrid", 100_000, 1e-9, node="another"),  # where no device was
+    *made(10, "numba", 10_000, 1e-9, termination_reason="max-iter"),  # it did not get there
+    *made(11, "hybrid", 100_000, 1e-9, node_id="another"),  # where no device was
 ]
 
 

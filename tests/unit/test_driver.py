@@ -65,7 +65,7 @@ def test_a_method_of_thirty_lines_is_a_solver():
     problem = build_first_problem(build_cloth(5))
     prepared = DiagonalDescent().prepare(problem.system)
     solution = prepared.solve(problem, StopRule(5000, 1e-3))
-    assert (solution.termination_reason, solution.residual_iterate) == ("tolerance", "returned")
+    assert (solution.termination_reason, solution.residual_iterate) == ("converged", "returned")
     assert 10 < solution.num_iterations < 5000
     assert solution.residual <= 1e-3 * solution.initial_residual
     assert solution.residual == prepared.residual_at(problem, solution.positions)
@@ -83,7 +83,7 @@ def test_without_a_tolerance_only_the_last_residual_is_asked_for(monkeypatch):
     measured = Diagonal.residual
     monkeypatch.setattr(Diagonal, "residual", lambda self: asked.append(0) or measured(self))
     solution = DiagonalDescent().prepare(problem.system).solve(problem, StopRule(6))
-    assert (solution.num_iterations, solution.termination_reason, len(asked)) == (6, "iterations", 1)
+    assert (solution.num_iterations, solution.termination_reason, len(asked)) == (6, "max-iter", 1)
 
 
 class Table(SolverState):
@@ -202,10 +202,10 @@ class PreparedStepping(IterativeSolver):
 @pytest.mark.parametrize(
     ("prepared", "stop", "wanted"),
     [
-        (PreparedStepping(0), StopRule(50, 1e-6), (20, "tolerance")),
-        (PreparedStepping(30), StopRule(50, 1e-6), (30, "tolerance")),
-        (PreparedStepping(30), StopRule(25, 1e-6), (25, "iterations")),
-        (PreparedStepping(30), StopRule(50, 1e-3), (10, "tolerance")),  # so loose a tolerance asks for no minimum
+        (PreparedStepping(0), StopRule(50, 1e-6), (20, "converged")),
+        (PreparedStepping(30), StopRule(50, 1e-6), (30, "converged")),
+        (PreparedStepping(30), StopRule(25, 1e-6), (25, "max-iter")),
+        (PreparedStepping(30), StopRule(50, 1e-3), (10, "converged")),  # so loose a tolerance asks for no minimum
         (PreparedStepping(30, most=24), StopRule(50, 1e-6), (24, "stalled")),
     ],
 )
@@ -225,10 +225,15 @@ class PreparedNear(PreparedStepping):
 @pytest.mark.parametrize(
     ("rests", "most", "wanted", "looks"),
     [
-        (0, 90, (40, "floor"), [40]),
-        (41, 90, (41, "floor"), [40, 41]),
-        (45, 90, (47, "floor"), [40, 41, 42, 44, 47]),  # not after every one: a look costs as much as some of them
-        (99, 43, (43, "iterations"), [40, 41, 42, 43]),
+        (0, 90, (40, "roundoff"), [40]),
+        (41, 90, (41, "roundoff"), [40, 41]),
+        (
+            45,
+            90,
+            (47, "roundoff"),
+            [40, 41, 42, 44, 47],
+        ),  # not after every one: a look costs as much as some of them
+        (99, 43, (43, "max-iter"), [40, 41, 42, 43]),
     ],
 )
 def test_a_small_residual_is_the_floor_where_the_gradient_is_round_off(monkeypatch, rests, most, wanted, looks):

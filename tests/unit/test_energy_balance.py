@@ -172,7 +172,7 @@ def test_round_off_is_no_gain():
 
 
 def test_growth_names_its_first_frame_and_its_largest_ratio():
-    rows = {n: {"energy_gained": float(gain), "energy_available": 2.0} for n, gain in enumerate((1, 2, 3, 9, 4), 1)}
+    rows = {n: {"energy_gain": float(gain), "energy_available": 2.0} for n, gain in enumerate((1, 2, 3, 9, 4), 1)}
     assert EnergyGrowth.from_rows(rows) == EnergyGrowth(first_frame=3, max_ratio=4.5)
     assert EnergyGrowth.from_rows({1: rows[1], 2: rows[2]}) is None
 
@@ -240,7 +240,7 @@ class Prepared:
 
     def solve(self, problem, stop):
         p = next(self.iterates(problem))
-        return Solution(p, 1, self.residual_at(problem, p), 1.0, "iterations")
+        return Solution(p, 1, self.residual_at(problem, p), 1.0, "max-iter")
 '''
 
 
@@ -264,7 +264,7 @@ def test_a_run_whose_energy_grows_says_so_in_all_rows(tmp_path: Path, record: st
     assert len(list_failed_runs(parquet_rows.read_rows([files.rows_path]))) == 1
     assert "without a source, from frame " in found[0]["reason"]
     assert found[0]["reason"].endswith("a step of 0.1 s is too long for midpoint")
-    steps = [row | {"distance": None, "stationarity": None} for row in found if row["phase"] == "step"]
+    steps = [row | {"reference_distance": None, "stationarity": None} for row in found if row["phase"] == "step"]
     assert classify_run(steps)[0] is ENERGY_GROWTH
     if record == "true":
         facts = read_replay(files.recording_path).properties
@@ -284,14 +284,14 @@ def test_a_run_whose_energy_grows_says_so_in_all_rows(tmp_path: Path, record: st
 def test_the_reason_of_growth_is_the_step_or_its_iterations(integrator: str, solver: str, iterations: int, words: str):
     scene = SceneSpec.model_construct(time_step=0.1)
     run = RunSpec.model_construct(integrator=integrator, solver=SolverSpec(solver, {}), iterations=60, scene=scene)
-    by_frame = {7: {"stopped": "iterations", "iterations": iterations}}
+    by_frame = {7: {"termination_reason": "max-iter", "num_iterations": iterations}}
     assert words in build_energy_growth_columns(run, EnergyGrowth(7, 2.0), by_frame)["reason"]
 
 
 def test_the_same_steps_by_implicit_euler_are_ok(tmp_path: Path):
     found, _ = done(tmp_path, "newton", "false", "rough", "implicit-euler")
     assert {row["status"] for row in found} == {"ok"}
-    assert all(row["energy_gained"] <= 0.0 < row["energy_available"] for row in found if row["phase"] == "step")
+    assert all(row["energy_gain"] <= 0.0 < row["energy_available"] for row in found if row["phase"] == "step")
 
 
 def test_a_blow_up_ends_a_run_at_its_first_frame(tmp_path: Path):

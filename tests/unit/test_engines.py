@@ -249,7 +249,7 @@ def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_num
     iterates = [p.copy() for p, _ in islice(together, 5)]
     np.testing.assert_array_equal(alone.positions, iterates[-1])
     np.testing.assert_array_equal(stated.step_start.positions, kept)
-    assert (alone.residual_iterate, alone.termination_reason, alone.num_iterations) == ("none", "iterations", 5)
+    assert (alone.residual_iterate, alone.termination_reason, alone.num_iterations) == ("none", "max-iter", 5)
     assert np.isnan([alone.residual, alone.initial_residual, prepared.residual_at(stated, kept)]).all()
     # Pins that move are at their ends, whatever came before.
     moved = replace(stated, pin_targets=stated.pin_targets + 0.01)

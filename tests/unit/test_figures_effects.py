@@ -24,12 +24,23 @@ def priced(folder: Path, solvers: list[str], refused: str, codes: dict[str, str]
     """Each effect's price by each solver; one refuses bending; codes: of solvers of other code."""
     rows: list[dict[str, Any]] = []
     for solver in solvers:
-        same = made.SHARED_COLUMNS | {"scene": "cloth", "size": 33, "vertices": 1089, "kind": "price", "solver": solver}
+        same = made.SHARED_COLUMNS | {
+            "scene": "cloth",
+            "size": 33,
+            "vertices": 1089,
+            "kind": "overhead",
+            "solver": solver,
+        }
         for name, (price, low, high) in PRICES.items():
-            told: dict[str, Any] = {"name": name, "price": price, "price_low": low, "price_high": high}
+            told: dict[str, Any] = {
+                "name": name,
+                "overhead_ratio": price,
+                "overhead_ratio_low": low,
+                "overhead_ratio_high": high,
+            }
             if (solver, name) == (refused, "bending"):
                 told = {"name": name, "status": "unsupported"}
-            rows.append(same | told | {"code": codes.get(solver)})
+            rows.append(same | told | {"source_fingerprint": codes.get(solver)})
     made.write_result_rows(folder / "ablation" / "cloth.parquet", rows, ABLATION_SCHEMA)
     return folder
 
@@ -72,7 +83,7 @@ def test_all_solvers_fit_a_page(tmp_path: Path, width: float) -> None:
 def test_a_solver_of_two_settings_has_a_column_for_each(tmp_path: Path) -> None:
     folder = priced(tmp_path, ["newton", "numba"], "", {})
     table = read_ablation(folder / "ablation" / "cloth.parquet")
-    graded = [row | {"parameters": '{"indefinite": "graded"}', "price": 9.0} for row in table[:4]]
+    graded = [row | {"parameters": '{"indefinite": "graded"}', "overhead_ratio": 9.0} for row in table[:4]]
     made.write_result_rows(folder / "ablation" / "other.parquet", graded, ABLATION_SCHEMA)
     figure, (grid,) = compose_kind("prices", folder, FigureOptions())
     assert {cell.column for cell in grid.cells} == {"newton", "newton, indefinite graded", "numba"}

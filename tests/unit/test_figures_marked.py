@@ -62,7 +62,7 @@ def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
     ]
     # The reproduction of the paper is by one solver alone.
     before = "numba" if kind == "liu2013" else "newton"
-    rows = [row | {"code": "before" if row.get("solver") == before else None} for row in rows]
+    rows = [row | {"source_fingerprint": "before" if row.get("solver") == before else None} for row in rows]
     asked = FigureOptions(selectors=(("net", "10", "gap"),)) if kind == "convergence" else FigureOptions()
     figure, panels = compose_kind(kind, synthetic_accuracy_rows.write_accuracy_rows(tmp_path, rows), asked)
     said = " ".join(text.get_text() for text in visible_texts(figure)).replace("\n", " ")

@@ -233,15 +233,15 @@ def test_rows_tell_the_rounds_and_what_they_left():
     row = build_solution_columns(
         made, step, step.problem.evaluate_terms(step.solution.positions), step.solution.residual
     )
-    assert row["friction_rounds"] == len(step.iteration_counts) == 2
-    assert row["friction_change"] < 1e-4
+    assert row["friction_iterations"] == len(step.iteration_counts) == 2
+    assert row["friction_relative_change"] < 1e-4
     made = pebble(0.0)
     (step,) = steps(made, 1)
     row = build_solution_columns(
         made, step, step.problem.evaluate_terms(step.solution.positions), step.solution.residual
     )
-    assert row["friction_rounds"] is None
-    assert row["friction_change"] is None
+    assert row["friction_iterations"] is None
+    assert row["friction_relative_change"] is None
 
 
 class Recited:
@@ -253,7 +253,7 @@ class Recited:
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         x, y = self.positions[self.solves % len(self.positions)]
         self.solves += 1
-        return Solution(np.array([[x, y, 0.0]]), 1, 0.0, 1.0, "tolerance")
+        return Solution(np.array([[x, y, 0.0]]), 1, 0.0, 1.0, "converged")
 
 
 SLID, STUCK, BETWEEN = (2e-3, -2e-3), (1e-7, 1e-4), (1e-3, -1e-3)

@@ -18,8 +18,22 @@ def results(folder: Path, *runs: dict[str, Any]) -> Path:
     (folder / "rows").mkdir(parents=True)
     for number, given in enumerate(runs):
         factor = given.pop("factor", 1.0)
-        shared = {"scene": "cloth", "size": 16, "solver": "numba", "parameters": "{}", "threads": 1, "machine": "here"}
-        shared |= {"cpu": "Fast 9000", "cores": 2, "status": "ok", "phase": "step", "digest": "abc", "iterations": 50}
+        shared = {
+            "scene": "cloth",
+            "size": 16,
+            "solver": "numba",
+            "parameters": "{}",
+            "threads": 1,
+            "machine_id": "here",
+        }
+        shared |= {
+            "cpu": "Fast 9000",
+            "cores": 2,
+            "status": "ok",
+            "phase": "step",
+            "positions_digest": "abc",
+            "num_iterations": 50,
+        }
         steps = [
             {"frame": frame, "round": round, "seconds": factor * (1 + frame % 3) * 1e-3 * (1 + round)}
             for frame in range(1, FRAMES + 1)
@@ -43,7 +57,7 @@ def gate(*arguments: str | Path) -> tuple[int, str]:
         ({}, {"factor": 1.05}, 0, "+5.0 % [+5.0, +5.0] unchanged"),
         ({}, {"factor": 1.2}, 1, "+20.0 % [+20.0, +20.0] slower"),
         ({}, {"factor": 0.8}, 0, "-20.0 % [-20.0, -20.0] faster"),
-        ({}, {"digest": "def", "iterations": 55}, 0, "unchanged 600 -> 660 others"),
+        ({}, {"positions_digest": "def", "num_iterations": 55}, 0, "unchanged 600 -> 660 others"),
         ({"residual": 1e-3}, {"residual": 2e-3, "stationarity": 1e-6}, 0, "0.001 -> 0.002; 1e-06 the same"),
         ({}, {"status": "failed", "reason": "no"}, 1, "fails now"),
     ],
@@ -74,7 +88,7 @@ def test_an_archive_is_as_good_as_its_folder_wherever_its_names_lead(tmp_path: P
 
 
 def test_times_of_other_machines_are_refused_and_ratios_to_a_yardstick_are_not(tmp_path: Path):
-    there = {"machine": "there", "cpu": "Slow 100"}
+    there = {"machine_id": "there", "cpu": "Slow 100"}
     old = results(tmp_path / "old", {}, {"solver": "sparse"})
     new = results(tmp_path / "new", {**there, "factor": 5.0}, {**there, "solver": "sparse", "factor": 4.0})
     code, told = gate(old, new)

@@ -102,42 +102,76 @@ def test_a_converged_run_is_stationary_and_where_the_reference_is():
     assert np.isfinite(known).all()
     for row in walked(made, StepVerifier(made, known, is_minimiser=True), 1e-8):
         assert row["stationarity"] <= 1.1e-8
-        assert row["minimum"]
-        assert row["distance"] < 1e-6  # errors of 1e-8 of a step's motion, and what four steps make of them
-    assert {"distance"} == set(walked(made, StepVerifier(made, known, is_minimiser=False), 1e-2)[0])
+        assert row["is_local_minimum"]
+        assert row["reference_distance"] < 1e-6  # errors of 1e-8 of a step's motion, and what four steps make of them
+    assert {"reference_distance"} == set(walked(made, StepVerifier(made, known, is_minimiser=False), 1e-2)[0])
 
 
 def test_a_reference_that_is_lost_is_no_reference():
     made = build_cloth(4)
     known = np.full((4, 16, 3), np.nan)
-    assert walked(made, StepVerifier(made, known, is_minimiser=True), 1e-8)[2]["distance"] is None
+    assert walked(made, StepVerifier(made, known, is_minimiser=True), 1e-8)[2]["reference_distance"] is None
 
 
-OK = {"status": "ok", "frame": 1, "stationarity": 1e-7, "attainable": 1e-12, "beyond": 1e-7, "tolerance": 1e-6}
-OK |= {"minimum": True, "flat": False, "distance": 1e-5, "stopped": "tolerance", "reason": None}
+OK = {
+    "status": "ok",
+    "frame": 1,
+    "stationarity": 1e-7,
+    "stationarity_roundoff_bound": 1e-12,
+    "stationarity_above_roundoff": 1e-7,
+    "residual_rtol": 1e-6,
+}
+OK |= {
+    "is_local_minimum": True,
+    "is_degenerate": False,
+    "reference_distance": 1e-5,
+    "termination_reason": "converged",
+    "reason": None,
+}
 GRADES = {
     "right": ([OK, OK], CORRECT),
-    "at round-off": ([OK | {"stationarity": 1e-3, "attainable": 1e-3, "beyond": 0.0}], CORRECT),
-    "where the round-off of another part would hide it": ([OK | {"attainable": 1.0, "beyond": 1e-3}], SILENTLY_WRONG),
-    "in a valley": ([OK, OK | {"minimum": False, "flat": True}], DEGENERATE_MINIMUM),
-    "in a valley, and at a saddle": ([OK | {"minimum": False}, OK | {"minimum": False, "flat": True}], SADDLE_POINT),
-    "no reference": ([OK | {"distance": None}], OTHER_MINIMUM),
-    "a reference that is lost": ([OK, OK | {"distance": None}], OTHER_MINIMUM),
-    "one step short": ([OK, OK | {"beyond": 2e-6, "stopped": "iterations"}], NOT_CONVERGED),
-    "stuck": ([OK | {"beyond": 2e-6, "stopped": "stalled"}, OK], NOT_CONVERGED),
-    "not a number": ([OK | {"beyond": float("nan"), "stopped": "iterations"}], NOT_CONVERGED),
-    "short, and said not to be": ([OK, OK | {"beyond": 2e-6}, OK | {"minimum": False}], SILENTLY_WRONG),
-    "at round-off, and not": ([OK | {"beyond": 1e-2, "stopped": "floor"}], SILENTLY_WRONG),
-    "no tolerance asked": ([OK | {"tolerance": None}], CORRECT),
-    "elsewhere": ([OK, OK | {"distance": 0.5}], OTHER_MINIMUM),
-    "a saddle": ([OK | {"minimum": False}], SADDLE_POINT),
-    "a motion that is close": ([OK | {"stationarity": None, "distance": 0.04}], CORRECT),
-    "a motion that is not": ([OK | {"stationarity": None, "distance": 0.06}], NOT_CONVERGED),
-    "a motion that is close while there is a reference": (
-        [OK | {"stationarity": None}, OK | {"stationarity": None, "distance": None}],
+    "at round-off": (
+        [OK | {"stationarity": 1e-3, "stationarity_roundoff_bound": 1e-3, "stationarity_above_roundoff": 0.0}],
+        CORRECT,
+    ),
+    "where the round-off of another part would hide it": (
+        [OK | {"stationarity_roundoff_bound": 1.0, "stationarity_above_roundoff": 1e-3}],
+        SILENTLY_WRONG,
+    ),
+    "in a valley": ([OK, OK | {"is_local_minimum": False, "is_degenerate": True}], DEGENERATE_MINIMUM),
+    "in a valley, and at a saddle": (
+        [OK | {"is_local_minimum": False}, OK | {"is_local_minimum": False, "is_degenerate": True}],
+        SADDLE_POINT,
+    ),
+    "no reference": ([OK | {"reference_distance": None}], OTHER_MINIMUM),
+    "a reference that is lost": ([OK, OK | {"reference_distance": None}], OTHER_MINIMUM),
+    "one step short": (
+        [OK, OK | {"stationarity_above_roundoff": 2e-6, "termination_reason": "max-iter"}],
         NOT_CONVERGED,
     ),
-    "a motion without a reference": ([OK | {"stationarity": None, "distance": None}], NOT_CONVERGED),
+    "stuck": ([OK | {"stationarity_above_roundoff": 2e-6, "termination_reason": "stalled"}, OK], NOT_CONVERGED),
+    "not a number": (
+        [OK | {"stationarity_above_roundoff": float("nan"), "termination_reason": "max-iter"}],
+        NOT_CONVERGED,
+    ),
+    "short, and said not to be": (
+        [OK, OK | {"stationarity_above_roundoff": 2e-6}, OK | {"is_local_minimum": False}],
+        SILENTLY_WRONG,
+    ),
+    "at round-off, and not": (
+        [OK | {"stationarity_above_roundoff": 1e-2, "termination_reason": "roundoff"}],
+        SILENTLY_WRONG,
+    ),
+    "no tolerance asked": ([OK | {"residual_rtol": None}], CORRECT),
+    "elsewhere": ([OK, OK | {"reference_distance": 0.5}], OTHER_MINIMUM),
+    "a saddle": ([OK | {"is_local_minimum": False}], SADDLE_POINT),
+    "a motion that is close": ([OK | {"stationarity": None, "reference_distance": 0.04}], CORRECT),
+    "a motion that is not": ([OK | {"stationarity": None, "reference_distance": 0.06}], NOT_CONVERGED),
+    "a motion that is close while there is a reference": (
+        [OK | {"stationarity": None}, OK | {"stationarity": None, "reference_distance": None}],
+        NOT_CONVERGED,
+    ),
+    "a motion without a reference": ([OK | {"stationarity": None, "reference_distance": None}], NOT_CONVERGED),
     "diverged": ([OK | {"status": "diverged", "reason": "not finite"}], DIVERGED),
     "wrong gradient": ([OK | {"status": "wrong-gradient", "reason": "a gradient differs"}], WRONG_GRADIENT),
     "refused": ([OK | {"status": "unsupported", "frame": None, "reason": "no mass"}], UNSUPPORTED),
@@ -204,7 +238,7 @@ def test_a_judged_sweep_becomes_a_map_whose_cells_name_their_runs(tmp_path: Path
 
 def test_results_that_were_not_judged_are_refused(tmp_path: Path):
     (tmp_path / "rows").mkdir()
-    row = {"run_id": "x", "scene": "net", "size": 4, "solver": "sparse", "started": "2026", "phase": "step"}
+    row = {"run_id": "x", "scene": "net", "size": 4, "solver": "sparse", "started_at": "2026", "phase": "step"}
     parquet_rows.write_rows(tmp_path / "rows" / "x.parquet", [row | {"round": 0, "status": "ok"}])
     with pytest.raises(InputError, match="judge: true"):
         read_verified_runs(tmp_path)
@@ -212,9 +246,9 @@ def test_results_that_were_not_judged_are_refused(tmp_path: Path):
 
 def test_runs_of_a_solver_from_outside_may_give_different_parameters(tmp_path: Path):
     (tmp_path / "rows").mkdir()
-    base = {"scene": "net", "size": 4, "solver": "./own.py:Own", "started": "2026", "phase": "step", "round": 0}
+    base = {"scene": "net", "size": 4, "solver": "./own.py:Own", "started_at": "2026", "phase": "step", "round": 0}
     for run_id, given in (("x", "{}"), ("y", '{"momentum": 0.5}'), ("z", '{"momentum": 0.8}')):
-        one = base | {"run_id": run_id, "parameters": given, "status": "ok", "distance": 0.0}
+        one = base | {"run_id": run_id, "parameters": given, "status": "ok", "reference_distance": 0.0}
         parquet_rows.write_rows(tmp_path / "rows" / f"{run_id}.parquet", [one])
     own = "./own.py:Own"
     assert [(cell.solver, cell.run_id) for cell in read_verified_runs(tmp_path)] == [

@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 from tests.contracts.hostile import scene
 from tests.synthetic_run_rows import build_dummy_rows
 
-ABLE = {"machine_bandwidth": 12.0e9, "machine_flops": 40.0e9, "machine_step": 3.1e-3}
+ABLE = {"machine_bandwidth": 12.0e9, "machine_flops_per_second": 40.0e9, "machine_step_seconds": 3.1e-3}
 
 
 def two_machines(solvers: tuple[str, ...] = ("sparse", "dense")) -> list[dict[str, Any]]:
@@ -33,7 +33,7 @@ def two_machines(solvers: tuple[str, ...] = ("sparse", "dense")) -> list[dict[st
     told = list[dict[str, Any]]()
     for number, solver in enumerate(solvers):
         own = {"run_id": f"{number:012x}", "solver": solver, "scene": "cloth", "size": 8, "residual": 1e-3}
-        own |= {"machine": f"{number}" * 12, "node": "e" * 12, "seconds": 1e-3 * (1 + number), **ABLE}
+        own |= {"machine_id": f"{number}" * 12, "node_id": "e" * 12, "seconds": 1e-3 * (1 + number), **ABLE}
         told += [row | own for row in build_dummy_rows(number)]
     return told
 
@@ -58,7 +58,7 @@ def test_a_sweeps_table_names_the_machine_of_each_run_and_what_it_can_do():
 
 
 def test_two_computers_of_one_kind_are_told_apart():
-    told = [row | {"machine": "a" * 12, "node": str(row["seconds"] > 1e-3) * 3} for row in two_machines()]
+    told = [row | {"machine_id": "a" * 12, "node_id": str(row["seconds"] > 1e-3) * 3} for row in two_machines()]
     assert sorted(label_runs(read_run_times(table_of(told))).values()) == [
         "dense, machine aaaaaa-True",
         "sparse, machine aaaaaa-Fals",
@@ -66,7 +66,7 @@ def test_two_computers_of_one_kind_are_told_apart():
 
 
 def test_a_table_of_one_machine_says_so_once_and_names_it_in_no_row():
-    one = [row | {"machine": "a" * 12} for row in two_machines()]
+    one = [row | {"machine_id": "a" * 12} for row in two_machines()]
     text = printed(build_summary_table(table_of(one)))
     assert len(re.findall("machine aaaaaa", text)) == 1
     assert COMPARISON_NOTE in text
@@ -74,14 +74,14 @@ def test_a_table_of_one_machine_says_so_once_and_names_it_in_no_row():
 
 def test_no_solver_is_called_faster_than_one_on_another_machine():
     assert not [line for line in summarise_sweep(read_run_times(table_of(two_machines()))) if "fastest" in line]
-    one = [row | {"machine": "a" * 12} for row in two_machines()]
+    one = [row | {"machine_id": "a" * 12} for row in two_machines()]
     assert [line for line in summarise_sweep(read_run_times(table_of(one))) if "fastest" in line]
 
 
 def test_medians_are_those_of_one_machine(tmp_path: Path):
     (path,) = write_medians(table_of(two_machines(("sparse", "sparse"))), tmp_path)
     with path.open() as file:
-        found = [(row["machine"], float(row["median_seconds"])) for row in csv.DictReader(file)]
+        found = [(row["machine_id"], float(row["median_seconds"])) for row in csv.DictReader(file)]
     assert found == [("0" * 12, 1e-3), ("1" * 12, 2e-3)]
 
 
@@ -99,7 +99,7 @@ def test_list_query_and_merge_say_it(tmp_path: Path):
     for name, told in zip("ab", (two_machines()[:2], two_machines()[2:]), strict=True):
         (tmp_path / name / "sweep" / "rows").mkdir(parents=True)
         parquet_rows.write_rows(tmp_path / name / "sweep" / "rows" / f"{name}.parquet", told)
-    question = "SELECT machine, median(seconds) FROM rows GROUP BY ALL"
+    question = "SELECT machine_id, median(seconds) FROM rows GROUP BY ALL"
     assert COMPARISON_NOTE in command("query", question, "--results", tmp_path / "a")
     assert COMPARISON_NOTE not in command("query", question, "--results", tmp_path / "a", "--csv"), (
         "it is read by programs"
@@ -121,8 +121,8 @@ def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatc
     found = machine_calibration.calibrate_machine(lambda said: None)
     assert set(found) == set(machine_calibration.CALIBRATION_COLUMNS)
     assert 1e7 < found["machine_bandwidth"] < 1e13
-    assert 1e7 < found["machine_flops"] < 1e13
-    assert 1e-6 < found["machine_step"] < 10.0
+    assert 1e7 < found["machine_flops_per_second"] < 1e13
+    assert 1e-6 < found["machine_step_seconds"] < 10.0
     (kept,) = user_cache_dir("machine").iterdir()
     assert kept.stem == compute_node_id()
     for name in ("measure_copy_bandwidth", "measure_flops", "measure_step_seconds"):

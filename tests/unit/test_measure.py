@@ -64,7 +64,7 @@ class Sleeper:
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         self.rest("solve")
-        return Solution(problem.initial_guess + 1.0, stop.max_iterations, 0.0, 0.0, "iterations")
+        return Solution(problem.initial_guess + 1.0, stop.max_iterations, 0.0, 0.0, "max-iter")
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         return 0.0
@@ -135,12 +135,12 @@ def test_every_time_lies_within_what_its_watch_saw(seen):
 def test_rows_tell_both_clocks_and_that_a_solver_which_sleeps_was_interrupted(seen):
     _, measured, _ = seen
     for row in timing_rows.build_timing_rows(measured):
-        assert row["summed_seconds"] <= row["pass_seconds"] * (1 + 5e-4)
-        assert row["cpu_seconds"] < row["pass_seconds"]
-        assert row["interrupted"]
+        assert row["wall_seconds_sum"] <= row["wall_seconds_check"] * (1 + 5e-4)
+        assert row["cpu_seconds"] < row["wall_seconds_check"]
+        assert row["preempted"]
     by_round = [
         {
-            r["summed_seconds"]
+            r["wall_seconds_sum"]
             for r in timing_rows.build_timing_rows(measured)
             if r["round"] == k and r["phase"] == "step"
         }
@@ -194,7 +194,7 @@ def test_rows_say_whether_phases_add_up_to_an_iteration(phases: dict[str, float]
         watch = watches.setdefault((t.phase, RunMeasurement.get_round(t)), PhaseWatch(1))
         watch.wall_seconds = watch.process_seconds = watch.thread_seconds = watch.wall_seconds + t.seconds * t.num_calls
     found = {
-        row["phase"]: row["adds_up"]
+        row["phase"]: row["phases_consistent"]
         for row in timing_rows.build_timing_rows(RunMeasurement(Sleeper(), timings, watches, np.zeros((4, 3))))
     }
     assert found == {"step": None, ITERATION_PHASE: expected} | dict.fromkeys(phases, expected)

@@ -50,7 +50,7 @@ def test_all_runs_are_there_once_with_their_recordings_and_again_changes_nothing
 
 def test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name(two: Path):
     (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
-    rewritten(unit, started="2027-01-01T00:00:00+00:00", seconds=9.0)
+    rewritten(unit, started_at="2027-01-01T00:00:00+00:00", seconds=9.0)
     for order in (("a", "b"), ("b", "a")):
         found = merge_results([two / name for name in order], two / f"all-{order[0]}", lambda line: None)
         assert found == MergeReport(6, 0, [], [], found.machine_summary)
@@ -62,11 +62,12 @@ def test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name(two: P
 
 def test_positions_that_differ_are_a_conflict_on_one_machine_and_told_between_two(two: Path):
     (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
-    rewritten(unit, digest="f" * 64)
+    rewritten(unit, positions_digest="f" * 64)
     found = merged(two, "a", "b")
     assert found.conflicts == found.cross_machine_differences == ["scene2 10 hybrid: from step 1"]
     parquet_rows.write_rows(
-        unit.with_name("there.parquet"), [r | {"digest": "e" * 64, "run_id": "e"} for r in build_dummy_rows(2)]
+        unit.with_name("there.parquet"),
+        [r | {"positions_digest": "e" * 64, "run_id": "e"} for r in build_dummy_rows(2)],
     )
     unit.unlink()
     found = merge_results([two / "a", two / "b"], two / "others", lambda line: None)
@@ -87,7 +88,7 @@ def test_rows_that_are_not_written_as_they_were_replace_nothing(two: Path, monke
     merged(two, "a")
     before = {path: path.read_bytes() for path in (two / "all").rglob("*.parquet")}
     (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
-    rewritten(unit, started="2027-01-01T00:00:00+00:00")
+    rewritten(unit, started_at="2027-01-01T00:00:00+00:00")
     write = pq.write_table
     monkeypatch.setattr(pq, "write_table", lambda table, file: write(table.slice(1), file))
     with pytest.raises(InputError, match="differ from those written"):
@@ -98,7 +99,7 @@ def test_rows_that_are_not_written_as_they_were_replace_nothing(two: Path, monke
 def test_a_column_of_another_type_is_named_before_anything_is_written(two: Path):
     unit = row_store.list_units(two / "a" / "sweep" / "rows")[1]
     table = pq.read_table(unit)
-    for name, values in (("size", ["large", "small"]), ("digest", [1.5, 2.5])):
+    for name, values in (("size", ["large", "small"]), ("positions_digest", [1.5, 2.5])):
         pq.write_table(table.set_column(table.schema.get_field_index(name), name, pa.array(values)), unit)
         with pytest.raises(InputError, match=rf"{unit.name}: rows do not fit .*{name}"):
             merged(two, "b", "a")

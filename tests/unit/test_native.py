@@ -103,4 +103,4 @@ def test_without_a_compiler_the_row_says_so(name: str, tmp_path: Path, monkeypat
 def test_they_are_not_among_those_that_are_everywhere():
     assert set(NATIVE) <= set(OPTIONAL_SOLVERS)
     assert not set(OPTIONAL_SOLVERS) & set(SOLVERS)
-    assert all(read_solver_metadata(name)["minimises"] for name in NATIVE)
+    assert all(read_solver_metadata(name)["is_minimiser"] for name in NATIVE)

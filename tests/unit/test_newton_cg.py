@@ -84,7 +84,7 @@ def test_negative_curvature_at_the_very_first_is_a_local_global_step():
 def test_other_energies_are_minimised_whatever_their_pattern(solver, reach):
     given = with_links(build_first_problem(build_cloth(7, "exact")), reach)
     solution = solver.prepare(given.system).solve(given, StopRule(200))
-    assert solution.termination_reason in {"stalled", "floor"}
+    assert solution.termination_reason in {"stalled", "roundoff"}
     step = StepObjective(FixedObjective(given.system), given)
     assert (
         np.abs(given.gradient(solution.positions)).max() <= 1e-9 * np.abs(given.gradient(given.current_positions)).max()

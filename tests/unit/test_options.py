@@ -108,9 +108,9 @@ def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -
     (file,) = (folder / "results" / "sweep" / "rows").glob("*-dormand-prince-8-*.parquet")
     found = [row for row in parquet_rows.read_rows([file]).to_pylist() if row["phase"] == "step"]
     assert [row["frame"] for row in found] == [1, 2, 3, 4]
-    assert all(0.0 < row["estimated"] <= row["asked"] == 1e-3 for row in found)
-    assert all(row["accepted"] > 0 and row["seconds"] > 0 and row["integrator"] == "own" for row in found)
-    assert found[-1]["recorded"], "the recording was read back"
+    assert all(0.0 < row["error_estimated"] <= row["error_requested"] == 1e-3 for row in found)
+    assert all(row["num_accepted_steps"] > 0 and row["seconds"] > 0 and row["integrator"] == "own" for row in found)
+    assert found[-1]["recording_digest"], "the recording was read back"
 
 
 def test_speed_compares_steps_as_they_are_stated(folder: Path) -> None:

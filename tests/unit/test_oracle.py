@@ -66,10 +66,10 @@ def test_a_distance_counts_by_the_size_of_its_own_component():
     moved = known.copy()
     moved[0, 0] += 0.087
     state = MotionState(Motion(moved, np.zeros_like(moved)), None, 1)
-    solution = Solution(moved, 1, 0.0, 0.0, "iterations")
+    solution = Solution(moved, 1, 0.0, 0.0, "max-iter")
     step = SimulationStep(stated, solution, state, (1,), ((stated, solution),), StopRule())
     row = StepVerifier(made, known[None], is_minimiser=False)(step)
-    assert row["distance"] == pytest.approx(0.087 / 3**0.5)
+    assert row["reference_distance"] == pytest.approx(0.087 / 3**0.5)
 
 
 def test_a_component_is_as_large_as_its_box_and_a_lone_vertex_as_the_others():

@@ -80,7 +80,9 @@ def test_the_code_of_a_row_covers_the_solver_s_module_wherever_it_lives(done: Pl
     for path in (done.sweep_path.parent / "r" / "sweep" / "rows").iterdir():
         row = pq.read_table(path).slice(0, 1).to_pylist()[0]
         (run,) = (run for run in load_config(done.sweep_path).list_runs() if run.solver.name == row["solver"])
-        assert (row["code"] == compute_source_fingerprint(collect_source_parts(run))) == (row["solver"] == "sparse")
+        assert (row["source_fingerprint"] == compute_source_fingerprint(collect_source_parts(run))) == (
+            row["solver"] == "sparse"
+        )
 
 
 def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -46,11 +46,13 @@ def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tm
     for (effect, solver), row in told.items():
         if solver == "dense" and effect != "air-drag":
             assert row["status"] == "unsupported"
-            assert row["price"] is None
+            assert row["overhead_ratio"] is None
             assert "Quadratic" in row["reason"] or "Bending" in row["reason"]
             continue
-        assert row["price_low"] <= row["price"] <= row["price_high"]
-        assert row["price_bound"] == 1.0 if effect == "air-drag" else 1.0 < row["price_bound"] < 2.0  # some kilobytes
+        assert row["overhead_ratio_low"] <= row["overhead_ratio"] <= row["overhead_ratio_high"]
+        assert (
+            row["overhead_ratio_bound"] == 1.0 if effect == "air-drag" else 1.0 < row["overhead_ratio_bound"] < 2.0
+        )  # some kilobytes
         assert 3 <= row["rounds"] <= 4
         assert row["seconds"] > 0.0
     table = build_overhead_table(list(told.values()))

@@ -147,16 +147,22 @@ FORGED: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
     "an integrator": (lambda row: row | {"integrator": "bdf2"}, "names and options"),
     "one row of another solver": (only(lambda row: row | {"solver": "fast"}, phase="step", frame=2), "names and"),
     "small residuals": (scaled("residual", 1e-6), "columns: .*residual"),
-    "small last residuals": (scaled("last_residual", 1e-6), "columns: .*last_residual"),
+    "small last residuals": (scaled("residual_last", 1e-6), "columns: .*residual_last"),
     "halved energies": (scaled("energy_springs", 0.5), "columns: .*energy_springs"),
     "an objective": (only(scaled("objective", 0.999), frame=2), "columns: .*objective"),
-    "fewer iterations": (only(scaled("iterations", 2), phase="step"), "columns: .*iterations"),
-    "another end of iterations": (lambda row: row | {"stopped": row["stopped"] and "tolerance"}, "columns: .*stopped"),
+    "fewer iterations": (only(scaled("num_iterations", 2), phase="step"), "columns: .*num_iterations"),
+    "another end of iterations": (
+        lambda row: row | {"termination_reason": row["termination_reason"] and "converged"},
+        "columns: .*termination_reason",
+    ),
     "more vertices": (scaled("vertices", 100), "columns: .*vertices"),
-    "a smaller strain": (scaled("largest_strain", 0.9), "columns: .*largest_strain"),
+    "a smaller strain": (scaled("max_strain", 0.9), "columns: .*max_strain"),
     "fewer numbers in the factor": (scaled("nnz_system", 2), "columns: .*nnz_system"),
     "a family": (lambda row: row | {"family": "mine"}, "columns: .*family"),
-    "positions of one step": (only(lambda row: row | {"digest": "0" * 64}, frame=2), "positions: .*step 2 of 2"),
+    "positions of one step": (
+        only(lambda row: row | {"positions_digest": "0" * 64}, frame=2),
+        "positions: .*step 2 of 2",
+    ),
     "a failed rival": (
         lambda row: row | ({"status": "diverged", "reason": "it is bad"} if row["solver"] == "dense" else {}),
         "end: does not hold",
@@ -176,7 +182,7 @@ FORGED: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
 
 def claims_of(runs: list[PublishedRun], new: list[list[ResultRow]]) -> list[str]:
     """All claims that do not hold, where nothing here was interrupted."""
-    undisturbed = [[row | {"interrupted": False} for row in found] for found in new]
+    undisturbed = [[row | {"preempted": False} for row in found] for found in new]
     named = [claim for one in runs if (claim := archive_verification._verify_options(one))]
     return [
         str(claim)
@@ -188,9 +194,7 @@ def claims_of(runs: list[PublishedRun], new: list[list[ResultRow]]) -> list[str]
 @pytest.mark.parametrize("kind", FORGED)
 def test_a_forged_column_does_not_hold(kind: str, repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
     runs, new = repeated
-    seconds = [
-        [row | {"interrupted": False} for row in found] for found in new
-    ]  # of this very repeat: not of its noise
+    seconds = [[row | {"preempted": False} for row in found] for found in new]  # of this very repeat: not of its noise
     honest = [replace(one, rows=found) for one, found in zip(runs, seconds, strict=True)]
     assert claims_of(honest, new) == []
     change, said = FORGED[kind]
@@ -213,8 +217,8 @@ def test_elsewhere_what_differs_refutes_nothing_and_confirms_nothing(
     repeated: tuple[list[PublishedRun], list[list[ResultRow]]],
 ):
     runs, new = repeated
-    for change in (scaled("residual", 0.5), scaled("seconds", 1e-3), lambda row: row | {"digest": "0"}):
-        there = [replace(one, rows=[change(row) | {"machine": "another"} for row in one.rows]) for one in runs]
+    for change in (scaled("residual", 0.5), scaled("seconds", 1e-3), lambda row: row | {"positions_digest": "0"}):
+        there = [replace(one, rows=[change(row) | {"machine_id": "another"} for row in one.rows]) for one in runs]
         assert claims_of(there, new) == []
         assert ClaimVerdict.INCONCLUSIVE in {claim.verdict for claim in archive_verification.verify_reruns(there, new)}
 
@@ -236,7 +240,8 @@ def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Pa
             (tmp_path / "x.parquet").write_bytes(content[name])
             lies = pq.read_table(tmp_path / "x.parquet").to_pylist()
             parquet_rows.write_rows(
-                tmp_path / "x.parquet", [row | {"digest": row["digest"] and "0" * 64} for row in lies]
+                tmp_path / "x.parquet",
+                [row | {"positions_digest": row["positions_digest"] and "0" * 64} for row in lies],
             )
             content[name] = (tmp_path / "x.parquet").read_bytes()
 
@@ -280,10 +285,10 @@ def claim(home: Path, factor: float, *, interrupted: bool = False, machine: str 
     """What is said of a ratio that was 1 and is `factor`."""
     with archive_verification.unpack_archive(home / "x.zip") as folder:
         run = archive_verification.load_published_runs(folder, print, with_user_code=False)[0][0].run
-    old = [row | {"interrupted": False} for row in build_dummy_rows(1)]
+    old = [row | {"preempted": False} for row in build_dummy_rows(1)]
     there = (PublishedRun(old, run), PublishedRun(old, run.replace_options(size=5)))
-    slower = [row | {"seconds": row["seconds"] * factor, "interrupted": interrupted} for row in old]
-    here = [[row | {"machine": machine} for row in found] for found in (slower, old)]
+    slower = [row | {"seconds": row["seconds"] * factor, "preempted": interrupted} for row in old]
+    here = [[row | {"machine_id": machine} for row in found] for found in (slower, old)]
     return archive_verification._verify_time_ratio(there, (here[0], here[1]))
 
 

@@ -42,14 +42,14 @@ def rows_of(solver: str) -> list[dict[str, Any]]:
     number = synthetic_site_rows.SOLVER_NAMES.index(solver)
     same = synthetic_site_rows.build_run_columns(number) | {
         "phase": "step",
-        "iterations": 5,
-        "stopped": "tolerance",
+        "num_iterations": 5,
+        "termination_reason": "converged",
         "residual": 1e-6,
     }
     return [
         same
         | {"frame": k % 3 + 1, "round": k // 3, "seconds": 1e-3 * ms}
-        | {"largest_strain": STRAINS[k % 3], "strain_99": 0.1}
+        | {"max_strain": STRAINS[k % 3], "strain_p99": 0.1}
         for k, ms in enumerate(MILLISECONDS[solver])
     ]
 
@@ -137,9 +137,23 @@ def test_a_distance_in_pictures_is_the_largest_in_mean_rest_lengths():
 
 
 def test_the_share_of_an_effect_is_of_the_whole_step():
-    plain = {"bytes": 1024, "nnz_factor": None, "status": "ok", "name": "wind", "largest": 1.0, "rms": 1.0}
-    plain |= {"energy": 0.1, "centre": 0.1, "cost": 5e-4, "cost_low": 4e-4, "cost_high": 6e-4, "seconds": 2e-3}
-    table = build_ablation_table([plain | {"kind": "whole"}, plain | {"kind": "without"}])
+    plain = {
+        "memory_bytes": 1024,
+        "nnz_factor": None,
+        "status": "ok",
+        "name": "wind",
+        "displacement_max": 1.0,
+        "displacement_rms": 1.0,
+    }
+    plain |= {
+        "energy_difference": 0.1,
+        "centroid_displacement": 0.1,
+        "added_seconds": 5e-4,
+        "added_seconds_low": 4e-4,
+        "added_seconds_high": 6e-4,
+        "seconds": 2e-3,
+    }
+    table = build_ablation_table([plain | {"kind": "full-scene"}, plain | {"kind": "ablated"}])
     console = Console(width=200, record=True, file=StringIO())
     console.print(table)
     # 0.5 ms of 2; of the 1.5 that are left it would be a third.
@@ -147,7 +161,16 @@ def test_the_share_of_an_effect_is_of_the_whole_step():
 
 
 def test_a_motion_within_one_percent_of_the_reference_is_the_same():
-    solved = {"status": "ok", "stationarity": 1e-9, "beyond": 1e-9, "tolerance": 1e-6, "minimum": True, "flat": False}
+    solved = {
+        "status": "ok",
+        "stationarity": 1e-9,
+        "stationarity_above_roundoff": 1e-9,
+        "residual_rtol": 1e-6,
+        "is_local_minimum": True,
+        "is_degenerate": False,
+    }
     for distance, outcome in ((0.0, CORRECT), (0.0099, CORRECT), (0.0101, OTHER_MINIMUM), (0.03, OTHER_MINIMUM)):
-        frames = [solved | {"stopped": "tolerance", "distance": way} for way in (0.0, distance, 0.0)]
+        frames = [
+            solved | {"termination_reason": "converged", "reference_distance": way} for way in (0.0, distance, 0.0)
+        ]
         assert classify_run(frames)[0] == outcome, distance

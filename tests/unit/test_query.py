@@ -28,9 +28,9 @@ def test_a_query_sees_the_rows_of_all_sweeps(results: Path):
 def test_a_query_sees_the_rows_of_all_ablations(results: Path):
     for scene, cost in (("cloth", 0.5), ("chain", 0.25)):
         (results / scene / "ablation").mkdir(parents=True)
-        row = {"kind": "without", "name": "bending", "scene": scene, "cost": cost}
+        row = {"kind": "ablated", "name": "bending", "scene": scene, "added_seconds": cost}
         parquet_rows.write_rows(results / scene / "ablation" / "a.parquet", [row], ABLATION_SCHEMA)
-    found = run_query("SELECT scene, cost FROM ablation ORDER BY cost", results)
+    found = run_query("SELECT scene, added_seconds FROM ablation ORDER BY added_seconds", results)
     assert found.values == [("chain", 0.25), ("cloth", 0.5)]
 
 

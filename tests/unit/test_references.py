@@ -42,8 +42,8 @@ def test_each_work_has_one_entry_and_a_key_of_its_own():
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_rows_carry_what_each_solver_states(solver: str):
     found, method = read_solver_metadata(solver), load_target(SOLVERS[solver])
-    assert json.loads(found["reference"]) == asdict(method.solver_info.citation)
-    assert (found["family"], found["minimises"]) == (method.solver_info.family, method.is_minimiser)
+    assert json.loads(found["citation"]) == asdict(method.solver_info.citation)
+    assert (found["family"], found["is_minimiser"]) == (method.solver_info.family, method.is_minimiser)
     assert method.solver_info.citation.doi.startswith("10.")
 
 

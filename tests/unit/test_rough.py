@@ -40,19 +40,22 @@ def test_a_rough_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_pat
     assert [(row["phase"], row["frame"]) for row in rough] == [("prepare", None), ("step", 1), ("step", 2), ("step", 3)]
     assert passes.count("second pass") == 3
     assert {said for said in passes if "pass" in said} == {"second pass"}
-    digests = {row["frame"]: row["digest"] for row in timed if row["phase"] == "step"}
-    assert {row["frame"]: row["digest"] for row in rough if row["phase"] == "step"} == digests
+    digests = {row["frame"]: row["positions_digest"] for row in timed if row["phase"] == "step"}
+    assert {row["frame"]: row["positions_digest"] for row in rough if row["phase"] == "step"} == digests
     assert all(row["seconds"] > 0 and row["timing"] == "rough" and row["status"] == "ok" for row in rough)
     assert len({row["run_id"] for row in (timed[0], rough[0])}) == 2
 
 
 def test_certificates_count_the_frames_that_are_free(tmp_path: Path):
     rows, _ = executed(tmp_path, "rough")
-    rows += [row | {"run_id": "other", "solver": "broken", "intersections": int(row["frame"] == 2)} for row in rows]
+    rows += [row | {"run_id": "other", "solver": "broken", "num_intersections": int(row["frame"] == 2)} for row in rows]
     rows.append(rows[0] | {"run_id": "none", "solver": "refuses", "phase": "run", "status": "unsupported"})
     (path,) = write_certificates(pa.Table.from_pylist(rows, schema=RUN_SCHEMA), tmp_path)
     with path.open() as file:
-        found = {row["solver"]: (row["frames"], row["free"], row["status"]) for row in csv.DictReader(file)}
+        found = {
+            row["solver"]: (row["num_frames"], row["num_intersection_free_frames"], row["status"])
+            for row in csv.DictReader(file)
+        }
     assert found == {"newton": ("3", "3", "ok"), "broken": ("3", "2", "ok"), "refuses": ("", "0", "unsupported")}
 
 

@@ -57,7 +57,10 @@ def test_a_run_whose_residual_is_no_number_is_not_ok(tmp_path: Path, solver: str
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @pytest.mark.parametrize("name", ["residual", "objective", "stationarity", "energy_springs"])
 def test_a_measured_column_that_is_no_number_fails_its_frame(name: str, value: float):
-    columns = {1: {name: 0.0, "digest": "", "minimum": True}, 2: {name: value, "digest": "", "minimum": None}}
+    columns = {
+        1: {name: 0.0, "positions_digest": "", "is_local_minimum": True},
+        2: {name: value, "positions_digest": "", "is_local_minimum": None},
+    }
     with pytest.raises(StepError) as caught:
         require_finite(columns, is_minimiser=True, has_rtol=True)
     assert caught.value.frame == 2
@@ -67,9 +70,9 @@ def test_a_measured_column_that_is_no_number_fails_its_frame(name: str, value: f
 
 @pytest.mark.parametrize("tolerance", [False, True])
 def test_what_a_method_does_not_have_is_null_and_no_failure(tolerance: bool):
-    columns = {1: {"residual": float("nan"), "yardstick": float("nan"), "objective": 1.0}}
+    columns = {1: {"residual": float("nan"), "residual_initial": float("nan"), "objective": 1.0}}
     require_finite(columns, is_minimiser=False, has_rtol=tolerance)
-    assert columns == {1: {"residual": None, "yardstick": None, "objective": 1.0}}
+    assert columns == {1: {"residual": None, "residual_initial": None, "objective": 1.0}}
 
 
 @pytest.mark.parametrize("solver", ["xpbd", "symplectic-euler", "velocity-verlet", "ros2", "baraff-witkin"])
@@ -83,7 +86,7 @@ def test_a_method_that_minimises_nothing_may_be_asked_for_a_tolerance(tmp_path: 
     files.rows_path.parent.mkdir()
     found = execute_run(spec, files, lambda phase: None)
     assert {row["status"] for row in found} == {"ok"}, found[0]["reason"]
-    assert all(row["residual"] is row["yardstick"] is None for row in found if row["phase"] == "step")
+    assert all(row["residual"] is row["residual_initial"] is None for row in found if row["phase"] == "step")
 
 
 @pytest.mark.parametrize("solver", ["newton", "newton-cg", "pncg", "jgs2"])
@@ -97,5 +100,5 @@ def test_a_scene_at_rest_is_recorded_with_no_iterations(tmp_path: Path, solver: 
     files.rows_path.parent.mkdir()
     found = execute_run(spec, files, lambda phase: None)
     assert {row["status"] for row in found} == {"ok"}, found[0]["reason"]
-    assert [row["iterations"] for row in found if row["phase"] == "step" and row["round"] == 0] == [0, 0, 0]
+    assert [row["num_iterations"] for row in found if row["phase"] == "step" and row["round"] == 0] == [0, 0, 0]
     assert summarise_recording(files.recording_path).is_complete

@@ -26,7 +26,7 @@ COUNT = 12
 def sweep(tmp_path: Path) -> Path:
     """A sweep of so many runs: of two schemas, one with a column of somebody's own."""
     units = write_dummy_runs(tmp_path / "sweep", COUNT)
-    older = pq.read_table(units[3]).drop_columns(["graded", "formula_check"])
+    older = pq.read_table(units[3]).drop_columns(["stationarity_audit", "formula_check"])
     pq.write_table(older, units[3])
     pq.write_table(pq.read_table(units[5]).append_column("colour", pa.array(["red", "blue"])), units[5])
     return tmp_path / "sweep"
@@ -46,8 +46,11 @@ def test_many_units_are_read_as_one_by_one_in_the_order_asked_for(sweep: Path):
     for asked in (units, units[::-1]):
         assert told(parquet_rows.read_rows(asked)) == told(one_by_one(asked))
         assert parquet_rows.read_rows(asked).schema.equals(one_by_one(asked).schema)
-    heads = parquet_rows.read_first_rows(units, ["status", "digest"], required_columns=("run_id",))
-    assert heads == {u: {"status": "ok", "digest": parquet_rows.read_rows([u])["digest"][0].as_py()} for u in units}
+    heads = parquet_rows.read_first_rows(units, ["status", "positions_digest"], required_columns=("run_id",))
+    assert heads == {
+        u: {"status": "ok", "positions_digest": parquet_rows.read_rows([u])["positions_digest"][0].as_py()}
+        for u in units
+    }
 
 
 def test_all_damaged_units_of_many_are_named(sweep: Path):
@@ -70,13 +73,13 @@ QUERY = "SELECT * FROM rows ORDER BY run_id, frame"
 def test_packed_rows_are_the_same_to_all_who_read(sweep: Path):
     units = row_store.list_units(sweep / "rows")
     before, asked = told(parquet_rows.read_rows(units)), repr(run_query(QUERY, sweep.parent).values)
-    heads = parquet_rows.read_first_rows(units, ["code"])
+    heads = parquet_rows.read_first_rows(units, ["source_fingerprint"])
     assert compact_results(sweep.parent, lambda line: None) == COUNT
     assert list((sweep / "rows").iterdir()) == []
     assert row_store.list_units(sweep / "rows") == units
     assert told(parquet_rows.read_rows(units)) == before
     assert repr(run_query(QUERY, sweep.parent).values) == asked
-    assert parquet_rows.read_first_rows(units, ["code"]) == heads
+    assert parquet_rows.read_first_rows(units, ["source_fingerprint"]) == heads
     first = parquet_rows.read_first_row(units[2])
     assert isinstance(first, dict)
     assert first["run_id"] == units[2].stem[-12:]

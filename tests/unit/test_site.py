@@ -112,7 +112,7 @@ def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
         assert sweep["made"], sweep["name"]
         for made in sweep["made"]:
             assert made["commit"]
-            assert made["machine"]
+            assert made["machine_id"]
             assert made["cpu"]
 
 
@@ -139,8 +139,10 @@ def test_a_run_s_frames_are_a_script_of_their_own(results: Path):
     frames = read(results, f"made/runs/{build_run_columns(0)['run_id']}")
     assert frames["frame"] == list(range(1, synthetic_site_rows.FRAME_COUNT + 1))
     assert frames["least"][0] == pytest.approx(3.2 * 1.02, rel=1e-5)
-    assert frames["ms"][0] == pytest.approx(3.2 * 1.07, rel=1e-5), "the median of both rounds"
-    assert frames["distance"] == [None] * synthetic_site_rows.FRAME_COUNT, "what is not in the rows is missing"
+    assert frames["step_ms"][0] == pytest.approx(3.2 * 1.07, rel=1e-5), "the median of both rounds"
+    assert frames["reference_distance"] == [None] * synthetic_site_rows.FRAME_COUNT, (
+        "what is not in the rows is missing"
+    )
 
 
 def test_the_table_comes_as_parquet_too(results: Path):
@@ -184,7 +186,7 @@ def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: 
         "net", 12, "early"
     )
     for solver, code, day in (("numba", "new", "2"), ("newton", "old", "1")):
-        known: dict[str, Any] = {"code": code, "started": f"2026-11-0{day}T10:00:00+00:00"}
+        known: dict[str, Any] = {"source_fingerprint": code, "started_at": f"2026-11-0{day}T10:00:00+00:00"}
         for size in (6, 12):
             rows += synthetic_accuracy_rows.build_curve_rows("net", size, "early", solver, **known)
         rows += [row | known for row in synthetic_accuracy_rows.build_work_rows("net", 6, (solver,))]
@@ -293,9 +295,9 @@ def test_a_run_alone_is_on_the_page(tmp_path: Path):
 def test_figures_of_what_blew_up_are_shown_as_large_as_a_page_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     normal = synthetic_site_rows.build_run_rows
     monkeypatch.setattr(
-        synthetic_site_rows, "build_run_rows", lambda k: [row | {"largest_strain": 5.2e39} for row in normal(k)]
+        synthetic_site_rows, "build_run_rows", lambda k: [row | {"max_strain": 5.2e39} for row in normal(k)]
     )
     synthetic_site_rows.write_site_results(tmp_path, 1)
     update_page(tmp_path)
     found = read(tmp_path, f"made/runs/{build_run_columns(0)['run_id']}")
-    assert found["strain"] == pytest.approx([3e38] * len(found["frame"]))
+    assert found["max_strain"] == pytest.approx([3e38] * len(found["frame"]))

@@ -28,7 +28,7 @@ def rows_of(made: PluginSweep, folder: Path) -> list[dict[str, Any]]:
 def test_a_sound_solver_is_ok_and_graded_by_the_oracle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     found = rows_of(write_plugin_solver(tmp_path, monkeypatch), tmp_path)
     assert {row["status"] for row in found} == {"ok"}
-    graded = {row["frame"]: row["graded"] for row in found if row["phase"] == "step"}
+    graded = {row["frame"]: row["stationarity_audit"] for row in found if row["phase"] == "step"}
     assert all(0.0 < graded[frame] < 1.0 for frame in (1, 2, 3))  # it descends in five iterations
 
 
@@ -40,7 +40,7 @@ def test_a_run_is_judged_whose_solver_says_no_more_than_the_readme_asks(
     assert len(steps) == 3
     for row in steps:
         assert row["stationarity"] >= 0.0
-        assert np.isfinite(row["distance"])
+        assert np.isfinite(row["reference_distance"])
 
 
 class Wrong(NamedTuple):
@@ -55,7 +55,7 @@ NOTHING = "return Solution(problem.initial_guess.copy(), 1, 0.0, 0.0, 'tolerance
 WRONG = {
     "does nothing and says that nothing is left": Wrong(NOTHING, "", "Mine: reports a residual of 0 J^(1/2), where"),
     "says that it reached the tolerance": Wrong(
-        "return replace(found, termination_reason='tolerance')", "", "says that it reached the tolerance, where"
+        "return replace(found, termination_reason='converged')", "", "says that it reached the tolerance, where"
     ),
     "says a residual that is too small": Wrong("return replace(found, residual=found.residual / 100)", "", "reports a"),
     "says no residual": Wrong("return replace(found, residual=float('nan'))", "", "reports a residual of nan"),
@@ -163,7 +163,7 @@ def test_of_a_solver_that_does_not_minimise_is_said_what_it_leaves_of_a_step(tmp
     found = list[dict[str, Any]]()
     for spec in load_config(tmp_path / "scene.yaml", **asked).list_runs():
         found += execute_run(spec, RunFiles.for_run(spec, tmp_path), lambda phase: None)
-    left = {row["solver"]: row["graded"] for row in found if row["phase"] == "step" and row["frame"] == 3}
+    left = {row["solver"]: row["stationarity_audit"] for row in found if row["phase"] == "step" and row["frame"] == 3}
     assert left["newton"] < 1e-6 < SOLVED_RESIDUAL < left["xpbd"]
     assert all(row.get("residual") is None for row in found if row["solver"] == "xpbd")
     said = " ".join(summarise_sweep(runs_of(pa.Table.from_pylist(found, RUN_SCHEMA))))

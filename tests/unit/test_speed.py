@@ -53,7 +53,7 @@ class Scripted:
 
     def __init__(self, solver: str, calls: list[str], *, at: float = 0.0, fails: Exception | None = None) -> None:
         self.run, self.calls, self.at, self.fails = run(solver), calls, at, fails
-        self.columns: dict[str, Any] = {"choice": solver}
+        self.columns: dict[str, Any] = {"solver_description": solver}
 
     def prepare(self) -> float | None:
         self.calls.append(f"prepare {self.run.solver.name}")
@@ -63,7 +63,7 @@ class Scripted:
 
     def time_phases(self) -> list[CandidateTiming]:
         self.calls.append(self.run.solver.name)
-        return [CandidateTiming("step", 0.25, {"iterations": 50})]
+        return [CandidateTiming("step", 0.25, {"num_iterations": 50})]
 
     def close(self):
         # The second coordinate gives the scene a size of 1.
@@ -78,7 +78,7 @@ def test_candidates_take_turns():
         assert [row["round"] for row in rows if row["phase"] == "prepare"] == list(range(NUM_PREPARATIONS))
         assert [row["seconds"] for row in rows if row["phase"] == "step"] == [0.25] * ROUNDS
         assert {row["status"] for row in rows} == {"ok"}
-        assert {(row["solver"], row["choice"], row["vertices"]) for row in rows} == {(solver, solver, 16)}
+        assert {(row["solver"], row["solver_description"], row["vertices"]) for row in rows} == {(solver, solver, 16)}
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_a_short_call_is_repeated_after_a_first_one_and_a_long_one_is_not():
 
 
 def test_an_entry_that_is_read_is_a_multiply_and_an_add_for_each_of_three_sides():
-    facts = {"nnz_factor": 100.0, "panel_bytes": 960.0, "flops_per_solve": 1440.0}
+    facts = {"nnz_factor": 100.0, "factor_bytes": 960.0, "flops_per_solve": 1440.0}
     work = count_operations(facts, vertices=10, springs=20)
     assert work["global"].flop_count == 1440
     assert work["global"].bytes_moved == 240 * 8 + 176 * 10
@@ -252,7 +252,7 @@ def test_a_time_that_another_clock_does_not_bear_out_is_a_failure(monkeypatch: p
     def timed() -> tuple[list[dict[str, Any]], float]:
         calls = benchmark_candidates.RepeatedCall(busy)
         found = compute_call_seconds(calls)
-        return [{"interrupted": calls.preempted}], found
+        return [{"preempted": calls.preempted}], found
 
     assert timed()[1] >= 0.005
     monkeypatch.setattr(benchmark_candidates, "perf_counter", lambda: perf_counter() / 1000)

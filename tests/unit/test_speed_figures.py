@@ -23,9 +23,9 @@ def machine_row(phase: str, seconds: float, *, bytes: float = 0.0, flops: float 
         "threads": 1,
         "phase": phase,
         "seconds": seconds,
-        "bytes": bytes,
+        "bytes_moved": bytes,
         "flops": flops,
-        "working_set": working_set,
+        "working_set_bytes": working_set,
         "status": "ok",
     }
 
@@ -59,11 +59,11 @@ def timed(solver: str, parameters: str, seconds: list[float], **columns: Any) ->
         "vertices": 16,
         "springs": 42,
         "status": "ok",
-        "load": 0.5,
+        "load_average": 0.5,
     }
     done = {"step": 10, "local": 1, "global": 1}
     return [
-        shared | columns | {"phase": phase, "seconds": s * done.get(phase, 1), "iterations": done.get(phase)}
+        shared | columns | {"phase": phase, "seconds": s * done.get(phase, 1), "num_iterations": done.get(phase)}
         for phase in ("prepare", "local", "global", "step")
         for s in seconds
     ]

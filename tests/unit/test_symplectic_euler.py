@@ -218,5 +218,5 @@ def test_what_it_cannot_do_is_said_before_any_work(change, told):
 def test_it_is_done_after_one_iteration_and_has_no_residual():
     problem = build_first_problem(build_cloth(6))
     solution = SymplecticEuler().prepare(problem.system).solve(problem, StopRule(50, 1e-3))
-    assert (solution.num_iterations, solution.termination_reason) == (1, "iterations")
+    assert (solution.num_iterations, solution.termination_reason) == (1, "max-iter")
     assert np.isnan([solution.residual, solution.initial_residual]).all()

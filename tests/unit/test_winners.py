@@ -26,13 +26,13 @@ def row(solver: str, integrator: str, error: float, cpu: float, **other: Any) ->
         "integrator": integrator,
         "error": error,
         "cpu_seconds": cpu,
-        "seconds_per_simulated": 9.9,
+        "seconds_per_simulated_second": 9.9,
         "seconds": [9.9],
     }
-    told |= {"horizon": 0.5, "time_step": 0.01, "iterations": 50, "stiffness_ratio": 0.09, "vertices": 81}
+    told |= {"t_end": 0.5, "time_step": 0.01, "max_iterations": 50, "stiffness_ratio": 0.09, "vertices": 81}
     return (
         made.build_shared_columns("net", 9, solver=solver, parameters="{}", kind="work")
-        | {"minimises": True}
+        | {"is_minimiser": True}
         | told
         | other
     )
@@ -42,7 +42,7 @@ ROWS = (
     row("numba", "implicit-euler", 0.05, 0.1),
     row("newton", "midpoint", 2e-3, 0.4),
     row("newton", "midpoint", 2e-5, 4.0),
-    row("rodas", "own", 5e-4, 0.3, minimises=False, family="linearly implicit"),
+    row("rodas", "own", 5e-4, 0.3, is_minimiser=False, family="linearly implicit"),
     row("newton", "sdirk-4", 1e-9, 0.01, status="uncertified"),
 )
 
@@ -110,7 +110,7 @@ def test_each_number_of_vertices_is_a_grid_of_errors_by_stiffness(tmp_path):
 
 @pytest.mark.parametrize("truth", ["integrated", "self-converged"])
 def test_errors_by_a_self_converged_motion_are_marked_wherever_they_are_shown(tmp_path, truth):
-    folder = made.write_accuracy_rows(tmp_path, [one | {"truth": truth} for one in ROWS])
+    folder = made.write_accuracy_rows(tmp_path, [one | {"reference_kind": truth} for one in ROWS])
     table = read_accuracy(folder)
     panels = [
         panel

@@ -46,7 +46,7 @@ from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.solvers.model.step_problem import Positions
 
 PrintMessage = Callable[[str], None]
-_SHARED_COLUMNS = ("sweep", "scene", "size", "vertices", "threads", "horizon", "asked")
+_SHARED_COLUMNS = ("sweep", "scene", "size", "vertices", "threads", "t_end", "error_requested")
 """Columns that the rows of third-party integrators share."""
 
 
@@ -138,14 +138,14 @@ def _execute_error_control(
     recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, scene, answer, status)
     row = _build_row(config.stem, asked, error, answer, status) | {
         "error": measured,
-        "recording": f"recordings/{recording.name}",
+        "recording_path": f"recordings/{recording.name}",
     }
     (folder / "accuracy").mkdir(exist_ok=True)
     found = [row, *(_build_third_party_rows(row, asked, error, answer, print_message) if compare_third_party else ())]
-    shared = {name: row[name] for name in (*_SHARED_COLUMNS, "problem")} | build_provenance_columns()
+    shared = {name: row[name] for name in (*_SHARED_COLUMNS, "problem_digest")} | build_provenance_columns()
     found += [shared | way for way in build_trial_rows(answer, before, error)]
     parquet_rows.write_rows(
-        folder / "accuracy" / f"{label}.parquet", [one | {"unit": label} for one in found], ACCURACY_SCHEMA
+        folder / "accuracy" / f"{label}.parquet", [one | {"unit_id": label} for one in found], ACCURACY_SCHEMA
     )
     if positions:
         save_positions(positions, path.positions[1:])
@@ -219,11 +219,11 @@ def _build_row(
 ) -> dict[str, Any]:
     best, path = search_result.best_trial, search_result.best_trial.trajectory
     return {
-        "kind": "asked",
+        "kind": "error-control",
         **status_columns,
         "sweep": name,
         "scene": name,
-        "problem": format_problem_id(error_target),
+        "problem_digest": format_problem_id(error_target),
         "size": error_target.size,
         "vertices": path.positions.shape[1],
         "solver": best.method.solver,
@@ -231,14 +231,14 @@ def _build_row(
         **read_solver_metadata(best.method.solver),
         "time_step": error_target.frame_seconds,
         "threads": 1,
-        "horizon": error_target.t_end,
-        "asked": error,
+        "t_end": error_target.t_end,
+        "error_requested": error,
         **best.columns,
-        "iterations_done": path.num_iterations,
+        "num_iterations": path.num_iterations,
         "seconds": [path.wall_seconds],
         "cpu_seconds": path.cpu_seconds,
-        "seconds_per_simulated": path.wall_seconds / error_target.t_end,
-        "estimate_seconds": search_result.search_seconds,
+        "seconds_per_simulated_second": path.wall_seconds / error_target.t_end,
+        "search_seconds": search_result.search_seconds,
         **build_provenance_columns(),
     }
 
@@ -261,10 +261,13 @@ def _build_third_party_rows(
         times = (
             {}
             if peer.reason
-            else {"seconds": [peer.wall_seconds], "seconds_per_simulated": peer.wall_seconds / error_target.t_end}
+            else {
+                "seconds": [peer.wall_seconds],
+                "seconds_per_simulated_second": peer.wall_seconds / error_target.t_end,
+            }
         )
-        estimated = {} if peer.reason else {"estimated": peer.error_estimated}
-        found.append(shared | became | times | estimated | {"kind": "peer", "solver": peer.name})
+        estimated = {} if peer.reason else {"error_estimated": peer.error_estimated}
+        found.append(shared | became | times | estimated | {"kind": "third-party", "solver": peer.name})
     return found
 
 
@@ -299,7 +302,7 @@ def _record_motion(
         properties={
             **properties,
             **{column: value for column, value in status_columns.items() if value},
-            "estimated": best.error_estimated,
+            "error_estimated": best.error_estimated,
             "cpu": here.cpu,
             "commit": machine_info.read_commit(),
         },

@@ -74,7 +74,7 @@ class AblationUnit(EffectUnit):
 
     def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
         """Build the row of a failed unit: without the full scene no comparison is possible."""
-        why = {"kind": "whole", "name": "", "status": status, "reason": reason}
+        why = {"kind": "full-scene", "name": "", "status": status, "reason": reason}
         return [build_specification_columns(self.run) | build_provenance_columns() | why]
 
 
@@ -143,18 +143,26 @@ def _measure_ablation(run: RunSpec, with_pairs: bool, tick: ProgressCallback) ->
 
 
 def _build_full_row(full: VariantRun) -> ResultRow:
-    return {"kind": "whole", "name": "", "status": "ok", "seconds": compute_step_seconds(full)} | _build_size_columns(
-        full
-    )
+    return {
+        "kind": "full-scene",
+        "name": "",
+        "status": "ok",
+        "seconds": compute_step_seconds(full),
+    } | _build_size_columns(full)
 
 
 def _build_variant_row(full: VariantRun, variant_run: VariantRun) -> ResultRow:
-    row: ResultRow = {"kind": "without", "name": variant_run.variant.name}
+    row: ResultRow = {"kind": "ablated", "name": variant_run.variant.name}
     if variant_run.failure_reason:
-        return row | {"status": "impossible", "reason": variant_run.failure_reason}
+        return row | {"status": "unsolvable", "reason": variant_run.failure_reason}
     assert full.scene is not None
     middle, low, high = compute_cost(full, variant_run)
-    costs = {"seconds": compute_step_seconds(variant_run), "cost": middle, "cost_low": low, "cost_high": high}
+    costs = {
+        "seconds": compute_step_seconds(variant_run),
+        "added_seconds": middle,
+        "added_seconds_low": low,
+        "added_seconds_high": high,
+    }
     apart = compute_motion_difference(
         full.scene, (full.positions, full.velocities), (variant_run.positions, variant_run.velocities)
     )
@@ -167,7 +175,7 @@ def _build_size_columns(variant_run: VariantRun) -> ResultRow:
     factor = facts.get("nnz_hessian_factor", facts.get("nnz_factor"))
     counts = {"nnz_system": facts.get("nnz_system"), "nnz_factor": factor}
     return {
-        "bytes": variant_run.memory_bytes,
+        "memory_bytes": variant_run.memory_bytes,
         **{name: None if value is None else int(value) for name, value in counts.items()},
     }
 
@@ -195,7 +203,7 @@ def _measure_reference_errors(
         except Exception as error:  # the better solver may fail in any way: then the error is not known
             told = build_failure_columns(error)
             found += [
-                {"kind": "error", "name": n, "status": "unknown", "reason": told["reason"]}
+                {"kind": "error", "name": n, "status": "failed", "reason": told["reason"]}
                 for n in _REFERENCE_KINDS[every - 1 :]
             ]
             break
@@ -210,6 +218,6 @@ def _add_shared_columns(run: RunSpec, scene: Scene, told: list[ResultRow]) -> li
         "springs": len(scene.all_springs.edges),
         "frames": run.frames,
         "rounds": run.rounds,
-        "extent": scene.mesh.bounding_box_diagonal / compute_mean_rest_length(scene),
+        "bounding_box_diagonal": scene.mesh.bounding_box_diagonal / compute_mean_rest_length(scene),
     }
     return [shared | build_provenance_columns() | row for row in told]

@@ -26,10 +26,10 @@ def compute_motion_difference(scene: Scene, a: MotionStates, b: MotionStates) ->
     energies = np.array([[_compute_energy(scene, x, v) for x, v in zip(*motion, strict=True)] for motion in (a, b)])
     most = float(np.abs(energies[0]).max())
     return {
-        "largest": float(away.max()) / unit,
-        "rms": float(np.sqrt((away**2).mean())) / unit,
-        "energy": float(np.abs(energies[0] - energies[1]).max()) / most if most else 0.0,
-        "centre": float(np.linalg.norm(centres, axis=1).max()) / unit,
+        "displacement_max": float(away.max()) / unit,
+        "displacement_rms": float(np.sqrt((away**2).mean())) / unit,
+        "energy_difference": float(np.abs(energies[0] - energies[1]).max()) / most if most else 0.0,
+        "centroid_displacement": float(np.linalg.norm(centres, axis=1).max()) / unit,
     }
 
 

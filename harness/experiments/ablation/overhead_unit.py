@@ -67,7 +67,7 @@ class OverheadUnit(EffectUnit):
         shared = (
             build_specification_columns(self.run)
             | build_provenance_columns()
-            | {"kind": "price", "frames": self.run.frames}
+            | {"kind": "overhead", "frames": self.run.frames}
         )
         return [shared | row for row in told]
 
@@ -78,7 +78,12 @@ def _build_row(overhead: EffectOverhead) -> ResultRow:
         return row | {"status": "unsupported", "reason": overhead.unsupported_reason}
     row["max_iterations"] = overhead.max_iterations
     middle, low, high = overhead.ratio_interval
-    measured = {"price": middle, "price_low": low, "price_high": high, "price_bound": overhead.min_ratio}
+    measured = {
+        "overhead_ratio": middle,
+        "overhead_ratio_low": low,
+        "overhead_ratio_high": high,
+        "overhead_ratio_bound": overhead.min_ratio,
+    }
     return row | {"status": "ok", "seconds": overhead.seconds} | measured
 
 

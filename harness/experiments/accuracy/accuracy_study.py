@@ -158,9 +158,9 @@ def list_failed_units(paths: Sequence[Path]) -> list[str]:
     """
     found = [parquet_rows.read_rows([path], ACCURACY_SCHEMA).to_pylist()[0] for path in paths]
     return [
-        f"{r['scene']} {r['size']} {r['moment'] or r['integrator']} {r['solver']}: {r['reason']}"
+        f"{r['scene']} {r['size']} {r['snapshot'] or r['integrator']} {r['solver']}: {r['reason']}"
         for r in found
-        if r["kind"] != "problem" and r["status"] in ("failed", "killed")
+        if r["kind"] != "snapshot" and r["status"] in ("failed", "killed")
     ]
 
 
@@ -191,14 +191,16 @@ def _build_curve_units(curves: Sequence[CurveSpec], results: AccuracyResults) ->
     A step is used once where two snapshots of a case are one step.
     """
     paths = dict.fromkeys(results.rows_path(spec.build_problem_stem()) for spec in curves)
-    steps = parquet_rows.read_first_rows(paths, ("problem", "moment", "frame", "status", "reason"), ACCURACY_SCHEMA)
+    steps = parquet_rows.read_first_rows(
+        paths, ("problem_digest", "snapshot", "frame", "status", "reason"), ACCURACY_SCHEMA
+    )
     moments: dict[tuple[str, str], str] = {}
     for spec in curves:
         label = spec.build_problem_stem()
         step = steps.get(results.rows_path(label))
         if (
             isinstance(step, dict)
-            and moments.setdefault((_format_case(spec), step["problem"] or label), label) == label
+            and moments.setdefault((_format_case(spec), step["problem_digest"] or label), label) == label
         ):
             yield CurveUnit(spec, results, step)
 
@@ -213,9 +215,9 @@ def _plan_units(units: Sequence[CurveUnit | WorkPrecisionUnit], results: Accurac
     here = machine_info.describe_machine().machine_id
 
     def as_asked(unit: CurveUnit | WorkPrecisionUnit, row: Mapping[str, Any]) -> bool:
-        of_step = not isinstance(unit, CurveUnit) or row["problem"] == unit.snapshot_row["problem"]
-        return of_step and row["unit"] == unit.spec.compute_unit_id(here)
+        of_step = not isinstance(unit, CurveUnit) or row["problem_digest"] == unit.snapshot_row["problem_digest"]
+        return of_step and row["unit_id"] == unit.spec.compute_unit_id(here)
 
     asked = {results.rows_path(unit.spec.build_file_stem()): partial(as_asked, unit) for unit in units}
-    found = read_completion_statuses(asked, ("unit", "problem"), ACCURACY_SCHEMA)
+    found = read_completion_statuses(asked, ("unit_id", "problem_digest"), ACCURACY_SCHEMA)
     return [_PlannedUnit(unit, found[results.rows_path(unit.spec.build_file_stem())]) for unit in units]

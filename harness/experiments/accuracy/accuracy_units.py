@@ -134,7 +134,7 @@ def _build_missing_snapshot_row(spec: CurveSpec, failure_columns: ResultRow) -> 
     """Build the row of a snapshot that could not be found."""
     return (
         failure_columns
-        | {"kind": "problem", "moment": format_snapshot(spec.moment)}
+        | {"kind": "snapshot", "snapshot": format_snapshot(spec.moment)}
         | _build_case_columns(spec.case)
         | build_provenance_columns()
     )
@@ -142,7 +142,9 @@ def _build_missing_snapshot_row(spec: CurveSpec, failure_columns: ResultRow) -> 
 
 def _write_snapshot_rows(path: Path, results: AccuracyResults, result_rows: Sequence[ResultRow]) -> None:
     parquet_rows.write_rows(
-        path, [{"sweep": results.name, "unit": row.get("problem")} | row for row in result_rows], ACCURACY_SCHEMA
+        path,
+        [{"sweep": results.name, "unit_id": row.get("problem_digest")} | row for row in result_rows],
+        ACCURACY_SCHEMA,
     )
 
 
@@ -161,7 +163,7 @@ class CurveUnit:
     @property
     def title(self) -> str:
         """Title of the unit, for messages."""
-        return f"{self.spec.case.title} {self.snapshot_row['moment']} {self.spec.solver.name}"
+        return f"{self.spec.case.title} {self.snapshot_row['snapshot']} {self.spec.solver.name}"
 
     @property
     def num_progress_steps(self) -> int:
@@ -192,7 +194,7 @@ class CurveUnit:
         )
 
     def _measure_rows(self, tick: ProgressCallback) -> list[ResultRow]:
-        if self.snapshot_row["problem"] is None:
+        if self.snapshot_row["problem_digest"] is None:
             return self._build_failure_rows({key: self.snapshot_row[key] for key in ("status", "reason")})
         try:
             graded = _load_snapshot_evaluation(_ReferenceRequest.for_snapshot(self.spec, self.results))
@@ -206,9 +208,9 @@ class CurveUnit:
         return found
 
     def _build_failure_rows(self, failure_columns: ResultRow) -> list[ResultRow]:
-        of_step = {key: self.snapshot_row[key] for key in ("problem", "moment", "frame")}
+        of_step = {key: self.snapshot_row[key] for key in ("problem_digest", "snapshot", "frame")}
         return [
-            of_step | failure_columns | {"kind": "curve", "first_guess": guess} for guess in self.spec.initial_guesses
+            of_step | failure_columns | {"kind": "curve", "initial_guess": guess} for guess in self.spec.initial_guesses
         ]
 
 
@@ -252,14 +254,14 @@ class WorkPrecisionUnit:
     def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write the row of a lost unit, and return the outcome as text."""
         spec = self.spec
-        row: ResultRow = {"kind": "work", "status": task_loss.status, "reason": str(task_loss), "horizon": spec.horizon}
+        row: ResultRow = {"kind": "work", "status": task_loss.status, "reason": str(task_loss), "t_end": spec.horizon}
         return _write_unit_rows(self.results, spec, [row | build_option_columns(spec)])
 
 
 def _write_unit_rows(results: AccuracyResults, spec: CurveSpec | WorkSpec, result_rows: Sequence[ResultRow]) -> str:
     """Write measured rows with the common columns, and return the outcome as text."""
     shared = {
-        "unit": spec.compute_unit_id(machine_info.describe_machine().machine_id),
+        "unit_id": spec.compute_unit_id(machine_info.describe_machine().machine_id),
         "sweep": results.name,
         **_build_case_columns(spec.case),
         "solver": spec.solver.name,

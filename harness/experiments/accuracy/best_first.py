@@ -155,7 +155,7 @@ def _slow(error: float) -> str:
 
 def _outcome(row: Mapping[str, Any]) -> tuple[float, float]:
     """Return the error and the cost of a row, infinite if there are none."""
-    return (row["error"], row["seconds_per_simulated"]) if row["status"] == "ok" else (inf, inf)
+    return (row["error"], row["seconds_per_simulated_second"]) if row["status"] == "ok" else (inf, inf)
 
 
 def _limited(spec: WorkSpec, best: float) -> WorkSpec:

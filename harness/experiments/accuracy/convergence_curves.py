@@ -243,4 +243,4 @@ def _time_iterates(
     if not np.array_equal(p, expected, equal_nan=True):
         raise RunFailed("a timed pass ended at other positions than the graded one")
     stamps[1:] -= began
-    return stamps, watch.build_columns("iterates", np.diff(stamps))["interrupted"]
+    return stamps, watch.build_columns("iterates", np.diff(stamps))["preempted"]

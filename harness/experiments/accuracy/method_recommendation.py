@@ -23,7 +23,7 @@ from typing import Any
 from springbench.harness.config.accuracy_config import AccuracyConfig, BenchmarkCase, MeasurementSettings, WorkSpec
 from springbench.harness.config.accuracy_loader import AccuracyPlan, expand_studies
 from springbench.harness.config.config_loader import find_scene_mistakes, load_scene
-from springbench.harness.config.run_options import STEP_OPTIONS
+from springbench.harness.config.run_options import RUN_OPTIONS, STEP_OPTIONS
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, InputMistake, RunFailed
@@ -309,11 +309,11 @@ def _measured(
         way.work_spec.build_file_stem(): {
             "status": "ok",
             "error": way.error,
-            "seconds_per_simulated": way.seconds_per_simulated_second,
+            "seconds_per_simulated_second": way.seconds_per_simulated_second,
         }
         for way in ways
     }
-    failed, here = {row["unit"]: row for row in without}, machine_info.describe_machine().machine_id
+    failed, here = {row["unit_id"]: row for row in without}, machine_info.describe_machine().machine_id
     say(
         f"measuring up to {len(asked.work)} settings, cheap ones first, for at most {budget:g} s (--budget); a "
         f"simulation ends once it is {SLOWER:g} times as slow as the best that keeps to the error"
@@ -364,7 +364,7 @@ def _read_measured_methods(
     for path in sorted(unit for unit in units if unit.name.startswith(f"{name}-{size}-work-")):
         row = parquet_rows.read_rows([path], ACCURACY_SCHEMA).to_pylist()[0]
         spec = _build_work_spec(row, name, scene)
-        if path.stem != spec.build_file_stem() or row["machine"] != here or row["horizon"] != t_end:
+        if path.stem != spec.build_file_stem() or row["machine_id"] != here or row["t_end"] != t_end:
             continue  # the scene was another then, or the machine, or the question
         if row["status"] == "ok":
             ways.append(_build_measured_method(spec, row))
@@ -378,7 +378,7 @@ def _build_work_spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSp
     case = BenchmarkCase(name, scene.with_time_step(row["time_step"]), row["size"], row["integrator"])
     solver = SolverSpec(row["solver"], json.loads(row["parameters"]))
     how = MeasurementSettings(row["threads"], rounds=1, time_limit=float("inf"))
-    return WorkSpec(case, row["horizon"], solver, {name: row[name] for name in STEP_OPTIONS}, how)
+    return WorkSpec(case, row["t_end"], solver, {name: row[RUN_OPTIONS[name].column] for name in STEP_OPTIONS}, how)
 
 
 def _check_method(
@@ -396,9 +396,9 @@ def _build_measured_method(spec: WorkSpec, row: dict[str, Any]) -> MeasuredMetho
     return MeasuredMethod(
         spec,
         row["error"],
-        row["seconds_per_simulated"],
-        row["truth"] or "integrated",
-        row["choice"] or "",
+        row["seconds_per_simulated_second"],
+        row["reference_kind"] or "integrated",
+        row["solver_description"] or "",
         row.get("sweep") or "",
     )
 

@@ -96,8 +96,8 @@ class SnapshotEvaluation:
         return {
             "vertices": self.step_snapshot.problem.system.num_vertices,
             "springs": len(self.scene.all_springs.edges),
-            "problem": self.step_snapshot.digest,
-            "moment": self.snapshot_name,
+            "problem_digest": self.step_snapshot.digest,
+            "snapshot": self.snapshot_name,
             "frame": self.step_snapshot.frame,
             "status": "ok",
         }
@@ -113,12 +113,12 @@ class SnapshotEvaluation:
         common["time_step"] = case.scene.time_step
         best = reference.minima[0].positions if reference.minima else problem.current_positions
         row = common | {
-            "kind": "problem",
+            "kind": "snapshot",
             "stiffness_ratio": compute_stiffness_ratio(problem.system, self.scene.all_springs.stiffness),
             "mean_rest_length": self.mean_rest_length,
-            "g0": problem.value(problem.current_positions),
-            "g0_inertial": problem.value(apply_initial_guess(problem, "inertial").initial_guess),
-            "magnitude": problem.value_scale(best),
+            "objective_initial": problem.value(problem.current_positions),
+            "objective_inertial": problem.value(apply_initial_guess(problem, "inertial").initial_guess),
+            "objective_magnitude": problem.value_scale(best),
         }
         if not reference.minima:
             row |= {"status": "uncertified", "reason": reference.reason}
@@ -127,14 +127,14 @@ class SnapshotEvaluation:
     def _build_minimum_row(self, index: int, minimum: MinimumCertificate) -> ResultRow:
         return {
             "kind": "minimum",
-            "branch": index,
-            "minimum": minimum.minimum_id,
-            "g": minimum.objective,
+            "minimum_index": index,
+            "minimum_id": minimum.minimum_id,
+            "objective": minimum.objective,
             "stationarity": self.reference_evaluator.measure_stationarity(
                 self.step_snapshot.problem, minimum.positions
             ).stationarity,
-            "smallest_eigenvalue": minimum.min_eigenvalue,
-            "certified": minimum.is_certified,
+            "min_eigenvalue": minimum.min_eigenvalue,
+            "is_certified": minimum.is_certified,
         }
 
     def find_reached_minimum(self, p: Positions, stationarity: float) -> MinimumCertificate | None:
@@ -179,7 +179,7 @@ def build_curve_rows(
                 tick()
     except Exception as error:  # whatever a solver raises, the others go on
         return [
-            shared | build_accuracy_failure_columns(error) | {"kind": "curve", "first_guess": guess}
+            shared | build_accuracy_failure_columns(error) | {"kind": "curve", "initial_guess": guess}
             for guess in spec.initial_guesses
         ]
     return found
@@ -194,7 +194,7 @@ def _time_preparation(solver: Solver, step: SnapshotEvaluation, num_rounds: int)
         began = perf_counter()
         prepared = solver.prepare(system)
         seconds.append(perf_counter() - began)
-    return prepared, {"kind": "prepare", "cold": cold, "seconds": seconds}
+    return prepared, {"kind": "prepare", "cold_seconds": cold, "seconds": seconds}
 
 
 def _measure_curve(
@@ -215,19 +215,19 @@ def _measure_curve(
     )
     shared: ResultRow = {
         "kind": "curve",
-        "first_guess": initial_guess,
-        "iterations": spec.iterations,
+        "initial_guess": initial_guess,
+        "max_iterations": spec.iterations,
         "status": curve.status,
         "reason": curve.reason or None,
-        "interrupted": curve.preempted,
+        "preempted": curve.preempted,
     }
     reference = step.known_minima  # again: this solver may have found a minimum
     if not reference.minima and curve.status == "ok":
         shared |= {"status": "uncertified", "reason": reference.reason}
     if reached:
-        shared["branch"] = reference.find_index(reached)
+        shared["minimum_index"] = reference.find_index(reached)
     if spec.recordings and initial_guess == spec.initial_guesses[0]:
-        shared["recording"] = str(
+        shared["recording_path"] = str(
             record_solve(spec, step, step.scene, initial_guess, curve, folder).relative_to(folder)
         )
     against = reached or next(iter(reference.minima), None)
@@ -239,13 +239,13 @@ def _build_iterate_rows(curve: ScoredCurve, system: System, minimum: MinimumCert
     for k, number in enumerate(curve.iterate_indices):
         row: ResultRow = {
             "iteration": number,
-            "g": _finite_or_none(curve.g[k]),
+            "objective": _finite_or_none(curve.g[k]),
             "stationarity": _finite_or_none(curve.stationarity[k]),
             "seconds": curve.seconds[k].tolist(),
         }
         if minimum:
             largest, rms = compute_vertex_distances(system, curve.positions[k], minimum.positions)
-            row |= {"minimum": minimum.minimum_id, "largest_error": largest, "rms_error": rms}
+            row |= {"minimum_id": minimum.minimum_id, "position_error_max_m": largest, "position_error_rms_m": rms}
         rows.append(row)
     return rows
 

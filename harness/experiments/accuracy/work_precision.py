@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from springbench.harness.config.accuracy_config import WorkSpec
+from springbench.harness.config.run_options import RUN_OPTIONS
 from springbench.harness.execution import machine_info
 from springbench.harness.experiments.accuracy.accuracy_failures import TimeLimitExceeded, build_accuracy_failure_columns
 from springbench.harness.experiments.accuracy.step_scales import compute_stiffness_ratio
@@ -44,7 +45,7 @@ def build_work_rows(
         trajectory: reference up to the horizon, or the error that prevents it.
         tick: called after each round.
     """
-    shared: ResultRow = {"kind": "work", "status": "ok", **build_option_columns(spec), "horizon": spec.horizon}
+    shared: ResultRow = {"kind": "work", "status": "ok", **build_option_columns(spec), "t_end": spec.horizon}
     try:
         if isinstance(trajectory, Exception):
             raise trajectory
@@ -56,7 +57,8 @@ def build_work_rows(
 
 def build_option_columns(spec: WorkSpec) -> ResultRow:
     """Build the columns of a simulation's options."""
-    return {**spec.options, "tolerance": convert_tolerance(spec.options["tolerance"])}
+    columns = {RUN_OPTIONS[name].column: value for name, value in spec.options.items()}
+    return columns | {"residual_rtol": convert_tolerance(spec.options["tolerance"])}
 
 
 def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: Callable[[], None]) -> ResultRow:
@@ -67,26 +69,26 @@ def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: C
     row: ResultRow = {
         "vertices": scene.system.num_vertices,
         "springs": len(scene.all_springs.edges),
-        "choice": prepared.description,
+        "solver_description": prepared.description,
     }
     row["stiffness_ratio"] = compute_stiffness_ratio(scene.system, scene.all_springs.stiffness)
     frames = round(spec.horizon / case.scene.time_step)
     seconds: list[float] = []
-    row["interrupted"] = False
+    row["preempted"] = False
     p, *_ = _simulate_timed(
         spec, scene, prepared, min(NUM_WARMUP_STEPS, frames), time_limit=inf
     )  # compiling counts against nobody
     for _ in range(spec.measurement.rounds):
         p, iterations, watched = _simulate_timed(spec, scene, prepared, frames)
-        seconds.append(watched["summed_seconds"])
+        seconds.append(watched["wall_seconds_sum"])
         row["cpu_seconds"] = min(row.get("cpu_seconds", inf), watched["cpu_seconds"])
-        row["interrupted"] |= watched["interrupted"]
-        row["iterations_done"] = iterations
+        row["preempted"] |= watched["preempted"]
+        row["num_iterations"] = iterations
         tick()
     away = (p - trajectory.positions[-1])[scene.system.free_vertices]
-    row["error"], row["truth"] = trajectory.measure_error(-1, p), trajectory.reference_kind
-    row["error_rms_m"] = float(np.sqrt(np.einsum("ij,ij->i", away, away).mean()))
-    row |= {"seconds": seconds, "seconds_per_simulated": float(np.median(seconds)) / spec.horizon}
+    row["error"], row["reference_kind"] = trajectory.measure_error(-1, p), trajectory.reference_kind
+    row["end_error_rms_m"] = float(np.sqrt(np.einsum("ij,ij->i", away, away).mean()))
+    row |= {"seconds": seconds, "seconds_per_simulated_second": float(np.median(seconds)) / spec.horizon}
     trajectory.require_accuracy(row["error"])
     return row
 

@@ -31,7 +31,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from springbench.harness.config.config_loader import load_config
-from springbench.harness.config.run_options import AUTO
+from springbench.harness.config.run_options import AUTO, RUN_OPTIONS
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import machine_info
@@ -55,12 +55,47 @@ processor has other vector units and caches. Times themselves depend on the enti
 
 IRREPRODUCIBLE_COLUMNS = frozenset(
     (
-        *("seconds", "pass_seconds", "summed_seconds", "cpu_seconds", "interrupted", "adds_up", "estimate_seconds"),
-        *("kernel_seconds", "transfer_seconds", "load", "started", "machine", "node", "cpu", "cores", "memory_gib"),
-        *("machine_bandwidth", "machine_flops", "machine_step", "system", "versions", "commit", "code", "device"),
+        *(
+            "seconds",
+            "wall_seconds_check",
+            "wall_seconds_sum",
+            "cpu_seconds",
+            "preempted",
+            "phases_consistent",
+            "search_seconds",
+        ),
+        *(
+            "kernel_seconds",
+            "transfer_seconds",
+            "load_average",
+            "started_at",
+            "machine_id",
+            "node_id",
+            "cpu",
+            "cores",
+            "memory_gib",
+        ),
+        *(
+            "machine_bandwidth",
+            "machine_flops_per_second",
+            "machine_step_seconds",
+            "operating_system",
+            "versions",
+            "commit",
+            "source_fingerprint",
+            "device",
+        ),
         *("device_memory_gib", "device_driver", "device_versions", "sm_clock_mhz"),
-        *("memory_clock_mhz", "power_w", "power_limit_w", "performance_state", "temperature_c", "sweep", "recorded"),
-        *("time_limit", "memory_limit", "timing", "at_once", "pinned"),
+        *(
+            "memory_clock_mhz",
+            "power_w",
+            "power_limit_w",
+            "performance_state",
+            "temperature_c",
+            "sweep",
+            "recording_digest",
+        ),
+        *("time_limit", "memory_limit", "timing", "num_concurrent_runs", "pinned_cores"),
     )
 )
 """Columns that a repeated run cannot confirm.
@@ -259,18 +294,20 @@ def _find_run_spec(config: Path, run_rows: Sequence[ResultRow], *, with_user_cod
     """
     steps = [row for row in run_rows if row["phase"] == "step"]
     first = (steps or run_rows)[0]
-    names = {"iterations": "max_iterations"} | {n: n for n in ("tolerance", "integrator", "time_step", "first_guess")}
-    options = {name: first[column] for name, column in names.items()}
+    names = ("iterations", "tolerance", "integrator", "time_step", "first_guess")
+    options = {name: first[RUN_OPTIONS[name].column] for name in names}
     options |= {"frames": _find_max(steps, "frame"), "rounds": 1 + _find_max(steps, "round")}
     options["tolerance"] = AUTO if options["tolerance"] == 0.0 else options["tolerance"]
-    if first["asked"] is not None:
-        options = {name: options[name] for name in ("time_step", "frames", "rounds")} | {"accuracy": first["asked"]}
+    if first["error_requested"] is not None:
+        options = {name: options[name] for name in ("time_step", "frames", "rounds")} | {
+            "accuracy": first["error_requested"]
+        }
     sizes = [first["size"]] if first["size"] else []
     scene = {"solvers": [first["solver"]], "sizes": sizes, **options}
     for given in ({}, scene | {"threads": "auto"}, scene | {"threads": first["threads"]}):
         for opens in (False, True) if with_user_code else (False,):
             for run in _load_runs(config, json.dumps(given, sort_keys=True), opens):
-                if run.compute_run_id(str(first["machine"])) == first["run_id"] and (
+                if run.compute_run_id(str(first["machine_id"])) == first["run_id"] and (
                     opens or not with_user_code or not run.find_plugins()
                 ):
                     return run
@@ -306,7 +343,7 @@ def _verify_options(published_run: PublishedRun) -> VerifiedClaim | None:
     """Return a failed claim if a run's names or options differ from its config."""
     left_out = {"threads", *read_solver_metadata(published_run.run.solver.name)}  # of the machine, and of the code
     if published_run.run.accuracy is not None:
-        left_out |= {"integrator", "time_step", "tolerance", "max_iterations", "first_guess"}  # are chosen
+        left_out |= {"integrator", "time_step", "residual_rtol", "max_iterations", "initial_guess"}  # are chosen
     asked_for = {
         name: value for name, value in build_specification_columns(published_run.run).items() if name not in left_out
     }
@@ -387,8 +424,8 @@ def _verify_rerun(original: PublishedRun, rerun_rows: list[ResultRow]) -> list[V
 
 def _verify_positions(original: PublishedRun, rerun_rows: list[ResultRow]) -> VerifiedClaim:
     what = f"{original.title}, positions"
-    now = {row["frame"]: row["digest"] for row in rerun_rows if row["phase"] == "step"}
-    others = {row["frame"] for row in original.step_rows if row["digest"] != now.get(row["frame"])}
+    now = {row["frame"]: row["positions_digest"] for row in rerun_rows if row["phase"] == "step"}
+    others = {row["frame"] for row in original.step_rows if row["positions_digest"] != now.get(row["frame"])}
     others |= now.keys() - {row["frame"] for row in original.step_rows}
     if not others:
         return VerifiedClaim(what, ClaimVerdict.PASS, f"{len(now)} steps, to the bit")
@@ -407,7 +444,7 @@ def _verify_columns(original: PublishedRun, rerun_rows: list[ResultRow]) -> Veri
         )
     if fewer := {place for place in of_place if place[0] == "step"} - {_row_key(row) for row in original.step_rows}:
         return _build_failed_claim(what, f"{len(fewer)} steps are missing", original, rerun_rows)
-    names = [name for name in run_schema.RUN_SCHEMA.names if name not in IRREPRODUCIBLE_COLUMNS | {"digest"}]
+    names = [name for name in run_schema.RUN_SCHEMA.names if name not in IRREPRODUCIBLE_COLUMNS | {"positions_digest"}]
     wrong = _find_differences([(row, of_place[_row_key(row)]) for row in original.rows], names)
     filled = [name for name in names if any(row[name] is not None for row in original.rows)]
     return (
@@ -479,7 +516,7 @@ _MAX_MACHINE_RATIO = 20.0
 def _compute_preempted_share(result_rows: Sequence[ResultRow]) -> float:
     """Compute the fraction of steps that were preempted."""
     steps = [row for row in result_rows if row["phase"] == "step"]
-    return sum(bool(row["interrupted"]) for row in steps) / len(steps)
+    return sum(bool(row["preempted"]) for row in steps) / len(steps)
 
 
 def _describe_environment_change(old: ResultRow, new: ResultRow) -> str:
@@ -488,7 +525,12 @@ def _describe_environment_change(old: ResultRow, new: ResultRow) -> str:
     return f"other {' and '.join(differ)}" if differ else ""
 
 
-_ENVIRONMENT_COLUMNS = {"machine": "machine", "versions": "libraries", "code": "code", "threads": "threads"}
+_ENVIRONMENT_COLUMNS = {
+    "machine_id": "machine",
+    "versions": "libraries",
+    "source_fingerprint": "source code",
+    "threads": "threads",
+}
 
 
 def _verify_time_ratio(

@@ -35,7 +35,7 @@ _BATCH_SIZE = 2_000
 _SECONDS_PER_DAY = 86_400.0
 _EMPTY_SCHEMA = pa.schema([])
 _FILE_FIELD = pa.field(row_store.FILE_COLUMN, pa.string())
-_STARTED_SCHEMA = pa.schema([run_schema.RUN_SCHEMA.field("started")])
+_STARTED_SCHEMA = pa.schema([run_schema.RUN_SCHEMA.field("started_at")])
 
 
 def compact_results(results: Path, print_message: Callable[[str], None], *, min_age_days: float = 0.0) -> int:
@@ -69,7 +69,7 @@ def _compact_folder(folder: Path, max_modified_time: float, print_message: Calla
         for name in names
         if (unit := folder / f"{name}.parquet").is_file() and unit.stat().st_mtime <= max_modified_time
     ]
-    heads = parquet_rows.read_first_rows(old, ["started"], _STARTED_SCHEMA)
+    heads = parquet_rows.read_first_rows(old, ["started_at"], _STARTED_SCHEMA)
     whole = [unit for unit in old if isinstance(heads.get(unit), dict) and _is_utf8(unit.stem)]
     if damaged := len(old) - len(whole):
         print_message(

@@ -34,7 +34,7 @@ from springbench.harness.results.folder_ownership import OWNER_FILE as CLAIM
 from springbench.harness.results.folder_ownership import claim_folder, read_owner
 
 _EMPTY_SCHEMA = pa.schema([])
-_STARTED_SCHEMA = pa.schema([run_schema.RUN_SCHEMA.field("started")])
+_STARTED_SCHEMA = pa.schema([run_schema.RUN_SCHEMA.field("started_at")])
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ def _merge_table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
     for name, units in by_name.items():
         if len(units) == 1:
             continue
-        heads = parquet_rows.read_first_rows(units, ["started"], _STARTED_SCHEMA)
+        heads = parquet_rows.read_first_rows(units, ["started_at"], _STARTED_SCHEMA)
         tables = [(unit, parquet_rows.read_rows_by_file([unit], _EMPTY_SCHEMA)) for unit in units]
         newest = sorted(
             tables, key=lambda pair: _read_start_time(heads[pair[0]]), reverse=True
@@ -155,7 +155,7 @@ def _merge_table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
 def _read_start_time(head: dict[str, object] | str) -> str:
     if isinstance(head, str):
         raise InputError(head)
-    return str(head["started"] or "")
+    return str(head["started_at"] or "")
 
 
 def _iterate_tables(units: Sequence[Path], batch: int = 1_000) -> Iterator[tuple[Path, pa.Table]]:
@@ -234,10 +234,13 @@ def _query_conflicts(units: Sequence[Path], table: pa.Table | None = None) -> tu
             connection.register("rows", table)
 
         def differing(key: str) -> list[str]:
-            each = f"SELECT {key}, {asked}, frame FROM rows WHERE phase = 'step' AND digest IS NOT NULL GROUP BY ALL"
+            each = (
+                f"SELECT {key}, {asked}, frame FROM rows "
+                "WHERE phase = 'step' AND positions_digest IS NOT NULL GROUP BY ALL"
+            )
             found = connection.execute(
                 f"SELECT scene, size, solver, parameters, first FROM (SELECT {key}, {asked}, min(frame) AS first "
-                f"FROM ({each} HAVING count(DISTINCT digest) > 1) GROUP BY ALL) ORDER BY ALL"
+                f"FROM ({each} HAVING count(DISTINCT positions_digest) > 1) GROUP BY ALL) ORDER BY ALL"
             ).fetchall()
             return [
                 f"{scene}{f' {size}' if size else ''} {solver}{'' if given == '{}' else f' {given}'}: from step {first}"
@@ -245,4 +248,4 @@ def _query_conflicts(units: Sequence[Path], table: pa.Table | None = None) -> tu
             ]
 
         where = connection.sql(f"SELECT {', '.join(FOOTER_COLUMNS)} FROM rows GROUP BY ALL").to_arrow_table()
-        return differing("run_id, code"), differing("0"), machine_footer(where)
+        return differing("run_id, source_fingerprint"), differing("0"), machine_footer(where)

@@ -65,11 +65,13 @@ class ErrorControlledRun:
             "vertices": scene.system.num_vertices,
             "springs": len(scene.all_springs.edges),
             "max_iterations": None,
-            "first_guess": None,
-            "asked": self.error_requested,
+            "initial_guess": None,
+            "error_requested": self.error_requested,
             **best.columns,
-            "estimate_seconds": self.search_result.search_seconds,
-            "choice": "; ".join([f"{best.method} of {len(self.search_result.trials)} ways", *self.messages]),
+            "search_seconds": self.search_result.search_seconds,
+            "solver_description": "; ".join(
+                [f"{best.method} of {len(self.search_result.trials)} ways", *self.messages]
+            ),
         }
         seen = [self._build_frame_columns(k, self.positions[k], balance) for k, balance in balances.items()]
         return [
@@ -78,8 +80,8 @@ class ErrorControlledRun:
             | {
                 "round": number,
                 "seconds": seconds,
-                "pass_seconds": one.wall_seconds,
-                "summed_seconds": sum(one.frame_seconds),
+                "wall_seconds_check": one.wall_seconds,
+                "wall_seconds_sum": sum(one.frame_seconds),
             }
             for number, one in enumerate(self.timed_trajectories)
             for columns, seconds in zip(seen, one.frame_seconds, strict=True)
@@ -91,8 +93,8 @@ class ErrorControlledRun:
             "frame": frame,
             **balance.columns,
             **compute_strain_columns(self.scene, p),
-            "intersections": crossed,
-            "digest": hash_positions(p),
+            "num_intersections": crossed,
+            "positions_digest": hash_positions(p),
         }
 
 

@@ -92,11 +92,11 @@ class Trial:
         """Columns of this trial, common to several tables."""
         return {
             "integrator": self.method.integrator,
-            "estimated": self.error_estimated,
-            "local_tolerance_m": self.step_atol,
-            "accepted": self.trajectory.num_accepted_steps,
-            "rejected": self.trajectory.num_rejected_steps,
-            "factorisations": self.trajectory.num_factorisations,
+            "error_estimated": self.error_estimated,
+            "step_atol_m": self.step_atol,
+            "num_accepted_steps": self.trajectory.num_accepted_steps,
+            "num_rejected_steps": self.trajectory.num_rejected_steps,
+            "num_factorisations": self.trajectory.num_factorisations,
         }
 
     def rerun_trial(self) -> Trajectory:

@@ -1,7 +1,7 @@
 """Read the trials of earlier searches, to select the methods worth running again.
 
-A row of the kind `way` states in the column `promised` the CPU seconds predicted for the requested error. For a similar
-error, methods whose predicted cost was several times the smallest are left out.
+A row of the kind `method` states in the column `predicted_seconds` the CPU seconds predicted for the requested error.
+For a similar error, methods whose predicted cost was several times the smallest are left out.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ def read_stored_trials(folder: Path, error_target: ErrorTarget) -> list[ResultRo
     They are of the same source code and machine.
     """
     here = {
-        "problem": format_problem_id(error_target),
-        "machine": machine_info.describe_machine().machine_id,
-        "code": machine_info.hash_sources(),
+        "problem_digest": format_problem_id(error_target),
+        "machine_id": machine_info.describe_machine().machine_id,
+        "source_fingerprint": machine_info.hash_sources(),
     }
     units = [unit for unit in row_store.list_units(folder) if "-asked-" in unit.name]
     found = parquet_rows.read_rows(units, ACCURACY_SCHEMA).to_pylist() if units else []
-    return [row for row in found if row["kind"] == "way" and here.items() <= row.items()]
+    return [row for row in found if row["kind"] == "method" and here.items() <= row.items()]
 
 
 def select_promising_methods(
@@ -62,12 +62,14 @@ def select_promising_methods(
 
     Returns: the nearest error, and integrators with solvers; none where no stored error is similar.
     """
-    nearest = min((row["asked"] for row in stored_trials), key=lambda asked: abs(log(asked / error)), default=0.0)
+    nearest = min(
+        (row["error_requested"] for row in stored_trials), key=lambda asked: abs(log(asked / error)), default=0.0
+    )
     if not error / _MAX_ERROR_RATIO <= nearest <= error * _MAX_ERROR_RATIO:
         return nearest, []
-    there = [row for row in stored_trials if row["asked"] == nearest]
-    most = _MAX_COST_RATIO * min(row["promised"] for row in there)
-    cheap = {(row["integrator"], row["solver"]) for row in there if row["promised"] <= most}
+    there = [row for row in stored_trials if row["error_requested"] == nearest]
+    most = _MAX_COST_RATIO * min(row["predicted_seconds"] for row in there)
+    cheap = {(row["integrator"], row["solver"]) for row in there if row["predicted_seconds"] <= most}
     return nearest, [
         (integrator, solver) for integrator, solver in list_candidate_methods() if (integrator, solver.name) in cheap
     ]
@@ -85,18 +87,22 @@ def build_trial_rows(search_result: SearchResult, stored_trials: Iterable[Result
     """
     made = [
         {
-            "kind": "way",
+            "kind": "method",
             "status": "ok",
             "parameters": "{}",
-            "promised": promised,
+            "predicted_seconds": promised,
             "solver": one.method.solver,
             **one.columns,
-            "iterations_done": one.trajectory.num_iterations,
+            "num_iterations": one.trajectory.num_iterations,
             "seconds": [one.trajectory.wall_seconds],
             "cpu_seconds": one.trajectory.cpu_seconds,
         }
         for one, promised in search_result.trials
     ]
     again = {(row["integrator"], row["solver"]) for row in made}
-    kept = [row for row in stored_trials if row["asked"] == error and (row["integrator"], row["solver"]) not in again]
+    kept = [
+        row
+        for row in stored_trials
+        if row["error_requested"] == error and (row["integrator"], row["solver"]) not in again
+    ]
     return [*made, *kept]

@@ -102,9 +102,9 @@ class SolverCandidate:
             counts = self._scene.system.num_vertices, len(self._scene.all_springs.edges)
             self._phase_counts = count_operations(prepared.stats, *counts, read_precision(self.run))
             self.columns = {name: int(value) for name, value in prepared.stats.items()}
-            self.columns["choice"] = prepared.description
+            self.columns["solver_description"] = prepared.description
             if self._converged_problem and read_precision(self.run) != "float64":
-                self.columns["apart"] = compute_precision_error(self._converged_problem, prepared)
+                self.columns["precision_error"] = compute_precision_error(self._converged_problem, prepared)
         return seconds
 
     def time_phases(self) -> list[CandidateTiming]:
@@ -128,14 +128,14 @@ class SolverCandidate:
         self._positions = self._prepared.solve(self._problem, StopRule(self.run.iterations, tolerance)).positions
 
     def _build_columns(self, phase: str, num_repeats: int) -> dict[str, Any]:
-        done = {"iterations": num_repeats}
+        done = {"num_iterations": num_repeats}
         if phase not in self._phase_counts:
             return done
         counted = self._phase_counts[phase]
         return done | {
-            "bytes": num_repeats * counted.bytes_moved,
+            "bytes_moved": num_repeats * counted.bytes_moved,
             "flops": num_repeats * counted.flop_count,
-            "working_set": counted.working_set_bytes,
+            "working_set_bytes": counted.working_set_bytes,
         }
 
 
@@ -169,9 +169,9 @@ class CppCandidate:
         answers = [running.step(iterations) for _ in range(number)] if number > 1 else [once]
         step, local, global_ = (sum(column) / len(answers) for column in zip(*answers, strict=True))
         return [
-            CandidateTiming("step", step, {"iterations": iterations}),
-            CandidateTiming("local", local / iterations, {"iterations": 1}),
-            CandidateTiming("global", global_ / iterations, {"iterations": 1}),
+            CandidateTiming("step", step, {"num_iterations": iterations}),
+            CandidateTiming("local", local / iterations, {"num_iterations": 1}),
+            CandidateTiming("global", global_ / iterations, {"num_iterations": 1}),
         ]
 
     def close(self) -> Positions | None:
@@ -201,7 +201,7 @@ class MachineCandidate:
             time_phase(
                 probe.name,
                 probe.call,
-                {"bytes": probe.bytes_moved, "flops": probe.flops, "working_set": probe.working_set_bytes},
+                {"bytes_moved": probe.bytes_moved, "flops": probe.flops, "working_set_bytes": probe.working_set_bytes},
                 0.0,
             )
             for probe in stream_probes.build_probes()
@@ -226,7 +226,7 @@ class RepeatedCall:
             for _ in range(num_calls):
                 self._call()
             found = perf_counter() - began
-        self.preempted |= watch.build_columns("calls", [found])["interrupted"]
+        self.preempted |= watch.build_columns("calls", [found])["preempted"]
         return found
 
 
@@ -243,7 +243,7 @@ def time_phase(
     """
     seconds = RepeatedCall(call)
     return CandidateTiming(
-        phase, compute_call_seconds(seconds, min_seconds), columns | {"interrupted": seconds.preempted}
+        phase, compute_call_seconds(seconds, min_seconds), columns | {"preempted": seconds.preempted}
     )
 
 

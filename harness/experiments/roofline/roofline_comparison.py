@@ -231,7 +231,7 @@ def _read_past_timings(found: Sequence[dict[str, Any]]) -> list[PastTiming]:
     The result is empty if it failed or has no steps.
     """
     prepare = [row["seconds"] for row in found if row["phase"] == "prepare"]
-    iteration = [row["seconds"] / row["iterations"] for row in found if row["phase"] == "step"]
+    iteration = [row["seconds"] / row["num_iterations"] for row in found if row["phase"] == "step"]
     if not (prepare and iteration):
         return []
     return [PastTiming(found[0]["vertices"], median(prepare), median(iteration))]

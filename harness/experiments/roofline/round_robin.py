@@ -147,7 +147,12 @@ def _catch_failure(
 
 
 def _build_row(reading: CandidateTiming, round: int) -> ResultRow:
-    found = {"phase": reading.phase, "seconds": reading.call_seconds, "round": round, "load": os.getloadavg()[0]}
+    found = {
+        "phase": reading.phase,
+        "seconds": reading.call_seconds,
+        "round": round,
+        "load_average": os.getloadavg()[0],
+    }
     if reading.phase == "step":
         found["frame"] = 1
     return found | reading.columns
@@ -168,7 +173,7 @@ def _compare_positions(rows: dict[BenchmarkCandidate, list[ResultRow]], alive: l
                 raise RunFailed(f"its positions lie {apart:.1e} of the scene's size from the others'; wanted {limit}")
             for row in rows[candidate]:
                 if row["phase"] == "step":
-                    row["digest"] = hash_positions(p)
+                    row["positions_digest"] = hash_positions(p)
 
 
 def _release_quietly(candidate: BenchmarkCandidate) -> None:

@@ -52,7 +52,9 @@ def read_accuracy(
         raise InputError(InputMistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_ResultRow]] = defaultdict(list)
     # Columns that older rows do not have.
-    missing = dict.fromkeys(("family", "reference", "minimises", "own_steps", "code", "started", "commit"))
+    missing = dict.fromkeys(
+        ("family", "citation", "is_minimiser", "is_substepping", "source_fingerprint", "started_at", "commit")
+    )
     table = read_rows(units, pa.schema([]), required_columns=("kind",), promote="permissive", on_invalid=on_invalid)
     for row in table.to_pylist():
         kinds[row["kind"]].append(missing | row)
@@ -65,7 +67,10 @@ def read_accuracy(
         tuple(_build_curves(kinds, problems, label)),
         tuple(_build_work_point(row, label) for row in kinds["work"]),
         _describe_machine(kinds["curve"] + kinds["work"]),
-        max(((row["started"] or "", row["code"] or "") for row in kinds["curve"] + kinds["work"]), default=("", ""))[1],
+        max(
+            ((row["started_at"] or "", row["source_fingerprint"] or "") for row in kinds["curve"] + kinds["work"]),
+            default=("", ""),
+        )[1],
     )
 
 
@@ -76,21 +81,21 @@ def _build_snapshots(kinds: dict[str, list[_ResultRow]]) -> dict[str, SnapshotPr
     """
     lowest: dict[str, float] = {}
     for row in kinds["curve"]:
-        if row["g"] is not None and row["g"] < lowest.get(row["problem"], np.inf):
-            lowest[row["problem"]] = row["g"]
+        if row["objective"] is not None and row["objective"] < lowest.get(row["problem_digest"], np.inf):
+            lowest[row["problem_digest"]] = row["objective"]
     minima: dict[str, list[_ResultRow]] = defaultdict(list)
     for row in kinds["minimum"]:
-        if row["g"] is not None:
-            minima[row["problem"]].append(row)
+        if row["objective"] is not None:
+            minima[row["problem_digest"]].append(row)
     found: dict[str, SnapshotProblem] = {}
-    for row in kinds["problem"]:
-        digest = row["problem"]
-        if digest is None or row["g0"] is None:
+    for row in kinds["snapshot"]:
+        digest = row["problem_digest"]
+        if digest is None or row["objective_initial"] is None:
             continue
-        known = sorted(minima[digest], key=lambda m: m["g"])
-        energies, names = [m["g"] for m in known], [m["minimum"] for m in known]
-        noise = ROUNDOFF_FACTOR * (row["magnitude"] or 0.0)
-        doubt = "" if known and known[0]["certified"] else "the lowest known minimum is not certified"
+        known = sorted(minima[digest], key=lambda m: m["objective"])
+        energies, names = [m["objective"] for m in known], [m["minimum_id"] for m in known]
+        noise = ROUNDOFF_FACTOR * (row["objective_magnitude"] or 0.0)
+        doubt = "" if known and known[0]["is_certified"] else "the lowest known minimum is not certified"
         seen = lowest.get(digest, np.inf)
         if not known:
             doubt = "no minimum is known; gaps refer to the lowest energy that a solver reached"
@@ -104,15 +109,15 @@ def _build_snapshots(kinds: dict[str, list[_ResultRow]]) -> dict[str, SnapshotPr
             scene=row["scene"],
             size=row["size"],
             vertices=row["vertices"],
-            snapshot=row["moment"],
+            snapshot=row["snapshot"],
             integrator=row["integrator"],
             time_step=row["time_step"],
             stiffness_ratio=_float_or_nan(row["stiffness_ratio"]),
             mean_rest_length=_float_or_nan(row["mean_rest_length"]),
-            objective_magnitude=_float_or_nan(row["magnitude"]),
+            objective_magnitude=_float_or_nan(row["objective_magnitude"]),
             problem_digest=digest,
             frame=row["frame"] or 0,
-            objective_initial=_float_or_nan(row["g0_inertial" if paper else "g0"]),
+            objective_initial=_float_or_nan(row["objective_inertial" if paper else "objective_initial"]),
             minima=tuple(energies),
             minimum_ids=tuple(names),
             uncertified_reason=doubt,
@@ -121,7 +126,7 @@ def _build_snapshots(kinds: dict[str, list[_ResultRow]]) -> dict[str, SnapshotPr
     return found
 
 
-_SOLVE_COLUMNS = ("problem", "solver", "parameters", "threads")
+_SOLVE_COLUMNS = ("problem_digest", "solver", "parameters", "threads")
 
 
 def _build_curves(
@@ -130,7 +135,7 @@ def _build_curves(
     prepared = {tuple(row[key] for key in _SOLVE_COLUMNS): row for row in kinds["prepare"]}
     groups: dict[tuple[Any, ...], list[_ResultRow]] = defaultdict(list)
     for row in kinds["curve"]:
-        groups[*(row[key] for key in _SOLVE_COLUMNS), row["first_guess"]].append(row)
+        groups[*(row[key] for key in _SOLVE_COLUMNS), row["initial_guess"]].append(row)
     for key, rows in groups.items():
         problem = problems.get(key[0])
         if problem is not None:
@@ -153,23 +158,23 @@ def _build_curve(
         problem=problem,
         solver=rows[0]["solver"],
         family=rows[0]["family"] or "",
-        citation=rows[0]["reference"] or "",
+        citation=rows[0]["citation"] or "",
         label=label,
         parameters=rows[0]["parameters"] or "{}",
-        initial_guess=rows[0]["first_guess"] or "",
+        initial_guess=rows[0]["initial_guess"] or "",
         threads=rows[0]["threads"] or 1,
         iterations=column("iteration"),
-        gap=problem.compute_gap(column("g")),
-        max_vertex_error=column("largest_error") / problem.mean_rest_length,
+        gap=problem.compute_gap(column("objective")),
+        max_vertex_error=column("position_error_max_m") / problem.mean_rest_length,
         stationarity=column("stationarity"),
         seconds=seconds if rounds else np.full((1, len(points)), np.nan),
         warm_seconds=float(np.median(warm)),
-        cold_seconds=_float_or_nan(prepared.get("cold")),
-        minimum_index=problem.minimum_index(rows[0]["minimum"]) if rows[0]["branch"] is not None else None,
+        cold_seconds=_float_or_nan(prepared.get("cold_seconds")),
+        minimum_index=problem.minimum_index(rows[0]["minimum_id"]) if rows[0]["minimum_index"] is not None else None,
         status=bad["status"],
         reason=bad["reason"] or "",
-        recording_path=next((row["recording"] for row in rows if row["recording"]), ""),
-        source_fingerprint=rows[0]["code"] or "",
+        recording_path=next((row["recording_path"] for row in rows if row["recording_path"]), ""),
+        source_fingerprint=rows[0]["source_fingerprint"] or "",
     )
 
 
@@ -177,24 +182,24 @@ def _build_work_point(row: _ResultRow, label: _RowLabeller) -> WorkPoint:
     same_names = ("scene", "size", "solver", "parameters", "integrator", "time_step", "status")
     return WorkPoint(
         **{name: row[name] for name in same_names},
-        residual_rtol=row["tolerance"],
-        max_iterations=row["iterations"],
-        initial_guess=row["first_guess"],
+        residual_rtol=row["residual_rtol"],
+        max_iterations=row["max_iterations"],
+        initial_guess=row["initial_guess"],
         family=row["family"] or "",
-        citation=row["reference"] or "",
-        is_minimiser=row["minimises"] is not False,
-        is_substepping=bool(row["own_steps"]),
+        citation=row["citation"] or "",
+        is_minimiser=row["is_minimiser"] is not False,
+        is_substepping=bool(row["is_substepping"]),
         label=label(row),
-        t_end=_float_or_nan(row["horizon"]),
+        t_end=_float_or_nan(row["t_end"]),
         error=_float_or_nan(row["error"]),
-        reference_kind=row["truth"] or "",
-        end_error_rms=_float_or_nan(row["error_rms_m"]),
-        seconds_per_simulated_second=_float_or_nan(row["seconds_per_simulated"]),
-        cpu_seconds_per_simulated_second=_float_or_nan(row["cpu_seconds"]) / _float_or_nan(row["horizon"]),
+        reference_kind=row["reference_kind"] or "",
+        end_error_rms=_float_or_nan(row["end_error_rms_m"]),
+        seconds_per_simulated_second=_float_or_nan(row["seconds_per_simulated_second"]),
+        cpu_seconds_per_simulated_second=_float_or_nan(row["cpu_seconds"]) / _float_or_nan(row["t_end"]),
         vertices=row["vertices"] or 0,
         stiffness=_float_or_nan(row["stiffness_ratio"]) / row["time_step"] ** 2,
         reason=row["reason"] or "",
-        source_fingerprint=row["code"] or "",
+        source_fingerprint=row["source_fingerprint"] or "",
     )
 
 

@@ -63,7 +63,7 @@ def _read_ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[Res
     found = [(path.stem, ablation_summary.read_ablation(path)) for path in row_store.list_units(folder / "ablation")]
     found = [(stem, table) for stem, table in found if ablation_summary.select_kind(table, kind)]
     if not found:
-        command = "springbench ablate SCENE" + (" --all-solvers" if kind == "price" else "")
+        command = "springbench ablate SCENE" + (" --all-solvers" if kind == "overhead" else "")
         raise InputError(InputMistake(f"holds nothing of that kind; wanted the rows of `{command}`", folder))
     yield from found
 
@@ -71,18 +71,18 @@ def _read_ablations(folder: Path, kind: str) -> Iterator[tuple[str, Sequence[Res
 def effect_cost_panels(folder: Path) -> list[PanelEntry]:
     """Build panels of the cost of each effect and the changes without it."""
     plots: list[CurvePlot] = []
-    for stem, table in _read_ablations(folder, "without"):
-        (whole,) = ablation_summary.select_kind(table, "whole")
-        points = [row for row in ablation_summary.select_kind(table, "without") if row["status"] == "ok"]
+    for stem, table in _read_ablations(folder, "ablated"):
+        (whole,) = ablation_summary.select_kind(table, "full-scene")
+        points = [row for row in ablation_summary.select_kind(table, "ablated") if row["status"] == "ok"]
         if whole["status"] != "ok" or not points:
             continue
         other = _is_stale(whole)
         series = [_build_effect_series(k, row, whole["seconds"], is_stale=other) for k, row in enumerate(points)]
         known = [row for row in ablation_summary.select_kind(table, "error") if row["status"] == "ok"]
         error, whose = ablation_summary.largest_known_error(table)
-        gone = [row["name"] for row in ablation_summary.select_kind(table, "without") if row["status"] != "ok"]
+        gone = [row["name"] for row in ablation_summary.select_kind(table, "ablated") if row["status"] != "ok"]
         below = [f"Shaded: less than {whose}, so not called for."] if whose else []
-        dashed = [f"{_ERROR_LABELS[row['name']]}, {row['largest']:.2g}" for row in known]
+        dashed = [f"{_ERROR_LABELS[row['name']]}, {row['displacement_max']:.2g}" for row in known]
         below += [f"Dashed: {'; '.join(dashed)}."] if dashed else []
         below += [f"Impossible without {', '.join(gone)}."] if gone else []
         plots.append(
@@ -92,7 +92,7 @@ def effect_cost_panels(folder: Path) -> list[PanelEntry]:
                 AxisScale("largest displacement without it [mean rest lengths]", "log", "power"),
                 series,
                 bands=[ShadedBand(0.0, error, "")] if np.isfinite(error) else [],
-                lines=[MarkedValue(max(row["largest"], 1e-6), "") for row in known],
+                lines=[MarkedValue(max(row["displacement_max"], 1e-6), "") for row in known],
                 notes=[*below, *([STALE_NOTE] if other else [])],
                 machine_words=describe_provenance(table),
             )
@@ -101,8 +101,10 @@ def effect_cost_panels(folder: Path) -> list[PanelEntry]:
 
 
 def _build_effect_series(k: int, row: ResultRow, full_run: float, *, is_stale: bool) -> CurveSeries:
-    x, low, high = (np.array([row[key] / full_run]) for key in ("cost", "cost_low", "cost_high"))
-    y = np.array([max(row["largest"], 1e-6)])
+    x, low, high = (
+        np.array([row[key] / full_run]) for key in ("added_seconds", "added_seconds_low", "added_seconds_high")
+    )
+    y = np.array([max(row["displacement_max"], 1e-6)])
     return CurveSeries(
         row["name"],
         indexed_style(k),
@@ -123,7 +125,11 @@ def overhead_panels(folder: Path) -> list[PanelEntry]:
     These are a map of all solvers, and intervals for each solver.
     """
     found = _label_rows(
-        [row for _, table in _read_ablations(folder, "price") for row in ablation_summary.select_kind(table, "price")]
+        [
+            row
+            for _, table in _read_ablations(folder, "overhead")
+            for row in ablation_summary.select_kind(table, "overhead")
+        ]
     )
     marked = assign_label_styles((row["label"], row["solver"]) for row in found)
     panels: list[FigurePanel] = []
@@ -150,7 +156,7 @@ def _label_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
 
 
 def _is_stale(row: ResultRow) -> bool:
-    return row["code"] not in (None, machine_info.hash_sources())
+    return row["source_fingerprint"] not in (None, machine_info.hash_sources())
 
 
 def _build_overhead_map(group: tuple[str, ...], subject: str, here: Sequence[ResultRow]) -> CellMap:
@@ -159,7 +165,7 @@ def _build_overhead_map(group: tuple[str, ...], subject: str, here: Sequence[Res
     The most expensive effect comes first, and all effects together come last.
     """
     known = [row for row in here if row["status"] == "ok"]
-    paid = {row["name"]: [r["price"] for r in known if r["name"] == row["name"]] for row in here}
+    paid = {row["name"]: [r["overhead_ratio"] for r in known if r["name"] == row["name"]] for row in here}
     order = sorted(paid, key=lambda name: (name == _ALL_EFFECTS, -median(paid[name] or [0.0])))
     cells = [_build_cell(row) for row in sorted(here, key=lambda row: order.index(row["name"]))]
     refused = dict.fromkeys(row["status"] for row in here if row["status"] != "ok")
@@ -184,9 +190,9 @@ def _build_cell(row: ResultRow) -> MapCell:
     at = row["name"], row["label"]
     if row["status"] != "ok":
         return MapCell(*at, row["status"], _describe_missing_overhead(row["status"]), "–", _is_stale(row))
-    price = row["price"]
+    price = row["overhead_ratio"]
     class_ = next((words, color) for most, words, color in _OVERHEAD_CLASSES if price <= most)
-    told = _INDISTINGUISHABLE if row["price_low"] <= 1.0 <= row["price_high"] else class_
+    told = _INDISTINGUISHABLE if row["overhead_ratio_low"] <= 1.0 <= row["overhead_ratio_high"] else class_
     return MapCell(*at, *told, f"{price:.2f}" if price < 9.995 else f"{price:.0f}", _is_stale(row))
 
 
@@ -198,9 +204,12 @@ def _build_interval_plot(
     group: tuple[str, ...], subject: str, style: SeriesStyle, rows: Sequence[ResultRow]
 ) -> CurvePlot:
     """Build a plot of a solver's overheads with their intervals, the most expensive effect first."""
-    mine, label = sorted(rows, key=lambda row: -row["price"]), rows[0]["label"]
+    mine, label = sorted(rows, key=lambda row: -row["overhead_ratio"]), rows[0]["label"]
     older = np.array([_is_stale(row) for row in mine])
-    x, low, high = (np.array([row[key] for row in mine], float) for key in ("price", "price_low", "price_high"))
+    x, low, high = (
+        np.array([row[key] for row in mine], float)
+        for key in ("overhead_ratio", "overhead_ratio_low", "overhead_ratio_high")
+    )
     y, names = np.arange(len(mine), dtype=float), tuple(row["name"] for row in mine)
     return CurvePlot(
         *(group, (label,), subject, label),

@@ -25,7 +25,7 @@ def build_ablation_charts(rows: Sequence[ResultRow]) -> tuple[dict[str, dict[str
     The rows may belong to several scenes.
     """
     made = {"ablation": _build_effect_chart(rows), "prices": _build_overhead_chart(rows)}
-    by_whole = [_select_unit_rows(whole, rows) for whole in select_kind(rows, "whole") if whole["status"] == "ok"]
+    by_whole = [_select_unit_rows(whole, rows) for whole in select_kind(rows, "full-scene") if whole["status"] == "ok"]
     words = [f"{some[0]['scene']}: {said}" for some in by_whole for said in summarise_ablation(some)]
     return {name: chart | {"command": _CHART_COMMANDS[name]} for name, chart in made.items() if chart["items"]}, words
 
@@ -37,7 +37,9 @@ def _select_unit_rows(full_run: ResultRow, rows: Sequence[ResultRow]) -> list[Re
 
 def _build_effect_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
     items = [
-        _build_item(_select_unit_rows(whole, rows)) for whole in select_kind(rows, "whole") if whole["status"] == "ok"
+        _build_item(_select_unit_rows(whole, rows))
+        for whole in select_kind(rows, "full-scene")
+        if whole["status"] == "ok"
     ]
     return {
         "title": "What each effect costs and changes",
@@ -47,10 +49,14 @@ def _build_effect_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
         "shape": "points",
         "x": [
             axis_choice("share", "percent of a step", _PERCENT_AXIS),
-            axis_choice("largest", "mean rest lengths moved"),
+            axis_choice("displacement_max", "mean rest lengths moved"),
         ],
         "y": [axis_choice("effect", "", _NAME_AXIS)],
-        "hover": [["effect", "without"], ["share", "percent of a step"], ["largest", "mean rest lengths moved"]],
+        "hover": [
+            ["effect", "without"],
+            ["share", "percent of a step"],
+            ["displacement_max", "mean rest lengths moved"],
+        ],
         "items": [item for item in items if item["effect"]],
         "marks": _build_styles(rows),
         "references": _build_references(rows),
@@ -58,11 +64,15 @@ def _build_effect_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
 
 
 def _build_item(some: Sequence[ResultRow]) -> dict[str, Any]:
-    whole, without = some[0], [row for row in select_kind(some, "without") if row["status"] == "ok"]
+    whole, without = some[0], [row for row in select_kind(some, "ablated") if row["status"] == "ok"]
     size = f" {whole['size']}" if whole["size"] else ""
     shares = {
         name: [round_number(100 * row[column] / whole["seconds"]) for row in without]
-        for name, column in (("share", "cost"), ("share_low", "cost_low"), ("share_high", "cost_high"))
+        for name, column in (
+            ("share", "added_seconds"),
+            ("share_low", "added_seconds_low"),
+            ("share_high", "added_seconds_high"),
+        )
     }
     return {
         "label": whole["solver"],
@@ -71,14 +81,14 @@ def _build_item(some: Sequence[ResultRow]) -> dict[str, Any]:
         "panel": f"{whole['scene']}{size}",
         "parameters": whole["parameters"],
         "effect": [row["name"] for row in without],
-        "largest": [round_number(row["largest"] or None) for row in without],
+        "displacement_max": [round_number(row["displacement_max"] or None) for row in without],
         **shares,
     }
 
 
 def _build_overhead_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
     priced: dict[tuple[str, str], list[ResultRow]] = {}
-    for row in select_kind(rows, "price"):
+    for row in select_kind(rows, "overhead"):
         if row["status"] == "ok":
             priced.setdefault((row["scene"], row["solver"]), []).append(row)
     items = [
@@ -89,10 +99,10 @@ def _build_overhead_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
             "panel": scene,
             "parameters": some[0]["parameters"],
             "effect": [row["name"] for row in some],
-            "price": [round_number(row["price"]) for row in some],
-            "price_low": [round_number(row["price_low"]) for row in some],
-            "price_high": [round_number(row["price_high"]) for row in some],
-            "bound": [round_number(row["price_bound"]) for row in some],
+            "overhead_ratio": [round_number(row["overhead_ratio"]) for row in some],
+            "overhead_ratio_low": [round_number(row["overhead_ratio_low"]) for row in some],
+            "overhead_ratio_high": [round_number(row["overhead_ratio_high"]) for row in some],
+            "bound": [round_number(row["overhead_ratio_bound"]) for row in some],
         }
         for (scene, solver), some in priced.items()
     ]
@@ -101,9 +111,13 @@ def _build_overhead_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
         "note": "CPU time of an iteration with the effect over one without, with its 95 % interval.",
         "filters": ["scene"],
         "shape": "points",
-        "x": [axis_choice("price", "times as long", LOG_AXIS)],
+        "x": [axis_choice("overhead_ratio", "times as long", LOG_AXIS)],
         "y": [axis_choice("effect", "", _NAME_AXIS)],
-        "hover": [["effect", "effect"], ["price", "times as long"], ["bound", "least that reading its numbers allows"]],
+        "hover": [
+            ["effect", "effect"],
+            ["overhead_ratio", "times as long"],
+            ["bound", "least that reading its numbers allows"],
+        ],
         "items": items,
         "marks": _build_styles(rows),
         "references": _build_references(rows),
@@ -118,4 +132,4 @@ def _build_styles(rows: Sequence[ResultRow]) -> dict[str, Any]:
 
 
 def _build_references(rows: Sequence[ResultRow]) -> dict[str, Any]:
-    return format_references((row["solver"], row["reference"]) for row in rows)
+    return format_references((row["solver"], row["citation"]) for row in rows)

@@ -76,7 +76,7 @@ def collect_benchmark_provenance(stored: Sequence[StoredBenchmarks]) -> list[Cha
         commit = one.commit_info.id + ("-dirty" if one.commit_info.dirty else "")
         dates.setdefault((commit, cpu, usable or cores or 0), []).append(one.datetime)
     told: list[ChartItem] = [
-        {"machine": None, "cpu": cpu, "cores": cores, "memory_gib": None, "system": None, "commit": commit}
+        {"machine_id": None, "cpu": cpu, "cores": cores, "memory_gib": None, "operating_system": None, "commit": commit}
         | {"codes": [], "from": min(when), "to": max(when), "count": len(when)}
         for (commit, cpu, cores), when in dates.items()
     ]

@@ -14,16 +14,16 @@ from springbench.harness.report.site.sweep_folders import SweepFolder
 from springbench.harness.report.table_queries import query_table
 
 _FRAME_COLUMNS = {
-    "ms": "1e3 * median(seconds)",
+    "step_ms": "1e3 * median(seconds)",
     "least": "1e3 * min(seconds)",
     "lower": "1e3 * quantile_cont(seconds, 0.25)",
     "upper": "1e3 * quantile_cont(seconds, 0.75)",
-    "iterations": "max(iterations)",
+    "num_iterations": "max(num_iterations)",
     "residual": "max(residual)",
-    "strain": "max(largest_strain)",
+    "max_strain": "max(max_strain)",
     "objective": "max(objective)",
-    "springs": "max(energy_springs)",
-    "distance": "max(distance)",
+    "energy_springs": "max(energy_springs)",
+    "reference_distance": "max(reference_distance)",
 }
 """Columns of a run's script, each as SQL over the rounds of a frame."""
 

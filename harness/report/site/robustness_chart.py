@@ -19,7 +19,7 @@ CHART_TITLE = "Hard cases"
 
 def has_verification(table: pa.Table) -> bool:
     """Return whether any of these rows was verified."""
-    columns = [table[name] for name in ("stationarity", "distance") if name in table.column_names]
+    columns = [table[name] for name in ("stationarity", "reference_distance") if name in table.column_names]
     return any(column.null_count < len(column) for column in columns)
 
 

@@ -9,12 +9,13 @@ import pyarrow as pa
 from springbench.harness.report.table_queries import query_table
 from springbench.harness.results.folder_ownership import OWNER_FILE as CLAIM
 
-_MACHINE_COLUMNS = ("machine", "cpu", "cores", "memory_gib", "system", "commit")
+_MACHINE_COLUMNS = ("machine_id", "cpu", "cores", "memory_gib", "operating_system", "commit")
 
 _PROVENANCE_QUERY = f"""
-select {", ".join(f'"{name}"' for name in _MACHINE_COLUMNS)}, list(distinct code order by code),
-    min(started), max(started), count(distinct {{unit}})
-from rows_of where machine is not null group by all order by max(started) desc
+select {", ".join(f'"{name}"' for name in _MACHINE_COLUMNS)},
+    list(distinct source_fingerprint order by source_fingerprint),
+    min(started_at), max(started_at), count(distinct {{unit}})
+from rows_of where machine_id is not null group by all order by max(started_at) desc
 """
 
 
@@ -25,7 +26,9 @@ def collect_provenance(table: pa.Table, unit: str) -> list[dict[str, Any]]:
         table: rows.
         unit: column whose distinct values are counted.
     """
-    lacking = [name for name in (*_MACHINE_COLUMNS, "code", "started", unit) if name not in table.column_names]
+    lacking = [
+        name for name in (*_MACHINE_COLUMNS, "source_fingerprint", "started_at", unit) if name not in table.column_names
+    ]
     for name in lacking:
         table = table.append_column(name, pa.nulls(len(table), pa.string()))
     names = (*_MACHINE_COLUMNS, "codes", "from", "to", "count")

@@ -29,7 +29,7 @@ def _to_run_times(run: RunRecord) -> RunTimes:
 def _describe_unconverged(run_records: Sequence[RunRecord]) -> Iterator[dict[str, Any]]:
     """Describe how many runs ended a step at the iteration limit."""
     done = [run for run in run_records if run["status"] == "ok" and run["termination_reason"]]
-    short = [run for run in done if run["termination_reason"] == "iterations"]
+    short = [run for run in done if run["termination_reason"] == "max-iter"]
     if short:
         words = f"{len(short)} of {len(done)} runs ended a step at the limit of iterations: look at residuals."
-        yield {"words": words, "runs": [short[0]["run_id"]], "filter": {"termination_reason": "iterations"}}
+        yield {"words": words, "runs": [short[0]["run_id"]], "filter": {"termination_reason": "max-iter"}}

@@ -28,16 +28,21 @@ MACHINE_SOLVER = "machine"
 _REQUIRED_COLUMNS = ("run_id", "scene", "size", "solver", "phase", "status")
 
 _RUN_QUERY = """
-select run_id, any_value(file) as unit, any_value(family) as family, any_value(reference) as reference,
-    any_value(integrator) as integrator, any_value(time_step) as time_step, any_value(first_guess) as first_guess,
-    any_value(max_iterations) as max_iterations, any_value(tolerance) as tolerance,
-    any_value(asked) as asked, any_value(estimated) as estimated, any_value(threads) as threads,
+select run_id, any_value(file) as unit, any_value(family) as family, any_value(citation) as citation,
+    any_value(integrator) as integrator, any_value(time_step) as time_step,
+    any_value(initial_guess) as initial_guess,
+    any_value(max_iterations) as max_iterations, any_value(residual_rtol) as residual_rtol,
+    any_value(error_requested) as error_requested, any_value(error_estimated) as error_estimated,
+    any_value(threads) as threads,
     max(frame) as frames, 1 + max("round") filter (phase = 'step') as rounds,
     sum(seconds) filter (phase in ('step', 'prepare')) as took,
-    arg_max(digest, frame) filter (digest is not null) as digest,
-    max(penetration) as penetration, any_value(machine) as machine, any_value(cpu) as cpu, any_value(cores) as cores,
-    any_value(memory_gib) as memory, any_value("system") as os, any_value("commit") as "commit",
-    any_value(code) as code, any_value(own) as own, any_value(started) as started, any_value(timing) as timing,
+    arg_max(positions_digest, frame) filter (positions_digest is not null) as positions_digest,
+    max(penetration_depth) as penetration_depth, any_value(machine_id) as machine_id,
+    any_value(cpu) as cpu, any_value(cores) as cores,
+    any_value(memory_gib) as memory_gib, any_value(operating_system) as operating_system,
+    any_value("commit") as "commit",
+    any_value(source_fingerprint) as source_fingerprint, any_value(plugins) as plugins,
+    any_value(started_at) as started_at, any_value(timing) as timing,
     any_value(versions) as versions
 from rows_of group by run_id
 """
@@ -112,7 +117,7 @@ def build_run_script(
         "n": len(run_records),
         "columns": {name: encode_column(values) for name, values in columns.items()} | exact,
         "marks": {label: plotly_style(mark) for label, mark in marks.items()},
-        "references": format_references((run["solver"], run["reference"]) for run in run_records),
+        "references": format_references((run["solver"], run["citation"]) for run in run_records),
     }
 
 
@@ -124,7 +129,7 @@ def format_references(pairs: Any) -> dict[str, dict[str, str]]:
     }
 
 
-_EXACT_COLUMNS = ("time_step", "tolerance", "asked")
+_EXACT_COLUMNS = ("time_step", "residual_rtol", "error_requested")
 """Columns that commands need to the last digit."""
 
 _PAGE_COLUMNS = (
@@ -132,11 +137,11 @@ _PAGE_COLUMNS = (
     *(
         "integrator",
         "time_step",
-        "first_guess",
+        "initial_guess",
         "max_iterations",
-        "tolerance",
-        "asked",
-        "estimated",
+        "residual_rtol",
+        "error_requested",
+        "error_estimated",
         "threads",
         "frames",
         "rounds",
@@ -159,11 +164,11 @@ _PAGE_COLUMNS = (
         "global",
         "max_strain",
         "strain_p99",
-        "penetration",
+        "penetration_depth",
         "preempted",
         "phases_consistent",
         "timing",
-        "digest",
+        "positions_digest",
     ),
     *(
         "picture",
@@ -171,13 +176,13 @@ _PAGE_COLUMNS = (
         "mesh",
         "replay",
         "by",
-        "machine",
+        "machine_id",
         "cpu",
         "commit",
-        "code",
-        "started",
+        "source_fingerprint",
+        "started_at",
         "took",
-        "own",
+        "plugins",
         "versions",
     ),
 )
@@ -214,11 +219,11 @@ def _classify_staleness(run_records: Sequence[RunRecord]) -> list[str]:
     all.
     """
     newest: dict[Any, RunRecord] = {}
-    for run in sorted(run_records, key=lambda run: run["started"] or ""):
+    for run in sorted(run_records, key=lambda run: run["started_at"] or ""):
         newest[run["scene"], run["solver"]] = newest[None] = run
     return [
         "other code"
-        if run["code"] != newest[run["scene"], run["solver"]]["code"]
+        if run["source_fingerprint"] != newest[run["scene"], run["solver"]]["source_fingerprint"]
         else "earlier commit"
         if run["commit"] != newest[None]["commit"]
         else ""

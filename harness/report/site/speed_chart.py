@@ -37,12 +37,12 @@ def build_speed_chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
     """Build the chart, and remarks in sentences."""
     found = compute_speed_figures(table)
     timed = [f for f in found if f.status == "ok"]
-    reference = dict(zip(*(table[name].to_pylist() for name in ("solver", "reference")), strict=True))
+    reference = dict(zip(*(table[name].to_pylist() for name in ("solver", "citation")), strict=True))
     lines: dict[tuple[str, str], list[SpeedFigures]] = {}
     for f in sorted(timed, key=lambda f: f.vertices):
         lines.setdefault((f.scene, f.label), []).append(f)
     marks = assign_label_styles((f.label, f.solver) for f in timed)
-    dated = zip(*(table[name].to_pylist() for name in ("started", "code")), strict=True)
+    dated = zip(*(table[name].to_pylist() for name in ("started_at", "source_fingerprint")), strict=True)
     newest = max(((started or "", code or "") for started, code in dated), default=("", ""))[1]
     hover = [["vertices", "vertices"], ["step", "ms a step"], ["global_", "ms a global step"]]
     return {

@@ -234,7 +234,7 @@ def _build_accuracy_section(
         plots,
         told,
         group_failures(failed),
-        row_provenance.collect_provenance(_read_rows(folder, "accuracy"), "unit"),
+        row_provenance.collect_provenance(_read_rows(folder, "accuracy"), "unit_id"),
         facts,
     )
 

@@ -54,7 +54,7 @@ def count_operations(
         return {"local": local}
     entry = _ENTRY_BYTES[precision]
     flops = stats.get("flops_per_solve", 12 * stats["nnz_factor"])
-    stored = stats.get("panel_bytes", entry * stats["nnz_factor"])
+    stored = stats.get("factor_bytes", entry * stats["nnz_factor"])
     whole = OperationCount(flops / 6 * entry + _GLOBAL_BYTES * vertices, flops, stored + _VECTOR_BYTES * vertices)
     both = OperationCount(
         local.bytes_moved + whole.bytes_moved,

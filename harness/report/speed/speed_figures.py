@@ -107,9 +107,9 @@ class MachineLimits:
     def __init__(self, rows: Sequence[ResultRow]) -> None:
         best: dict[tuple[int, str], dict[float, float]] = defaultdict(dict)
         for row in rows:
-            rate = (row["bytes"] or row["flops"]) / row["seconds"]
+            rate = (row["bytes_moved"] or row["flops"]) / row["seconds"]
             at = best[row["threads"], row["phase"]]
-            at[row["working_set"]] = max(rate, at.get(row["working_set"], 0.0))
+            at[row["working_set_bytes"]] = max(rate, at.get(row["working_set_bytes"], 0.0))
         self._best = best
 
     def measured_bandwidth(self, threads: int, working_set: float, kernel: str = "read") -> float:
@@ -207,9 +207,9 @@ def _compute_candidate(
     first = run_rows[0]
     known = SpeedFigures(
         *(first["scene"], first["size"], first["vertices"], label, first["threads"]),
-        *(first["status"], first["reason"], first["choice"]),
+        *(first["status"], first["reason"], first["solver_description"]),
         solver=first["solver"],
-        source_fingerprint=first["code"] or "",
+        source_fingerprint=first["source_fingerprint"] or "",
         cpu=first["cpu"] or "",
         cores=first["cores"],
         commit=first["commit"] or "",
@@ -218,7 +218,7 @@ def _compute_candidate(
         return known
     times = {phase: _phase_seconds(run_rows, phase) for phase in ("prepare", "local", "global", "step")}
     known = known._replace(
-        iterations=next(row["iterations"] for row in run_rows if row["phase"] == "step"),
+        iterations=next(row["num_iterations"] for row in run_rows if row["phase"] == "step"),
         cold=1e3 * times["prepare"][0],
         warm=1e3 * float(np.median(times["prepare"][1:])) if len(times["prepare"]) > 1 else None,
         local=1e3 * float(np.median(times["local"])),
@@ -232,10 +232,10 @@ def _compute_candidate(
         solve_speedup_over_cholespy=_compute_speedup(
             group, _single_thread_label(group, _uses_cholespy), "global", times
         ),
-        precision_error=first["apart"],
-        load_average=max(row["load"] for row in run_rows),
+        precision_error=first["precision_error"],
+        load_average=max(row["load_average"] for row in run_rows),
     )
-    facts = {name: first[name] for name in ("nnz_factor", "panel_bytes", "flops_per_solve") if first[name] is not None}
+    facts = {name: first[name] for name in ("nnz_factor", "factor_bytes", "flops_per_solve") if first[name] is not None}
     if "nnz_factor" not in facts:
         return known
     precision = json.loads(first["parameters"]).get("precision", "float64")
@@ -256,7 +256,11 @@ def _compute_candidate(
 def _phase_seconds(run_rows: Sequence[ResultRow], phase: str) -> NDArray[np.float64]:
     """Return the seconds of a phase by round; for a step, those of one iteration."""
     return np.array(
-        [row["seconds"] / (row["iterations"] if phase == "step" else 1) for row in run_rows if row["phase"] == phase]
+        [
+            row["seconds"] / (row["num_iterations"] if phase == "step" else 1)
+            for row in run_rows
+            if row["phase"] == phase
+        ]
     )
 
 

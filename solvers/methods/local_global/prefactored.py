@@ -30,7 +30,7 @@ LocalStep = Callable[[Positions, Positions, Positions], None]
 """A function (p, y, out) that writes y + A'K d(p) to `out`."""
 
 
-_FACTOR_STATS = {"nnz_factor": "nonzeros", "panel_bytes": "factor_bytes", "flops_per_solve": "flops"}
+_FACTOR_STATS = {"nnz_factor": "nonzeros", "factor_bytes": "factor_bytes", "flops_per_solve": "flops"}
 """Statistics of a factor, by the attribute that provides them, if any."""
 
 

@@ -3,16 +3,16 @@
 (() => {
   const { element, data, number, fixed, percent, state, glyph, title, address, rowOf, picture, floats, whole } = springbench;
   const FIELDS = [
-    ["scene", "scene"], ["size", "size"], ["solver", "solver"], ["parameters", "parameters"], ["integrator", "integrator"], ["time_step", "time step, s"], ["first_guess", "first guess"],
-    ["max_iterations", "iterations at most"], ["tolerance", "tolerance"], ["threads", "threads"], ["frames", "frames"], ["rounds", "rounds"], ["cpu", "processor"], ["commit", "commit"], ["code", "sources"],
+    ["scene", "scene"], ["size", "size"], ["solver", "solver"], ["parameters", "parameters"], ["integrator", "integrator"], ["time_step", "time step, s"], ["initial_guess", "first guess"],
+    ["max_iterations", "iterations at most"], ["residual_rtol", "tolerance"], ["threads", "threads"], ["frames", "frames"], ["rounds", "rounds"], ["cpu", "processor"], ["commit", "commit"], ["source_fingerprint", "sources"],
   ];
-  const CURVES = [["ms", "ms a step", { type: "log" }], ["residual", "residual, J^½", { type: "log" }], ["iterations", "iterations", {}], ["strain", "largest strain, %", {}], ["objective", "objective, J", {}], ["distance", "from the reference, sizes", { type: "log" }]];
+  const CURVES = [["step_ms", "ms a step", { type: "log" }], ["residual", "residual, J^½", { type: "log" }], ["num_iterations", "iterations", {}], ["max_strain", "largest strain, %", {}], ["objective", "objective, J", {}], ["reference_distance", "from the reference, sizes", { type: "log" }]];
 
   const middle = some => { const s = Float64Array.from(some).sort(), h = s.length >> 1; return s.length % 2 ? s[h] : (s[h - 1] + s[h]) / 2; };
 
   // The 95 % interval of the ratio of two runs' ms a step, by resampling the frames (seeded, so it is reproducible).
   function interval(frames, first) {
-    const pairs = frames.ms.map((v, k) => [v, first.ms[k]]).filter(([a, b]) => a > 0 && b > 0);
+    const pairs = frames.step_ms.map((v, k) => [v, first.step_ms[k]]).filter(([a, b]) => a > 0 && b > 0);
     if (pairs.length < 2) return null;
     let seed = 12345;
     const random = () => { seed = (1103515245 * seed + 12345) % 2147483648; return seed / 2147483648; };
@@ -35,8 +35,8 @@
       ...differing.map(([key, words]) => line(words, rows.map(row => (key === "commit" ? springbench.commit(row[key]) : key === "parameters" ? Object.entries(JSON.parse(row[key])).map(pair => pair.join(" ")).join(", ") || "–" : String(row[key] ?? "–"))))),
       line("status", rows.map(row => state(row.status))), line("ms a step, quartiles", rows.map(row => (row.step === null ? "–" : `${number(row.step)} (${number(row.lower)} to ${number(row.upper)})`))),
       rows.length > 1 && line("times as long as the first, 95 % by frames", against), line("least ms", rows.map(row => number(row.least))), line("prepare ms, cold, warm", rows.map(row => `${number(row.cold)}, ${number(row.warm)}`)),
-      line("iterations, stopped by", rows.map(row => `${number(row.num_iterations)}, ${row.termination_reason || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.largest_strain))),
-      rows.length > 1 && line("last positions", rows.map((row, k) => (k ? (row.digest && row.digest === rows[0].digest ? "equal to the bit" : "differ") : ""))),
+      line("iterations, stopped by", rows.map(row => `${number(row.num_iterations)}, ${row.termination_reason || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.max_strain))),
+      rows.length > 1 && line("last positions", rows.map((row, k) => (k ? (row.positions_digest && row.positions_digest === rows[0].positions_digest ? "equal to the bit" : "differ") : ""))),
     ];
     const head = rows.map(row => element("th", { scope: "col" }, glyph(row.mark), " ", element("a", { href: address("runs", { sweep: row.slug, run: row.key }) }, title(row))));
     return [element("div.scroll", { tabIndex: 0, role: "region", "aria-label": "The runs side by side" }, element("table.plain", {}, element("thead", {}, element("tr", {}, element("td"), ...head)), element("tbody", {}, ...body.filter(Boolean)))),
@@ -50,8 +50,8 @@
     const drawings = [];
     for (const [column, words, how] of CURVES) {
       const items = rows.map((row, k) => series[k] && {
-        label: labels[k], what: "", frame: series[k].frame, [column]: column === "strain" ? series[k].strain.map(v => v && 100 * v) : series[k][column],
-        ...(column === "ms" ? { ms_low: series[k].lower, ms_high: series[k].upper } : {}),
+        label: labels[k], what: "", frame: series[k].frame, [column]: column === "max_strain" ? series[k].max_strain.map(v => v && 100 * v) : series[k][column],
+        ...(column === "step_ms" ? { step_ms_low: series[k].lower, step_ms_high: series[k].upper } : {}),
       }).filter(item => item && item[column].some(v => v !== null));
       if (!items.length) continue;
       const plot = element("div.plot.small", { tabIndex: 0, role: "group", "aria-label": `Plot: ${words} by frame. Arrow keys go through its points.` });

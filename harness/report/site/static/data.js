@@ -50,13 +50,13 @@ Object.assign(springbench, (() => {
   function command(row) {
     const sweep = sweepOf(row.slug), scene = own(sweep.scenes, row.scene);
     const whole = `springbench run ${quoted(sweep.config || `${sweep.name}.yaml`)}`;
-    if (!scene || !row.plain || row.own) return `${whole} --rerun`;
-    const chosen = row.asked !== null && row.asked !== undefined;
+    if (!scene || !row.plain || row.plugins) return `${whole} --rerun`;
+    const chosen = row.error_requested !== null && row.error_requested !== undefined;
     const stated = {
-      iterations: row.max_iterations, tolerance: row.tolerance === 0 ? "auto" : row.tolerance, integrator: row.integrator, "first-guess": row.first_guess,
+      iterations: row.max_iterations, tolerance: row.residual_rtol === 0 ? "auto" : row.residual_rtol, integrator: row.integrator, "first-guess": row.initial_guess,
     };
     const options = {
-      size: row.size || null, solver: row.solver, ...(chosen ? { accuracy: row.asked } : stated), "time-step": row.time_step && (Math.abs(Math.round(1 / row.time_step) * row.time_step - 1) < 1e-12 ? `1/${Math.round(1 / row.time_step)}` : row.time_step), threads: row.threads,
+      size: row.size || null, solver: row.solver, ...(chosen ? { accuracy: row.error_requested } : stated), "time-step": row.time_step && (Math.abs(Math.round(1 / row.time_step) * row.time_step - 1) < 1e-12 ? `1/${Math.round(1 / row.time_step)}` : row.time_step), threads: row.threads,
       frames: row.frames, rounds: row.rounds,
     };
     const told = Object.entries(options).filter(([, value]) => value !== null && value !== undefined);

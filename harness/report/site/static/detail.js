@@ -37,7 +37,7 @@ Object.assign(springbench, (() => {
     const given = Object.entries(JSON.parse(row.parameters || "{}"));
     return list([
       ["mesh", `${number(row.vertices, 6)} vertices, ${number(row.springs, 6)} springs`], ["integrator", row.integrator], ["time step", row.time_step && step(row.time_step)],
-      ["first guess", row.first_guess], ["iterations at most", row.max_iterations], ["tolerance", row.tolerance === 0 ? "auto" : row.tolerance], ["error asked", row.asked], ["estimated", row.estimated],
+      ["first guess", row.initial_guess], ["iterations at most", row.max_iterations], ["tolerance", row.residual_rtol === 0 ? "auto" : row.residual_rtol], ["error asked", row.error_requested], ["estimated", row.error_estimated],
       ["threads", row.threads], ["frames, rounds", row.frames && `${row.frames}, ${row.rounds}`], ...given.map(([name, value]) => [name, String(value)]),
     ]);
   }
@@ -50,7 +50,7 @@ Object.assign(springbench, (() => {
       ["iterations", `${number(row.num_iterations)}, stopped by ${row.termination_reason || "their number"}`],
       ["last residual", row.residual === null ? "none: it minimises nothing" : `${fixed(row.residual)} J^½`],
       ["largest strain", percent(row.max_strain)], ["99 % of springs below", row.strain_p99 === undefined || row.strain_p99 === null ? null : percent(row.strain_p99)],
-      ["deepest inside an obstacle", row.penetration ? `${number(row.penetration)} m` : null],
+      ["deepest inside an obstacle", row.penetration_depth ? `${number(row.penetration_depth)} m` : null],
     ]);
   }
 
@@ -73,8 +73,8 @@ Object.assign(springbench, (() => {
       element("h3", {}, "Do it again"), code(command(row), "Command that repeats the run"),
       source && element("h3", {}, "Method"), method(source),
       element("h3", {}, "Made by"), list([
-        ["code", element("span", {}, element("code", {}, commit(row.commit)), ` (sources ${row.code})`)], ["machine", `${row.cpu || "unknown"} (${(row.machine || "").slice(0, 6)})`],
-        ["on", (row.started || "").replace("T", " ").slice(0, 16)], ["timed", row.timing], ["own code", row.own],
+        ["code", element("span", {}, element("code", {}, commit(row.commit)), ` (sources ${row.source_fingerprint})`)], ["machine", `${row.cpu || "unknown"} (${(row.machine_id || "").slice(0, 6)})`],
+        ["on", (row.started_at || "").replace("T", " ").slice(0, 16)], ["timed", row.timing], ["own code", row.plugins],
       ]),
       element("p", {}, element("a", { href: link(sweep.up, `rows/${row.unit}.parquet`) }, "Its rows (Parquet)"), " · ",
         element("a", { href: springbench.address("compare", { sel: key }) }, "Frame by frame")));

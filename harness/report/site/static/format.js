@@ -29,8 +29,8 @@ Object.assign(springbench, (() => {
   // List the code versions and machines of figures: each pair once, the newest first.
   const commit = text => (text || "unknown").slice(0, 10) + (/dirty/.test(text) ? "-dirty" : "");
   function madeBy(some, most = 2) {
-    const told = [...new Set(some.map(one => `${one.cpu || "unknown processor"}${one.machine ? ` (machine ${one.machine.slice(0, 6)})` : ""}, code ${commit(one.commit)}`))];
-    const machines = new Set(some.map(one => one.machine || one.cpu)).size;
+    const told = [...new Set(some.map(one => `${one.cpu || "unknown processor"}${one.machine_id ? ` (machine ${one.machine_id.slice(0, 6)})` : ""}, code ${commit(one.commit)}`))];
+    const machines = new Set(some.map(one => one.machine_id || one.cpu)).size;
     const compare = machines > 1 ? ` · ${machines} machines: compare times within one, ratios of such times across them` : "";
     return `made on ${told.slice(0, most).join("; on ")}${told.length > most ? `; and by ${told.length - most} more` : ""}${compare}`;
   }

@@ -25,7 +25,7 @@
     return sweep.made.slice(0, 3).map(m => element("div", {},
       `${m.cpu || "unknown processor"}, ${many(m.cores || 0, "core")}${m.memory_gib ? `, ${m.memory_gib} GiB` : ""}`, element("br"),
       element("span.muted", {}, `code `, element("code", {}, commit(m.commit)),
-        `${m.machine ? ` · machine ${m.machine.slice(0, 6)}` : ""} · ${day(m.from) === day(m.to) ? day(m.to) : `${day(m.from)} to ${day(m.to)}`}`)));
+        `${m.machine_id ? ` · machine ${m.machine_id.slice(0, 6)}` : ""} · ${day(m.from) === day(m.to) ? day(m.to) : `${day(m.from)} to ${day(m.to)}`}`)));
   }
 
   function way(sweep, finding) {

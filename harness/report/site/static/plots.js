@@ -9,11 +9,11 @@
   const OF_RUNS = {
     size: {
       title: "Time by size", note: "The median over frames and rounds, with its quartiles, at each size; point at a mark to read its run.",
-      x: [axis("vertices", "vertices"), axis("size", "mesh size")], y: [axis("step", "ms a step"), axis("least", "ms, the least step"), axis("warm", "ms to prepare, warm"), axis("local", "ms, a local step"), axis("global", "ms, a global step"), axis("iterations", "iterations a step", PLAIN), axis("strain", "largest strain, %", PLAIN)],
+      x: [axis("vertices", "vertices"), axis("size", "mesh size")], y: [axis("step", "ms a step"), axis("least", "ms, the least step"), axis("warm", "ms to prepare, warm"), axis("local", "ms, a local step"), axis("global", "ms, a global step"), axis("num_iterations", "iterations a step", PLAIN), axis("max_strain", "largest strain, %", PLAIN)],
     },
     accuracy: {
       title: "Time and accuracy", shape: "points", note: "What a step takes against how far its last iterate is from a minimum: to the lower left is better.",
-      x: [axis("step", "ms a step"), axis("least", "ms, the least step")], y: [axis("residual", "last residual, J^½"), axis("strain", "largest strain, %", PLAIN)],
+      x: [axis("step", "ms a step"), axis("least", "ms, the least step")], y: [axis("residual", "last residual, J^½"), axis("max_strain", "largest strain, %", PLAIN)],
     },
   };
 
@@ -30,11 +30,11 @@
       return {
         label: some[0].label, what: some[0].scene, scene: some[0].scene, panel: some[0].scene, runs: column("key"), vertices: column("vertices"), size: column("size"), step: column("step"),
         step_low: column("lower"), step_high: column("upper"), least: column("least"), warm: column("warm"), local: column("local"), global: column("global"),
-        iterations: column("num_iterations"), residual: column("residual"), strain: some.map(row => row.max_strain === null ? null : 100 * row.max_strain),
+        num_iterations: column("num_iterations"), residual: column("residual"), max_strain: some.map(row => row.max_strain === null ? null : 100 * row.max_strain),
         older: some.map(row => row.by === "other code"),
       };
     });
-    const hover = [["vertices", "vertices"], ["step", "ms a step"], ["least", "least ms"], ["iterations", "iterations"], ["residual", "last residual"], ["strain", "largest strain, %"]];
+    const hover = [["vertices", "vertices"], ["step", "ms a step"], ["least", "least ms"], ["num_iterations", "iterations"], ["residual", "last residual"], ["max_strain", "largest strain, %"]];
     return { ...OF_RUNS[id], filters: ["scene"], hover, items, marks: table.marks, references: Object.fromEntries(items.map(item => [item.label, own(table.references, item.label.split(",")[0])])) };
   }
 

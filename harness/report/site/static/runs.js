@@ -122,7 +122,7 @@
         changes.rows = shown;
         changes.sort = [sort.replace("-", ""), sort.startsWith("-")];
         total.textContent = shown.length === all.length ? many(all.length, "run") : `${count(shown.length)} of ${many(all.length, "run")}`;
-        by.textContent = shown.length ? madeBy([...shown].sort((a, b) => (b.started || "").localeCompare(a.started || ""))) : "";
+        by.textContent = shown.length ? madeBy([...shown].sort((a, b) => (b.started_at || "").localeCompare(a.started_at || ""))) : "";
         note.textContent = shown.some(row => row.preempted) ? `! ${DOUBT}` : "";
         for (const { key, select } of facets) {
           const sizes = new Map();
