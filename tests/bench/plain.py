@@ -27,7 +27,7 @@ def refuse_energy(bundles, shares, number, x, right, out):
 
 def energy(bundles, number, x, measure):
     """Half of each spring's k |v|^2, and what holds each vertex."""
-    own, neighbour, kinds, weights = bundles.own, bundles.neighbour, bundles.weight_offset, bundles.weights
+    own, neighbour, kinds, weights = bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights
     total = 0.0
     for lane in range(LANES):
         i = own[LANES * number + lane]
@@ -41,7 +41,7 @@ def energy(bundles, number, x, measure):
 
 def newton(bundles, number, x, right, majorant, near):
     """Vertex block descent: a Newton step of each vertex; springs that are short are not looked for."""
-    own, neighbour, kind, weights = bundles.own, bundles.neighbour, bundles.weight_offset, bundles.weights
+    own, neighbour, kind, weights = bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights
     for lane in range(LANES):
         i, at = own[LANES * number + lane], RHS_STRIDE * number + lane
         held = right[at + 3 * LANES]

@@ -2,7 +2,7 @@
 
 A kernel is compiled twice, as it is and with plain functions (`tests.bench.plain`) in the place of the vectors that it
 calls. Both must find the same, and are then timed in turns, A B B A or B A A B by a coin, by this thread's CPU time;
-the interval is the gates' (see README.md). What buys less than 15 % has no place in `solvers/vectors`.
+the interval is the gates' (see README.md). What buys less than 15 % has no place in `solvers/simd`.
 """
 
 from __future__ import annotations
@@ -72,11 +72,11 @@ def recompiled(kernel: Any, plain: dict[str, Callable[..., Any]]) -> Any:
         value = function.__globals__.get(name)
         if name in plain and value is not None:
             names[name] = _compiled(plain[name])
-        elif isinstance(value, ModuleType) and value.__name__.startswith("solvers."):
+        elif isinstance(value, ModuleType) and value.__name__.startswith("springbench.solvers."):
             names[name] = ModuleType(name)
             found = {key: part for key, part in plain.items() if hasattr(value, key)}
             vars(names[name]).update(vars(value) | {key: _compiled(part) for key, part in found.items()})
-        elif hasattr(value, "py_func") and value.__module__.startswith("solvers.") and _reaches(value, set(plain)):
+        elif hasattr(value, "py_func") and value.__module__.startswith("springbench.solvers.") and _reaches(value, set(plain)):
             names[name] = recompiled(value, plain)
     copy = FunctionType(function.__code__, function.__globals__ | names, function.__name__, function.__defaults__)
     return _compiled(copy)
@@ -124,8 +124,8 @@ def of_springs() -> Iterator[Case]:
     """Over bundles of eight vertices with their springs."""
     state, _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
     parts, p, out = state.spring_packets, window.trial_position, window.trial_descent.copy()
-    whole = 0, len(parts.start) - 1
-    short = {"project": plain.refuse, "correct": plain.refuse}
+    whole = 0, len(parts.packet_start) - 1
+    short = {"add_spring_projection": plain.refuse, "add_spring_forces": plain.refuse}
     yield Case(
         "projections", spring_local_step.add_projection, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,)
     )
@@ -135,11 +135,11 @@ def of_springs() -> Iterator[Case]:
     norm = (
         state.norm_packets,
         0,
-        len(state.norm_packets.start) - 1,
+        len(state.norm_packets.packet_start) - 1,
         window.direction.copy(),
-        state.iteration_plan.measure,
+        state.iteration_plan.norm_diagonal,
     )
-    yield Case("norm of Q", spring_local_step.squared_norm, norm, {"energy": plain.energy}, ())
+    yield Case("norm of Q", spring_local_step.squared_norm, norm, {"spring_squared_norm": plain.energy}, ())
 
 
 def of_descent() -> Iterator[Case]:
@@ -152,14 +152,14 @@ def of_descent() -> Iterator[Case]:
         state.right_hand_side,
         window.trial_descent.copy(),
     )
-    none = {"descend": plain.refuse_energy}
+    none = {"spring_energy_and_descent": plain.refuse_energy}
     yield Case("objective and gradient", spring_objective.value_and_descent, descent, none, (4,))
 
 
 def of_dots() -> Iterator[Case]:
     """Over the vectors of L-BFGS."""
     _, _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
-    both = {"dot": plain.dot, "dots": plain.dots}
+    both = {"ordered_dot": plain.dot, "ordered_dot_pair": plain.dots}
     yield Case("a step of L-BFGS", accelerated_descent.accept_trial, (window, window.correction.copy()), both, ())
 
 
@@ -167,14 +167,14 @@ def of_vbd() -> Iterator[Case]:
     """Over colours."""
     blocks, spaces, beside, right, _, work, p, _ = given(vbd_sweeps, "run_iterations", solving("vbd"))
     yield Case(
-        "sweep", vbd_sweeps._sweep_vertices, (blocks, spaces, beside, right, p, work), {"descend": plain.newton}, (4,)
+        "sweep", vbd_sweeps._sweep_vertices, (blocks, spaces, beside, right, p, work), {"vbd_newton_step": plain.newton}, (4,)
     )
 
 
 def of_supernodal() -> Iterator[Case]:
     """Over the panels of Q's factor."""
     Q, b = system()
-    panel = {"add_forward": plain.add_forward, "set_backward": plain.set_backward}
+    panel = {"add_panel_product": plain.add_forward, "set_transposed_product": plain.set_backward}
     for precision in ("float64", "float32"):
         factor = SupernodalCholesky(Q, precision=precision)
         solve = given(supernodal_cholesky, "solve_from_arrays", lambda factor=factor: factor.solve(b, np.empty_like(b)))
@@ -183,8 +183,14 @@ def of_supernodal() -> Iterator[Case]:
 
 def of_block() -> Iterator[Case]:
     """Over the fronts of a Hessian."""
-    names = ("subtract_product", "divide", "factorise_corner", "solve_columns", "solve_rows", "add")
-    tiles = {name: getattr(plain, name) for name in names}
+    tiles = {
+        "subtract_tile_product": plain.subtract_product,
+        "solve_tile_triangle": plain.divide,
+        "factorise_tile": plain.factorise_corner,
+        "forward_solve_tile": plain.solve_columns,
+        "backward_solve_tile": plain.solve_rows,
+        "add_vector": plain.add,
+    }
     newton = solving("newton")
     yield Case(
         "factorisation",
@@ -199,8 +205,8 @@ def of_block() -> Iterator[Case]:
 def of_rows() -> Iterator[Case]:
     """Over sparse rows, of Q and of the levels above it."""
     Q, b = system()
-    cg, rows = ConjugateGradients(Q), {"gather": plain.gather}
-    for what, name, found in (("product with Q", "multiply_and_dot", (4,)), ("smoothing, float32", "smooth", (7, 9))):
+    cg, rows = ConjugateGradients(Q), {"sparse_row_product": plain.gather}
+    for what, name, found in (("product with Q", "multiply_sparse_and_dot", (4,)), ("smoothing, float32", "chebyshev_step", (7, 9))):
         arguments = given(multigrid_kernels, name, lambda: cg.solve(b, np.empty_like(b)))
         yield Case(what, getattr(multigrid_kernels, name), arguments, rows, found)
 
@@ -222,24 +228,25 @@ def of_eights() -> Iterator[Case]:
     space = collisions.allocate_collisions(len(pairs.vertices), made.thickness, made.reach)
     slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
     arguments = pairs, collisions.pad_positions(p), np.empty((9, 8)), slots, space
-    yield Case("closest points of pairs", collisions.gather_collisions, arguments, {"eight": plain.eight}, (2, 3))
+    yield Case("closest points of pairs", collisions.gather_collisions, arguments, {"compute_packet_distances": plain.eight}, (2, 3))
 
 
 CASES = {
-    "forces": of_springs,
-    "descent": of_descent,
-    "dots": of_dots,
-    "vbd": of_vbd,
-    "supernodal": of_supernodal,
-    "block": of_block,
-    "rows": of_rows,
-    "eights": of_eights,
+    "spring_forces": of_springs,
+    "spring_descent": of_descent,
+    "dot_products": of_dots,
+    "vbd_packets": of_vbd,
+    "panel_products": of_supernodal,
+    "front_tiles": of_block,
+    "sparse_rows": of_rows,
+    "float64x8": of_eights,
 }
-"""By the file of `solvers/vectors`."""
+"""By the file of `solvers/simd`."""
 
 
 def ratio(case: Case) -> tuple[float, float, float]:
     """Plain over vectors: the median, and the interval around it. Raises AssertionError where they find otherwise."""
+    assert _reaches(case.kernel, set(case.plain)), f"{case.what}: calls none of {sorted(case.plain)}"
     kernels = [recompiled(case.kernel, names) for names in (case.plain, {})]
     kept, answers = [np.copy(case.arguments[k]) for k in case.found], []
     for kernel in kernels:
