@@ -115,8 +115,8 @@ PLUGIN_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     ),
     "report": ("a function of rows and a folder", callable),
     "integrator": (
-        "an object of springbench.solvers.model.integrators.Integrator, of "
-        "finite numbers, with `inertia_factor` above 0",
+        "an object of a class of springbench.solvers.model.integrators (SingleStageIntegrator, RungeKutta, "
+        "GeneralisedAlpha) of finite numbers, with `inertia_factor` above 0",
         lambda made: isinstance(made, integrators.AnyIntegrator) and _is_valid_integrator(made),
     ),
 }

@@ -32,7 +32,7 @@ InitialGuess = Literal["assignment", "current", "inertial", "motion", "coarse"]
 
 def registered_name(table: PluginTable) -> Any:
     """Return the type of a registered name or a plug-in (see
-    `springbench.solvers.plugins.plugin_discovery.plugin_discovery`).
+    `springbench.solvers.plugins.plugin_discovery`).
 
     The validation context provides the folder of the config.
     """

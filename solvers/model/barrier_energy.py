@@ -2,9 +2,9 @@
 
 A method that moves from p along a search direction limits the step size to `max_step_size` at each iterate, so that it
 stays on the side on which it started. The line search of the descent methods does this
-(`springbench.solvers.methods.base.descent_method.backtracking_line_search`); the accelerated methods shorten their
+(`springbench.solvers.iteration.descent_method.backtracking_line_search`); the accelerated methods shorten their
 trial steps
-(`springbench.solvers.methods.local_global.reference_local_global.accelerated_local_global`). Positions from another
+(`springbench.solvers.methods.local_global.accelerated_local_global`). Positions from another
 source, such as the inertial
 prediction or an initial guess, are accepted if the straight path to them is free of collisions.
 """

@@ -1,6 +1,7 @@
 """A public name has one meaning, and no file uses two classes of one name."""
 
 import ast
+import re
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
@@ -75,3 +76,32 @@ def test_a_clash_is_found_under_another_name_too() -> None:
     assert met(parsed(texts)) == []
     assert met(parsed([*texts, ("a.w", "from a.x import Step as One\nfrom a.y import Step")])) == ["a.w: Step"]
     assert met(parsed([*texts, ("a.v", "from a.x import Step as Energy\nfrom a.y import Step")])) == []
+
+
+def find_unresolved(text: str, root: Path) -> set[str]:
+    """Return dotted names `springbench.harness...` and `springbench.solvers...` in a text that nothing defines."""
+    return {name for name in set(re.findall(r"\bspringbench((?:\.[A-Za-z]\w*)+)", text)) if not _is_defined(name, root)}
+
+
+def _is_defined(name: str, root: Path) -> bool:
+    _, *parts = name.split(".")
+    if parts[0] not in ("harness", "solvers"):
+        return True
+    place = root
+    while parts and (place / parts[0]).is_dir():
+        place /= parts.pop(0)
+    if not parts:
+        return True
+    is_module = (place / f"{parts[0]}.py").is_file()
+    file = place / (f"{parts.pop(0)}.py" if is_module else "__init__.py")
+    return not parts or re.search(rf"\b{parts[0]}\b", file.read_text()) is not None
+
+
+def test_dotted_names_in_texts_of_the_product_are_defined() -> None:
+    pages = [path for path in ROOT.glob("*/README.md") if path.parent.name != "tests"]
+    assert {(path.name, name) for path in (*FILES, *pages) for name in find_unresolved(path.read_text(), ROOT)} == set()
+
+
+def test_a_dotted_name_that_nothing_defines_is_found() -> None:
+    text = "`springbench.solvers.registry.SOLVER_TABLE`, `springbench.solvers.registry.nothing`, springbench.harness.none.x"
+    assert find_unresolved(text, ROOT) == {".solvers.registry.nothing", ".harness.none.x"}

@@ -22,6 +22,7 @@ import numpy as np
 import springbench.solvers.cuda
 from springbench.solvers.cuda.cuda_target import cuda
 from springbench.solvers.linalg import additive_schwarz
+from springbench.solvers.methods import newton, position_based, vertex_block
 
 CAPABILITY = 9, 0
 
@@ -37,20 +38,29 @@ class Compiled(NamedTuple):
     doubles: int = 0
 
 
+def device_modules() -> list[str]:
+    """The modules of kernels: those of `springbench.solvers.cuda`, and `device_*` beside each method."""
+    return [
+        f"{package.__name__}.{name}"
+        for package in (springbench.solvers.cuda, newton, position_based, vertex_block)
+        for _, name, _ in iter_modules(package.__path__)
+        if package is springbench.solvers.cuda or name.startswith("device_")
+    ]
+
+
 def kernels() -> dict[str, Any]:
-    """All kernels of `springbench.solvers.cuda` that a host launches, by names that are the same in the simulator."""
+    """All kernels that a host launches, by names that are the same in the simulator."""
     found = dict[str, Any]()
-    for _, name, _ in iter_modules(springbench.solvers.cuda.__path__):
-        module = import_module(f"{springbench.solvers.cuda.__name__}.{name}")
+    for module in map(import_module, device_modules()):
+        name = module.__name__.rpartition(".")[2]
         own = {k: v for k, v in vars(module).items() if getattr(v, "__module__", None) == module.__name__}
         found |= {f"{name}.{k}": v for k, v in own.items() if hasattr(v, "py_func")}
-        if "kernels" not in own:
-            continue
-        for real in (np.float32, np.float64):
-            more = (additive_schwarz.SUBDOMAIN_SIZE,) if "patch" in signature(own["kernels"]).parameters else ()
-            made: Any = own["kernels"](real, *more)
-            each = {made.py_func.__name__: made} if hasattr(made, "py_func") else made._asdict()
-            found |= {f"{name}.{k}, {real.__name__}": v for k, v in each.items()}
+        for build in (v for k, v in own.items() if k.startswith("build_") and k.endswith("_kernels")):
+            for real in (np.float32, np.float64):
+                more = (additive_schwarz.SUBDOMAIN_SIZE,) if "patch" in signature(build).parameters else ()
+                made: Any = build(real, *more)
+                each = {made.py_func.__name__: made} if hasattr(made, "py_func") else made._asdict()
+                found |= {f"{name}.{k}, {real.__name__}": v for k, v in each.items()}
     return {name: kernel for name, kernel in found.items() if not for_kernels_alone(kernel)}
 
 

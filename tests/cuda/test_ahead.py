@@ -53,8 +53,8 @@ MOST_THREADS = 256
 """Of a block, that kernels are launched with."""
 
 WITHOUT_DOUBLES = (
-    *("vbd_kernels.sweep", "vbd_kernels.extrapolate", "xpbd_kernels.project"),
-    *("schwarz_kernels.gather", "schwarz_kernels.multiply"),
+    *("device_vbd_kernels.sweep_colour", "device_vbd_kernels.extrapolate_iterate"),
+    *("device_xpbd_kernels.project_colour", "schwarz_kernels.restrict_residual", "schwarz_kernels.apply_inverses"),
 )
 """Kernels that in float32 compute nothing in float64: a literal in it would make all that it meets float64."""
 

@@ -2,7 +2,7 @@
 
 Contact acts on single vertices with forces that appear and vanish, and is far stiffer than anything in Q. No constant Q
 contains it, so that it is no projective energy. It provides its stiffness as rows instead, which
-`springbench.solvers.methods.local_global.reference_local_global.half_space_contact` adds to Q in each iteration.
+`springbench.solvers.methods.local_global.half_space_contact` adds to Q in each iteration.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ dominant. Hence S and 2 S^-1 - Q are positive definite. As Q majorises the Hessi
 With bending terms the eigenvalues can exceed 2; D is then the diagonal times half of the largest eigenvalue.
 
 The iterations are accelerated by Chebyshev polynomials, as Wang (2015) accelerates Jacobi's method
-(`springbench.solvers.methods.quasi_newton.windowed_acceleration.chebyshev`). They require nonnegative eigenvalues of
+(`springbench.solvers.methods.quasi_newton.chebyshev`). They require nonnegative eigenvalues of
 I - S Q. For odd l, S is therefore
 divided by the largest possible eigenvalue of S Q, 1 + (m - 1)^l, where m is that of D^-1 Q. The factor of Q serves
 only to compute the residual.

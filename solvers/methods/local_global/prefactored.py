@@ -1,6 +1,6 @@
 """The local-global iteration over a prefactored Q, independent of the backend of its two steps.
 
-The method is described in `springbench.solvers.methods.local_global.reference_local_global.reference_local_global`.
+The method is described in `springbench.solvers.methods.local_global.reference_local_global`.
 """
 
 from __future__ import annotations

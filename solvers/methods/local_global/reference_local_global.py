@@ -10,7 +10,7 @@ from Q, and their columns contribute to the right-hand side.
 
 Backends differ only in the implementation of the two steps: `DenseLocalGlobal` uses NumPy matrices,
 `SparseLocalGlobal` SciPy matrices, and
-`springbench.solvers.methods.local_global.reference_local_global.compiled_local_global` compiled code.
+`springbench.solvers.methods.local_global.compiled_local_global` compiled code.
 """
 
 from __future__ import annotations

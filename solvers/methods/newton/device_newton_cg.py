@@ -1,4 +1,4 @@
-"""Newton-CG on a device: the iterates of `springbench.solvers.methods.newton.newton_direct.newton_cg` with additive
+"""Newton-CG on a device: the iterates of `springbench.solvers.methods.newton.newton_cg` with additive
 Schwarz.
 
 Positions and gradients are float64, directions `real`: p + t d retains the digits of positions, and the next gradient

@@ -5,7 +5,7 @@
 For springs Q majorises H, so the eigenvalues of Q^-1 H are at most 1. Conjugate gradients stop at a direction of
 negative curvature with their current iterate; at the first direction, that is -Q^-1 g, a local-global iteration.
 
-`springbench.solvers.methods.base.preconditioners` documents the other preconditioners, and the matrix that replaces
+`springbench.solvers.iteration.preconditioners` documents the other preconditioners, and the matrix that replaces
 Q with active
 contacts. An iteration converges friction, and may consist of several steps, as in Newton's method.
 """
@@ -57,7 +57,7 @@ class NewtonCG(PrecisionOptions):
     """Newton's method without a factorisation of the Hessian; needs as much memory as local-global.
 
     Args:
-        preconditioner: of conjugate gradients (`springbench.solvers.methods.base.preconditioners`); a device
+        preconditioner: of conjugate gradients (`springbench.solvers.iteration.preconditioners`); a device
         supports schwarz only.
     """
 

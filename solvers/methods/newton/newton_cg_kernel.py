@@ -1,7 +1,7 @@
 """Compiled conjugate gradients on the exact Hessian, preconditioned by a factor of Q.
 
 H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see
-`springbench.solvers.methods.newton.newton_direct.newton_cg`
+`springbench.solvers.methods.newton.newton_cg`
 """
 
 from __future__ import annotations

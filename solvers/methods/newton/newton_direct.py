@@ -5,14 +5,14 @@
 The Hessian of compressed springs may be indefinite. It remains exact wherever it has a Cholesky factor, which preserves
 quadratic convergence. Where it has none, an increasing part of the springs' negative lateral stiffness is removed, and
 finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite`, see
-`springbench.solvers.methods.newton.newton_direct.hessian_regularisation`); clamping all of them (Teran et al. 2005)
+`springbench.solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005)
 converges linearly. Where the
 slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a saddle. From a stationary
 point whose exact Hessian has no factor, the method escapes
-(`springbench.solvers.methods.newton.newton_direct.negative_curvature`).
+(`springbench.solvers.methods.newton.negative_curvature`).
 
 With active contacts, an iteration converges friction and may consist of several steps
-(`springbench.solvers.methods.newton.newton_direct.friction_gauss_seidel`).
+(`springbench.solvers.methods.newton.friction_gauss_seidel`).
 """
 
 from __future__ import annotations

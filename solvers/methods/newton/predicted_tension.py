@@ -3,7 +3,7 @@
     H(t) = M/dt^2 + sum_e k nn' + t_e/l_e (I - nn'),   (H(t) + s M/dt^2) d = -grad g(p)
     t_e <- k_e (l_e + n (A d)_e - r_e)
 
-`springbench.solvers.methods.newton.newton_direct.hybrid_newton` gives the motivation. If H(t) is not positive
+`springbench.solvers.methods.newton.hybrid_newton` gives the motivation. If H(t) is not positive
 definite, a step along unstable
 modes is longer the closer s is to the smallest value that has a factor (More and Sorensen 1983). So a smaller s is
 tried after each step that allows it. The ratio of reduction is squared if there was a factor; otherwise its square root

@@ -7,7 +7,7 @@ iteration linearises all springs, solves for the increments of their tensions t,
     (J W J' + K^-1) dt = C(p) - K^-1 t,    p <- p - W J' dt,   t <- t + dt
 
 with C the elongations of the springs (m,), J its derivative, a row n_e at i and -n_e at j, and W = 1/q the compliance
-of the vertices (`springbench.solvers.methods.base.vertex_terms`). This is the paper's formula in terms of forces,
+of the vertices (`springbench.solvers.iteration.vertex_terms`). This is the paper's formula in terms of forces,
 lambda = -t dt^2.
 It is solved for s = K^-1/2 t instead, which avoids a division by a stiffness:
 

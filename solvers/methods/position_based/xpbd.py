@@ -7,14 +7,14 @@ k (|p_i - p_j| - r):
     dt = (k (|p_i - p_j| - r) - t) / (1 + k (1/q_i + 1/q_j)),    p_i -= dt/q_i n,    p_j += dt/q_j n
 
 with n the direction of the spring and q = c m/dt^2 + w the anchor stiffness of a vertex, so that pins of any weight
-need no separate constraints (see `springbench.solvers.methods.base.vertex_terms`). This is the paper's formula in
+need no separate constraints (see `springbench.solvers.iteration.vertex_terms`). This is the paper's formula in
 terms of forces,
 lambda = -t dt^2, and valid from k = 0 to the largest k. Small steps (Macklin et al. 2019) divides the time step
 instead, with one iteration per substep.
 
 Neither minimises the objective of the step. Tensions are accumulated along directions that rotate during the iteration,
 without correction terms. The fixed point is the minimiser if springs do not rotate (a straight chain), and close to it
-if they rotate little in a step. `device: cuda` computes the same iterates in `springbench.solvers.cuda.device_xpbd`.
+if they rotate little in a step. `device: cuda` computes the same iterates in `springbench.solvers.methods.position_based.device_xpbd`.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class PreparedXpbdSmallSteps(IterativeSolver):
 def _prepare_on_device(
     method: PrecisionOptions, system: System, anchor_stiffness: NDArray[np.float64], solver: str, *, small_steps: bool
 ) -> PreparedSolver:
-    """Prepare the method on a CUDA device (`springbench.solvers.cuda.device_xpbd`)."""
+    """Prepare the method on a CUDA device (`springbench.solvers.methods.position_based.device_xpbd`)."""
     from springbench.solvers.cuda.cuda_device import require_device  # for those who ask for it
 
     require_device(solver)

@@ -11,7 +11,7 @@ positive and below Q, s y is at least y Q^-1 y, and H stays positive definite. A
 are not projective do not contribute to Q.
 
 `preconditioner: a-jacobi` replaces Q^-1 by S, the aggregate of several Jacobi sweeps
-(`springbench.solvers.methods.local_global.reference_local_global.aggregated_jacobi`): a product with a sparse
+(`springbench.solvers.methods.local_global.aggregated_jacobi`): a product with a sparse
 matrix, which suits a graphics processor.
 """
 

@@ -9,7 +9,7 @@ Shen et al. 2024; they precondition by the diagonal of the Hessian, as interior-
 H d is a product, element by element. If d is no descent direction, or the model has negative curvature along it, d is
 reset to -z: a local-global iteration. A step without sufficient decrease is halved, and the step size is
 collision-free. With active surface contacts, P = S Q S replaces Q
-(`springbench.solvers.methods.base.preconditioners`). Contact of
+(`springbench.solvers.iteration.preconditioners`). Contact of
 single vertices is not supported: it activates abruptly and friction sticks within 1e-8 m, so no quadratic model
 holds for a step along d. Landing sheets took 340 to 2,600 iterations where L-BFGS took 23 to 135.
 """
@@ -45,7 +45,7 @@ class NonlinearCG:
     """Preconditioned nonlinear conjugate gradients for all energies; needs as much memory as local-global.
 
     Args:
-        preconditioner: see `springbench.solvers.methods.base.preconditioners`.
+        preconditioner: see `springbench.solvers.iteration.preconditioners`.
     """
 
     omitted_defaults: ClassVar[frozenset[str]] = frozenset({"preconditioner"})

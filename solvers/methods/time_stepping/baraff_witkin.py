@@ -7,7 +7,7 @@ codes use it. It has the order of the integrator that defines the step, 1 with i
 Ko 2002) and midpoint. The accuracy of a step cannot be controlled: where springs rotate far in one step, x is far from
 the minimum. E is zero wherever H has a Cholesky factor. Where compressed springs leave it none, part of their negative
 lateral stiffness is removed, and if necessary all of it
-(`springbench.solvers.methods.newton.newton_direct.hessian_regularisation`); Choi and Ko
+(`springbench.solvers.methods.newton.hessian_regularisation`); Choi and Ko
 always remove all of it.
 """
 

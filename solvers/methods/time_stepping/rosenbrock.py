@@ -8,7 +8,7 @@ with P = p + sum a u_j and V = v + sum a w_j. The velocities are eliminated, so 
 is factorised at the start of the step. K is the exact Hessian of the energies there, as the order conditions require.
 If the step is too long for compressed springs, it may have no Cholesky factor. Adaptive steps are then halved. Fixed
 steps reduce the springs' negative lateral stiffness
-(`springbench.solvers.methods.newton.newton_direct.hessian_regularisation`); only ROS2
+(`springbench.solvers.methods.newton.hessian_regularisation`); only ROS2
 retains its order in that case.
 """
 
