@@ -103,5 +103,7 @@ def test_dotted_names_in_texts_of_the_product_are_defined() -> None:
 
 
 def test_a_dotted_name_that_nothing_defines_is_found() -> None:
-    text = "`springbench.solvers.registry.SOLVER_TABLE`, `springbench.solvers.registry.nothing`, springbench.harness.none.x"
+    text = (
+        "springbench.solvers.registry.SOLVER_TABLE, `springbench.solvers.registry.nothing`, springbench.harness.none.x"
+    )
     assert find_unresolved(text, ROOT) == {".solvers.registry.nothing", ".harness.none.x"}
