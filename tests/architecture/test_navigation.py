@@ -15,18 +15,20 @@ ROOT = Path(__file__).resolve().parents[2]
 
 ANSWERS = {
     "where is the time of impact computed?": "solvers/contact/ccd.py:pair_time_of_impact",
-    "which file adds the Hessian of friction?": "solvers/contact/potentials/friction.py:write_friction_hessian",
+    "which file adds friction's Hessian?": "solvers/contact/potentials/friction.py:write_friction_hessian",
     "where does a row get its residual?": "harness/simulation/instrumentation_pass.py:compute_returned_residual",
-    "where is the numeric phase of the Cholesky factorisation?": "solvers/linalg/cholesky/numeric_factorisation.py:factorise_supernodes",
+    "where is the numeric phase of Cholesky?": (
+        "solvers/linalg/cholesky/numeric_factorisation.py:factorise_supernodes"
+    ),
     "what do I change to add a stop criterion?": "solvers/model/step_problem.py:StopRule",
-    "where is the barrier of incremental potential contact?": "solvers/contact/potentials/barrier.py:barrier_derivatives",
+    "where is the barrier function?": "solvers/contact/potentials/barrier.py:barrier_derivatives",
     "where are candidate pairs found?": "solvers/contact/broad_phase/bvh.py:find_candidate_pairs",
     "where is the local step of local-global?": "solvers/kernels/spring_local_step.py:run_local_step",
     "where is the global step solved?": "solvers/methods/local_global/prefactored.py:PreparedLocalGlobal",
     "where is a spring's Hessian?": "solvers/kernels/spring_hessian.py:assemble_hessian",
     "where is the Armijo condition?": "solvers/kernels/line_search_conditions.py:is_armijo_step",
     "how does vertex block descent sweep?": "solvers/methods/vertex_block/vbd_sweeps.py:_sweep_vertices",
-    "where are the coefficients of implicit Runge-Kutta methods?": "solvers/model/integrators/implicit_runge_kutta.py:RungeKutta",
+    "where are Runge-Kutta coefficients?": "solvers/model/integrators/implicit_runge_kutta.py:RungeKutta",
     "which column has which unit?": "harness/results/run_schema.py:ColumnSpec",
     "where is a step timed?": "harness/simulation/timing_pass.py:measure_run",
     "where is a minimum certified?": "harness/reference/certified_minimum.py:certify_minimum",
