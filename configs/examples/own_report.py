@@ -13,7 +13,7 @@ def iterations(rows: pa.Table, folder: Path) -> list[Path]:
     steps = [row for row in rows.to_pylist() if row["phase"] == "step" and row["round"] == 0]
     for solver in dict.fromkeys(row["solver"] for row in steps):
         mine = [row for row in steps if row["solver"] == solver]
-        axes.plot([row["frame"] for row in mine], [row["iterations"] for row in mine], label=solver)
+        axes.plot([row["frame"] for row in mine], [row["num_iterations"] for row in mine], label=solver)
     axes.set(xlabel="step", ylabel="iterations")
     axes.legend()
     figure.savefig(path := folder / "iterations.png")

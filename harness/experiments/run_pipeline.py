@@ -39,7 +39,7 @@ from springbench.harness.experiments.source_fingerprint import (
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.recording.obstacle_shapes import list_obstacles
 from springbench.harness.recording.recorder_interface import (
-    INTERSECTIONS_ENTITY,
+    INTERSECTION_FREE_PROPERTY,
     FrameSamples,
     RecordedFrame,
     RecordingInfo,
@@ -422,7 +422,7 @@ def _open_recorder(
         "springs": len(scene.all_springs.edges),
         "frames": run.frames,
         **outcome,
-        INTERSECTIONS_ENTITY: scene.has_self_contact,
+        INTERSECTION_FREE_PROPERTY: scene.has_self_contact,
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,

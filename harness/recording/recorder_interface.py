@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from springbench.harness.scenes.surface_obstacles import AnySurface
 
 
-LAYOUT_VERSION = 2
+LAYOUT_VERSION = 3
 """Version of the layout of entities and columns; recordings of another version are rejected."""
 
 
-INTERSECTIONS_ENTITY = "self_contact"
+INTERSECTION_FREE_PROPERTY = "prevents_self_intersection"
 """Property of a recording that states whether an effect prevents self-intersection of the mesh."""
 
 NUM_SAMPLES = 8

@@ -124,7 +124,7 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> RecordingR
             triangles=read_triangles(source),
             springs=springs["springs"].reshape(-1, 2).astype(np.int64),
             rest_lengths=springs["rest_lengths"].astype(np.float64),
-            pinned_vertices=springs["pinned"].astype(np.int64),
+            pinned_vertices=springs["pinned_vertices"].astype(np.int64),
             strain_range=float(springs["strain_range"][0]),
             scalars=_group_by_frame(_read_scalars(source)),
             properties=facts,
@@ -209,13 +209,16 @@ def open_recording_source(path: Path) -> Generator[RecordingSource]:
 
 
 def read_network(source: RecordingSource) -> dict[str, NDArray[Any]]:
-    """Return the constant arrays: springs (2m,), rest_lengths (m,), pinned (q,), strain_range (1,), time_step (1,)."""
+    """Return the constant arrays.
+
+    They are springs (2m,), rest_lengths (m,), pinned_vertices (q,), strain_range (1,) and time_step (1,).
+    """
     for chunk in source.iterate_chunks(content="/network"):
         batch = chunk.to_record_batch()
         names = [name for name in batch.schema.names if name != _ROW_ID]
         # Rerun writes no column for an empty array: a mesh without springs, or without pins.
-        none = dict.fromkeys(("springs", "rest_lengths", "pinned"), np.empty(0))
-        if "layout" not in names or int(read_cell(batch, "layout")[0]) != LAYOUT_VERSION:
+        none = dict.fromkeys(("springs", "rest_lengths", "pinned_vertices"), np.empty(0))
+        if "layout_version" not in names or int(read_cell(batch, "layout_version")[0]) != LAYOUT_VERSION:
             problem = "is laid out as another version of springbench did it; do its run again, with --rerun"
             raise InputError(InputMistake(problem, file=source.path))
         return none | {name: read_cell(batch, name) for name in names}

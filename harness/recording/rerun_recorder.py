@@ -12,7 +12,7 @@ Entities:
   `/scene/mesh`: positions, exact to float32; also `/scene/pins`, `/scene/springs`, `/scene/obstacles/*`.
   `/scene/forces/*`: arrows, hidden at first.
   `/scene/scale`: strain colour scale.
-  `/energy/*`, `/residual`, `/iterations`, `/strain/largest`, `/milliseconds/*`: scalars by `frame` and `time`.
+  `/energy/*`, `/residual`, `/num_iterations`, `/max_strain`, `/milliseconds/*`: scalars by `frame` and `time`.
   `/energy_change/*`: change of each energy, relative to its largest change.
   `/convergence/residual`, `/convergence/objective`: values by `iteration` for each frame listed in `/convergence`.
   `/curves/*`: the convergence curves as drawings.
@@ -49,7 +49,7 @@ index."""
 _MAX_BUFFERED_ROWS = 100_000
 """Maximum number of buffered vertices, summed over the buffered frames."""
 
-_STYLED_ENTITIES = ("/milliseconds/", "/strain/largest", "/residual/log10")
+_STYLED_ENTITIES = ("/milliseconds/", "/max_strain", "/residual/log10")
 """Scalars that the layout plots; only these get a line style."""
 
 _STRIP_TYPE: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
@@ -112,8 +112,8 @@ class RerunRecorder:
             self._energies.setdefault(name, {})[frame.index] = value
         largest = float(np.abs(strain).max(initial=0.0))
         self._ends = widen_range(self._ends, strain)
-        self._add_scalars(frame.index, {"/strain/largest": largest, "/iterations": frame.num_iterations})
-        crossed = {} if frame.num_intersections is None else {"/intersections": frame.num_intersections}
+        self._add_scalars(frame.index, {"/max_strain": largest, "/num_iterations": frame.num_iterations})
+        crossed = {} if frame.num_intersections is None else {"/num_intersections": frame.num_intersections}
         self._add_scalars(
             frame.index, crossed | {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)}
         )
@@ -189,12 +189,12 @@ class RerunRecorder:
         facts: dict[str, Any] = {k: [v] for k, v in stated.items()}
         self._stream.send_property("run", rr.AnyValues(**facts))
         network: dict[str, Any] = {
-            "layout": LAYOUT_VERSION,
+            "layout_version": LAYOUT_VERSION,
             "time_step": info.time_step,
             "strain_range": info.strain_range,
             "springs": info.springs.ravel().astype(np.uint32),
             "rest_lengths": info.rest_lengths,
-            "pinned": info.pinned_vertices.astype(np.uint32),
+            "pinned_vertices": info.pinned_vertices.astype(np.uint32),
         }
         self._stream.log("/network", rr.AnyValues(**network), static=True)
         document = rr.TextDocument(viewer_blueprint.format_run_document(info), media_type=rr.MediaType.MARKDOWN)

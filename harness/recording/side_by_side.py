@@ -34,10 +34,10 @@ from springbench.harness.recording.viewer_blueprint import build_panels, build_p
 
 _QUANTITIES = {
     "/residual/log10": "log10 residual [J^(1/2)]",
-    "/strain/largest": "Largest strain of a spring",
+    "/max_strain": "Largest strain of a spring",
     "/milliseconds/step": "Milliseconds of a step",
     "/energy/springs": "Elastic energy [J]",
-    "/iterations": "Iterations of a step",
+    "/num_iterations": "Iterations of a step",
 }
 _MAX_LISTED_PROPERTIES = 3
 """Number of quantities shown at once; the others are in another tab."""

@@ -115,7 +115,7 @@ def build_blueprint(
             value_range=value_ranges.get("/energy_change", _SHARE_RANGE),
         ),
         build_plot("log10 residual [J^(1/2)]", ["+ /residual/log10"], last=last),
-        build_plot("Largest strain of a spring", ["+ /strain/largest"], last=last),
+        build_plot("Largest strain of a spring", ["+ /max_strain"], last=last),
         build_plot(
             "Milliseconds by phase",
             ["+ /milliseconds/**"],
@@ -159,7 +159,7 @@ def _build_solve_plots(last: int, ends: ValueRanges) -> rrb.Vertical:
             last=last,
             value_range=ends.get("/energy_change", _SHARE_RANGE),
         ),
-        build_plot("Largest strain of a spring", ["+ /strain/largest"], last=last),
+        build_plot("Largest strain of a spring", ["+ /max_strain"], last=last),
         row_shares=[1.0, _LIST_HEIGHT_SHARE, 1.0],
         name="By iteration",
     )

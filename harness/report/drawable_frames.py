@@ -41,8 +41,8 @@ def max_recorded_strain(replay: RecordingReplay) -> float:
 
     The result is NaN if no frame after the start was recorded.
     """
-    if "/strain/largest" in replay.scalars:
-        return quantities.compute_max_strain(*replay.scalars["/strain/largest"])
+    if "/max_strain" in replay.scalars:
+        return quantities.compute_max_strain(*replay.scalars["/max_strain"])
     strains = [np.abs(compute_spring_strain(replay, k)).max(initial=0.0) for k in range(len(replay.frames))]
     return quantities.compute_max_strain(replay.frames, np.array(strains))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from springbench.harness.recording.recorder_interface import INTERSECTIONS_ENTITY, RecordingReplay
+from springbench.harness.recording.recorder_interface import INTERSECTION_FREE_PROPERTY, RecordingReplay
 from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
 
 _MAX_TRIANGLES = 50_000
@@ -20,7 +20,7 @@ def describe_self_intersection(replay: RecordingReplay, frames: Iterable[int]) -
         frames: indices of the frames to test.
     Returns: at most one phrase; empty if self-contact was simulated or there is no surface.
     """
-    if not len(replay.triangles) or replay.properties.get(INTERSECTIONS_ENTITY, True):
+    if not len(replay.triangles) or replay.properties.get(INTERSECTION_FREE_PROPERTY, True):
         return []
     if len(replay.triangles) > _MAX_TRIANGLES:
         return ["no self-contact: may pass through itself"]

@@ -112,7 +112,7 @@ def test_topology_is_written_once(tmp_path: Path):
 def test_scalars_come_in_bulk(tmp_path: Path):
     frames = 3 * FLUSH_INTERVAL + 2
     with open_recording_source(write_recording(tmp_path / "a.rrd", frame_count=frames)) as source:
-        chunks = list(source.iterate_chunks(content="/strain/largest", components=["Scalars:scalars"]))
+        chunks = list(source.iterate_chunks(content="/max_strain", components=["Scalars:scalars"]))
     assert [chunk.num_rows for chunk in chunks] == [FLUSH_INTERVAL + 1, FLUSH_INTERVAL, FLUSH_INTERVAL, 1]
 
 
@@ -155,7 +155,7 @@ def test_two_recordings_of_one_run_are_equal(tmp_path: Path):
     other = columns(write_recording(tmp_path / "c.rrd", amplitude=0.1 + 1e-6))
     assert first.keys() == other.keys()
     changed = {entity for entity, name in first if first[entity, name] != other[entity, name]}
-    assert changed >= {"/scene/mesh", "/strain/largest"}
+    assert changed >= {"/scene/mesh", "/max_strain"}
 
 
 def test_the_scalars_of_a_replay_have_one_value_a_frame(tmp_path: Path):
@@ -165,7 +165,7 @@ def test_the_scalars_of_a_replay_have_one_value_a_frame(tmp_path: Path):
     np.testing.assert_array_equal(scalars["/milliseconds/local"], (steps, steps / 2))
     np.testing.assert_array_equal(scalars["/residual"][1], [np.nan, *(10.0**-k for k in range(1, 12))])
     np.testing.assert_allclose(scalars["/residual/log10"][1][1:], -steps)
-    np.testing.assert_array_equal(scalars["/iterations"][1], np.arange(12))
+    np.testing.assert_array_equal(scalars["/num_iterations"][1], np.arange(12))
     assert not any("convergence" in entity for entity in scalars)
 
 

@@ -80,7 +80,7 @@ def test_a_killed_run_leaves_all_frames_up_to_the_last_flush(tmp_path: Path):
         frame.positions.astype(np.float32) for frame in generate_waves(build_recording_info(), len(replay.frames))
     ]
     np.testing.assert_array_equal(replay.positions, expected)
-    assert len(replay.scalars["/strain/largest"][0]) == len(replay.frames)
+    assert len(replay.scalars["/max_strain"][0]) == len(replay.frames)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.99])

@@ -62,7 +62,7 @@ def replay_of(solver: str) -> RecordingReplay:
         title="", run_id="", frames=np.arange(4), times=np.arange(4.0), positions=stretched,
         triangles=np.zeros((0, 3), np.int64), springs=np.array([[0, 1]]), rest_lengths=np.ones(1),
         pinned_vertices=np.zeros(0, np.int64), strain_range=0.1,
-        scalars={"/strain/largest": (np.arange(4), np.array([0.9, *STRAINS])), "/residual": (np.arange(1), np.ones(1))},
+        scalars={"/max_strain": (np.arange(4), np.array([0.9, *STRAINS])), "/residual": (np.arange(1), np.ones(1))},
         properties=own | {"milliseconds_per_step": compute_ms_per_step([1e-3 * ms for ms in MILLISECONDS[solver]])},
     )  # fmt: skip
 

@@ -346,7 +346,7 @@ def test_a_picture_says_of_a_surface_that_nothing_keeps_it_apart(apart: bool, fo
     positions = plain.positions.copy()
     positions[7, 35] = positions[7, 14] + [0.05, 0.05, -folded]
     positions[7, 34] += [0, 0, np.float32(folded)]
-    replay = replace(plain, positions=positions, properties={**plain.properties, "self_contact": apart})
+    replay = replace(plain, positions=positions, properties={**plain.properties, "prevents_self_intersection": apart})
     if not folded:
         replay = replace(replay, positions=plain.positions)
     assert describe_self_intersection(replay, [0, 7]) == wanted

@@ -56,7 +56,7 @@ def _simulate_tile(run: RunSpec, tick: ProgressCallback) -> Any:
     from springbench.harness.execution import machine_info
     from springbench.harness.recording.local_origin import compute_local_origin, store_relative
     from springbench.harness.recording.obstacle_shapes import build_obstacles_property, list_obstacles
-    from springbench.harness.recording.recorder_interface import INTERSECTIONS_ENTITY, RecordingReplay
+    from springbench.harness.recording.recorder_interface import INTERSECTION_FREE_PROPERTY, RecordingReplay
     from springbench.harness.recording.strain_shading import DEFAULT_STRAIN_RANGE
     from springbench.harness.report.gallery_sheet import SceneTile
     from springbench.harness.scenes.scene_builder import build_scene
@@ -87,7 +87,7 @@ def _simulate_tile(run: RunSpec, tick: ProgressCallback) -> Any:
         scalars={},
         properties={
             **build_obstacles_property(list_obstacles(run.scene.effects)),
-            INTERSECTIONS_ENTITY: scene.has_self_contact,
+            INTERSECTION_FREE_PROPERTY: scene.has_self_contact,
             "cpu": machine_info.describe_machine().cpu,
             "commit": machine_info.read_commit(),
         },
