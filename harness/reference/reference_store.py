@@ -1,8 +1,8 @@
 """Store of references on disk, indexed by a digest of the scene and the request.
 
     run-SCENE-SIZE-INTEGRATOR.npz             decrease of the objective in each step of a reference run
-    problem-SCENE-SIZE-INTEGRATOR-FRAME.npz   a step snapshot
-    minima-PROBLEM.npz                        its known minima
+    snapshot-SCENE-SIZE-INTEGRATOR-FRAME.npz  a step snapshot
+    minima-SNAPSHOT.npz                       its known minima
     trajectory-SCENE-SIZE-TIMES.npz           positions and velocities at some times; SCENE without its step size
     growth-SCENE-SIZE-HORIZON.npz             growth of a perturbation of the start up to an end time
     converged-SCENE-SIZE-TIMES.npz            positions and velocities of a scene with contact, self-converged
@@ -87,12 +87,12 @@ class ReferenceStore:
         """
         asked = _ReferenceRequest(spec, size, integrator)
         path = self.folder / f"run-{asked.name}.npz"
-        violence = _read_arrays(path, ["violence"]).get("violence", np.empty(0))
+        violence = _read_arrays(path, ["objective_decrease"]).get("objective_decrease", np.empty(0))
         moments = select_snapshot_frames(violence, spec.frames)
         known = self._load_known_snapshots(asked, moments.values()) if len(violence) == spec.frames else {}
         if not set(moments.values()) <= set(known):
             steps, violence = run_reference(asked.scene, self.solver, spec.frames)
-            _write_arrays(path, {"violence": violence})
+            _write_arrays(path, {"objective_decrease": violence})
             known, moments = self._save_steps(asked, steps), select_snapshot_frames(violence, spec.frames)
         return {moment: known[frame] for moment, frame in moments.items()}
 
@@ -181,12 +181,12 @@ class ReferenceStore:
         seen.require_predictable(error, times)
         scene = build_ode_scene(spec, size)
         witness, path = OdeField(scene).evaluate_fingerprint(), self.folder / f"trajectory-{name}.npz"
-        stored = _read_arrays(path, [*_TRAJECTORY_FIELDS, "witness"])
-        if stored and is_equal_to_roundoff(stored.pop("witness"), witness):
+        stored = _read_arrays(path, [*_TRAJECTORY_FIELDS, "fingerprint"])
+        if stored and is_equal_to_roundoff(stored.pop("fingerprint"), witness):
             found = ReferenceTrajectory(**stored, growth=seen.interpolate_growth(times))
         else:
             found = replace(integrate_motion(scene, times, report_progress), growth=seen.interpolate_growth(times))
-            _write_arrays(path, {key: getattr(found, key) for key in _TRAJECTORY_FIELDS} | {"witness": witness})
+            _write_arrays(path, {key: getattr(found, key) for key in _TRAJECTORY_FIELDS} | {"fingerprint": witness})
         found.require_accuracy(error)
         return found
 
@@ -204,12 +204,12 @@ class ReferenceStore:
         """
         witness = OdeField(build_ode_scene(spec, size)).evaluate_fingerprint()
         path = self.folder / f"growth-{_build_motion_name(spec, size, [t_end])}.npz"
-        stored = _read_arrays(path, [*_GROWTH_FIELDS, "witness"])
-        if stored and is_equal_to_roundoff(stored.pop("witness"), witness):
+        stored = _read_arrays(path, [*_GROWTH_FIELDS, "fingerprint"])
+        if stored and is_equal_to_roundoff(stored.pop("fingerprint"), witness):
             return PerturbationGrowth(scale=float(stored.pop("scale")), **stored)
         found = estimate_growth(spec, size, t_end)
         arrays = {name: np.asarray(getattr(found, name)) for name in _GROWTH_FIELDS}
-        _write_arrays(path, arrays | {"witness": witness})
+        _write_arrays(path, arrays | {"fingerprint": witness})
         return found
 
     def _load_self_converged(
@@ -220,8 +220,8 @@ class ReferenceStore:
         Its fingerprint is its first step.
         """
         witness = next(iter(run_reference(build_exact_scene(spec, size), self.solver, 1, [1])[0].values())).positions
-        stored = _read_arrays(path, [*_SELF_CONVERGED_FIELDS, "witness", "error"])
-        known = bool(stored) and is_equal_to_roundoff(stored.pop("witness"), witness)
+        stored = _read_arrays(path, [*_SELF_CONVERGED_FIELDS, "fingerprint", "error"])
+        known = bool(stored) and is_equal_to_roundoff(stored.pop("fingerprint"), witness)
         if known and float(stored.pop("error")) <= error:
             scalars = {key: stored.pop(key).item() for key in ("step", "last_change")}
             found = SelfConvergedTrajectory(**stored, **scalars)
@@ -230,7 +230,7 @@ class ReferenceStore:
                 lambda h, name: build_exact_scene(spec.with_time_step(h), size, name), spec.time_step, times, error
             )
             arrays = {name: np.asarray(getattr(found, name)) for name in _SELF_CONVERGED_FIELDS}
-            _write_arrays(path, arrays | {"witness": witness, "error": np.asarray(error)})
+            _write_arrays(path, arrays | {"fingerprint": witness, "error": np.asarray(error)})
         found.require_accuracy(error)
         return found
 
@@ -241,7 +241,7 @@ class ReferenceStore:
         return {snapshot.frame: snapshot for snapshot in snapshots if snapshot}
 
     def _snapshot_path(self, asked: _ReferenceRequest, frame: int) -> Path:
-        return self.folder / f"problem-{asked.name}-{frame}.npz"
+        return self.folder / f"snapshot-{asked.name}-{frame}.npz"
 
     def _save_steps(self, asked: _ReferenceRequest, steps: dict[int, SimulationStep]) -> dict[int, StepSnapshot]:
         kept: dict[int, StepSnapshot] = {}

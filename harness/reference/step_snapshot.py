@@ -145,8 +145,13 @@ def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dic
 _PROBLEM_FIELDS = ("inertial_target", "external_force", "pin_targets", "current_positions")
 _OPTIONAL_FIELDS = ("lag_override", "predicted_acceleration", "warm_start", "normal_force_positions")
 _START_FIELDS = tuple(field.name for field in fields(StepStart) if field.name not in _OPTIONAL_FIELDS)
-SNAPSHOT_ARRAYS = (*_PROBLEM_FIELDS, *(f"start_{name}" for name in _START_FIELDS))
-"""Names of the arrays of a stored snapshot that depend on names of fields."""
+SNAPSHOT_ARRAYS = (
+    *_PROBLEM_FIELDS,
+    *(f"start_{name}" for name in _START_FIELDS),
+    *("mass", "pinned_vertices", "gradient", "time_step", "inertia_factor", "frame"),
+    *("end_positions", "end_velocity", "digest"),
+)
+"""Names of the arrays that every stored snapshot has."""
 
 
 def save_snapshot(step: SimulationStep, origin: str) -> tuple[StepSnapshot, Arrays]:
@@ -158,31 +163,32 @@ def save_snapshot(step: SimulationStep, origin: str) -> tuple[StepSnapshot, Arra
     """
     problem, now = step.problem, step.state.motion
     system, start = problem.system, problem.step_start
-    arrays: dict[str, Any] = {name: getattr(problem, name) for name in _PROBLEM_FIELDS}
-    arrays |= {f"start_{name}": getattr(start, name) for name in _START_FIELDS}
-    arrays |= {f"start_{name}": known for name in _OPTIONAL_FIELDS if (known := getattr(start, name)) is not None}
-    arrays |= {
+    stored: dict[str, Any] = {name: getattr(problem, name) for name in _PROBLEM_FIELDS}
+    stored |= {f"start_{name}": getattr(start, name) for name in (*_START_FIELDS, *_OPTIONAL_FIELDS)}
+    stored |= {
         "mass": system.mass,
-        "pins": system.pins.vertices,
+        "pinned_vertices": system.pins.vertices,
         "gradient": problem.gradient(problem.current_positions),
+        "time_step": system.time_step,
+        "inertia_factor": system.inertia_factor,
+        "frame": step.index,
     }
-    arrays |= {"time_step": system.time_step, "factor": system.inertia_factor, "frame": step.index}
-    arrays = {name: np.asarray(value) for name, value in arrays.items()}
     content = hashlib.sha256(origin.encode())
-    for name, array in arrays.items():
-        content.update(f"{name} {array.dtype} {array.shape} ".encode() + array.tobytes())
-    digest = content.hexdigest()[:12]
-    ends = {"after_positions": now.positions, "after_velocity": now.velocity, "digest": np.asarray(digest)}
-    if (acceleration := step.state.acceleration) is not None:
-        ends["after_acceleration"] = acceleration
-    return StepSnapshot(step.index, problem, now, digest, acceleration), arrays | ends
+    for k, array in enumerate(stored.values()):  # numbers, not names, which would change the digest of equal states
+        if array is not None:
+            array = np.asarray(array)
+            content.update(f"{k} {array.dtype} {array.shape} ".encode() + array.tobytes())
+    digest, acceleration = content.hexdigest()[:12], step.state.acceleration
+    stored |= {"end_positions": now.positions, "end_velocity": now.velocity, "end_acceleration": acceleration}
+    arrays = {name: np.asarray(array) for name, array in stored.items() if array is not None}
+    return StepSnapshot(step.index, problem, now, digest, acceleration), arrays | {"digest": np.asarray(digest)}
 
 
 def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
     """Restore a saved snapshot for a scene; None where the problem has changed."""
     if any(f"start_{name}" not in arrays for name in _START_FIELDS):
         return None
-    system = replace(scene.system, inertia_factor=float(arrays["factor"]))
+    system = replace(scene.system, inertia_factor=float(arrays["inertia_factor"]))
     begun: dict[str, Any] = {
         name: arrays[f"start_{name}"] for name in (*_START_FIELDS, *_OPTIONAL_FIELDS) if f"start_{name}" in arrays
     }
@@ -192,11 +198,11 @@ def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
     same = (
         system.time_step == arrays["time_step"]
         and np.array_equal(system.mass, arrays["mass"])
-        and np.array_equal(system.pins.vertices, arrays["pins"])
+        and np.array_equal(system.pins.vertices, arrays["pinned_vertices"])
         and is_equal_to_roundoff(problem.gradient(problem.current_positions), arrays["gradient"])
     )
-    after = Motion(arrays["after_positions"], arrays["after_velocity"])
-    told = str(arrays["digest"]), arrays.get("after_acceleration")
+    after = Motion(arrays["end_positions"], arrays["end_velocity"])
+    told = str(arrays["digest"]), arrays.get("end_acceleration")
     return StepSnapshot(int(arrays["frame"]), problem, after, *told) if same else None
 
 

@@ -203,7 +203,7 @@ def test_complete_files_alone_are_left(tmp_path):
     for one in store.load_snapshots(SPEC, SIZE).values():
         store.find_minima(one)
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
-    assert {path.name.split("-")[0] for path in tmp_path.iterdir()} == {"run", "problem", "minima"}
+    assert {path.name.split("-")[0] for path in tmp_path.iterdir()} == {"run", "snapshot", "minima"}
     for path in tmp_path.iterdir():
         with np.load(path, allow_pickle=False) as stored:
             assert all(stored[name].dtype.kind in "fiU" for name in stored)
