@@ -24,7 +24,6 @@ from springbench.harness.cli.commands.list_runs import list_command
 from springbench.harness.cli.commands.preview import preview
 from springbench.harness.cli.commands.recommend import recommend
 from springbench.harness.cli.commands.regress import regress
-from springbench.harness.cli.commands.regress_history import regress_history
 from springbench.harness.cli.commands.roofline import roofline
 from springbench.harness.cli.shared_options import (
     CompareOption,
@@ -260,7 +259,6 @@ app.command()(figure)
 app.command()(gallery)
 app.command()(preview)
 app.command()(regress)
-app.command()(regress_history)
 
 
 @app.command()

@@ -113,6 +113,8 @@ def _load_any(
     document.user_code = policy
     if {"curves", "work"} & set(document.data):
         raise InputError(InputMistake("is an accuracy config; run it with `springbench accuracy`", path))
+    if "gates" in document.data:
+        raise InputError(InputMistake("is a gates file; run it with `springbench regress`, without --baseline", path))
     if "scenes" in document.data:
         if solvers or sizes or asked:
             raise InputError(InputMistake("is a sweep, which says itself what to run; change the file instead", path))

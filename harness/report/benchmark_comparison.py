@@ -2,8 +2,8 @@
 
 A benchmark that was measured against a baseline stores `extra_info["ratio"]` (median, low, high). It is slower if the
 new interval lies wholly above the old one by more than a margin. For other benchmarks the minima are compared, with a
-wide margin; between two machines such a difference is only a remark. A missing benchmark counts as a regression, so
-that deleting a benchmark cannot hide one. Without a common benchmark the result is "cannot tell".
+wide margin; between two machines such a difference is inconclusive. A missing benchmark fails, so that deleting a
+benchmark cannot hide a regression. Without a common benchmark the comparison is inconclusive.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rich.markup import escape
 from rich.table import Table
 from springbench.harness.console import split_wide_table
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.report.results_comparison import INCONCLUSIVE_EXIT_CODE
+from springbench.harness.results.regression_verdict import RegressionVerdict, combine_verdicts, describe_counts
 
 RATIO_MARGIN = 0.10
 """Margin beyond both intervals: those of two runs of the same code differed by up to 4 % on a loaded machine."""
@@ -30,9 +30,6 @@ MINIMUM_MARGIN = 0.5
 
 _MAX_FILE_BYTES = 2**25
 """Maximum size of a stored file [bytes]; each time of each benchmark takes 20."""
-
-REGRESSION_VERDICTS = ("slower", "vanished")
-
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -99,62 +96,63 @@ class StoredBenchmarks(BaseModel):
     @property
     def machine_key(self) -> tuple[Any, ...]:
         """The properties that determine speed: the processor, its number of cores and the usable cores."""
-        told = self.machine_info.get("cpu")
-        cpu = cast(Mapping[str, Any], told) if isinstance(told, Mapping) else dict[str, Any]()
+        stored = self.machine_info.get("cpu")
+        cpu = cast(Mapping[str, Any], stored) if isinstance(stored, Mapping) else dict[str, Any]()
         return (cpu.get("brand_raw"), cpu.get("count"), self.machine_info.get("affinity"))
 
 
-def compare_benchmarks(base: Path, new: Path, console: Console) -> int:
-    """Print a table of the changes from `base` to `new`.
+def compare_benchmarks(baseline: Path, new: Path, console: Console) -> RegressionVerdict:
+    """Print a table of the changes from `baseline` to `new`.
 
     Args:
-        base: pytest-benchmark file of the old version.
+        baseline: pytest-benchmark file of the old version.
         new: pytest-benchmark file of the new version.
         console: console that the table is printed on.
-    Returns: 1 if a benchmark became slower or is missing; INCONCLUSIVE_EXIT_CODE if there is no common benchmark;
-        otherwise 0.
+    Returns: the verdict of all benchmarks; a new one has none.
     Raises:
         InputError: if pytest-benchmark did not write one of the files.
     """
-    old, now = read_stored_benchmarks(base), read_stored_benchmarks(new)
-    if not old.benchmarks_by_name.keys() & now.benchmarks_by_name.keys():
-        console.print(f"cannot tell: {base} and {new} have no benchmark in common", markup=False)
-        return INCONCLUSIVE_EXIT_CODE
-    same = old.machine_key == now.machine_key
-    table = Table("benchmark", "old", "new", "change", "verdict", box=SIMPLE_HEAD)
-    verdicts: list[str] = []
-    for name in old.benchmarks_by_name | now.benchmarks_by_name:
-        before, after = old.benchmarks_by_name.get(name), now.benchmarks_by_name.get(name)
-        change, verdict = _classify_change(before, after, same)
-        verdicts.append(verdict)
-        table.add_row(
-            *map(escape, (name.rpartition("::")[2], _format_time(before), _format_time(after), change, verdict))
-        )
+    before, after = read_stored_benchmarks(baseline), read_stored_benchmarks(new)
+    if not before.benchmarks_by_name.keys() & after.benchmarks_by_name.keys():
+        console.print(f"inconclusive: {baseline} and {new} have no benchmark in common", markup=False)
+        return RegressionVerdict.INCONCLUSIVE
+    is_same_machine = before.machine_key == after.machine_key
+    table = Table("benchmark", "baseline", "new", "change", "verdict", box=SIMPLE_HEAD)
+    verdicts: list[RegressionVerdict] = []
+    for name in before.benchmarks_by_name | after.benchmarks_by_name:
+        old, now = before.benchmarks_by_name.get(name), after.benchmarks_by_name.get(name)
+        change, verdict, remark = _classify_change(old, now, is_same_machine)
+        verdicts += [verdict] if verdict else []
+        words = ": ".join(filter(None, (verdict, remark)))
+        table.add_row(*map(escape, (name.rpartition("::")[2], _format_time(old), _format_time(now), change, words)))
     console.print(split_wide_table(table))
-    if not same:
-        console.print("The files come from different machines: minima are not judged, ratios with a wider margin.")
-    bad = sum(verdict in REGRESSION_VERDICTS for verdict in verdicts)
-    console.print(f"{bad} of {len(verdicts)} became slower or vanished" if bad else "nothing became slower")
-    return 1 if bad else 0
+    if not is_same_machine:
+        console.print("The files come from different machines: only ratios are compared, with a wider margin.")
+    verdict = combine_verdicts(verdicts)
+    console.print(f"{verdict}: {describe_counts(verdicts)}")
+    return verdict
 
 
-def _classify_change(old: BenchmarkRecord | None, new: BenchmarkRecord | None, same_machine: bool) -> tuple[str, str]:
-    """Return the change and its class: slower, vanished, faster, unchanged, new, or not judged."""
+def _classify_change(
+    old: BenchmarkRecord | None, new: BenchmarkRecord | None, is_same_machine: bool
+) -> tuple[str, RegressionVerdict | None, str]:
+    """Return the change, the verdict (None for a new benchmark), and a remark."""
     if old is None or new is None:
-        return "", "new" if old is None else "vanished"
+        return ("", None, "new") if old is None else ("", RegressionVerdict.FAIL, "missing")
     was, now = old.extra_info.ratio, new.extra_info.ratio
     if was and not now:
-        return "", "vanished"
+        return "", RegressionVerdict.FAIL, "its ratio is missing"
     if was and now:
-        margin = RATIO_MARGIN if same_machine else OTHER_MACHINE_MARGIN
+        margin = RATIO_MARGIN if is_same_machine else OTHER_MACHINE_MARGIN
         change = now.median / was.median
         slower, faster = now.low > was.high * (1 + margin), now.high * (1 + margin) < was.low
     else:
         change = new.stats.min / old.stats.min
         slower, faster = change > 1 + MINIMUM_MARGIN, change * (1 + MINIMUM_MARGIN) < 1
-        if not same_machine and (slower or faster):
-            return f"{change - 1:+.1%}", "not judged: other machine"
-    return f"{change - 1:+.1%}", "slower" if slower else "faster" if faster else "unchanged"
+        if not is_same_machine and (slower or faster):
+            return f"{change - 1:+.1%}", RegressionVerdict.INCONCLUSIVE, "another machine"
+    verdict = RegressionVerdict.FAIL if slower else RegressionVerdict.PASS
+    return f"{change - 1:+.1%}", verdict, "slower" if slower else "faster" if faster else ""
 
 
 def _format_time(benchmark: BenchmarkRecord | None) -> str:
@@ -163,7 +161,7 @@ def _format_time(benchmark: BenchmarkRecord | None) -> str:
         return ""
     ratio = benchmark.extra_info.ratio
     if ratio is None:
-        return f"{1e3 * benchmark.stats.min:.3g} ms at best"
+        return f"{1e3 * benchmark.stats.min:.3g} ms (minimum)"
     return f"{ratio.median:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
 
 
@@ -173,18 +171,18 @@ def read_stored_benchmarks(path: Path) -> StoredBenchmarks:
     Raises:
         InputError: if the file cannot be read, is too large or has another format.
     """
-    wanted = "wanted a file that pytest-benchmark stored; `pytest tests/bench --benchmark-only` makes one"
+    expected = "expected a file that pytest-benchmark stored; `pytest tests/bench --benchmark-only` stores one"
     try:
         if path.exists() and not path.is_file():
-            raise InputError(InputMistake(f"is no file; {wanted}", path))
+            raise InputError(InputMistake(f"is not a file; {expected}", path))
         with path.open("rb") as file:
             content = file.read(_MAX_FILE_BYTES + 1)
         if len(content) > _MAX_FILE_BYTES:
-            raise InputError(InputMistake(f"has more than {_MAX_FILE_BYTES:,} bytes; {wanted}", path))
+            raise InputError(InputMistake(f"has more than {_MAX_FILE_BYTES:,} bytes; {expected}", path))
         return StoredBenchmarks.model_validate_json(content)
     except OSError as error:
-        raise InputError(InputMistake(f"cannot be read ({error.strerror}); {wanted}", path)) from error
+        raise InputError(InputMistake(f"cannot be read ({error.strerror}); {expected}", path)) from error
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))
-        raise InputError(InputMistake(f"{first['msg']}; {wanted}", path, key=key)) from error
+        raise InputError(InputMistake(f"{first['msg']}; {expected}", path, key=key)) from error

@@ -103,7 +103,7 @@ def find_stored_files(paths: Iterable[Path]) -> list[Path]:
     found: list[Path] = []
     for place in paths:
         if not place.exists():
-            raise InputError(InputMistake("is not there; wanted a folder of pytest-benchmark, or a file of it", place))
+            raise InputError(InputMistake("does not exist; expected a folder or a file of pytest-benchmark", place))
         found += sorted(place.rglob("*.json")) if place.is_dir() else [place]
     return found
 
@@ -163,16 +163,16 @@ def detect_changes(points: Sequence[BenchmarkPoint]) -> tuple[int, ...]:
 
 def estimate_noise(y: FloatArray) -> float:
     """Estimate the noise of results around their segment's mean from the median difference of neighbours."""
-    apart = np.abs(np.diff(y))
-    return max(float(np.median(apart)) / (0.6745 * math.sqrt(2)), NOISE_FLOOR)
+    differences = np.abs(np.diff(y))
+    return max(float(np.median(differences)) / (0.6745 * math.sqrt(2)), NOISE_FLOOR)
 
 
 def build_history_table(gate_histories: Sequence[BenchmarkHistory]) -> Table:
     """Build a table of the benchmarks, their last level and their changes."""
-    table = Table("gate", "results", "now", "changes", box=SIMPLE_HEAD)
+    table = Table("benchmark", "results", "level", "changes", box=SIMPLE_HEAD)
     for series in gate_histories:
-        told = [f"{100 * (r - 1):+.1f} % at {series.points[k].commit}" for k, r in series.level_changes]
-        few = f"too few to tell; wanted {MIN_RESULTS}" if len(series.points) < MIN_RESULTS else "none"
-        now = f"{series.segment_levels[-1]:.3g}" if series.is_ratio else f"{1e3 * series.segment_levels[-1]:.3g} ms"
-        table.add_row(escape(series.benchmark_name), str(len(series.points)), now, ", ".join(told) or few)
+        changes = [f"{100 * (r - 1):+.1f} % at {series.points[k].commit}" for k, r in series.level_changes]
+        none = f"inconclusive: fewer than {MIN_RESULTS} results" if len(series.points) < MIN_RESULTS else "none"
+        level = f"{series.segment_levels[-1]:.3g}" if series.is_ratio else f"{1e3 * series.segment_levels[-1]:.3g} ms"
+        table.add_row(escape(series.benchmark_name), str(len(series.points)), level, ", ".join(changes) or none)
     return table

@@ -2,9 +2,9 @@
 
 It finds regressions in time, and other changes. Runs are paired by their inputs, and compared step by step
 (`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). The load of the machine may have differed
-between the two
-results, and statistics cannot detect that: hence a margin beyond the interval, and `springbench regress --against` for
-smaller changes. Times of two machines are not comparable; with a baseline solver that both ran, the ratios to it are.
+between the two results, and statistics cannot detect that: hence a margin beyond the interval, and
+`springbench regress --baseline REVISION` for smaller changes. Times of two machines are not comparable; with a
+reference solver that both ran, the ratios to it are.
 """
 
 from __future__ import annotations
@@ -28,9 +28,7 @@ from rich.table import Table
 from springbench.harness.console import split_wide_table
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results import bootstrap_statistics, parquet_rows, row_store
-
-INCONCLUSIVE_EXIT_CODE = 3
-"""Exit code if valid results have nothing comparable: 2 would mean an invalid file, and 0 or 1 would be untrue."""
+from springbench.harness.results.regression_verdict import RegressionVerdict, combine_verdicts, describe_counts
 
 REGRESSION_MARGIN = 0.10
 """Margin beyond the interval: minima of two runs of the same code differ by up to 4 % on an idle machine, more on
@@ -80,61 +78,59 @@ class StoredRun:
         return f"{self.row['scene']}{size} {self.row['solver']}{given}"
 
 
-def compare_results(old: Path, new: Path, console: Console, baseline_solver: str | None = None) -> int:
-    """Print what changed from `old` to `new`.
+def compare_results(
+    baseline: Path, new: Path, console: Console, reference_solver: str | None = None
+) -> RegressionVerdict:
+    """Print what changed from `baseline` to `new`.
 
     Args:
-        old: folder or archive of the old results.
+        baseline: folder or archive of the old results.
         new: folder or archive of the new results.
         console: console that the table is printed on.
-        baseline_solver: times are divided by those of this solver, so that they are comparable between machines.
-    Returns: 1 if a run became slower or fails now; INCONCLUSIVE_EXIT_CODE, after the reasons, if nothing is comparable;
-        otherwise 0.
+        reference_solver: times are divided by those of this solver, so that they are comparable between machines.
+    Returns: the verdict of all runs that both have. A run that became slower, or that fails now, fails.
     Raises:
-        InputError: if there are no results, or none of the baseline solver.
+        InputError: if there are no results, or none of the reference solver.
     """
-    was, now = read_stored_runs(old), read_stored_runs(new)
-    for path, runs in ((old, was), (new, now)):
-        if baseline_solver is not None and all(run.row["solver"] != baseline_solver for run in runs.values()):
-            raise InputError(
-                InputMistake(f"{baseline_solver} was not run in {path}; wanted a solver of both", key="--yardstick")
-            )
+    before, after = read_stored_runs(baseline), read_stored_runs(new)
+    for path, runs in ((baseline, before), (new, after)):
+        if reference_solver is not None and all(run.row["solver"] != reference_solver for run in runs.values()):
+            problem = f"{path} has no runs of {reference_solver}; expected a solver of both results"
+            raise InputError(InputMistake(problem, key="--relative-to"))
+    if not before.keys() & after.keys():
+        console.print(f"inconclusive: {baseline} and {new} have no run in common", markup=False)
+        return RegressionVerdict.INCONCLUSIVE
     table = Table(
-        "run", "old", "new", "change", "verdict", "iterations", "residual", "error", "last positions", box=SIMPLE_HEAD
+        *("run", "baseline", "new", "change", "verdict", "iterations", "residual", "error", "last positions"),
+        box=SIMPLE_HEAD,
     )
-    refused, bad, compared = dict[str, str](), 0, 0
-    for key in was | now:
-        if key not in was or key not in now:
-            side, lone = ("new", now[key]) if key not in was else ("vanished", was[key])
-            table.add_row(escape(lone.run_label), *("", "", "", side))
+    reasons, verdicts = dict[str, str](), list[RegressionVerdict]()
+    for key in before | after:
+        if key not in before or key not in after:
+            remark, run = ("new", after[key]) if key not in before else ("missing", before[key])
+            table.add_row(escape(run.run_label), "", "", "", remark)
             continue
-        before, after = was[key], now[key]
-        reason = _incomparable_reason(before, after, baseline_solver)
-        units = (
-            (1e3, 1e3)
-            if baseline_solver is None
-            else tuple(_baseline_scale(runs, key, baseline_solver) for runs in (was, now))
-        )
+        old, now = before[key], after[key]
+        units = (1e3, 1e3)
+        if reference_solver is not None:
+            units = tuple(_reference_scale(runs, key, reference_solver) for runs in (before, after))
+        reason = _incomparable_reason(old, now, reference_solver)
         if not reason and None in units:
-            reason = f"{baseline_solver} was not run beside it in both"
+            reason = f"{reference_solver} was not run on the same scene in both"
         if reason:
-            refused[before.run_label] = reason
-            continue
-        compared += 1
-        figures, verdict = _classify_change(before, after, units)
-        bad += verdict in ("slower", "fails now")
-        table.add_row(escape(before.run_label), *figures, verdict, *_compare_other_quantities(before, after))
-    if not compared:
-        said = "; ".join(dict.fromkeys(refused.values())) or "they have no run in common"
-        console.print(f"cannot tell: {old} and {new} cannot be compared: {said}", markup=False)
-        return INCONCLUSIVE_EXIT_CODE
+            reasons[old.run_label] = reason
+        figures, verdict, remark = _classify_change(old, now, units, is_comparable=not reason)
+        verdicts.append(verdict)
+        words = ": ".join(filter(None, (verdict, remark)))
+        table.add_row(escape(old.run_label), *figures, words, *_compare_other_quantities(old, now))
     console.print(split_wide_table(table))
-    for name, reason in refused.items():
+    for name, reason in reasons.items():
         console.print(f"not compared: {name}: {reason}", markup=False)
-    if baseline_solver:
-        console.print(f"times are multiples of those of {baseline_solver}", markup=False)
-    console.print(f"{bad} of {compared} became slower or fail now" if bad else f"nothing of {compared} became slower")
-    return 1 if bad else 0
+    if reference_solver:
+        console.print(f"times are relative to those of {reference_solver}", markup=False)
+    verdict = combine_verdicts(verdicts)
+    console.print(f"{verdict}: {describe_counts(verdicts)}")
+    return verdict
 
 
 def read_stored_runs(path: Path) -> dict[RunKey, StoredRun]:
@@ -148,9 +144,7 @@ def read_stored_runs(path: Path) -> dict[RunKey, StoredRun]:
             unit for of_rows in row_store.find_row_folders(folder, "rows") for unit in row_store.list_units(of_rows)
         ]
         if not files:
-            raise InputError(
-                InputMistake("holds no rows (rows/*.parquet); wanted results that `springbench run` left", path)
-            )
+            raise InputError(InputMistake("has no rows (rows/*.parquet); expected results of `springbench run`", path))
         with parquet_rows.limit_read_memory(files):
             found = parquet_rows.read_rows(files).to_pylist()
     runs: dict[RunKey, list[ResultRow]] = defaultdict(list)
@@ -165,9 +159,9 @@ def _open_results(path: Path) -> Generator[Path]:
     if path.is_dir():
         yield path
         return
-    wanted = "wanted a folder of results, an archive of one (.zip, .tar.*), or pytest-benchmark's (.json)"
-    if not path.is_file():  # a device or a pipe would be read for ever
-        raise InputError(InputMistake(f"is {'no file' if path.exists() else 'not there'}; {wanted}", path))
+    expected = "expected a folder of results, an archive of one (.zip, .tar.*), or pytest-benchmark's (.json)"
+    if not path.is_file():  # reading a device or a pipe would not end
+        raise InputError(InputMistake(f"{'is not a file' if path.exists() else 'does not exist'}; {expected}", path))
     with TemporaryDirectory() as scratch:
         try:
             if zipfile.is_zipfile(path):
@@ -182,7 +176,7 @@ def _open_results(path: Path) -> Generator[Path]:
                     for info in inside:  # not `extractall`: its safe filter is not in every Python 3.11
                         _unpack_member(packed, info, Path(scratch))
             else:
-                raise InputError(InputMistake(wanted, path))
+                raise InputError(InputMistake(expected, path))
         except (OSError, zipfile.BadZipFile, tarfile.TarError) as error:
             raise InputError(InputMistake(f"cannot be unpacked: {error}", path)) from error
         yield Path(scratch)
@@ -201,7 +195,7 @@ def _unpack_member(packed: tarfile.TarFile, info: tarfile.TarInfo, folder: Path)
 def _require_unpacked_size(path: Path, unpacked: int) -> None:
     if unpacked > _MAX_UNPACKED_BYTES:
         raise InputError(
-            InputMistake(f"its rows take {unpacked:,} bytes unpacked; wanted {_MAX_UNPACKED_BYTES:,} at most", path)
+            InputMistake(f"its rows take {unpacked:,} bytes unpacked; expected {_MAX_UNPACKED_BYTES:,} at most", path)
         )
 
 
@@ -219,58 +213,57 @@ def _build_stored_run(run_rows: Sequence[ResultRow]) -> StoredRun:
     )
 
 
-def _incomparable_reason(old: StoredRun, new: StoredRun, baseline: str | None) -> str:
+def _incomparable_reason(old: StoredRun, new: StoredRun, reference_solver: str | None) -> str:
     """Return why two times are not comparable; empty if they are."""
     if old.status != "ok":
-        return f"there is no old time: {old.status}"
-    if old.row["machine_id"] != new.row["machine_id"] and baseline is None:
-        where = [f"{run.row['cpu']}, {run.row['cores']} cores" for run in (old, new)]
-        return f"other machines ({where[0]}; {where[1]}); --yardstick SOLVER compares ratios to one that both ran"
+        return f"the baseline has no time: {old.status}"
+    if old.row["machine_id"] != new.row["machine_id"] and reference_solver is None:
+        machines = [f"{run.row['cpu']}, {run.row['cores']} cores" for run in (old, new)]
+        return f"other machines ({machines[0]}; {machines[1]}); --relative-to SOLVER compares ratios to one of both"
     return ""
 
 
-def _baseline_scale(runs: Mapping[RunKey, StoredRun], key: RunKey, baseline: str) -> float | None:
-    """Return 1 / (median step time of the baseline [s]).
+def _reference_scale(runs: Mapping[RunKey, StoredRun], key: RunKey, reference_solver: str) -> float | None:
+    """Return 1 / (median step time of the reference solver [s]).
 
-    The baseline has the same scene, size and steps; None if it was not run.
+    Its run has the same scene, size and steps; None if there is none.
     """
-    at = {name: key[PAIRING_COLUMNS.index(name)] for name in ("scene", "size", "time_step", "integrator", "threads")}
-    found = [
-        run for run in runs.values() if run.row["solver"] == baseline and run.status == "ok" and run.seconds_by_frame
-    ]
-    found = [run for run in found if all(run.row[name] == value for name, value in at.items())]
-    return 1 / float(np.median(list(found[0].seconds_by_frame.values()))) if found else None
+    same = {name: key[PAIRING_COLUMNS.index(name)] for name in ("scene", "size", "time_step", "integrator", "threads")}
+    same["solver"] = reference_solver
+    for run in runs.values():
+        is_same = all(run.row[name] == value for name, value in same.items())
+        if is_same and run.status == "ok" and run.seconds_by_frame:
+            return 1 / float(np.median(list(run.seconds_by_frame.values())))
+    return None
 
 
-def _classify_change(old: StoredRun, new: StoredRun, units: Sequence[float | None]) -> tuple[tuple[str, str, str], str]:
-    """Return both times, their change with its interval, and its class.
-
-    Classes are slower, faster, unchanged and fails now.
-    """
+def _classify_change(
+    old: StoredRun, new: StoredRun, units: Sequence[float | None], *, is_comparable: bool
+) -> tuple[tuple[str, str, str], RegressionVerdict, str]:
+    """Return both times and their change with its interval, the verdict, and a remark."""
+    if not is_comparable:
+        return ("", "", ""), RegressionVerdict.INCONCLUSIVE, ""
     if new.status != "ok":
-        return ("", "", ""), "fails now"
+        return ("", "", ""), RegressionVerdict.FAIL, f"run {new.status}"
     frames = sorted(set(old.seconds_by_frame) & set(new.seconds_by_frame))
     was, now = (
         {f: run.seconds_by_frame[f] * (unit or 1) for f in frames} for run, unit in zip((old, new), units, strict=True)
     )
     ratio, low, high = bootstrap_statistics.estimate_slowdown(now, was)
     slower, faster = low > 1 + REGRESSION_MARGIN, high * (1 + REGRESSION_MARGIN) < 1
-    told = [f"{float(np.median([*x.values()])):.4g}" for x in (was, now)]
+    medians = [f"{float(np.median([*times.values()])):.4g}" for times in (was, now)]
     change = f"{100 * (ratio - 1):+.1f} % [{100 * (low - 1):+.1f}, {100 * (high - 1):+.1f}]"
-    return (told[0], told[1], change), "slower" if slower else "faster" if faster else "unchanged"
+    verdict = RegressionVerdict.FAIL if slower else RegressionVerdict.PASS
+    return (medians[0], medians[1], change), verdict, "slower" if slower else "faster" if faster else ""
 
 
 def _compare_other_quantities(old: StoredRun, new: StoredRun) -> tuple[str, str, str, str]:
     """Compare iterations, residual, stationarity error and last positions."""
-    told: list[str] = []
+    cells: list[str] = []
     for name in ("num_iterations", "last_residual", "last_stationarity"):
         was, now = getattr(old, name), getattr(new, name)
         same = was == now or was is None or now is None
-        told.append(("" if now is None else f"{now:.4g}") if same else f"{was:.4g} -> {now:.4g}")
-    known = old.positions_digest is not None and new.positions_digest is not None
-    return (
-        told[0],
-        told[1],
-        told[2],
-        ("the same" if old.positions_digest == new.positions_digest else "others") if known else "",
-    )
+        cells.append(("" if now is None else f"{now:.4g}") if same else f"{was:.4g} -> {now:.4g}")
+    is_known = old.positions_digest is not None and new.positions_digest is not None
+    is_equal = old.positions_digest == new.positions_digest
+    return cells[0], cells[1], cells[2], ("equal" if is_equal else "different") if is_known else ""

@@ -42,7 +42,7 @@ class Gate:
     """Two makers of work that must come to the same positions, and how their times may compare.
 
     limit: of time of the candidate / time of the yardstick, which must hold on every machine; what becomes slower
-    below it `springbench regress --against` sees; why: where the limit comes from; guards: the exact gates, tests of
+    below it `springbench regress --baseline` finds; why: where the limit comes from; guards: the exact gates, tests of
     `test_exact.py`, that see on any machine what would make the candidate slow; clock: what time is, cpu or wall;
     goal: what the ratio is to become where it is not yet: the limit then keeps what has been reached; tolerance: the
     largest difference of the two answers, in their size, None where each maker makes sure of its own; budget: seconds

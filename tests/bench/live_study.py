@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow as pa
 from springbench.harness.experiments.regression.abba_benchmark import run_confirmed_benchmark
-from springbench.harness.experiments.regression.confidence_sequence import SequentialTest, SequentialVerdict
+from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
 from springbench.harness.experiments.regression.revision_comparison import (
     ComparisonOptions,
     WorkRequest,
@@ -18,6 +18,7 @@ from springbench.harness.experiments.regression.revision_comparison import (
 )
 from springbench.harness.experiments.regression.revision_process import GitRevision
 from springbench.harness.results import parquet_rows, run_schema
+from springbench.harness.results.regression_verdict import RegressionVerdict
 
 from tests.bench.replay_study import run_background_load
 
@@ -81,7 +82,7 @@ def run_live_study(
                         "condition": background_load,
                         "injected_slowdown": injected_slowdown,
                         "max_ratio": options.max_ratio,
-                        "verdict": result.verdict.name.lower(),
+                        "verdict": result.verdict,
                         "ratio": result.interval.ratio,
                         "low": result.interval.low,
                         "high": result.interval.high,
@@ -105,8 +106,8 @@ def summarise_live_study(path: Path) -> list[tuple[str, ...]]:
         load, seconds = (median(row[name] for row in rows) for name in ("load", "seconds"))
         verdicts = [row["verdict"] for row in rows]
         counts = [
-            str(verdicts.count(verdict.name.lower()))
-            for verdict in (SequentialVerdict.FAIL, SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE)
+            str(verdicts.count(verdict))
+            for verdict in (RegressionVerdict.FAIL, RegressionVerdict.PASS, RegressionVerdict.INCONCLUSIVE)
         ]
         cells = [f"{load:.1f}", f"{slowdown:.0%}", f"{max_ratio - 1:.0%}", str(len(rows)), *counts, f"{seconds:.1f}"]
         table.append((gate, condition, *cells))

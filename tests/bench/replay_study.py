@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 from random import Random
@@ -30,7 +31,7 @@ from springbench.harness.experiments.regression.abba_benchmark import (
     LayoutRandomiser,
     draw_block_orders,
 )
-from springbench.harness.experiments.regression.confidence_sequence import SequentialTest, SequentialVerdict
+from springbench.harness.experiments.regression.confidence_sequence import SequentialTest, compute_critical_count
 from springbench.harness.experiments.regression.revision_comparison import (
     ComparisonOptions,
     WorkRequest,
@@ -38,6 +39,7 @@ from springbench.harness.experiments.regression.revision_comparison import (
 )
 from springbench.harness.experiments.regression.revision_process import GitRevision
 from springbench.harness.results import parquet_rows, run_schema
+from springbench.harness.results.regression_verdict import RegressionVerdict
 
 RECORD_COLUMNS = (
     run_schema.ColumnSpec("gate", pa.string(), "", "the benchmarked work"),
@@ -206,22 +208,22 @@ def replay_tests(
         seed: seed of the random generator.
     Returns: rates of the verdicts.
     """
-    rng, answers, seconds = np.random.default_rng(seed), list[SequentialVerdict](), list[float]()
+    rng, answers, seconds = np.random.default_rng(seed), list[RegressionVerdict](), list[float]()
     for _ in range(num_replays):
         answer, spent = _replay_test(rng, recorded_blocks, slowdown, sequential_test, budget)
-        if answer is SequentialVerdict.FAIL:
+        if answer is RegressionVerdict.FAIL:
             again, more = _replay_test(
                 rng, recorded_blocks, slowdown, replace(sequential_test, alpha=CONFIRMATION_ALPHA), budget - spent
             )
             answer, spent = (
-                (SequentialVerdict.FAIL if again is SequentialVerdict.FAIL else SequentialVerdict.INCONCLUSIVE),
+                (RegressionVerdict.FAIL if again is RegressionVerdict.FAIL else RegressionVerdict.INCONCLUSIVE),
                 spent + more,
             )
         answers.append(answer)
         seconds.append(spent)
     fails, holds, undecided = (
         answers.count(a) / num_replays
-        for a in (SequentialVerdict.FAIL, SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE)
+        for a in (RegressionVerdict.FAIL, RegressionVerdict.PASS, RegressionVerdict.INCONCLUSIVE)
     )
     return ReplayRates(fails, holds, undecided, float(np.median(seconds)))
 
@@ -232,7 +234,7 @@ def _replay_test(
     slowdown: float,
     sequential_test: SequentialTest,
     budget: float,
-) -> tuple[SequentialVerdict, float]:
+) -> tuple[RegressionVerdict, float]:
     """Replay one test, and return its verdict and its duration [s].
 
     It draws another process pair every RESTART_SECONDS.
@@ -246,8 +248,33 @@ def _replay_test(
         drawn.append(start.log_ratios[turns])
         walls.append(np.full(len(turns), start.wall_seconds))
         left -= RESTART_SECONDS
-    answer, used = sequential_test.decide_first_verdict(np.log(slowdown) + np.concatenate(drawn))
+    answer, used = find_first_verdict(sequential_test, np.log(slowdown) + np.concatenate(drawn))
     return answer, float(np.concatenate(walls)[:used].sum())
+
+
+def find_first_verdict(sequential_test: SequentialTest, log_ratios: FloatArray) -> tuple[RegressionVerdict, int]:
+    """Find the first decision of a test that is evaluated after every block.
+
+    It equals `decide_verdict` block by block, but takes one pass.
+
+    Args:
+        sequential_test: the test.
+        log_ratios: log ratios of the blocks (n,).
+    Returns: the decision and its number of blocks, n if there is no decision.
+    """
+    limit, n = np.log(sequential_test.max_ratio), len(log_ratios)
+    needed = _tabulate_critical_counts(1 << n.bit_length(), sequential_test.alpha)[:n]  # few tables for many n
+    above, below = (np.cumsum(side) >= needed for side in (log_ratios > limit, log_ratios < limit))
+    decided = np.flatnonzero(above | below)
+    if not len(decided):
+        return RegressionVerdict.INCONCLUSIVE, n
+    first = int(decided[0])
+    return (RegressionVerdict.FAIL if above[first] else RegressionVerdict.PASS), first + 1
+
+
+@lru_cache(maxsize=64)
+def _tabulate_critical_counts(n: int, alpha: float) -> NDArray[np.int64]:
+    return np.array([compute_critical_count(num_blocks, alpha) for num_blocks in range(1, n + 1)], np.int64)
 
 
 def _draw_stretches(rng: np.random.Generator, length: int, num_blocks: int) -> NDArray[np.int64]:

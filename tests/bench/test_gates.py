@@ -3,8 +3,8 @@
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.experiments.regression.program_pair import CLOCK_FUNCTIONS
 from springbench.harness.experiments.regression.pytest_plugin import PairedBenchmark
-from springbench.harness.experiments.regression.solver_pair import CLOCK_FUNCTIONS
 
 from tests.bench import test_exact
 from tests.bench.accuracy import ACCURACY

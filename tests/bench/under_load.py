@@ -1,10 +1,10 @@
-"""How often our own gates are wrong while other programs keep the machine busy: each is held so many times.
+"""How often our own gates are wrong while other programs keep the machine busy: each is run several times.
 
     python -m tests.bench.under_load [--times 50] [--condition busy] [--budget 10] [GATE ...]
 
-A program on each core goes through memory beside them, always (`busy`) or in bursts (`bursty`); `nothing` leaves the
-load to others. The work of both sides is prepared anew for each race. None may fail: what they compare lies below
-their limits by more than a load moves ratios by.
+A background program on each core sweeps over memory, always (`busy`) or in bursts (`bursty`); `nothing` leaves the
+load to other programs. The work of both sides is prepared again for each benchmark. None may fail: the ratios lie
+below their limits by more than the load changes them.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from springbench.harness.execution.machine_info import limit_threads
-from springbench.harness.experiments.regression.abba_benchmark import BenchmarkResult, ProgramPair, run_paired_benchmark
-from springbench.harness.experiments.regression.answer_agreement import describe_difference
-from springbench.harness.experiments.regression.confidence_sequence import SequentialTest, SequentialVerdict
-from springbench.harness.experiments.regression.solver_pair import build_timer, choose_num_calls
+from springbench.harness.experiments.regression.abba_benchmark import BenchmarkResult, run_paired_benchmark
+from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
+from springbench.harness.experiments.regression.program_pair import build_program_pair, require_agreement
+from springbench.harness.results.regression_verdict import RegressionVerdict
 
 from tests.bench.contact import CONTACT
 from tests.bench.gates import GATES, THREADS, Gate
@@ -30,15 +30,13 @@ NAMED = {gate.name: gate for gate in (*GATES, *CONTACT)}
 ASKED = ("harness-against-bare-solver-64", "numba-against-sparse-64", "idle-contact-against-none-64")
 
 
-def held(gate: Gate, budget: float) -> BenchmarkResult:
-    """One race of a gate, as `paired_benchmark` of the plugin for pytest has it."""
-    candidate, yardstick = gate.candidate(), gate.yardstick()
+def run_gate(gate: Gate, budget: float) -> BenchmarkResult:
+    """One benchmark of a gate, as by `paired_benchmark` of the pytest plugin."""
+    candidate, baseline = gate.candidate(), gate.yardstick()
     assert gate.tolerance is not None, f"{gate.name}: has no answers to compare"
-    if said := describe_difference(candidate(), yardstick(), gate.tolerance):
-        raise AssertionError(f"{gate.name}: {said}")
-    calls = choose_num_calls(candidate, yardstick)
-    a, b = (build_timer(work, calls, gate.clock) for work in (candidate, yardstick))
-    return run_paired_benchmark(ProgramPair(a, b), SequentialTest(gate.limit, gate.error), time_budget=budget)
+    require_agreement(candidate(), baseline(), gate.tolerance)
+    programs = build_program_pair(candidate, baseline, gate.clock)
+    return run_paired_benchmark(programs, SequentialTest(gate.limit, gate.error), time_budget=budget)
 
 
 def main() -> None:
@@ -56,14 +54,14 @@ def main() -> None:
     with limit_threads(THREADS), run_background_load(asked.condition):
         for number in range(asked.times):
             for name, results in found.items():
-                results.append(held(NAMED[name], asked.budget))
+                results.append(run_gate(NAMED[name], asked.budget))
                 console.print(f"{number + 1} of {asked.times}, {name}: {results[-1]}", style="dim")
-    table = Table("gate", "limit", "fails", "holds", "cannot tell", "ratio", "median s", "load", box=SIMPLE_HEAD)
+    table = Table("gate", "limit", "fail", "pass", "inconclusive", "ratio", "median s", "load", box=SIMPLE_HEAD)
     for name, results in found.items():
         answers = Counter(result.verdict for result in results)
         counts = (
             str(answers[verdict])
-            for verdict in (SequentialVerdict.FAIL, SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE)
+            for verdict in (RegressionVerdict.FAIL, RegressionVerdict.PASS, RegressionVerdict.INCONCLUSIVE)
         )
         ratio, seconds, load = (
             median(values)

@@ -10,12 +10,12 @@ from pathlib import Path
 from tests.contracts.hostile import BOMB
 from tests.contracts.hostile_more import stored
 
-TABLE = "gates:\n  - {scene: good.yaml, solver: sparse, against: dense, limit: 1}\n"
+TABLE = "gates:\n  - {scene: good.yaml, solver: sparse, baseline: dense, max_ratio: 1}\n"
 
 
 def given(**values: str) -> str:
     """A table of one gate with these keys."""
-    keys = {"scene": "good.yaml", "solver": "sparse", "against": "dense", "limit": "1"} | values
+    keys = {"scene": "good.yaml", "solver": "sparse", "baseline": "dense", "max_ratio": "1"} | values
     return "gates:\n  - {" + ", ".join(f"{key}: {value}" for key, value in keys.items()) + "}\n"
 
 
@@ -25,7 +25,7 @@ TABLES: dict[str, str | bytes | Callable[[Path], object]] = {
     "no gates": "gates: []\n",
     "gates of a word": "gates: fast\n",
     "gates of gates": "gates: [[[]]]\n",
-    "an unknown key": given(limt="1"),
+    "an unknown key": given(maxratio="1"),
     "a scene that is missing": given(scene="none.yaml"),
     "a scene of a device": given(scene="/dev/zero"),
     "a scene of a pipe": given(scene="pipe"),
@@ -37,11 +37,11 @@ TABLES: dict[str, str | bytes | Callable[[Path], object]] = {
     "a parameter that is missing": given(solver="{name: sparse, speed: 9}"),
     "code that is missing": given(solver="./none.py:Solver"),
     "code elsewhere": given(solver="./../../etc/passwd.py:Solver"),
-    "a limit of zero": given(limit="0"),
-    "a limit of NaN": given(limit=".nan"),
-    "a limit of 1e999": given(limit="1e999"),
-    "an agreement of 2": given(agree="2"),
-    "an agreement of NaN": given(agree=".nan"),
+    "a limit of zero": given(max_ratio="0"),
+    "a limit of NaN": given(max_ratio=".nan"),
+    "a limit of 1e999": given(max_ratio="1e999"),
+    "an agreement of 2": given(agreement_rtol="2"),
+    "an agreement of NaN": given(agreement_rtol=".nan"),
     "a size of 1e9": given(size="1e9"),
     "a size of zero": given(size="0"),
     "no iterations": given(iterations="0"),
@@ -77,9 +77,10 @@ RECORDS: dict[str, str | bytes | Callable[[Path], object]] = {
 PLUGIN = """
 import pytest
 WRONG = [
-    {"limit": float("nan")}, {"limit": 0.0}, {"limit": -1.0}, {"limit": float("inf")}, {"limit": "fast"},
-    {"limit": 1.0, "clock": "sun"}, {"limit": 1.0, "agree": -1.0}, {"limit": 1.0, "agree": float("nan")},
-    {"limit": 1.0, "error": 2.0}, {"limit": 1.0, "error": -1.0},
+    {"max_ratio": float("nan")}, {"max_ratio": 0.0}, {"max_ratio": -1.0}, {"max_ratio": float("inf")},
+    {"max_ratio": "fast"}, {"max_ratio": 1.0, "clock": "sun"}, {"max_ratio": 1.0, "agreement_rtol": -1.0},
+    {"max_ratio": 1.0, "agreement_rtol": float("nan")}, {"max_ratio": 1.0, "alpha": 2.0},
+    {"max_ratio": 1.0, "alpha": -1.0},
 ]
 @pytest.mark.parametrize("given", WRONG)
 def test_race(paired_benchmark, given):

@@ -71,7 +71,7 @@ def test_hostile_results_are_answered_by_all_commands(name: str, tmp_path: Path)
             ["compact", "results"],
             ["merge", "clean", "results", "-o", "results/../results-merged"],
             ["publish", "results", "-o", "results-published.zip"],
-            ["regress", "clean", "results"],
+            ["regress", "results", "--baseline", "clean"],
             ["query", "SELECT count(*) FROM rows", "--results", "results"],
         )
     ):

@@ -57,7 +57,12 @@ def test_a_hostile_assignment_is_refused_by_name(folder: Path, case: str) -> Non
 @pytest.mark.parametrize("case", GATES)
 def test_a_hostile_benchmark_is_refused_by_name(folder: Path, case: str) -> None:
     write(folder / "hostile.json", GATES[case])
-    require_message(attempt(folder, ["regress", "hostile.json", "hostile.json"]), 2, "hostile.json", "pytest-benchmark")
+    require_message(
+        attempt(folder, ["regress", "hostile.json", "--baseline", "hostile.json"]),
+        2,
+        "hostile.json",
+        "pytest-benchmark",
+    )
 
 
 @pytest.mark.parametrize("case", QUERIES)

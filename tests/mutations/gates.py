@@ -1,4 +1,4 @@
-"""Lies in gates: in their statistics, their answers and what they compare."""
+"""Planted errors in performance tests: in their statistics, verdicts and comparisons."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ _UNIT_ABBA, _UNIT_LISTED, _UNIT_SEQUENTIAL = (
 
 GATES = (
     Mutation(
-        "each-gate-errs-as-the-table-may",
-        "harness/experiments/regression/regression_table.py",
-        "alpha / len(table.gates)",
+        "each-gate-errs-as-the-file-may",
+        "harness/experiments/regression/gates_file.py",
+        "alpha / len(gates_file.gates)",
         "alpha",
         (_UNIT_LISTED,),
     ),
@@ -26,8 +26,8 @@ GATES = (
     Mutation(
         "unconfirmed-holds",
         "harness/experiments/regression/abba_benchmark.py",
-        "SequentialVerdict.FAIL if second.verdict is SequentialVerdict.FAIL else SequentialVerdict.INCONCLUSIVE",
-        "SequentialVerdict.FAIL if second.verdict is SequentialVerdict.FAIL else SequentialVerdict.PASS",
+        "RegressionVerdict.FAIL if second.verdict is RegressionVerdict.FAIL else RegressionVerdict.INCONCLUSIVE",
+        "RegressionVerdict.FAIL if second.verdict is RegressionVerdict.FAIL else RegressionVerdict.PASS",
         (_UNIT_ABBA,),
     ),
     Mutation(
@@ -39,14 +39,14 @@ GATES = (
     ),
     Mutation(
         "undecided-outweighs-failure",
-        "harness/experiments/regression/revision_comparison.py",
-        "(SequentialVerdict.FAIL, SequentialVerdict.INCONCLUSIVE) if a in verdicts",
-        "(SequentialVerdict.INCONCLUSIVE, SequentialVerdict.FAIL) if a in verdicts",
-        ("tests/unit/test_gate_against.py::test_one_failure_outweighs_what_is_undecided_and_that_what_holds",),
+        "harness/results/regression_verdict.py",
+        "if RegressionVerdict.FAIL in found:",
+        "if found == {RegressionVerdict.FAIL}:",
+        ("tests/unit/test_gate_against.py::test_a_failure_outweighs_an_inconclusive_test_and_that_a_pass",),
     ),
     Mutation(
         "sizes-from-the-origin",
-        "harness/experiments/regression/answer_agreement.py",
+        "harness/experiments/regression/program_pair.py",
         "float(np.ptp(points, axis=0).max(initial=0.0)) if points.size",
         "float(np.abs(points).max(initial=0.0)) if points.size",
         ("tests/unit/test_gate_plugin.py::test_answers_are_compared_in_their_own_size",),

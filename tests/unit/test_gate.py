@@ -1,4 +1,4 @@
-"""`springbench regress`: what counts as a regression between two stored benchmark files."""
+"""`springbench regress`: regressions between two files of pytest-benchmark."""
 
 import io
 import json
@@ -13,6 +13,7 @@ from rich.console import Console
 from springbench.harness.cli.main import app
 from springbench.harness.errors import InputError
 from springbench.harness.report.benchmark_comparison import compare_benchmarks
+from springbench.harness.results.regression_verdict import RegressionVerdict
 from typer.testing import CliRunner
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,60 +36,63 @@ def stored(path: Path, *benchmarks: dict[str, Any], machine: dict[str, Any] = HE
     return path
 
 
-def judged(base: Path, new: Path) -> tuple[int, str]:
+def compare(base: Path, new: Path) -> tuple[RegressionVerdict, str]:
     console = Console(file=io.StringIO(), width=200)
-    code = compare_benchmarks(base, new, console)
+    verdict = compare_benchmarks(base, new, console)
     assert isinstance(console.file, io.StringIO)
-    return code, console.file.getvalue()
+    return verdict, console.file.getvalue()
 
 
 WIDE = ratio(1.2, spread=0.12)  # from 1.08 to 1.32: above 1.00 +- 0.01, but not by the margin of 10 %
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "machine", "code", "verdict"),
+    ("old", "new", "machine", "words"),
     [
-        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.0)}, HERE, 0, "unchanged", id="the same ratio"),
-        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.2)}, HERE, 1, "slower", id="a higher ratio"),
-        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(0.8)}, HERE, 0, "faster", id="a lower ratio"),
-        pytest.param({"ratio": ratio(1.0)}, {"ratio": WIDE}, HERE, 0, "unchanged", id="an uncertain ratio"),
-        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.2)}, ELSEWHERE, 0, "unchanged", id="ratio elsewhere"),
-        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.5)}, ELSEWHERE, 1, "slower", id="far ratio elsewhere"),
-        pytest.param({"ratio": ratio(1.0)}, {}, HERE, 1, "vanished", id="a ratio that vanished"),
-        pytest.param({}, {"minimum": 1.4 * MINIMUM}, HERE, 0, "unchanged", id="a minimum within the margin"),
-        pytest.param({}, {"minimum": 1.6 * MINIMUM}, HERE, 1, "slower", id="a minimum beyond the margin"),
-        pytest.param({}, {"minimum": 0.5 * MINIMUM}, HERE, 0, "faster", id="a lower minimum"),
-        pytest.param({}, {"minimum": 9 * MINIMUM}, ELSEWHERE, 0, "not judged", id="a minimum elsewhere"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.0)}, HERE, "pass", id="the same ratio"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.2)}, HERE, "fail: slower", id="a higher ratio"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(0.8)}, HERE, "pass: faster", id="a lower ratio"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": WIDE}, HERE, "pass", id="an uncertain ratio"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.2)}, ELSEWHERE, "pass", id="ratio elsewhere"),
+        pytest.param({"ratio": ratio(1.0)}, {"ratio": ratio(1.5)}, ELSEWHERE, "fail: slower", id="far ratio elsewhere"),
+        pytest.param({"ratio": ratio(1.0)}, {}, HERE, "fail: its ratio is missing", id="a ratio that is missing"),
+        pytest.param({}, {"minimum": 1.4 * MINIMUM}, HERE, "pass", id="a minimum within the margin"),
+        pytest.param({}, {"minimum": 1.6 * MINIMUM}, HERE, "fail: slower", id="a minimum beyond the margin"),
+        pytest.param({}, {"minimum": 0.5 * MINIMUM}, HERE, "pass: faster", id="a lower minimum"),
+        pytest.param(
+            *({}, {"minimum": 9 * MINIMUM}, ELSEWHERE, "inconclusive: another machine"), id="a minimum elsewhere"
+        ),
     ],
 )
-def test_a_benchmark_is_judged(old: dict, new: dict, machine: dict, code: int, verdict: str, tmp_path: Path):
+def test_a_benchmark_is_compared(old: dict, new: dict, machine: dict, words: str, tmp_path: Path):
     base = stored(tmp_path / "base.json", benchmark(**old))
-    found, text = judged(base, stored(tmp_path / "new.json", benchmark(**new), machine=machine))
-    assert found == code
-    assert verdict in text
+    verdict, text = compare(base, stored(tmp_path / "new.json", benchmark(**new), machine=machine))
+    assert verdict == words.partition(":")[0]
+    (row,) = [line for line in text.splitlines() if "test_gate[numba]" in line]
+    assert row.rstrip().endswith(words)
+    assert f"{verdict}: 1 {verdict}" in text
     assert ("different machines" in text) == (machine is ELSEWHERE)
 
 
-def test_a_ratio_is_judged_whatever_the_times_were(tmp_path: Path):
+def test_a_ratio_is_compared_whatever_the_times_were(tmp_path: Path):
     base = stored(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
-    code, text = judged(base, stored(tmp_path / "new.json", benchmark(minimum=5 * MINIMUM, ratio=ratio(1.0))))
-    assert code == 0
-    assert "unchanged" in text
+    verdict, _ = compare(base, stored(tmp_path / "new.json", benchmark(minimum=5 * MINIMUM, ratio=ratio(1.0))))
+    assert verdict == "pass"
 
 
-def test_a_gate_that_vanished_is_a_regression_and_a_new_one_is_not(tmp_path: Path):
+def test_a_missing_benchmark_fails_and_a_new_one_has_no_verdict(tmp_path: Path):
     one, both = stored(tmp_path / "one.json", benchmark("a")), tmp_path / "both.json"
     stored(both, benchmark("a"), benchmark("b"))
-    code, text = judged(both, one)
-    assert code == 1
-    assert [line.split()[-1] for line in text.splitlines() if "[b]" in line] == ["vanished"]
-    code, text = judged(one, both)
-    assert code == 0
+    verdict, text = compare(both, one)
+    assert verdict == "fail"
+    assert [line.split()[-2:] for line in text.splitlines() if "[b]" in line] == [["fail:", "missing"]]
+    verdict, text = compare(one, both)
+    assert verdict == "pass"
     assert [line.split()[-1] for line in text.splitlines() if "[b]" in line] == ["new"]
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "problem"),
     [
         pytest.param(None, "No such file", id="missing"),
         pytest.param("no JSON", "Invalid JSON", id="no JSON"),
@@ -107,30 +111,30 @@ def test_a_gate_that_vanished_is_a_regression_and_a_new_one_is_not(tmp_path: Pat
         ),
     ],
 )
-def test_a_foreign_file_is_the_users_mistake(content: str | None, told: str, tmp_path: Path):
+def test_a_foreign_file_is_the_users_mistake(content: str | None, problem: str, tmp_path: Path):
     good, bad = stored(tmp_path / "good.json", benchmark()), tmp_path / "bad.json"
     if content is not None:
         bad.write_text(content)
     for pair in ((good, bad), (bad, good)):
         with pytest.raises(InputError) as caught:
-            judged(*pair)
+            compare(*pair)
         message = str(caught.value)
         assert message.startswith(f"{bad}: ")
-        assert told in message
-        assert "wanted a file that pytest-benchmark stored" in message
+        assert problem in message
+        assert "expected a file that pytest-benchmark stored" in message
 
 
-def test_files_without_a_common_benchmark_tell_nothing(tmp_path: Path):
-    code, text = judged(stored(tmp_path / "a.json", benchmark("a")), stored(tmp_path / "b.json", benchmark("b")))
-    assert code == 3
+def test_files_without_a_common_benchmark_are_inconclusive(tmp_path: Path):
+    verdict, text = compare(stored(tmp_path / "a.json", benchmark("a")), stored(tmp_path / "b.json", benchmark("b")))
+    assert verdict == "inconclusive"
     assert "no benchmark in common" in " ".join(text.split())  # long paths wrap
 
 
 @pytest.mark.parametrize(("new", "code"), [(1.0, 0), (1.5, 1), (None, 2)])
-def test_the_command_line_answers_with_the_exit_code(new: float | None, code: int, tmp_path: Path):
+def test_the_verdict_is_the_exit_code(new: float | None, code: int, tmp_path: Path):
     base = stored(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
     other = stored(tmp_path / "new.json", benchmark(ratio=ratio(new))) if new else tmp_path / "missing.json"
-    assert CliRunner().invoke(app, ["regress", str(base), str(other)]).exit_code == code
+    assert CliRunner().invoke(app, ["regress", str(other), "--baseline", str(base)]).exit_code == code
 
 
 BENCHMARK = """
@@ -164,14 +168,13 @@ def test_what_the_gates_store_can_be_compared_and_names_no_host(tmp_path: Path):
     # Benchmarks measure nothing in a process that shares its machine with other tests, and this one says it does.
     alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
     environment = alone | {"PYTHONPATH": str(ROOT)}
-    told = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert told.returncode == 0, told.stdout + told.stderr
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
     (file,) = (tmp_path / "results" / "bench").glob("*/0001_gates.json")
     content = json.loads(file.read_text())
     assert "node" not in content["machine_info"]
     found = content["benchmarks"][0]
-    assert len(found["stats"]["data"]) == 2 * found["extra_info"]["turns"]
-    code, text = judged(file, file)
-    assert code == 0
+    assert len(found["stats"]["data"]) == 2 * found["extra_info"]["num_blocks"]
+    verdict, text = compare(file, file)
+    assert verdict == "pass"
     assert "test_counts" in text
-    assert "unchanged" in text

@@ -20,8 +20,8 @@ from springbench.harness.experiments.regression.abba_benchmark import (
 from springbench.harness.experiments.regression.confidence_sequence import (
     RatioInterval,
     SequentialTest,
-    SequentialVerdict,
 )
+from springbench.harness.results.regression_verdict import RegressionVerdict
 
 RULE = SequentialTest(1.03)
 
@@ -32,17 +32,17 @@ def clock(seconds: float) -> Callable[[], float]:
 
 @pytest.mark.parametrize(
     ("ratio", "answer"),
-    [(1.0, SequentialVerdict.PASS), (1.05, SequentialVerdict.FAIL), (1.03, SequentialVerdict.INCONCLUSIVE)],
+    [(1.0, RegressionVerdict.PASS), (1.05, RegressionVerdict.FAIL), (1.03, RegressionVerdict.INCONCLUSIVE)],
 )
-def test_a_race_ends_when_it_knows(ratio: float, answer: SequentialVerdict):
+def test_a_race_ends_when_it_knows(ratio: float, answer: RegressionVerdict):
     # The third ratio is the limit itself: neither above nor below, so that only the budget ends it.
     found = run_paired_benchmark(
         ProgramPair(clock(ratio), clock(1.0)),
         RULE,
-        time_budget=60.0 if answer is not SequentialVerdict.INCONCLUSIVE else 0.05,
+        time_budget=60.0 if answer is not RegressionVerdict.INCONCLUSIVE else 0.05,
     )
     assert found.verdict is answer
-    if answer is not SequentialVerdict.INCONCLUSIVE:
+    if answer is not RegressionVerdict.INCONCLUSIVE:
         assert len(found.blocks) == 16  # the fewest that can decide at an error of 0.1 %
         assert (found.interval.low, found.interval.high) == pytest.approx((ratio, ratio))
 
@@ -80,7 +80,7 @@ def test_a_race_makes_the_work_of_both_anew_until_it_knows():
     found = run_paired_benchmark(
         ProgramPair(clock(1.0), clock(1.0), lambda: renewed.append(None)), RULE, time_budget=60.0
     )
-    assert (found.verdict, len(found.blocks)) == (SequentialVerdict.PASS, 16)
+    assert (found.verdict, len(found.blocks)) == (RegressionVerdict.PASS, 16)
     assert 1 <= len(renewed) <= 15
 
 
@@ -99,15 +99,15 @@ def pairs(*ratios: float) -> tuple[Callable[..., object], list[float]]:
 @pytest.mark.parametrize(
     ("ratios", "answer"),
     [
-        ((1.0,), SequentialVerdict.PASS),
-        ((1.06, 1.05), SequentialVerdict.FAIL),
+        ((1.0,), RegressionVerdict.PASS),
+        ((1.06, 1.05), RegressionVerdict.FAIL),
         (
             (1.06, 1.0),
-            SequentialVerdict.INCONCLUSIVE,
+            RegressionVerdict.INCONCLUSIVE,
         ),  # two processes of the same code may differ by where their memory lies
     ],
 )
-def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[float, ...], answer: SequentialVerdict):
+def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[float, ...], answer: RegressionVerdict):
     start, started = pairs(*ratios)
     found = run_confirmed_benchmark(start, RULE, time_budget=60.0)  # type: ignore[arg-type]
     assert found.verdict is answer
@@ -136,7 +136,7 @@ def test_programs_are_started_anew_as_long_as_a_race_lasts(monkeypatch: pytest.M
     start, started = pairs(*[1.0] * 16)
     found = run_confirmed_benchmark(start, RULE, time_budget=60.0)  # type: ignore[arg-type]
     assert (found.verdict, found.num_process_pairs, len(found.blocks), len(started)) == (
-        SequentialVerdict.PASS,
+        RegressionVerdict.PASS,
         16,
         16,
         16,
@@ -147,7 +147,7 @@ def test_pairs_that_differ_all_their_lives_decide_nothing_together(monkeypatch: 
     monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark.RESTART_SECONDS", 0.0)
     start, _ = pairs(*[1.05, 1.0] * 10_000)
     found = run_confirmed_benchmark(start, RULE, time_budget=0.05)  # type: ignore[arg-type]
-    assert found.verdict is SequentialVerdict.INCONCLUSIVE
+    assert found.verdict is RegressionVerdict.INCONCLUSIVE
     assert found.num_process_pairs == len(found.blocks) > 16
     assert found.elapsed_seconds == pytest.approx(0.05, abs=0.05)
 
@@ -155,23 +155,23 @@ def test_pairs_that_differ_all_their_lives_decide_nothing_together(monkeypatch: 
 @pytest.mark.parametrize(
     ("answer", "limit", "interval", "said"),
     [
-        (SequentialVerdict.FAIL, 1.03, (1.061, 1.052, 1.07), "slower by 6.1 % [5.2, 7.0]: fails (limit 3.0 %)"),
-        (SequentialVerdict.PASS, 1.03, (1.003, 0.99, 1.012), "no slower than 1.2 %: holds (limit 3.0 %)"),
-        (SequentialVerdict.PASS, 1.03, (0.9, 0.89, 0.91), "ratio 0.9 [0.89, 0.91]: holds (limit 1.03)"),
-        (SequentialVerdict.FAIL, 0.45, (0.5, 0.48, 0.52), "ratio 0.5 [0.48, 0.52]: fails (limit 0.45)"),
-        (SequentialVerdict.FAIL, 1.03, (3.0, 2.9, 3.1), "ratio 3 [2.9, 3.1]: fails (limit 1.03)"),
+        (RegressionVerdict.FAIL, 1.03, (1.061, 1.052, 1.07), "fail: slower by 6.1 % [5.2, 7.0] (limit 3.0 %)"),
+        (RegressionVerdict.PASS, 1.03, (1.003, 0.99, 1.012), "pass: at most 1.2 % slower (limit 3.0 %)"),
+        (RegressionVerdict.PASS, 1.03, (0.9, 0.89, 0.91), "pass: ratio 0.9 [0.89, 0.91] (limit 1.03)"),
+        (RegressionVerdict.FAIL, 0.45, (0.5, 0.48, 0.52), "fail: ratio 0.5 [0.48, 0.52] (limit 0.45)"),
+        (RegressionVerdict.FAIL, 1.03, (3.0, 2.9, 3.1), "fail: ratio 3 [2.9, 3.1] (limit 1.03)"),
         (
-            *(SequentialVerdict.INCONCLUSIVE, 1.03, (1.01, 0.96, 1.07)),
-            "cannot tell within 120 s: 0.96 to 1.07 (limit 1.03), on a machine with load 7",
+            *(RegressionVerdict.INCONCLUSIVE, 1.03, (1.01, 0.96, 1.07)),
+            "inconclusive: ratio 0.96 to 1.07 (limit 1.03) after 120 s, load average 7",
         ),
         (
-            *(SequentialVerdict.INCONCLUSIVE, 1.03, (1.01, 0.0, float("inf"))),
-            "cannot tell within 120 s: 1 turns are too few (limit 1.03), on a machine with load 7",
+            *(RegressionVerdict.INCONCLUSIVE, 1.03, (1.01, 0.0, float("inf"))),
+            "inconclusive: 1 blocks only (limit 1.03) after 120 s, load average 7",
         ),
     ],
 )
 def test_a_result_says_what_was_found(
-    answer: SequentialVerdict, limit: float, interval: tuple[float, float, float], said: str
+    answer: RegressionVerdict, limit: float, interval: tuple[float, float, float], said: str
 ):
     turn = TimedBlock("ABBA", (1.0, 1.0, 1.0, 1.0))
     assert str(BenchmarkResult(answer, SequentialTest(limit), RatioInterval(*interval), (turn,), 120.0, 7.2)) == said

@@ -1,4 +1,4 @@
-"""`springbench regress --against REVISION`, in small repositories whose gates do arithmetic instead of physics."""
+"""`springbench regress --baseline REVISION`, in small repositories whose gates do arithmetic instead of physics."""
 
 import re
 import subprocess
@@ -9,13 +9,9 @@ from types import SimpleNamespace
 import pytest
 from springbench.harness.cli.main import app
 from springbench.harness.experiments.regression import git_worktrees, revision_worker
-from springbench.harness.experiments.regression.confidence_sequence import SequentialVerdict
-from springbench.harness.experiments.regression.revision_comparison import (
-    WorkRequest,
-    choose_exit_code,
-    start_revisions,
-)
+from springbench.harness.experiments.regression.revision_comparison import WorkRequest, start_revisions
 from springbench.harness.experiments.regression.revision_process import GitRevision, describe_changes, start_workers
+from springbench.harness.results.regression_verdict import RegressionVerdict, combine_verdicts
 from typer.testing import CliRunner
 
 from tests.scene_builders import CLOTH_SCENE_YAML
@@ -72,46 +68,45 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def gate(*arguments: str) -> tuple[int, str]:
+def regress(*arguments: str) -> tuple[int, str]:
     done = CliRunner().invoke(app, ["regress", *arguments])
     return done.exit_code, " ".join(done.output.split())
 
 
-def test_a_program_that_takes_twice_as_long_fails_and_an_equal_one_holds(repository: Path):
+def test_a_program_that_takes_twice_as_long_fails_and_an_equal_one_passes(repository: Path):
     # Nothing depends on the machine's speed: the limits lie far from the ratios 2 and 1, and there is time enough.
     state(repository, rounds=200_000)
-    code, said = gate("--against", "HEAD", "-k", "adding", "--limit", "1.2", "--budget", "500")
+    code, said = regress("--baseline", "HEAD", "-k", "adding", "--max-ratio", "1.2", "--budget", "500")
     assert code == 1, said
-    assert re.search(r"adding: (ratio|slower by) .*: fails \(limit (1.2|20.0 %)\)", said), said
+    assert re.search(r"adding: fail: (ratio|slower by) .* \(limit (1.2|20.0 %)\)", said), said
     state(repository)
-    code, said = gate("--against", "HEAD", "-k", "adding", "--limit", "5", "--budget", "500")
+    code, said = regress("--baseline", "HEAD", "-k", "adding", "--max-ratio", "5", "--budget", "500")
     assert code == 0, said
-    assert "holds (limit 5)" in said
+    assert re.search(r"adding: pass: ratio .* \(limit 5\)", said), said
 
 
-def test_what_cannot_be_told_in_time_has_an_exit_code_of_its_own(repository: Path):
-    code, said = gate("--against", "HEAD", "-k", "adding", "--budget", "0.001")
+def test_an_inconclusive_comparison_has_an_exit_code_of_its_own(repository: Path):
+    code, said = regress("--baseline", "HEAD", "-k", "adding", "--budget", "0.001")
     assert code == 3, said
-    assert "adding: cannot tell within" in said
-    assert "turns are too few" in said
+    assert re.search(r"adding: inconclusive: \d+ blocks only", said), said
 
 
 def test_answers_that_differ_fail_before_anything_is_timed(repository: Path):
     state(repository, answer=0.5)
-    code, said = gate("--against", "HEAD", "-k", "adding")
+    code, said = regress("--baseline", "HEAD", "-k", "adding")
     assert code == 2
     # The old answer's size is 1, which 0.5 is half of.
-    assert "answer differently: they lie 5.0e-01 of the answer's size apart, wanted 1e-09; nothing was timed" in said
+    assert "the answers differ by 5.0e-01 of their size, at most 1e-09 is allowed; nothing was timed" in said
 
 
-def test_a_revision_that_does_not_run_says_why_in_its_own_words(repository: Path):
+def test_a_revision_that_cannot_be_run_gives_its_own_reason(repository: Path):
     (repository / "tests" / "bench" / "test_gates.py").write_text("ALL = (\n")
     commit(repository)
     state(repository)
-    code, said = gate("--against", "HEAD", "-k", "adding")
+    code, said = regress("--baseline", "HEAD", "-k", "adding")
     assert code == 2
     assert "revision HEAD" in said
-    assert "does not run: SyntaxError: '(' was never closed" in said
+    assert "cannot be run: SyntaxError: '(' was never closed" in said
 
 
 @pytest.mark.long
@@ -120,53 +115,55 @@ def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Pat
     (repository / "pyproject.toml").write_text(project.format("0", '"no such thing !"'))
     commit(repository)
     (repository / "pyproject.toml").write_text(project.format("1", ""))
-    code, said = gate("--against", "HEAD", "-k", "adding")
+    code, said = regress("--baseline", "HEAD", "-k", "adding")
     assert code == 2
-    assert "does not build:" in said
+    assert "cannot be installed:" in said
     # One that was killed while it was built is not taken for whole.
     (tree,) = (path for path in git_worktrees.worktree_cache().iterdir() if path.is_dir())
     (tree / ".venv" / "bin").mkdir(parents=True)
     (tree / ".venv" / "bin" / "python").touch()
-    code, said = gate("--against", "HEAD", "-k", "adding")
+    code, said = regress("--baseline", "HEAD", "-k", "adding")
     assert code == 2
-    assert "does not build:" in said
+    assert "cannot be installed:" in said
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--against", "nowhere", "-k", "adding"), "--against: unknown revision 'nowhere'; wanted a commit"),
-        (("--against", "--help", "-k", "adding"), "--against: unknown revision '--help'; wanted a commit"),
-        (("--against", "HEAD", "-k", "subtracting"), "-k subtracting: neither has such a gate; they have adding, new"),
-        (("--against", "HEAD", "-k", "new"), "-k new: revision HEAD"),
-        (("--against", "HEAD", "-k", "old"), "-k old: this checkout has no gate old"),
-        (("--against", "HEAD", "scene.yaml", "-k", "old"), "wanted one scene, one sweep, or -k NAME"),
-        (("--against", "HEAD", "nowhere.yaml"), "cannot be read: No such file"),
-        (("--against", "HEAD", "--clock", "sun"), "--clock: came sun; wanted cpu or wall"),
-        (("--against", "HEAD", "--budget", "-1"), "--budget: came -1.0; wanted seconds"),
-        (("--against", "HEAD", "--limit", "-1"), "--limit: came -1.0; wanted a ratio of times"),
-        (("-k", "old"), "-k: chooses gates to compare with another revision; wanted --against REVISION"),
-        (("a.json", "b.json", "--budget", "3"), "--budget: nothing is timed between stored results"),
-        (("a.json",), "regress: came 1 file; wanted --against REVISION, a table of gates, or two stored"),
-        ((), "regress: came 0 files; wanted --against REVISION, a table of gates, or two stored"),
+        (("--baseline", "nowhere", "-k", "adding"), "--baseline: unknown revision 'nowhere'; expected a commit"),
+        (("--baseline", "--help", "-k", "adding"), "--baseline: unknown revision '--help'; expected a commit"),
+        (("--baseline", "HEAD", "-k", "subtracting"), "-k subtracting: no such gate; expected a part of adding, new"),
+        (("--baseline", "HEAD", "-k", "new"), "-k new: revision HEAD"),
+        (("--baseline", "HEAD", "-k", "old"), "-k old: this checkout has no gate old"),
+        (("--baseline", "HEAD", "scene.yaml", "-k", "old"), "-k: does not apply to a comparison of a scene or a sweep"),
+        (("--baseline", "HEAD", "nowhere.yaml"), "cannot be read: No such file"),
+        (("--baseline", "HEAD", "--clock", "sun"), "'sun' is not one of 'cpu', 'wall'"),
+        (("--baseline", "HEAD", "--budget", "-1"), "--budget: got -1.0; expected a positive number of seconds"),
+        (("--baseline", "HEAD", "--max-ratio", "-1"), "--max-ratio: got -1.0; expected a ratio of times"),
+        (("--baseline", "HEAD", "--size", "4"), "--size: does not apply to a comparison of gates with a revision"),
+        (("-k", "old"), "nothing to compare with; add --baseline REVISION"),
+        (("a.json", "--baseline", "b.json", "--budget", "3"), "--budget: does not apply to a comparison of stored"),
+        (("a.json", "b.json"), "got 2 subjects; expected one"),
+        (("a.json",), "nothing to compare with; add --baseline REVISION"),
+        ((), "nothing to compare with; add --baseline REVISION"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else "",
 )
 def test_a_mistake_is_one_message(repository: Path, arguments: tuple[str, ...], said: str):
     state(repository, other="new")
-    code, told = gate(*arguments)
+    code, told = regress(*arguments)
     assert code == 2, told
     assert said in told
 
 
 def test_a_folder_outside_git_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    code, said = gate("--against", "HEAD", "-k", "adding")
+    code, said = regress("--baseline", "HEAD", "-k", "adding")
     assert code == 2
     assert "is in no git checkout" in said
 
 
-def test_a_run_of_a_scene_is_held_with_its_exact_facts_and_each_revision_has_its_own_file(repository: Path):
+def test_a_run_has_exact_counts_and_each_revision_its_own_file(repository: Path):
     (repository / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     other = repository / "elsewhere"
     other.mkdir()
@@ -195,7 +192,7 @@ def test_a_run_of_a_scene_is_held_with_its_exact_facts_and_each_revision_has_its
     assert abs(held[0].answer - held[1].answer).max() > 1e-6
 
 
-def test_work_that_is_renewed_is_made_again_before_it_is_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_rebuilt_work_is_prepared_again_before_it_is_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made, done = list[int](), list[int]()
 
     def candidate() -> Callable[[], float]:
@@ -203,24 +200,24 @@ def test_work_that_is_renewed_is_made_again_before_it_is_timed(tmp_path: Path, m
         return lambda: done.append(number) or 0.0
 
     monkeypatch.setattr(
-        revision_worker, "_load_tests", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")}
+        revision_worker, "_load_gates", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")}
     )
     held = revision_worker.RevisionWorker()
     monkeypatch.setattr(held, "_pin_threads", lambda threads: None)
-    held.prepare_test("mine", str(tmp_path / "answer.npy"))
+    held.prepare_gate("mine", str(tmp_path / "answer.npy"))
     held.rebuild_work()
     held.time_calls(2, "cpu")
     assert (made, done) == ([0, 1], [0, 1, 1])
 
 
-def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
+def test_a_worker_that_dies_is_reported_with_its_last_line(tmp_path: Path):
     (tmp_path / "json.py").write_text("raise SystemExit('there is no more json')")
-    request = WorkRequest("a gate", "prepare_test", {"name": "a gate"})
+    request = WorkRequest("a gate", "prepare_gate", {"name": "a gate"})
     from springbench.harness.errors import InputError
     from springbench.harness.experiments.regression.revision_comparison import ComparisonOptions
 
     with (
-        pytest.raises(InputError, match="that: does not run: there is no more json"),
+        pytest.raises(InputError, match="that: cannot be run: there is no more json"),
         start_revisions(
             (GitRevision("that", tmp_path), GitRevision("this", tmp_path)), request, ComparisonOptions(1.0), print
         ),
@@ -228,7 +225,7 @@ def test_a_worker_that_dies_is_told_with_its_last_words(tmp_path: Path):
         pass
 
 
-def test_changes_of_exact_facts_are_told():
+def test_changes_of_exact_counts_are_described():
     old = {"iterations": 200, "nnz_factor": 1000, "instructions": 1_000_000, "gone": 1}
     new = {"iterations": 210, "nnz_factor": 1000, "instructions": 1_000_900, "come": 2}
     assert describe_changes(new, old) == ["iterations 200 -> 210 (+5.0%)"]
@@ -236,12 +233,44 @@ def test_changes_of_exact_facts_are_told():
 
 
 @pytest.mark.parametrize(
-    ("answers", "code"),
+    ("verdicts", "code"),
     [
-        ([SequentialVerdict.PASS], 0),
-        ([SequentialVerdict.PASS, SequentialVerdict.INCONCLUSIVE], 3),
-        ([SequentialVerdict.INCONCLUSIVE, SequentialVerdict.FAIL, SequentialVerdict.PASS], 1),
+        (["pass"], 0),
+        (["pass", "inconclusive"], 3),
+        (["inconclusive", "fail", "pass"], 1),
+        ([], 3),
     ],
 )
-def test_one_failure_outweighs_what_is_undecided_and_that_what_holds(answers: list[SequentialVerdict], code: int):
-    assert choose_exit_code(answers) == code
+def test_a_failure_outweighs_an_inconclusive_test_and_that_a_pass(verdicts: list[str], code: int):
+    assert combine_verdicts(map(RegressionVerdict, verdicts)).exit_code == code
+
+
+@pytest.mark.parametrize(
+    ("package", "message"),
+    [
+        ("", "lacks a name that a comparison needs (No module named 'springbench.harness.config"),
+        ("def load_config(path): ...", "lacks a name that a comparison needs (load_config() got an unexpected keyword"),
+    ],
+    ids=["other modules", "other parameters"],
+)
+def test_a_revision_with_other_names_is_refused(repository: Path, package: str, message: str):
+    (repository / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
+    config = repository / ".src" / "springbench" / "harness" / "config"
+    config.mkdir(parents=True)
+    for folder in (config.parents[1], config.parent, *([config] if package else [])):
+        (folder / "__init__.py").touch()
+    if package:
+        (config / "config_loader.py").write_text(package)
+    else:
+        config.rmdir()
+    commit(repository)
+    code, output = regress("--baseline", "HEAD", "cloth.yaml", "--solver", "sparse")
+    assert code == 2, output
+    assert message in output
+
+
+def test_a_revision_without_the_package_is_refused(repository: Path):
+    (repository / ".src").mkdir()
+    code, output = regress("--baseline", "HEAD", "-k", "adding")
+    assert code == 2, output
+    assert "has no folder .src, so its code cannot be run by this checkout; choose a later revision" in output

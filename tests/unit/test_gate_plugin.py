@@ -1,15 +1,19 @@
-"""The fixture `paired_benchmark` and tables of gates, as somebody uses them in a folder of their own."""
+"""The fixture `paired_benchmark` and gates files, in a folder of the user's own."""
 
 import json
 import os
+import re
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 from springbench.harness.cli.main import app
-from springbench.harness.experiments.regression.answer_agreement import describe_difference
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.errors import InputError
+from springbench.harness.experiments.regression.program_pair import AnswersDiffer, require_agreement
 from typer.testing import CliRunner
 
 SCENE = """
@@ -53,7 +57,7 @@ def session(folder: Path, test: str, *options: str) -> tuple[int, str, list[dict
     return told.returncode, told.stdout + told.stderr, found
 
 
-def test_a_race_has_three_answers_and_stores_what_it_found(tmp_path: Path):
+def test_a_paired_benchmark_has_three_verdicts_and_stores_its_result(tmp_path: Path):
     # Nothing depends on the machine's speed: limits lie far from the true ratios of 1 and 3, and there is time enough.
     test = """
 def test_holds(paired_benchmark): paired_benchmark(spin(50_000), spin(50_000), max_ratio=20)
@@ -63,16 +67,16 @@ def test_inconclusive(paired_benchmark): paired_benchmark(spin(100_000), spin(10
     code, said, stored = session(tmp_path, test, "--paired-benchmark-budget=500")
     assert code == 1
     assert "1 failed, 1 passed, 1 inconclusive" in said
-    assert "FAILED test_mine.py::test_fails - Failed: ratio" in said
-    assert "INCONCLUSIVE test_mine.py::test_inconclusive: cannot tell within" in said
-    assert [b["extra_info"]["answer"] for b in stored] == ["pass", "fail", "inconclusive"]
+    assert "FAILED test_mine.py::test_fails - Failed: fail: ratio" in said
+    assert re.search(r"INCONCLUSIVE test_mine.py::test_inconclusive: .* \(limit 1\) after", said)
+    assert [b["extra_info"]["verdict"] for b in stored] == ["pass", "fail", "inconclusive"]
     for benchmark in stored:
         extra = benchmark["extra_info"]
         assert extra["ratio"]["low"] <= extra["ratio"]["median"] <= extra["ratio"]["high"]
-        assert benchmark["stats"]["rounds"] == 2 * extra["turns"]
+        assert benchmark["stats"]["rounds"] == 2 * extra["num_blocks"]
 
 
-def test_a_session_without_failures_that_cannot_tell_has_an_exit_code_of_its_own(tmp_path: Path):
+def test_an_inconclusive_session_has_an_exit_code_of_its_own(tmp_path: Path):
     test = (
         "def test_it(paired_benchmark): paired_benchmark(spin(100_000), spin(100_000), "
         "max_ratio=1, budget=1e-3)\ndef test_other(): pass"
@@ -86,7 +90,7 @@ def test_answers_that_differ_fail_and_nothing_is_timed(tmp_path: Path):
     test = "def test_it(paired_benchmark): paired_benchmark(spin(10, [0.0, 2.0]), spin(10, [0.0, 4.0]), max_ratio=9)"
     code, said, stored = session(tmp_path, test)
     assert code == 1
-    assert "the answers differ, so nothing was timed: they lie 5.0e-01 of the answer's size apart, wanted 0" in said
+    assert "the answers differ by 5.0e-01 of their size, at most 0 is allowed; nothing was timed" in said
     assert not stored
 
 
@@ -102,7 +106,7 @@ def test_other(paired_benchmark): paired_benchmark(spin(10, 1.0), spin(10, 2.0),
     assert not stored
 
 
-def test_solvers_race_on_a_scene_and_one_of_them_may_be_ones_own(tmp_path: Path):
+def test_solvers_are_compared_on_a_scene_and_one_may_be_the_users_own(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     test = """
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
@@ -117,86 +121,92 @@ def test_other_answers(paired_benchmark):
     assert code == 1
     assert "2 passed" in said
     assert "FAILED test_mine.py::test_other_answers - Failed: the answers differ" in said
-    assert [b["extra_info"]["answer"] for b in stored] == ["pass", "pass"]
+    assert [b["extra_info"]["verdict"] for b in stored] == ["pass", "pass"]
 
 
-def gate(path: Path, *options: str) -> tuple[int, str]:
+def regress(path: Path, *options: str) -> tuple[int, str]:
     done = CliRunner().invoke(app, ["regress", str(path), *options])
     return done.exit_code, " ".join(done.output.split())
 
 
-def table(folder: Path, *gates: str) -> Path:
+def write_gates(folder: Path, *gates: str) -> Path:
     (folder / "cloth.yaml").write_text(SCENE)
     path = folder / "gates.yaml"
-    path.write_text("gates:\n" + "".join(f"  - {{{gate}}}\n" for gate in gates))
+    path.write_text("gates:\n" + "".join(f"  - {{scene: cloth.yaml, {gate}}}\n" for gate in gates))
     return path
 
 
-def test_a_table_of_gates_is_run_without_python(tmp_path: Path):
-    path = table(
+def test_a_gates_file_is_run_without_python(tmp_path: Path):
+    path = write_gates(
         tmp_path,
-        "scene: cloth.yaml, solver: sparse, against: dense, limit: 1e6",
-        "scene: cloth.yaml, size: 5, solver: dense, against: {name: sparse}, limit: 1e-6",
-        "scene: cloth.yaml, solver: sparse, against: dense, limit: 1, budget: 1e-3",
+        "solver: sparse, baseline: dense, max_ratio: 1e6",
+        "size: 5, solver: dense, baseline: {name: sparse}, max_ratio: 1e-6",
+        "solver: sparse, baseline: dense, max_ratio: 1, budget: 1e-3",
     )
-    code, said = gate(path, "--budget", "500")
+    code, output = regress(path, "--budget", "500")
     assert code == 1
-    assert "cloth, sparse against dense: ratio" in said
-    assert "holds (limit 1e+06)" in said
-    assert "cloth 5, dense against sparse: ratio" in said
-    assert "fails (limit 1e-06)" in said
-    assert "cannot tell within" in said
-    undecided = table(tmp_path, "scene: cloth.yaml, solver: sparse, against: dense, limit: 1, budget: 1e-3")
-    assert gate(undecided)[0] == 3
+    assert "cloth, sparse vs dense: pass: ratio" in output
+    assert "(limit 1e+06)" in output
+    assert "cloth 5, dense vs sparse: fail: ratio" in output
+    assert "(limit 1e-06)" in output
+    assert "cloth, sparse vs dense: inconclusive: " in output
+    inconclusive = write_gates(tmp_path, "solver: sparse, baseline: dense, max_ratio: 1, budget: 1e-3")
+    assert regress(inconclusive)[0] == 3
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("gate", "message"),
     [
-        (
-            "scene: nowhere.yaml, solver: sparse, against: dense, limit: 1",
-            "gates.yaml:2: gates[0].scene: there is no file",
-        ),
-        (
-            "scene: cloth.yaml, solver: sparce, against: dense, limit: 1",
-            'gates.yaml:2: gates[0]: unknown name "sparce"; expected',
-        ),
-        ("scene: cloth.yaml, solver: sparse, against: dense", "gates.yaml:2: gates[0].limit: is missing"),
-        (
-            "scene: cloth.yaml, solver: sparse, against: dense, limit: -1",
-            "gates[0].limit: came -1; should be greater than 0",
-        ),
-        (
-            "scene: cloth.yaml, solver: xpbd, against: sparse, limit: 9",
-            "gates[0]: the answers differ, so nothing was timed",
-        ),
-        ("scene: cloth.yaml, solver: sparse, against: dense, limit: 1, clock: sun", 'gates[0].clock: came "sun"'),
+        ("solver: sparce, baseline: dense, max_ratio: 1", 'gates.yaml:2: gates[0]: unknown name "sparce"; expected'),
+        ("solver: sparse, baseline: dense", "gates.yaml:2: gates[0].max_ratio: is missing"),
+        ("solver: sparse, baseline: dense, max_ratio: -1", "gates[0].max_ratio: came -1; should be greater than 0"),
+        ("solver: xpbd, baseline: sparse, max_ratio: 9", "gates.yaml:2: gates[0]: the answers differ by"),
+        ("solver: sparse, baseline: dense, max_ratio: 1, clock: sun", 'gates[0].clock: came "sun"'),
     ],
 )
-def test_a_mistake_in_a_table_is_told_with_its_line(tmp_path: Path, line: str, said: str):
-    code, told = gate(table(tmp_path, line))
-    assert code == 2, told
-    assert said in told
+def test_a_mistake_in_a_gates_file_is_reported_with_its_line(tmp_path: Path, gate: str, message: str):
+    code, output = regress(write_gates(tmp_path, gate))
+    assert code == 2, output
+    assert message in output
 
 
-def test_options_that_a_table_states_itself_are_refused(tmp_path: Path):
-    code, said = gate(table(tmp_path, "scene: cloth.yaml, solver: sparse, against: dense, limit: 1"), "--limit", "2")
+def test_a_missing_scene_is_reported_with_its_line(tmp_path: Path):
+    path = write_gates(tmp_path, "solver: sparse, baseline: dense, max_ratio: 1")
+    (tmp_path / "cloth.yaml").unlink()
+    code, output = regress(path)
+    assert code == 2, output
+    assert "gates.yaml:2: gates[0].scene: there is no file" in output
+
+
+def test_a_scene_is_no_gates_file_and_a_gates_file_is_no_scene(tmp_path: Path):
+    path = write_gates(tmp_path, "solver: sparse, baseline: dense, max_ratio: 1")
+    code, output = regress(tmp_path / "cloth.yaml")
     assert code == 2
-    assert "--limit: a table of gates says so itself" in said
+    assert "is no gates file, it has no `gates`; to compare a scene or a sweep with a git revision" in output
+    with pytest.raises(InputError, match="is a gates file; run it with `springbench regress`, without --baseline"):
+        load_config(path)
+
+
+def test_options_that_a_gates_file_sets_are_refused(tmp_path: Path):
+    path = write_gates(tmp_path, "solver: sparse, baseline: dense, max_ratio: 1")
+    code, output = regress(path, "--max-ratio", "2")
+    assert code == 2
+    assert "--max-ratio: does not apply to a gates file, which sets the options of each gate" in output
 
 
 @pytest.mark.parametrize(
-    ("new", "old", "tolerance", "said"),
+    ("new", "old", "rtol", "message"),
     [
-        ([[0.0, 1.0], [4.0, 2.0]], [[0.0, 1.0], [4.0, 2.0]], 0.0, ""),
-        ([[0.0, 1.0], [4.1, 2.0]], [[0.0, 1.0], [4.0, 2.0]], 0.03, ""),
-        ([[0.0], [4.1]], [[0.0], [4.0]], 0.02, "they lie 2.5e-02 of the answer's size apart, wanted 0.02"),
-        ([[996.0], [1000.1]], [[996.0], [1000.0]], 0.02, "they lie 2.5e-02 of the answer's size apart, wanted 0.02"),
-        (3.0, 2.0, 0.1, "they lie 5.0e-01 of the answer's size apart, wanted 0.1"),
-        (float("nan"), 2.0, 0.1, "they lie nan of the answer's size apart, wanted 0.1"),
-        ([0.0], [0.0], 0.0, ""),
-        ([1.0, 2.0], [1.0], 0.1, "arrays of (2,) and (1,)"),
+        ([[0.0, 1.0], [4.0, 2.0]], [[0.0, 1.0], [4.0, 2.0]], 0.0, None),
+        ([[0.0, 1.0], [4.1, 2.0]], [[0.0, 1.0], [4.0, 2.0]], 0.03, None),
+        ([[0.0], [4.1]], [[0.0], [4.0]], 0.02, "differ by 2.5e-02 of their size, at most 0.02"),
+        ([[996.0], [1000.1]], [[996.0], [1000.0]], 0.02, "differ by 2.5e-02 of their size, at most 0.02"),
+        (3.0, 2.0, 0.1, "differ by 5.0e-01 of their size, at most 0.1"),
+        (float("nan"), 2.0, 0.1, "differ by nan of their size, at most 0.1"),
+        ([0.0], [0.0], 0.0, None),
+        ([1.0, 2.0], [1.0], 0.1, r"shapes \(2,\) and \(1,\)"),
     ],
-)  # fmt: skip
-def test_answers_are_compared_in_their_own_size(new: Any, old: Any, tolerance: float, said: str):
-    assert describe_difference(new, old, tolerance) == said
+)
+def test_answers_are_compared_in_their_own_size(new: Any, old: Any, rtol: float, message: str | None):
+    with pytest.raises(AnswersDiffer, match=message) if message else nullcontext():
+        require_agreement(new, old, rtol)

@@ -8,10 +8,12 @@ import pytest
 from numpy.typing import NDArray
 from springbench.harness.experiments.regression.confidence_sequence import (
     SequentialTest,
-    SequentialVerdict,
     compute_critical_count,
     compute_interval,
 )
+from springbench.harness.results.regression_verdict import RegressionVerdict
+
+from tests.bench.replay_study import find_first_verdict
 
 TURNS, SAMPLES = 400, 1000
 
@@ -58,7 +60,7 @@ def test_looking_after_every_turn_is_wrong_as_rarely_as_stated(bursts: bool):
     # once in a thousand repetitions of this test (binomial); the seeds are fixed.
     rule = SequentialTest(1.0, alpha=0.05)
     wrong = [
-        rule.decide_first_verdict(sample(seed, bursts=bursts))[0] is not SequentialVerdict.INCONCLUSIVE
+        find_first_verdict(rule, sample(seed, bursts=bursts))[0] is not RegressionVerdict.INCONCLUSIVE
         for seed in range(SAMPLES)
     ]
     assert 0 < sum(wrong) <= 71
@@ -78,20 +80,20 @@ def test_the_interval_covers_the_truth_at_every_number_of_turns(bursts: bool):
 @pytest.mark.parametrize("bursts", [False, True], ids=["calm", "bursty"])
 @pytest.mark.parametrize(("slower", "limit", "within"), [(1.05, 1.03, 200), (1.1, 1.03, 60), (1.02, 1.01, 400)])
 def test_a_slowdown_is_found(slower: float, limit: float, within: int, bursts: bool):
-    found = [SequentialTest(limit).decide_first_verdict(sample(seed, slower, bursts=bursts)) for seed in range(200)]
-    assert sum(answer is SequentialVerdict.FAIL and turns <= within for answer, turns in found) >= 190
-    assert not any(answer is SequentialVerdict.PASS for answer, _ in found)
+    found = [find_first_verdict(SequentialTest(limit), sample(seed, slower, bursts=bursts)) for seed in range(200)]
+    assert sum(answer is RegressionVerdict.FAIL and turns <= within for answer, turns in found) >= 190
+    assert not any(answer is RegressionVerdict.PASS for answer, _ in found)
 
 
 def test_equal_programs_hold_and_none_fails():
-    found = [SequentialTest(1.03).decide_first_verdict(sample(seed, bursts=seed % 2 == 0)) for seed in range(SAMPLES)]
-    assert {answer for answer, _ in found} == {SequentialVerdict.PASS}
+    found = [find_first_verdict(SequentialTest(1.03), sample(seed, bursts=seed % 2 == 0)) for seed in range(SAMPLES)]
+    assert {answer for answer, _ in found} == {RegressionVerdict.PASS}
 
 
 def test_noise_too_large_for_the_limit_is_undecided_and_not_passed():
-    found = [SequentialTest(1.03).decide_first_verdict(sample(seed, 1.05, noise=0.5))[0] for seed in range(200)]
-    assert found.count(SequentialVerdict.INCONCLUSIVE) >= 190  # the interval of 400 such turns is .3 wide
-    assert SequentialVerdict.PASS not in found
+    found = [find_first_verdict(SequentialTest(1.03), sample(seed, 1.05, noise=0.5))[0] for seed in range(200)]
+    assert found.count(RegressionVerdict.INCONCLUSIVE) >= 190  # the interval of 400 such turns is .3 wide
+    assert RegressionVerdict.PASS not in found
 
 
 def test_the_first_answer_is_that_of_looking_turn_by_turn():
@@ -102,11 +104,11 @@ def test_the_first_answer_is_that_of_looking_turn_by_turn():
             (
                 (a, n)
                 for n in range(1, TURNS + 1)
-                if (a := rule.decide_verdict(x[:n])) is not SequentialVerdict.INCONCLUSIVE
+                if (a := rule.decide_verdict(x[:n])) is not RegressionVerdict.INCONCLUSIVE
             ),
             None,
         )
-        assert rule.decide_first_verdict(x) == (looked or (SequentialVerdict.INCONCLUSIVE, TURNS))
+        assert find_first_verdict(rule, x) == (looked or (RegressionVerdict.INCONCLUSIVE, TURNS))
 
 
 def test_an_answer_is_what_the_interval_says():
@@ -114,8 +116,8 @@ def test_an_answer_is_what_the_interval_says():
         x = sample(seed, 1.0 + 0.005 * seed)
         for n in (10, 20, 50, 400):
             found, answer = compute_interval(x[:n]), SequentialTest(1.03).decide_verdict(x[:n])
-            assert (found.low > 1.03) == (answer is SequentialVerdict.FAIL)
-            assert (found.high < 1.03) == (answer is SequentialVerdict.PASS)
+            assert (found.low > 1.03) == (answer is RegressionVerdict.FAIL)
+            assert (found.high < 1.03) == (answer is RegressionVerdict.PASS)
 
 
 def test_one_turn_that_was_disturbed_without_end_changes_nothing():
@@ -132,11 +134,11 @@ def test_a_smaller_error_takes_more_turns():
 @pytest.mark.parametrize(
     ("given", "named"),
     [
-        ({"max_ratio": 0.0}, "limit: came 0.0"),
-        ({"max_ratio": -1.0}, "limit: came -1.0"),
-        ({"max_ratio": float("nan")}, "limit: came nan"),
-        ({"max_ratio": 1.03, "alpha": 0.0}, "alpha: came 0.0"),
-        ({"max_ratio": 1.03, "alpha": 1.0}, "alpha: came 1.0"),
+        ({"max_ratio": 0.0}, "max_ratio: got 0.0"),
+        ({"max_ratio": -1.0}, "max_ratio: got -1.0"),
+        ({"max_ratio": float("nan")}, "max_ratio: got nan"),
+        ({"max_ratio": 1.03, "alpha": 0.0}, "alpha: got 0.0"),
+        ({"max_ratio": 1.03, "alpha": 1.0}, "alpha: got 1.0"),
     ],
 )
 def test_a_rule_that_cannot_be_is_refused(given: dict[str, float], named: str):

@@ -1,11 +1,10 @@
-"""`springbench regress-history`: changes are found where they are, noise is none, and too little is said to be so."""
+"""`springbench regress --history`: changes of level over commits."""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 from springbench.harness.cli.main import app
 from springbench.harness.report.change_detection import (
     BenchmarkPoint,
@@ -22,13 +21,13 @@ def points(values: Any) -> list[BenchmarkPoint]:
     return [BenchmarkPoint(f"{k:07x}", float(v), float(v) * 0.985, float(v) * 1.015) for k, v in enumerate(values)]
 
 
-def test_a_step_of_five_percent_in_noise_of_one_is_found_within_a_commit_of_where_it_is():
+def test_a_step_of_five_percent_in_noise_of_one_is_found_within_a_commit():
     found = [detect_changes(points(build_ratio_series(seed, 30, (18, 1.05)))) for seed in range(100)]
     hits = [starts for starts in found if len(starts) == 2 and abs(starts[1] - 18) <= 1]
     assert len(hits) >= 95
 
 
-def test_noise_alone_seldom_looks_like_a_change_and_an_outlier_never_does_where_there_is_none():
+def test_noise_seldom_causes_a_change_and_an_outlier_never_does():
     alarms = sum(len(detect_changes(points(build_ratio_series(seed, 30)))) > 1 for seed in range(200))
     assert alarms <= 4
     lone = np.ones(30)
@@ -36,7 +35,7 @@ def test_noise_alone_seldom_looks_like_a_change_and_an_outlier_never_does_where_
     assert detect_changes(points(lone)) == (0,)
 
 
-def test_changes_are_told_by_commit_with_their_size_the_largest_first(tmp_path: Path):
+def test_changes_have_a_commit_and_a_size_the_largest_first(tmp_path: Path):
     gates = {"test_same": build_ratio_series(1, 24), "test_slower": build_ratio_series(2, 24, (8, 1.1), (16, 0.8))}
     found = read_histories(find_stored_files([write_benchmark_files(tmp_path / "bench", gates)]))
     assert [one.benchmark_name for one in found] == ["test_slower", "test_same"]
@@ -47,34 +46,40 @@ def test_changes_are_told_by_commit_with_their_size_the_largest_first(tmp_path: 
     assert found[1].level_changes == []
 
 
-@pytest.mark.parametrize("ratio", [True, False], ids=["ratios", "least times"])
-def test_the_command_tells_them_and_draws_a_picture(tmp_path: Path, ratio: bool):
+def find_history(*arguments: str | Path) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["regress", "--history", *map(str, arguments)])
+    return done.exit_code, " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("ratio", [True, False], ids=["ratios", "minima"])
+def test_the_command_prints_the_changes(tmp_path: Path, ratio: bool):
     folder = write_benchmark_files(
         tmp_path / "bench",
         {"test_slower": build_ratio_series(2, 12, (6, 1.2)), "test_same": build_ratio_series(3, 12)},
         is_ratio=ratio,
     )
-    told = CliRunner().invoke(app, ["regress-history", str(folder), "-o", str(tmp_path / "history.png")])
-    assert told.exit_code == 0, told.output
-    assert "% at 0000006" in told.output
-    assert imread(tmp_path / "history.png").std() > 0
+    code, output = find_history(folder)
+    assert code == 0, output
+    assert "% at 0000006" in output
+    assert f"`springbench figure history {folder}` draws them" in output
 
 
-def test_too_little_is_said_to_be_so_and_is_no_answer(tmp_path: Path):
+def test_too_few_results_are_inconclusive(tmp_path: Path):
     folder = write_benchmark_files(tmp_path / "bench", {"test_slower": build_ratio_series(2, 5, (3, 2.0))})
-    told = CliRunner().invoke(app, ["regress-history", str(folder), "-o", str(tmp_path / "history.png")])
-    assert told.exit_code == 3
-    assert "at most 5 results of a gate, wanted 6; `pytest tests/bench" in " ".join(told.output.split())
-    assert not (tmp_path / "history.png").exists()
+    code, output = find_history(folder)
+    assert code == 3
+    assert "inconclusive: at most 5 results of a benchmark, expected 6; `pytest tests/bench" in output
 
 
-def test_what_is_no_stored_result_is_named(tmp_path: Path):
+def test_a_mistake_is_one_message(tmp_path: Path):
     (tmp_path / "x.json").write_text("{}")
     (tmp_path / "empty").mkdir()
-    for place, said in (
-        (tmp_path, "x.json"),
-        (tmp_path / "empty", "no stored results"),
-        (tmp_path / "no", "not there"),
+    for arguments, message in (
+        ((tmp_path,), "x.json"),
+        ((tmp_path / "empty",), "no stored results"),
+        ((tmp_path / "no",), "does not exist"),
+        ((tmp_path, "--baseline", "HEAD"), "--history: compares all stored results"),
+        ((tmp_path, "--budget", "3"), "--budget: does not apply to --history"),
     ):
-        told = CliRunner().invoke(app, ["regress-history", str(place)])
-        assert (told.exit_code, said in told.output) == (2, True), told.output
+        code, output = find_history(*arguments)
+        assert (code, message in output) == (2, True), output

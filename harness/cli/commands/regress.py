@@ -1,117 +1,189 @@
-"""The command `springbench regress`: performance regressions against a revision, from a table, or between stored
-results."""
+"""The command `springbench regress`: did it become slower?
+
+The subject selects what is compared: this checkout with a git revision, two solvers (a gates file), two stored results,
+or the stored results of many commits.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from springbench.harness.console import get_output_console, print_message
+from springbench.harness.console import get_output_console, print_message, split_wide_table
 from springbench.harness.errors import InputError
+from springbench.harness.results.regression_verdict import RegressionVerdict, combine_verdicts
+
+if TYPE_CHECKING:
+    from springbench.harness.experiments.regression.revision_comparison import ComparisonOptions
+
+STORED_FOLDERS = (Path("results/bench"), Path(".benchmarks"))
+"""Default folders of a history: those of this project, and those of pytest-benchmark."""
+
+_SCENE_OPTIONS = ("--solver", "--size", "--iterations", "--tolerance")
+_TIMING_OPTIONS = ("--budget", "--max-ratio", "--clock")
+_USED_OPTIONS = {
+    "a comparison of a scene or a sweep with a revision": {*_TIMING_OPTIONS, *_SCENE_OPTIONS},
+    "a comparison of gates with a revision": {*_TIMING_OPTIONS, "-k"},
+    "a gates file, which sets the options of each gate": {"--budget"},
+    "a comparison of stored results": {"--relative-to"},
+    "--history": set[str](),
+}
+"""Kinds of comparison, and the options that each uses."""
+SCENE, GATES, GATES_FILE, STORED, HISTORY = _USED_OPTIONS
 
 
 def regress(
-    paths: Annotated[
+    subjects: Annotated[
         list[Path] | None,
-        typer.Argument(help="With --against a scene or a sweep; else a table of gates, or two stored results."),
+        typer.Argument(
+            metavar="SUBJECT",
+            help="A scene or a sweep, a gates file, or stored results; this checkout's gates if left out.",
+        ),
     ] = None,
-    against: Annotated[str | None, typer.Option(help="A git revision to be no slower than.")] = None,
-    pattern: Annotated[
-        str, typer.Option("-k", help="With --against: the tree's own gates whose name holds this.")
-    ] = "",
-    budget: Annotated[float | None, typer.Option(help="Seconds that a gate may take; 240 if left out.")] = None,
-    limit: Annotated[float | None, typer.Option(help="Ratio of times that counts as slower; 1.03 if left out.")] = None,
-    clock: Annotated[str | None, typer.Option(help="cpu or wall; what suits the work if left out.")] = None,
-    yardstick: Annotated[
-        str | None, typer.Option(help="Between stored results: a solver whose multiples are compared instead of times.")
+    baseline: Annotated[
+        str | None,
+        typer.Option(help="A git revision; or of stored results, a folder, an archive or pytest-benchmark's file."),
+    ] = None,
+    history: Annotated[
+        bool, typer.Option("--history", help="Find changes over commits in files of pytest-benchmark, or folders.")
+    ] = False,
+    gate_name: Annotated[str, typer.Option("-k", help="Only the gates whose name contains this.")] = "",
+    budget: Annotated[float | None, typer.Option(help="Seconds until a test is inconclusive; 240 if left out.")] = None,
+    max_ratio: Annotated[
+        float | None, typer.Option(help="Ratio of times that counts as slower; 1.03 if left out.")
+    ] = None,
+    clock: Annotated[
+        Literal["cpu", "wall"] | None, typer.Option(help="If left out: cpu for one thread, wall for several.")
+    ] = None,
+    relative_to: Annotated[
+        str | None, typer.Option(help="Of stored results: divide times by those of this solver.")
     ] = None,
     solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
     size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
     iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
     tolerance: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of a step.")] = None,
 ) -> None:
-    """Find performance regressions. Exit code 1: a regression; 3: inconclusive; 0: all tests pass."""
-    files = paths or []
-    chosen = {"--solver": solver, "--size": size, "--iterations": iterations, "--tolerance": tolerance}
-    if against is not None:
-        given = {"iterations": iterations, "tolerance": tolerance}
-        stated = {name: value for name, value in given.items() if value is not None}
-        options = _build_options(budget, limit, clock)
-        raise typer.Exit(
-            _compare_with_revision(
-                against, files, pattern, options, {"solvers": solver or [], "sizes": size or [], **stated}
-            )
+    """Find performance regressions. Exit code 0: pass; 1: fail; 3: inconclusive."""
+    paths = subjects or []
+    kind = _choose_kind(paths, baseline, history=history)
+    given = {"--budget": budget, "--max-ratio": max_ratio, "--clock": clock, "-k": gate_name}
+    given |= {"--relative-to": relative_to, "--solver": solver, "--size": size}
+    given |= {"--iterations": iterations, "--tolerance": tolerance}
+    for option, value in given.items():
+        if value not in (None, "", []) and option not in _USED_OPTIONS[kind]:
+            raise InputError(f"{option}: does not apply to {kind}; leave it out")
+    if kind == HISTORY:
+        verdict = _find_history_changes(paths)
+    elif kind == STORED:
+        verdict = _compare_stored(Path(baseline or ""), paths[0], relative_to)
+    elif kind == GATES_FILE:
+        verdict = _run_gates_file(paths[0], _build_options(budget, None, None).budget)
+    else:
+        run_options = {"solvers": solver or [], "sizes": size or []}
+        limits = {"iterations": iterations, "tolerance": tolerance}
+        run_options |= {name: value for name, value in limits.items() if value is not None}
+        options = _build_options(budget, max_ratio, clock)
+        verdict = _compare_with_revision(baseline or "", paths, gate_name, options, run_options)
+    raise typer.Exit(verdict.exit_code)
+
+
+def _choose_kind(paths: Sequence[Path], baseline: str | None, *, history: bool) -> str:
+    """Return the kind of comparison; raise InputError if subject and baseline do not fit."""
+    if history:
+        if baseline is not None:
+            raise InputError("--history: compares all stored results; leave --baseline out")
+        return HISTORY
+    if len(paths) > 1:
+        raise InputError(
+            f"regress: got {len(paths)} subjects; expected one, and what it is compared with as --baseline"
         )
-    if len(files) == 1 and files[0].suffix.lower() in (".yaml", ".yml"):
-        for option, value in {**chosen, "--limit": limit, "--clock": clock, "-k": pattern}.items():
-            if value:
-                raise InputError(
-                    f"{option}: a table of gates says so itself; change {files[0]}, or give --against REVISION"
-                )
-        raise typer.Exit(_run_table(files[0], _build_options(budget, limit, clock).budget))
-    if pattern:
-        raise InputError("-k: chooses gates to compare with another revision; wanted --against REVISION beside it")
-    for option, value in {"--budget": budget, "--limit": limit, "--clock": clock, **chosen}.items():
-        if value:
-            raise InputError(f"{option}: nothing is timed between stored results; leave it out")
-    if len(files) != 2:
-        wanted = "wanted --against REVISION, a table of gates, or two stored results, the old one first"
-        raise InputError(f"regress: came {len(files)} file{'s' * (len(files) != 1)}; {wanted}")
-    raise typer.Exit(_compare_stored(files[0], files[1], yardstick))
+    is_yaml = bool(paths) and paths[0].suffix.lower() in (".yaml", ".yml")
+    if baseline is None:
+        if is_yaml:
+            return GATES_FILE
+        raise InputError(
+            "regress: nothing to compare with; add --baseline REVISION (of a scene, a sweep or the gates of this "
+            "checkout), --baseline RESULTS (of stored results) or --history"
+        )
+    if not paths:
+        return GATES
+    # A scene of the assignment is JSON, as are the files of pytest-benchmark.
+    is_assignment = paths[0].suffix.lower() == ".json" and Path(baseline).suffix.lower() != ".json"
+    return SCENE if is_yaml or (is_assignment and not Path(baseline).exists()) else STORED
 
 
-def _compare_stored(old: Path, new: Path, yardstick: str | None) -> int:
-    from springbench.harness.report import benchmark_comparison as benchmarks
-    from springbench.harness.report import results_comparison
-
-    ours = [path.suffix.lower() != ".json" for path in (old, new)]
-    if ours[0] != ours[1]:
-        raise InputError(f"{old} and {new} cannot be compared: one is of pytest-benchmark, the other is not")
-    if all(ours):
-        return results_comparison.compare_results(old, new, get_output_console(), yardstick)
-    if yardstick:
-        raise InputError("--yardstick: compares results of sweeps; a file of pytest-benchmark has its own ratios")
-    return benchmarks.compare_benchmarks(old, new, get_output_console())
-
-
-def _run_table(path: Path, budget: float) -> int:
-    from springbench.harness.experiments.regression.regression_table import run_regression_table
-    from springbench.harness.experiments.regression.revision_comparison import choose_exit_code
-
-    return choose_exit_code([result.verdict for _, result in run_regression_table(path, budget, print_message)])
-
-
-def _build_options(budget: float | None, limit: float | None, clock: str | None) -> Any:
+def _build_options(budget: float | None, max_ratio: float | None, clock: str | None) -> ComparisonOptions:
     from springbench.harness.experiments.regression.abba_benchmark import TIME_BUDGET
     from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
     from springbench.harness.experiments.regression.revision_comparison import DEFAULT_MAX_RATIO, ComparisonOptions
 
-    if clock not in (None, "cpu", "wall"):
-        raise InputError(f"--clock: came {clock}; wanted cpu or wall")
     if budget is not None and not budget > 0:
-        raise InputError(f"--budget: came {budget}; wanted seconds")
+        raise InputError(f"--budget: got {budget}; expected a positive number of seconds")
+    max_ratio = DEFAULT_MAX_RATIO if max_ratio is None else max_ratio
     try:
-        SequentialTest(limit or DEFAULT_MAX_RATIO)
+        SequentialTest(max_ratio)
     except ValueError as error:
-        raise InputError(f"--{error}") from error
-    return ComparisonOptions(budget or TIME_BUDGET, limit or DEFAULT_MAX_RATIO, clock=clock)
+        raise InputError(f"--max-ratio: {str(error).partition(': ')[2]}") from error
+    return ComparisonOptions(budget or TIME_BUDGET, max_ratio, clock=clock)
 
 
 def _compare_with_revision(
-    revision: str, files: list[Path], pattern: str, options: Any, run_options: dict[str, Any]
-) -> int:
+    revision: str, paths: Sequence[Path], gate_name: str, options: ComparisonOptions, run_options: dict[str, Any]
+) -> RegressionVerdict:
     from springbench.harness.experiments.regression import git_worktrees
     from springbench.harness.experiments.regression.revision_comparison import (
         build_config_requests,
-        build_test_requests,
-        choose_exit_code,
+        build_gate_requests,
         compare_revisions,
     )
 
-    if len(files) > 1 or (files and pattern):
-        raise InputError("regress --against: wanted one scene, one sweep, or -k NAME; came several of them")
     both = git_worktrees.open_revisions(git_worktrees.find_checkout(Path.cwd()), revision)
-    requests = build_config_requests(both, files[0], run_options) if files else build_test_requests(both, pattern)
+    requests = build_config_requests(both, paths[0], run_options) if paths else build_gate_requests(both, gate_name)
     found = compare_revisions(both, requests, options, print_message)
-    return choose_exit_code([result.verdict for _, result in found])
+    return combine_verdicts(result.verdict for _, result in found)
+
+
+def _run_gates_file(path: Path, budget: float) -> RegressionVerdict:
+    from springbench.harness.experiments.regression.gates_file import run_gates_file
+
+    return combine_verdicts(result.verdict for _, result in run_gates_file(path, budget, print_message))
+
+
+def _compare_stored(baseline: Path, new: Path, relative_to: str | None) -> RegressionVerdict:
+    from springbench.harness.report.benchmark_comparison import compare_benchmarks
+    from springbench.harness.report.results_comparison import compare_results
+
+    are_benchmarks = [path.suffix.lower() == ".json" for path in (baseline, new)]
+    if are_benchmarks[0] != are_benchmarks[1]:
+        raise InputError(f"{baseline} and {new} cannot be compared: one is a file of pytest-benchmark, one is not")
+    if not all(are_benchmarks):
+        return compare_results(baseline, new, get_output_console(), relative_to)
+    if relative_to:
+        raise InputError("--relative-to: applies to results of sweeps; a file of pytest-benchmark has its own ratios")
+    return compare_benchmarks(baseline, new, get_output_console())
+
+
+def _find_history_changes(paths: Sequence[Path]) -> RegressionVerdict:
+    """Print the changes over commits. They are not judged: the verdict is pass if there are enough results."""
+    from springbench.harness.report.change_detection import (
+        MIN_RESULTS,
+        build_history_table,
+        find_stored_files,
+        read_histories,
+    )
+
+    places = paths or [folder for folder in STORED_FOLDERS if folder.exists()]
+    files = find_stored_files(places)
+    hint = "`pytest tests/bench --benchmark-only` stores one for the commit that is checked out"
+    if not files:
+        raise InputError(f"--history: no stored results in {', '.join(map(str, paths or STORED_FOLDERS))}; {hint}")
+    found = read_histories(files)
+    get_output_console().print(split_wide_table(build_history_table(found)))
+    most = max((len(series.points) for series in found), default=0)
+    if most < MIN_RESULTS:
+        print_message(f"inconclusive: at most {most} results of a benchmark, expected {MIN_RESULTS}; {hint}")
+        return RegressionVerdict.INCONCLUSIVE
+    print_message(f"`springbench figure history {places[0]}` draws them")
+    return RegressionVerdict.PASS

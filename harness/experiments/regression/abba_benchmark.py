@@ -25,10 +25,10 @@ from typing import Literal
 from springbench.harness.experiments.regression.confidence_sequence import (
     RatioInterval,
     SequentialTest,
-    SequentialVerdict,
     compute_interval,
     compute_log_ratio,
 )
+from springbench.harness.results.regression_verdict import RegressionVerdict
 
 BLOCK_ORDERS = ("ABBA", "BAAB")
 
@@ -56,20 +56,21 @@ seven other programs on two cores, blocks of 10 and of 40 ms have the same sprea
 
 ClockName = Literal["cpu", "wall"]
 TimedCall = Callable[[], float]
-"""Function that performs the work once and returns its time [s] by some clock."""
+"""Function that performs some work and returns its time [s] by some clock."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramPair:
     """Two programs after warm-up.
 
-    a, b: perform the work once and return its time [s].
+    a, b: perform the work `num_calls` times and return the time [s] of all calls.
     rebuild_work: rebuilds the work of both at other addresses and warms it up; None if that is impossible.
     """
 
     a: TimedCall
     b: TimedCall
     rebuild_work: Callable[[], None] | None = None
+    num_calls: int = 1
 
 
 StartPrograms = Callable[[], AbstractContextManager[ProgramPair]]
@@ -125,7 +126,7 @@ class BenchmarkResult:
     num_process_pairs: number of pairs of started programs, one every RESTART_SECONDS and those of the confirmation.
     """
 
-    verdict: SequentialVerdict
+    verdict: RegressionVerdict
     sequential_test: SequentialTest
     interval: RatioInterval
     blocks: tuple[TimedBlock, ...]
@@ -134,29 +135,19 @@ class BenchmarkResult:
     num_process_pairs: int = 1
 
     def __str__(self) -> str:
-        limit, (ratio, low, high) = (
-            self.sequential_test.max_ratio,
-            (self.interval.ratio, self.interval.low, self.interval.high),
-        )
-        if self.verdict is SequentialVerdict.INCONCLUSIVE:
-            held = f"{low:.3g} to {high:.3g}" if low > 0 else f"{len(self.blocks)} turns are too few"
-            return (
-                f"cannot tell within {self.elapsed_seconds:.0f} s: {held} (limit "
-                f"{limit:.3g}), on a machine with {self._load_text}"
+        limit, found = self.sequential_test.max_ratio, self.interval
+        if self.verdict is RegressionVerdict.INCONCLUSIVE:
+            ratios = (
+                f"ratio {found.low:.3g} to {found.high:.3g}" if found.low > 0 else f"{len(self.blocks)} blocks only"
             )
-        near = 0.9 <= limit <= 1.5 and ratio < 2
-        if self.verdict is SequentialVerdict.FAIL:
-            if near:
-                bounds = f"[{_format_percent(low)}, {_format_percent(high)}]"
-                return f"slower by {_format_percent(ratio)} % {bounds}: fails (limit {_format_percent(limit)} %)"
-            return f"ratio {ratio:.3g} [{low:.3g}, {high:.3g}]: fails (limit {limit:.3g})"
-        if near and high >= 1:
-            return f"no slower than {_format_percent(high)} %: holds (limit {_format_percent(limit)} %)"
-        return f"ratio {ratio:.3g} [{low:.3g}, {high:.3g}]: holds (limit {limit:.3g})"
-
-    @property
-    def _load_text(self) -> str:
-        return f"load {self.load_average:.0f}" if self.load_average >= 1 else "no load"
+            after = f"after {self.elapsed_seconds:.0f} s, load average {self.load_average:.0f}"
+            return f"inconclusive: {ratios} (limit {limit:.3g}) {after}"
+        if not 0.9 <= limit <= 1.5 or found.ratio >= 2 or found.high < 1:
+            return f"{self.verdict}: ratio {found.ratio:.3g} [{found.low:.3g}, {found.high:.3g}] (limit {limit:.3g})"
+        low, high, allowed = (_format_percent(ratio) for ratio in (found.low, found.high, limit))
+        if self.verdict is RegressionVerdict.PASS:
+            return f"pass: at most {high} % slower (limit {allowed} %)"
+        return f"fail: slower by {_format_percent(found.ratio)} % [{low}, {high}] (limit {allowed} %)"
 
 
 def run_paired_benchmark(
@@ -176,7 +167,7 @@ def run_paired_benchmark(
         rng: chooses the orders; by default the system's random source, which no other program can follow.
         earlier_blocks: blocks of earlier processes of the same programs, which count too.
     """
-    game = iterate_paired_benchmark(
+    blocks = iterate_paired_benchmark(
         programs.b,
         sequential_test,
         time_budget=time_budget,
@@ -184,10 +175,10 @@ def run_paired_benchmark(
         rebuild_work=programs.rebuild_work,
         earlier_blocks=earlier_blocks,
     )
-    next(game)
+    next(blocks)
     while True:
         try:
-            game.send(programs.a())
+            blocks.send(programs.a())
         except StopIteration as done:
             return done.value
 
@@ -213,16 +204,16 @@ def iterate_paired_benchmark(
         rebuild_work: rebuilds the work of both programs.
         earlier_blocks: blocks of earlier processes of the same programs, which count too.
     """
-    began, turns, renewing = perf_counter(), list(earlier_blocks), LayoutRandomiser(rebuild_work)
+    start, blocks, layout = perf_counter(), list(earlier_blocks), LayoutRandomiser(rebuild_work)
     for order in draw_block_orders(rng):
-        at, seconds = perf_counter(), list[float]()
-        for who in order:
-            seconds.append((yield) if who == "A" else b())
-        turns.append(TimedBlock(order, tuple(seconds)))
-        answer, now = sequential_test.decide_verdict([t.log_ratio for t in turns]), perf_counter()
-        if answer is not SequentialVerdict.INCONCLUSIVE or now - began >= time_budget:
-            return build_result(sequential_test, turns, now - began)
-        renewing.rebuild_after(now - at)
+        block_start, seconds = perf_counter(), list[float]()
+        for program in order:
+            seconds.append((yield) if program == "A" else b())
+        blocks.append(TimedBlock(order, tuple(seconds)))
+        verdict, now = sequential_test.decide_verdict([block.log_ratio for block in blocks]), perf_counter()
+        if verdict is not RegressionVerdict.INCONCLUSIVE or now - start >= time_budget:
+            return build_result(sequential_test, blocks, now - start)
+        layout.rebuild_after(now - block_start)
     raise AssertionError("orders do not end")
 
 
@@ -266,20 +257,20 @@ def run_confirmed_benchmark(
         time_budget: seconds of both benchmarks together, without the starts of programs.
     """
     first = _run_restarted_benchmark(start_programs, sequential_test, time_budget)
-    if first.verdict is not SequentialVerdict.FAIL:
+    if first.verdict is not RegressionVerdict.FAIL:
         return first
     second = _run_restarted_benchmark(
         start_programs,
         replace(sequential_test, alpha=max(sequential_test.alpha, CONFIRMATION_ALPHA)),
         max(time_budget - first.elapsed_seconds, 0.0),
     )
-    answer = SequentialVerdict.FAIL if second.verdict is SequentialVerdict.FAIL else SequentialVerdict.INCONCLUSIVE
+    verdict = RegressionVerdict.FAIL if second.verdict is RegressionVerdict.FAIL else RegressionVerdict.INCONCLUSIVE
     both, elapsed = (*first.blocks, *second.blocks), first.elapsed_seconds + second.elapsed_seconds
     # Each benchmark's interval has its own error; the wider bounds contain both.
     low, high = (f(getattr(r.interval, end) for r in (first, second)) for f, end in ((min, "low"), (max, "high")))
     found = RatioInterval(compute_interval([t.log_ratio for t in both], sequential_test.alpha).ratio, low, high)
     return BenchmarkResult(
-        answer,
+        verdict,
         sequential_test,
         found,
         both,
@@ -293,15 +284,15 @@ def _run_restarted_benchmark(
     start_programs: StartPrograms, sequential_test: SequentialTest, budget: float
 ) -> BenchmarkResult:
     """Run one benchmark over successive pairs of processes, whose blocks are pooled."""
-    elapsed, turns = 0.0, tuple[TimedBlock, ...]()
-    for starts in count(1):
-        with start_programs() as racers:
+    elapsed, blocks = 0.0, tuple[TimedBlock, ...]()
+    for num_process_pairs in count(1):
+        with start_programs() as programs:
             found = run_paired_benchmark(
-                racers, sequential_test, time_budget=min(RESTART_SECONDS, budget - elapsed), earlier_blocks=turns
+                programs, sequential_test, time_budget=min(RESTART_SECONDS, budget - elapsed), earlier_blocks=blocks
             )
-        elapsed, turns = elapsed + found.elapsed_seconds, found.blocks
-        if found.verdict is not SequentialVerdict.INCONCLUSIVE or elapsed >= budget:
-            return replace(found, elapsed_seconds=elapsed, num_process_pairs=starts)
+        elapsed, blocks = elapsed + found.elapsed_seconds, found.blocks
+        if found.verdict is not RegressionVerdict.INCONCLUSIVE or elapsed >= budget:
+            return replace(found, elapsed_seconds=elapsed, num_process_pairs=num_process_pairs)
     raise AssertionError("count does not end")
 
 

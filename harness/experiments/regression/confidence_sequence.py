@@ -22,13 +22,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 from functools import lru_cache
 from math import exp, log
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import betaln
+from springbench.harness.results.regression_verdict import RegressionVerdict
 
 DEFAULT_ALPHA = 0.001
 """Default error probability: the probability that the interval ever excludes the true ratio."""
@@ -37,17 +37,6 @@ MIXTURE_PARAMETER = 2.0
 """Parameter a of the mixture. Between 60 and 1000 blocks no other value from 1 to 15 makes an interval narrower by more
 than 5 %. With this value, 16 blocks that agree are sufficient for a decision.
 """
-
-
-class SequentialVerdict(Enum):
-    """Decision of a test.
-
-    The value is the exit code of a command that ends with it.
-    """
-
-    PASS = 0
-    FAIL = 1
-    INCONCLUSIVE = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,39 +69,19 @@ class SequentialTest:
 
     def __post_init__(self) -> None:
         if not 0 < self.max_ratio < float("inf"):
-            raise ValueError(f"limit: came {self.max_ratio}; wanted a ratio of times, such as 1.03 for 3 % slower")
+            raise ValueError(f"max_ratio: got {self.max_ratio}; expected a ratio of times such as 1.03")
         if not 0 < self.alpha < 1:
-            raise ValueError(f"alpha: came {self.alpha}; wanted a probability between 0 and 1, such as {DEFAULT_ALPHA}")
+            raise ValueError(f"alpha: got {self.alpha}; expected a probability such as {DEFAULT_ALPHA}")
 
-    def decide_verdict(self, log_ratios: ArrayLike) -> SequentialVerdict:
+    def decide_verdict(self, log_ratios: ArrayLike) -> RegressionVerdict:
         """Decide after the blocks so far, given their log ratios (n,)."""
         x = np.asarray(log_ratios, float)
         needed = compute_critical_count(len(x), self.alpha)
         if np.count_nonzero(x > log(self.max_ratio)) >= needed:
-            return SequentialVerdict.FAIL
-        return (
-            SequentialVerdict.PASS
-            if np.count_nonzero(x < log(self.max_ratio)) >= needed
-            else SequentialVerdict.INCONCLUSIVE
-        )
-
-    def decide_first_verdict(self, log_ratios: ArrayLike) -> tuple[SequentialVerdict, int]:
-        """Find the first decision when the test is evaluated after every block.
-
-        It equals `decide_verdict` block by block, but takes one pass, for a replay of many recorded samples.
-
-        Args:
-            log_ratios: log ratios of the blocks (n,).
-        Returns: the decision and its number of blocks, n if there is no decision.
-        """
-        x = np.asarray(log_ratios, float)
-        needed = _list_critical_counts(len(x), self.alpha)
-        above, below = (np.cumsum(side) >= needed for side in (x > log(self.max_ratio), x < log(self.max_ratio)))
-        decided = np.flatnonzero(above | below)
-        if not len(decided):
-            return SequentialVerdict.INCONCLUSIVE, len(x)
-        at = int(decided[0])
-        return (SequentialVerdict.FAIL if above[at] else SequentialVerdict.PASS), at + 1
+            return RegressionVerdict.FAIL
+        if np.count_nonzero(x < log(self.max_ratio)) >= needed:
+            return RegressionVerdict.PASS
+        return RegressionVerdict.INCONCLUSIVE
 
 
 def compute_log_ratio(a: Sequence[float], b: Sequence[float]) -> float:
@@ -146,19 +115,7 @@ def compute_critical_count(n: int, alpha: float) -> int:
         alpha: error probability.
     """
     k = np.arange(n // 2, n + 1)
-    refused = n * log(2) + betaln(MIXTURE_PARAMETER + k, MIXTURE_PARAMETER + n - k) - betaln(
+    is_rejected = n * log(2) + betaln(MIXTURE_PARAMETER + k, MIXTURE_PARAMETER + n - k) - betaln(
         MIXTURE_PARAMETER, MIXTURE_PARAMETER
     ) >= -log(alpha)
-    return n // 2 + int(np.argmax(refused)) if refused[-1] else n + 1
-
-
-def _list_critical_counts(n: int, alpha: float) -> NDArray[np.int64]:
-    """List the critical counts of 1 to n blocks."""
-    return _tabulate_critical_counts(1 << n.bit_length(), alpha)[
-        :n
-    ]  # so that a replay, which asks for many n, makes a few tables
-
-
-@lru_cache(maxsize=64)
-def _tabulate_critical_counts(n: int, alpha: float) -> NDArray[np.int64]:
-    return np.array([compute_critical_count(turns, alpha) for turns in range(1, n + 1)], np.int64)
+    return n // 2 + int(np.argmax(is_rejected)) if is_rejected[-1] else n + 1

@@ -31,19 +31,19 @@ def worktree_cache() -> Path:
 
 def find_checkout(folder: Path) -> Path:
     """Return the git checkout that contains a folder; raise InputError if there is none."""
-    told = _run_git(folder, "rev-parse", "--show-toplevel")
-    if told.returncode:
-        raise InputError(f"--against: {folder} is in no git checkout ({_last_line(told.stderr)}); go to one")
-    return Path(told.stdout.strip())
+    done = _run_git(folder, "rev-parse", "--show-toplevel")
+    if done.returncode:
+        raise InputError(f"--baseline: {folder} is in no git checkout ({_last_line(done.stderr)}); change to one")
+    return Path(done.stdout.strip())
 
 
 def resolve_commit(checkout: Path, revision: str) -> str:
     """Return the commit that a revision names; raise InputError if it is unknown."""
-    told = _run_git(checkout, "rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}")
-    if told.returncode:
-        wanted = "wanted a commit, a branch or a tag, such as HEAD~1; `git log --oneline` lists them"
-        raise InputError(f"--against: unknown revision {revision!r}; {wanted}")
-    return told.stdout.strip()
+    done = _run_git(checkout, "rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}")
+    if done.returncode:
+        expected = "expected a commit, a branch or a tag, such as HEAD~1; `git log --oneline` lists them"
+        raise InputError(f"--baseline: unknown revision {revision!r}; {expected}")
+    return done.stdout.strip()
 
 
 def open_revisions(checkout: Path, revision: str) -> tuple[GitRevision, GitRevision]:
@@ -58,7 +58,10 @@ def open_revisions(checkout: Path, revision: str) -> tuple[GitRevision, GitRevis
     tree = prepare_worktree(checkout, commit)
     name = f"revision {revision}" if commit.startswith(revision) else f"revision {revision} ({commit[:10]})"
     if (checkout / PACKAGE_FOLDER).is_dir() and not (tree / PACKAGE_FOLDER).is_dir():
-        raise InputError(f"--against: {name} has no folder {PACKAGE_FOLDER}: it is older than the package springbench")
+        raise InputError(
+            f"--baseline: {name} has no folder {PACKAGE_FOLDER}, so its code cannot be run by this checkout; "
+            "choose a later revision"
+        )
     return GitRevision("this checkout", checkout), GitRevision(
         name, tree, _prepare_python(checkout, tree, name), checkout
     )
@@ -84,9 +87,9 @@ def prepare_worktree(checkout: Path, commit: str) -> Path:
                 return tree
             shutil.rmtree(tree)
             _run_git(checkout, "worktree", "prune")
-        told = _run_git(checkout, "worktree", "add", "--detach", "--force", str(tree), commit)
-        if told.returncode:
-            raise InputError(f"--against: no worktree of {commit[:10]}: {_last_line(told.stderr)}")
+        done = _run_git(checkout, "worktree", "add", "--detach", "--force", str(tree), commit)
+        if done.returncode:
+            raise InputError(f"--baseline: no worktree of {commit[:10]}: {_last_line(done.stderr)}")
         for old in sorted(worktree_cache().glob("[0-9a-f]*"), key=lambda path: path.stat().st_mtime)[:-MAX_WORKTREES]:
             shutil.rmtree(old, ignore_errors=True)
     return tree
@@ -101,17 +104,17 @@ def _prepare_python(checkout: Path, tree: Path, name: str) -> Path:
         return Path(sys.executable)
     own = tree / ".venv"
     python, whole = own / "bin" / "python", own / "whole"
-    if whole.exists():  # what was killed on the way is built again
+    if whole.exists():  # an interrupted build is repeated
         return python
     shutil.rmtree(own, ignore_errors=True)
     for command in (
         [sys.executable, "-m", "venv", str(own)],
         [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-e", str(tree)],
     ):
-        told = subprocess.run(command, cwd=tree, capture_output=True, text=True)
-        if told.returncode:
+        done = subprocess.run(command, cwd=tree, capture_output=True, text=True)
+        if done.returncode:
             shutil.rmtree(own, ignore_errors=True)
-            raise InputError(f"{name}: does not build: {_last_line(told.stderr or told.stdout)}")
+            raise InputError(f"{name}: cannot be installed: {_last_line(done.stderr or done.stdout)}")
     whole.touch()
     return python
 
@@ -129,12 +132,12 @@ def _run_git(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     try:
         return subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True)
     except OSError as error:
-        raise InputError(f"--against: git cannot be run ({error}); install it") from error
+        raise InputError(f"--baseline: git cannot be run ({error}); install it") from error
 
 
 def _last_line(said: str) -> str:
     """Return the last line of a program's output."""
-    return next((line.strip() for line in reversed(said.splitlines()) if line.strip()), "it does not say why")
+    return next((line.strip() for line in reversed(said.splitlines()) if line.strip()), "no reason given")
 
 
 @contextmanager

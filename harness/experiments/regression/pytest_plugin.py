@@ -7,9 +7,9 @@
         paired_benchmark.compare_solvers("cloth.yaml", New(), "numba", max_ratio=1.0, agreement_rtol=1e-6)
 
 Both must give the same answer, in every test run. With pytest-benchmark enabled they are then timed in interleaved
-blocks, and pytest-benchmark's JSON has the result. An inconclusive test is neither passed nor failed: it is counted as
-`inconclusive`. A session without failures then ends with the exit code 13, because 3 is pytest's code of internal
-errors.
+blocks, as by `springbench regress gates.yaml`, and pytest-benchmark's JSON has the result. An inconclusive test is
+neither passed nor failed: it is counted as `inconclusive`. A session without failures then ends with the exit code 13,
+because 3 is pytest's code of internal errors.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ import pytest
 if TYPE_CHECKING:
     from pytest_benchmark.fixture import BenchmarkFixture
     from springbench.harness.experiments.regression.abba_benchmark import BenchmarkResult
-    from springbench.harness.experiments.regression.solver_pair import SolverInput, WorkFunction
+    from springbench.harness.experiments.regression.program_pair import WorkFunction
+    from springbench.harness.experiments.regression.solver_pair import SolverInput
 
 INCONCLUSIVE_KEY = pytest.StashKey[bool]()
 EXIT_INCONCLUSIVE = 13
@@ -72,45 +73,46 @@ class PairedBenchmark:
         Returns: the result, or None if nothing is timed.
         """
         from springbench.harness.experiments.regression.abba_benchmark import iterate_paired_benchmark
-        from springbench.harness.experiments.regression.answer_agreement import describe_difference
-        from springbench.harness.experiments.regression.confidence_sequence import (
-            DEFAULT_ALPHA,
-            SequentialTest,
-            SequentialVerdict,
+        from springbench.harness.experiments.regression.confidence_sequence import DEFAULT_ALPHA, SequentialTest
+        from springbench.harness.experiments.regression.program_pair import (
+            AnswersDiffer,
+            build_program_pair,
+            require_agreement,
         )
-        from springbench.harness.experiments.regression.solver_pair import build_timer, choose_num_calls
+        from springbench.harness.results.regression_verdict import RegressionVerdict
 
-        rule, benchmark = SequentialTest(max_ratio, alpha or DEFAULT_ALPHA), cast(Any, self._benchmark)
+        sequential_test = SequentialTest(max_ratio, alpha or DEFAULT_ALPHA)
+        benchmark = cast(Any, self._benchmark)
         answer: Any = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
         if agreement_rtol is not None:
-            said = describe_difference(answer, baseline(), agreement_rtol)
-            if said:
-                pytest.fail(f"the answers differ, so nothing was timed: {said}", pytrace=False)
+            try:
+                require_agreement(answer, baseline(), agreement_rtol)
+            except AnswersDiffer as error:
+                pytest.fail(str(error), pytrace=False)
         elif not benchmark.disabled:
-            baseline()
+            baseline()  # warm-up
         if benchmark.disabled:
             return None
-        calls = choose_num_calls(candidate, baseline)
-        a, b = (build_timer(work, calls, clock) for work in (candidate, baseline))
-        found: list[BenchmarkResult] = []
-        last: list[float] = []
-        game = iterate_paired_benchmark(b, rule, time_budget=budget or self._budget)
+        programs = build_program_pair(candidate, baseline, clock)
+        results: list[BenchmarkResult] = []
+        seconds: list[float] = []
+        blocks = iterate_paired_benchmark(programs.b, sequential_test, time_budget=budget or self._budget)
 
-        def before() -> None:
+        def advance_blocks() -> None:
             try:
-                game.send(last.pop()) if last else next(game)
+                blocks.send(seconds.pop()) if seconds else next(blocks)
             except StopIteration as done:
-                found.append(done.value)
+                results.append(done.value)
                 raise _BenchmarkDecided from None
 
         with suppress(_BenchmarkDecided):
-            benchmark.pedantic(lambda: last.append(a()), setup=before, rounds=MAX_ROUNDS)
-        (result,) = found
-        benchmark.extra_info |= extra_info | _build_extra_info(result, calls, clock)
-        if result.verdict is SequentialVerdict.INCONCLUSIVE:
+            benchmark.pedantic(lambda: seconds.append(programs.a()), setup=advance_blocks, rounds=MAX_ROUNDS)
+        (result,) = results
+        benchmark.extra_info |= extra_info | _build_extra_info(result, programs.num_calls, clock)
+        if result.verdict is RegressionVerdict.INCONCLUSIVE:
             self._item.stash[INCONCLUSIVE_KEY] = True
             pytest.skip(str(result))
-        if result.verdict is SequentialVerdict.FAIL:
+        if result.verdict is RegressionVerdict.FAIL:
             pytest.fail(str(result), pytrace=False)
         return result
 
@@ -154,13 +156,13 @@ def _build_extra_info(result: BenchmarkResult, num_calls: int, clock: str) -> di
     found = result.interval
     return {
         "ratio": {"median": found.ratio, "low": max(found.low, 1e-300), "high": min(found.high, 1e300)},  # no inf
-        "limit": result.sequential_test.max_ratio,
-        "answer": result.verdict.name.lower(),
-        "error": result.sequential_test.alpha,
-        "turns": len(result.blocks),
-        "calls": num_calls,
+        "max_ratio": result.sequential_test.max_ratio,
+        "verdict": str(result.verdict),
+        "alpha": result.sequential_test.alpha,
+        "num_blocks": len(result.blocks),
+        "num_calls": num_calls,
         "clock": clock,
-        "load": round(result.load_average, 2),
+        "load_average": round(result.load_average, 2),
     }
 
 
@@ -220,5 +222,5 @@ def pytest_report_teststatus(report: pytest.TestReport) -> tuple[str, str, tuple
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Print the inconclusive tests with their reasons."""
     for report in terminalreporter.stats.get("inconclusive", []):
-        said = report.longrepr[2].removeprefix("Skipped: ")
-        terminalreporter.write_line(f"INCONCLUSIVE {report.nodeid}: {said}")
+        reason = report.longrepr[2].removeprefix("Skipped: inconclusive: ")
+        terminalreporter.write_line(f"INCONCLUSIVE {report.nodeid}: {reason}")

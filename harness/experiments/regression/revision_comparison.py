@@ -1,6 +1,6 @@
 """Comparison of this checkout with a git revision, the baseline.
 
-`springbench regress --against REVISION` runs it, in one run on one machine. Both must give the same answer before
+`springbench regress --baseline REVISION` runs it, in one run on one machine. Both must give the same answer before
 anything is timed. Deterministic counts (iterations, entries, bytes) are compared exactly. Then two processes are
 benchmarked by interleaved blocks.
 """
@@ -23,12 +23,8 @@ from springbench.harness.experiments.regression.abba_benchmark import (
     ProgramPair,
     run_confirmed_benchmark,
 )
-from springbench.harness.experiments.regression.answer_agreement import describe_difference
-from springbench.harness.experiments.regression.confidence_sequence import (
-    DEFAULT_ALPHA,
-    SequentialTest,
-    SequentialVerdict,
-)
+from springbench.harness.experiments.regression.confidence_sequence import DEFAULT_ALPHA, SequentialTest
+from springbench.harness.experiments.regression.program_pair import AnswersDiffer, require_agreement
 from springbench.harness.experiments.regression.revision_process import (
     GitRevision,
     PreparedWork,
@@ -47,7 +43,7 @@ class WorkRequest:
 
     title: description in messages.
     command: request of `revision_worker.py`, with its arguments.
-    config: file of the run, in each revision's version; None for a performance test of the checkout.
+    config: file of the run, in each revision's version; None for a gate of the checkout.
     """
 
     title: str
@@ -94,8 +90,8 @@ def build_config_requests(revisions: Sequence[GitRevision], config: Path, option
         ]
     if listed[0] != listed[1]:
         raise InputError(
-            f"{config}: {revisions[0].name} and {revisions[1].name} read different runs "
-            f"out of it: {_find_first_difference(listed)}"
+            f"{config}: {revisions[0].name} and {revisions[1].name} read different runs from it: "
+            f"{_find_first_difference(listed)}"
         )
     return [
         WorkRequest(title, "prepare_run", {"run_options": options, "index": i}, config)
@@ -103,24 +99,24 @@ def build_config_requests(revisions: Sequence[GitRevision], config: Path, option
     ]
 
 
-def build_test_requests(revisions: Sequence[GitRevision], name: str) -> list[WorkRequest]:
-    """Build a request for each performance test of the checkout whose name contains `name`.
+def build_gate_requests(revisions: Sequence[GitRevision], name: str) -> list[WorkRequest]:
+    """Build a request for each gate of the checkout whose name contains `name`.
 
     Args:
         revisions: the two revisions.
         name: part of the names.
     Raises:
-        InputError: if no test matches, or if one revision lacks it.
+        InputError: if no gate matches, or if one revision lacks it.
     """
     with start_workers(*revisions) as alive:
-        listed = [worker.send_request("list_tests")["tests"] for worker in alive]
-    found = [[test for test in tests if name in test] for tests in listed]
+        listed = [worker.send_request("list_gates")["gates"] for worker in alive]
+    found = [[gate for gate in gates if name in gate] for gates in listed]
     if not any(found):
-        raise InputError(f"-k {name}: neither has such a gate; they have {', '.join(listed[0])}")
+        raise InputError(f"-k {name}: no such gate; expected a part of {', '.join(listed[0])}")
     for one, other, side in ((*found, revisions[1]), (*found[::-1], revisions[0])):
         if missing := sorted(set(one) - set(other)):
-            raise InputError(f"-k {name}: {side.name} has no gate {', '.join(missing)}; name others")
-    return [WorkRequest(test, "prepare_test", {"name": test}) for test in found[0]]
+            raise InputError(f"-k {name}: {side.name} has no gate {', '.join(missing)}; select others")
+    return [WorkRequest(gate, "prepare_gate", {"name": gate}) for gate in found[0]]
 
 
 def compare_revisions(
@@ -141,19 +137,14 @@ def compare_revisions(
     """
     rule = SequentialTest(options.max_ratio, options.alpha / len(requests))
     found: list[tuple[WorkRequest, BenchmarkResult]] = []
-    told = cache(print_message)  # what differs is found at each start, and told once
+    print_once = cache(print_message)  # differences are found at each start
     for request in requests:
         result = run_confirmed_benchmark(
-            partial(start_revisions, revisions, request, options, told), rule, time_budget=options.budget
+            partial(start_revisions, revisions, request, options, print_once), rule, time_budget=options.budget
         )
         print_message(f"{request.title}: {result}")
         found.append((request, result))
     return found
-
-
-def choose_exit_code(verdicts: Sequence[SequentialVerdict]) -> int:
-    """Return 1 for any failure, else 3 for any inconclusive verdict, else 0."""
-    return next((a.value for a in (SequentialVerdict.FAIL, SequentialVerdict.INCONCLUSIVE) if a in verdicts), 0)
 
 
 @contextmanager
@@ -177,36 +168,37 @@ def start_revisions(
         InputError: if the work fails, or if the answers differ.
     """
     with start_workers(*revisions) as alive:
-        held = _prepare_work(alive, request, 1)
-        clock = options.clock or held[0].clock
+        prepared = _prepare_work(alive, request, 1)
+        clock = options.clock or prepared[0].clock
         once = min(worker.time_calls(1, clock) for worker in alive)
         if request.config and once < MIN_CALL_SECONDS:
-            held = _prepare_work(alive, request, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
+            prepared = _prepare_work(alive, request, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
             once = min(worker.time_calls(1, clock) for worker in alive)
-        if said := describe_difference(held[0].answer, held[1].answer):
-            named = f"{request.title}: {revisions[0].name} and {revisions[1].name}"
-            raise InputError(f"{named} answer differently: {said}; nothing was timed")
-        facts = [one.stats | _count_instructions(worker) for one, worker in zip(held, alive, strict=True)]
-        for change in describe_changes(*facts):
+        try:
+            require_agreement(prepared[0].answer, prepared[1].answer)
+        except AnswersDiffer as error:
+            raise InputError(f"{request.title}: {revisions[0].name} and {revisions[1].name}: {error}") from error
+        counts = [work.stats | _count_instructions(worker) for work, worker in zip(prepared, alive, strict=True)]
+        for change in describe_changes(*counts):
             print_message(f"{request.title}: {change}")
         calls = max(1, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
         a, b = (partial(worker.time_calls, calls, clock) for worker in alive)
-        yield ProgramPair(a, b, partial(_rebuild_work, alive))
+        yield ProgramPair(a, b, partial(_rebuild_work, alive), calls)
 
 
 def _prepare_work(processes: Sequence[RevisionProcess], request: WorkRequest, num_frames: int) -> list[PreparedWork]:
     """Prepare the request's work in both processes; for a run it has num_frames steps."""
-    held: list[PreparedWork] = []
+    prepared: list[PreparedWork] = []
     for worker in processes:
-        more: dict[str, Any] = {}
+        run_arguments: dict[str, Any] = {}
         if request.config:
-            more = {
+            run_arguments = {
                 "config": str(worker.revision.resolve_file(request.config)),
                 "num_frames": num_frames,
                 "injected_slowdown": worker.revision.injected_slowdown,
             }
-        held.append(worker.prepare_work(request.command, **request.arguments, **more))
-    return held
+        prepared.append(worker.prepare_work(request.command, **request.arguments, **run_arguments))
+    return prepared
 
 
 def _rebuild_work(processes: Sequence[RevisionProcess]) -> None:
@@ -214,10 +206,10 @@ def _rebuild_work(processes: Sequence[RevisionProcess]) -> None:
 
     The order is random because the last process to run has the warmest caches.
     """
-    chance = sample(processes, len(processes))
-    for worker in chance:
+    shuffled = sample(processes, len(processes))
+    for worker in shuffled:
         worker.rebuild_work()
-    for worker in chance:
+    for worker in shuffled:
         worker.time_calls(1, "cpu")
 
 

@@ -105,10 +105,10 @@ class RevisionProcess:
             process.wait()
             self._listener.join()
             last = self._error_lines[-1] if self._error_lines else f"its process ended with code {process.returncode}"
-            raise InputError(f"{self.revision.name}: does not run: {last}")
+            raise InputError(f"{self.revision.name}: cannot be run: {last}")
         answer = json.loads(line)
         if "error" in answer:
-            raise InputError(f"{self.revision.name}: does not run: {answer['error']}")
+            raise InputError(f"{self.revision.name}: cannot be run: {answer['error']}")
         return answer
 
     def prepare_work(self, command: str, **arguments: Any) -> PreparedWork:

@@ -7,8 +7,8 @@ code is timed.
     {"command": "list_runs", "config": "...", "run_options": {...}}     -> {"runs": ["cloth 32 numba", ...]}
     {"command": "prepare_run", "config": "...", "run_options": {...}, "index": i, "num_frames": n,
      "injected_slowdown": 0.0, "positions": "..."}            -> {"stats": {...}, "clock": "cpu", "num_frames": n}
-    {"command": "list_tests"}                                 -> {"tests": ["numba-against-sparse-64", ...]}
-    {"command": "prepare_test", "name": "...", "positions": "..."}      -> {"stats": {...}, "clock": "cpu"}
+    {"command": "list_gates"}                                 -> {"gates": ["numba-against-sparse-64", ...]}
+    {"command": "prepare_gate", "name": "...", "positions": "..."}      -> {"stats": {...}, "clock": "cpu"}
     {"command": "time_calls", "num_calls": n, "clock": "cpu"} -> {"seconds": s}, all calls together
     {"command": "rebuild_work"}                               -> {}, the same work, rebuilt at other addresses
     {"command": "count_instructions"}                         -> {"instructions": n}, null if they are hidden
@@ -68,27 +68,27 @@ class RevisionWorker:
         Returns: deterministic counts, suitable clock and number of steps.
         """
         run = _load_runs(config, run_options)[index]
-        threads = 1 if run.threads == "auto" else run.threads  # idle cores now are not idle cores later
+        threads = 1 if run.threads == "auto" else run.threads  # the number of idle cores varies
         self._pin_threads(threads)
         num_frames = min(num_frames, run.frames)
         steps = self._prepare_work(lambda: _RevisionSteps(run, num_frames, injected_slowdown), positions)
         return {"stats": steps.collect_stats(), "clock": "cpu" if threads == 1 else "wall", "num_frames": num_frames}
 
-    def list_tests(self) -> dict[str, Any]:
-        """List the names of the worktree's own performance tests."""
-        return {"tests": sorted(_load_tests())}
+    def list_gates(self) -> dict[str, Any]:
+        """List the names of the worktree's own gates."""
+        return {"gates": sorted(_load_gates())}
 
-    def prepare_test(self, name: str, positions: str) -> dict[str, Any]:
-        """Prepare the candidate of one of the worktree's own performance tests.
+    def prepare_gate(self, name: str, positions: str) -> dict[str, Any]:
+        """Prepare the candidate of one of the worktree's own gates.
 
         Args:
-            name: name of the test.
+            name: name of the gate.
             positions: path of the file that receives the answer.
         """
         self._pin_threads(1)
-        test = _load_tests()[name]
-        self._prepare_work(test.candidate, positions)
-        return {"stats": {}, "clock": test.clock}
+        gate = _load_gates()[name]
+        self._prepare_work(gate.candidate, positions)
+        return {"stats": {}, "clock": gate.clock}
 
     def rebuild_work(self) -> dict[str, Any]:
         """Rebuild the work behind a random offset, while the old work still occupies its memory."""
@@ -106,10 +106,10 @@ class RevisionWorker:
         """
         now, work = CLOCK_FUNCTIONS[clock], self._work
         assert work is not None
-        began = now()
+        start = now()
         for _ in range(num_calls):
             work()
-        return {"seconds": now() - began}
+        return {"seconds": now() - start}
 
     def count_instructions(self) -> dict[str, Any]:
         """Count the instructions of one call.
@@ -147,23 +147,24 @@ class _RevisionSteps:
 
     def __init__(self, run: Any, frames: int, injected_slowdown: float) -> None:
         from springbench.harness.scenes.scene_builder import build_scene
+        from springbench.harness.simulation.auto_tolerance import build_stop_rule
         from springbench.harness.simulation.time_loop import prepare
         from springbench.solvers.registry import SOLVERS, load_target
 
         self._run, self._num_frames, self._injected_slowdown, self._iterations = run, frames, injected_slowdown, 0
         self._scene = build_scene(run.scene, run.size, run.integrator)
         self._prepared = prepare(self._scene, load_target(SOLVERS[run.solver.name])(**run.solver.parameters))
-        self._stop = _build_stop_rule(run)
+        self._stop = build_stop_rule(run.iterations, run.tolerance)
 
     def __call__(self) -> Any:
         from springbench.harness.simulation.time_loop import simulate_scene
         from springbench.solvers.model.step_problem import StopRule
 
-        self._iterations, step, first_guess = 0, None, self._run.first_guess
+        self._iterations, step = 0, None
         for step in simulate_scene(
-            self._scene, self._prepared, self._stop, initial_guess=first_guess, frames=self._num_frames
+            self._scene, self._prepared, self._stop, initial_guess=self._run.first_guess, frames=self._num_frames
         ):
-            self._iterations += _count_iterations(step)
+            self._iterations += step.num_iterations
         assert step is not None
         if self._injected_slowdown:
             self._prepared.solve(step.problem, StopRule(max(1, round(self._injected_slowdown * self._iterations))))
@@ -175,25 +176,10 @@ class _RevisionSteps:
         return counts | {"iterations": self._iterations, "steps": self._num_frames}
 
 
-def _build_stop_rule(run: Any) -> Any:
-    from springbench.solvers.model.step_problem import StopRule
-
-    if isinstance(run.tolerance, str):  # `auto`, which older revisions do not know
-        from springbench.harness.simulation.auto_tolerance import build_stop_rule
-
-        return build_stop_rule(run.iterations, run.tolerance)
-    return StopRule(run.iterations, run.tolerance)
-
-
 def _load_runs(config: str, run_options: dict[str, Any]) -> list[Any]:
     from springbench.harness.config.config_loader import load_config
 
     return load_config(Path(config), **run_options).list_runs()
-
-
-def _count_iterations(step: Any) -> int:
-    """Count the iterations of a step; older revisions report them only in the solution."""
-    return step.num_iterations if hasattr(step, "num_iterations") else step.solution.num_iterations
 
 
 def _format_title(run: Any) -> str:
@@ -204,17 +190,29 @@ def _format_title(run: Any) -> str:
     return ", ".join([run.scene_name, *size, *given, *threads])
 
 
-def _load_tests() -> dict[str, Any]:
+def _load_gates() -> dict[str, Any]:
     from tests.bench import test_gates
 
     groups: list[tuple[Any, ...]] = [value for value in vars(test_gates).values() if isinstance(value, tuple)]
-    return {test.name: test for group in groups for test in group if hasattr(test, "candidate")}
+    return {gate.name: gate for group in groups for gate in group if hasattr(gate, "candidate")}
+
+
+def _describe_error(error: Exception) -> str:
+    """Describe an error of the worktree's code, or a name that this script expects and the worktree lacks."""
+    if any(base.__name__ == "SpringbenchError" for base in type(error).__mro__):
+        return str(error)
+    if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith("tests"):
+        return "there is no tests/bench/test_gates.py, which lists the gates of a checkout"
+    place = traceback.extract_tb(error.__traceback__)[-1].filename
+    if place == __file__ and isinstance(error, AttributeError | ImportError | TypeError):
+        return f"it lacks a name that a comparison needs ({error}); choose a revision with the names of this checkout"
+    return f"{type(error).__name__}: {error}"
 
 
 def main() -> None:
     """Answer requests until standard input ends."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # what the work prints must not look like an answer
+    os.dup2(2, 1)  # the work may print; that is no answer
     worker = RevisionWorker()
     for line in sys.stdin:
         request = json.loads(line)
@@ -222,8 +220,7 @@ def main() -> None:
             answer = getattr(worker, request.pop("command"))(**request)
         except Exception as error:  # of any class: the other process reports it in one message
             traceback.print_exc()
-            ours = any(base.__name__ == "SpringbenchError" for base in type(error).__mro__)
-            answer = {"error": str(error) if ours else f"{type(error).__name__}: {error}"}
+            answer = {"error": _describe_error(error)}
         answers.write(json.dumps(answer) + "\n")
 
 

@@ -5,9 +5,8 @@ Their answers can be compared, and their times measured.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -16,20 +15,16 @@ from springbench.harness.config.config_loader import load_config, require_fixed_
 from springbench.harness.config.run_options import DEFAULT_SOLVER, RunOptions
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.errors import InputError
-from springbench.harness.experiments.regression.abba_benchmark import MIN_CALL_SECONDS, ClockName, TimedCall
+from springbench.harness.experiments.regression.abba_benchmark import MIN_CALL_SECONDS
+from springbench.harness.experiments.regression.program_pair import build_timer
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.auto_tolerance import build_stop_rule
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.model.step_problem import Positions, Solver
 from springbench.solvers.registry import SOLVERS, load_target
 
-CLOCK_FUNCTIONS: dict[ClockName, Callable[[], float]] = {"cpu": time.process_time, "wall": time.perf_counter}
-
 SolverInput = str | Mapping[str, Any] | Solver
 """A solver: its name, a mapping of its name and parameters, or a solver object."""
-
-WorkFunction = Callable[[], Any]
-"""Function that performs some work once and returns its answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,30 +57,27 @@ def prepare_solver_pair(
         options: options of a run, such as iterations and tolerance.
     Raises: InputError, Unsupported, NotPositiveDefinite.
     """
-    both = [_prepare_steps(scene, given, size, options) for given in (solver, baseline)]
-    once = min(measure_call_seconds(steps) for steps in both)
-    frames = min(both[0].run.frames, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
-    candidate, yardstick = (SceneSteps(s.run, frames, s.simulate_frames) for s in both)
-    return candidate, yardstick
+    first, second = (_prepare_steps(scene, given, size, options) for given in (solver, baseline))
+    for steps in (first, second):
+        steps()  # warm-up
+    once = min(build_timer(steps, 1, "cpu")() for steps in (first, second))
+    frames = min(first.run.frames, ceil(MIN_CALL_SECONDS / max(once, 1e-6)))
+    return replace(first, num_frames=frames), replace(second, num_frames=frames)
 
 
 def _prepare_steps(scene: Path, solver_input: SolverInput, size: int | None, options: dict[str, Any]) -> SceneSteps:
-    asked: list[Any] = [
-        dict(solver_input)
-        if isinstance(solver_input, Mapping)
-        else solver_input
-        if isinstance(solver_input, str)
-        else DEFAULT_SOLVER
-    ]
-    stated = {name: RunOptions.model_fields[name].default for name in ("iterations", "tolerance")}
-    more: dict[str, Any] = {"threads": 1} | stated | options
-    runs = load_config(scene, solvers=asked, sizes=[size] if size else [], **more).list_runs()
+    is_named = isinstance(solver_input, (str, Mapping))
+    named: Any = dict(solver_input) if isinstance(solver_input, Mapping) else solver_input
+    defaults = {name: RunOptions.model_fields[name].default for name in ("iterations", "tolerance")}
+    run_options: dict[str, Any] = {"threads": 1} | defaults | options
+    runs = load_config(
+        scene, solvers=[named if is_named else DEFAULT_SOLVER], sizes=[size] if size else [], **run_options
+    ).list_runs()
     if len(runs) != 1:
-        raise InputError(f"{scene}: a gate is on one run; came {len(runs)}")
+        raise InputError(f"{scene}: got {len(runs)} runs; a gate compares one run")
     require_fixed_steps(runs)
     (run,) = runs
-    named = isinstance(solver_input, (str, Mapping))
-    solver: Solver = load_target(SOLVERS[run.solver.name])(**run.solver.parameters) if named else solver_input
+    solver: Solver = load_target(SOLVERS[run.solver.name])(**run.solver.parameters) if is_named else named
     bound = build_scene(run.scene, run.size, run.integrator)
     prepared, stop = prepare(bound, solver), build_stop_rule(run.iterations, run.tolerance)
 
@@ -96,37 +88,3 @@ def _prepare_steps(scene: Path, solver_input: SolverInput, size: int | None, opt
         return p
 
     return SceneSteps(run, 1, positions)
-
-
-def build_timer(work: WorkFunction, num_calls: int, clock: ClockName) -> TimedCall:
-    """Build a function that returns the time [s] of a number of calls together.
-
-    Args:
-        work: function to time.
-        num_calls: number of calls.
-        clock: "cpu" or "wall".
-    """
-    now = CLOCK_FUNCTIONS[clock]
-
-    def seconds() -> float:
-        began = now()
-        for _ in range(num_calls):
-            work()
-        return now() - began
-
-    return seconds
-
-
-def measure_call_seconds(work: WorkFunction) -> float:
-    """Measure the CPU seconds of one call, after a warm-up call."""
-    work()
-    return build_timer(work, 1, "cpu")()
-
-
-def choose_num_calls(candidate: WorkFunction, baseline: WorkFunction) -> int:
-    """Choose the number of calls that are timed together.
-
-    Both programs are warm. The calls together are long enough for a clock.
-    """
-    once = min(build_timer(work, 1, "wall")() for work in (candidate, baseline))
-    return max(1, ceil(MIN_CALL_SECONDS / max(once, 1e-7)))

@@ -1,7 +1,7 @@
-"""Table of performance tests in a YAML file: `springbench regress gates.yaml`.
+"""Gates file, a list of performance tests in YAML: `springbench regress gates.yaml`.
 
 gates:
-  - {scene: cloth.yaml, size: 32, solver: numba, against: sparse, limit: 0.6, agree: 1e-6}
+  - {scene: cloth.yaml, size: 32, solver: numba, baseline: sparse, max_ratio: 0.6, agreement_rtol: 1e-6}
 """
 
 from __future__ import annotations
@@ -23,9 +23,14 @@ from springbench.harness.experiments.regression.abba_benchmark import (
     ProgramPair,
     run_confirmed_benchmark,
 )
-from springbench.harness.experiments.regression.answer_agreement import DEFAULT_AGREEMENT_RTOL, describe_difference
 from springbench.harness.experiments.regression.confidence_sequence import DEFAULT_ALPHA, SequentialTest
-from springbench.harness.experiments.regression.solver_pair import build_timer, choose_num_calls, prepare_solver_pair
+from springbench.harness.experiments.regression.program_pair import (
+    DEFAULT_AGREEMENT_RTOL,
+    AnswersDiffer,
+    build_program_pair,
+    require_agreement,
+)
+from springbench.harness.experiments.regression.solver_pair import prepare_solver_pair
 from springbench.harness.scenes.scene_spec import FrameCount, IntegratorName, MeshSize
 from springbench.harness.schema.base_model import ConfigModel
 from springbench.harness.schema.config_document import ConfigDocument
@@ -40,14 +45,14 @@ class RegressionTest(ConfigModel):
     """
 
     scene: str
-    """The scene's file (*.yaml, or *.json of the assignment), relative to the table."""
+    """The scene's file (*.yaml, or *.json of the assignment), relative to the gates file."""
     solver: str | dict[str, Any]
     """The tested solver: a name, or a mapping of `name` and the solver's parameters."""
-    against: str | dict[str, Any]
+    baseline: str | dict[str, Any]
     """The baseline, in the same form."""
-    limit: float = Field(gt=0, le=1e6)
+    max_ratio: float = Field(gt=0, le=1e6)
     """The largest ratio of times, the solver's over the baseline's."""
-    agree: float = Field(default=DEFAULT_AGREEMENT_RTOL, ge=0, le=1)
+    agreement_rtol: float = Field(default=DEFAULT_AGREEMENT_RTOL, ge=0, le=1)
     """Tolerance of the difference of their positions, relative to the scene's size; nothing is timed if it is
     exceeded."""
     size: MeshSize | None = None
@@ -69,11 +74,11 @@ class RegressionTest(ConfigModel):
     def title(self) -> str:
         """Description of the test."""
         size = f" {self.size}" if self.size else ""
-        return f"{Path(self.scene).stem}{size}, {_format_solver(self.solver)} against {_format_solver(self.against)}"
+        return f"{Path(self.scene).stem}{size}, {_format_solver(self.solver)} vs {_format_solver(self.baseline)}"
 
 
-class RegressionTable(ConfigModel):
-    """A table of performance tests."""
+class GatesFile(ConfigModel):
+    """A list of performance tests."""
 
     description: str = Field(default="", max_length=1000)
     """One sentence about what the tests protect."""
@@ -81,31 +86,34 @@ class RegressionTable(ConfigModel):
     """The tests."""
 
 
-def run_regression_table(
+def run_gates_file(
     path: Path, budget: float, print_message: Callable[[str], None], alpha: float = DEFAULT_ALPHA
 ) -> list[tuple[RegressionTest, BenchmarkResult]]:
-    """Run all tests of a table, and print each result at once.
+    """Run all tests of a gates file, and print each result at once.
 
     Args:
-        path: the table.
+        path: the gates file.
         budget: seconds of a test without a budget of its own.
         print_message: receives one line per result.
         alpha: error probability of all tests together.
     Raises:
-        InputError: for a mistake in the table, or if the answers differ.
+        InputError: for a mistake in the file, or if the answers differ.
     """
     document = read_yaml(path)
-    table = document.validate_data(RegressionTable, document.data)
-    if table is None:
+    if "gates" not in document.data:
+        remedy = "to compare a scene or a sweep with a git revision, add --baseline REVISION"
+        raise InputError(InputMistake(f"is no gates file, it has no `gates`; {remedy}", path))
+    gates_file = document.validate_data(GatesFile, document.data)
+    if gates_file is None:
         raise document.build_error()
-    for i, gate in enumerate(table.gates):
+    for i, gate in enumerate(gates_file.gates):
         if not (path.parent / gate.scene).is_file():
             document.add_mistake(f"there is no file {path.parent / gate.scene}", ("gates", i, "scene"))
     if document.mistakes:
         raise document.build_error()
     found: list[tuple[RegressionTest, BenchmarkResult]] = []
-    for i, gate in enumerate(table.gates):
-        rule = SequentialTest(gate.limit, alpha / len(table.gates))
+    for i, gate in enumerate(gates_file.gates):
+        rule = SequentialTest(gate.max_ratio, alpha / len(gates_file.gates))
         result = run_confirmed_benchmark(
             partial(_start_solvers, document, i, gate), rule, time_budget=gate.budget or budget
         )
@@ -120,12 +128,12 @@ def _start_solvers(document: ConfigDocument, index: int, test: RegressionTest) -
     options = {key: getattr(test, key) for key in ("iterations", "tolerance", "integrator", "frames")}
     with limit_threads(1):
         try:
-            candidate, yardstick = prepare_solver_pair(
-                document.path.parent / test.scene, test.solver, test.against, size=test.size, **options
+            candidate, baseline = prepare_solver_pair(
+                document.path.parent / test.scene, test.solver, test.baseline, size=test.size, **options
             )
-            said = describe_difference(candidate(), yardstick(), test.agree)
-        except (Unsupported, NotPositiveDefinite) as error:
-            document.add_mistake(f"cannot be run: {error}", ("gates", index))
+            require_agreement(candidate(), baseline(), test.agreement_rtol)
+        except (AnswersDiffer, Unsupported, NotPositiveDefinite) as error:
+            document.add_mistake(str(error), ("gates", index))
             raise document.build_error() from error
         except InputError as error:
             # Mistakes of a scene or a solver are reported at the line of the test that uses it.
@@ -133,11 +141,7 @@ def _start_solvers(document: ConfigDocument, index: int, test: RegressionTest) -
             raise InputError(
                 [_add_location(mistake, document.path, line, index) for mistake in error.mistakes]
             ) from error
-        if said:
-            document.add_mistake(f"the answers differ, so nothing was timed: {said}", ("gates", index))
-            raise document.build_error()
-        calls = choose_num_calls(candidate, yardstick)
-        yield ProgramPair(build_timer(candidate, calls, test.clock), build_timer(yardstick, calls, test.clock))
+        yield build_program_pair(candidate, baseline, test.clock)
 
 
 def _add_location(mistake: InputMistake, path: Path, line: int | None, index: int) -> InputMistake:
