@@ -83,5 +83,5 @@ def build_program_pair(candidate: WorkFunction, baseline: WorkFunction, clock: C
     """
     once = min(build_timer(work, 1, "wall")() for work in (candidate, baseline))
     num_calls = max(1, ceil(MIN_CALL_SECONDS / max(once, 1e-7)))
-    timers = (build_timer(work, num_calls, clock) for work in (candidate, baseline))
-    return ProgramPair(*timers, num_calls=num_calls)
+    a, b = (build_timer(work, num_calls, clock) for work in (candidate, baseline))
+    return ProgramPair(a, b, num_calls=num_calls)
