@@ -20,7 +20,7 @@ from tests.oracles.complex_step import (
     differentiate_along,
     to_extended,
 )
-from tests.oracles.external_effects import check_own_gradient
+from tests.oracles.external_effects import read_own_derivatives
 from tests.oracles.key_frame_motion import bound_roundoff
 from tests.oracles.scene_declaration import Array
 from tests.oracles.scene_terms import SceneTerms
@@ -65,26 +65,25 @@ class ComparisonPoint:
     @property
     def pin_target_scale(self) -> float:
         """The size [m] whose product with eps is the round-off of the pins' targets."""
-        size = self.coordinate_scale + sum(opinion.coordinate_scale for opinion in self.scene_terms.effect_terms)
+        size = self.coordinate_scale + sum(terms.coordinate_scale for terms in self.scene_terms.effect_terms)
         moves = [
             motion for effect in self.scene_terms.declaration.effects if (motion := getattr(effect, "motion", None))
         ]
         end = self.reference_step.step_moment.time + self.reference_step.step_moment.time_step
-        held = float(
-            np.abs(self.reference_step.pin_targets).max(initial=0.0)
-        )  # where the mesh is all in one point, they are not
-        return max([size, held, *(bound_roundoff(motion, size, end) / EPS for motion in moves)])
+        # A mesh may lie in one point and its pin targets elsewhere.
+        target_scale = float(np.abs(self.reference_step.pin_targets).max(initial=0.0))
+        return max([size, target_scale, *(bound_roundoff(motion, size, end) / EPS for motion in moves)])
 
 
-def with_friction_at(stated: ReferenceStep, problem: StepProblem, x: Array) -> ReferenceStep:
+def with_friction_at(step: ReferenceStep, problem: StepProblem, x: Array) -> ReferenceStep:
     """Return the step with friction's normal forces at its solution x (n, 3) [m].
 
     It is unchanged unless the harness has a further friction round.
     """
     return (
-        stated
+        step
         if problem.step_start.normal_force_positions is None
-        else replace(stated, step_moment=replace(stated.step_moment, normal_force_positions=to_extended(x)))
+        else replace(step, step_moment=replace(step.step_moment, normal_force_positions=to_extended(x)))
     )
 
 
@@ -101,31 +100,31 @@ def compare_arrays(name: str, ours: Any, theirs: Any, size: float) -> Iterator[T
     if ours.shape != theirs.shape:
         yield TermMismatch(f"{name} (number)", 1.0)
         return
-    away = float(np.where(ours == theirs, 0.0, np.abs(ours - theirs)).max(initial=0.0))
-    if not away <= ROUNDOFF_MULTIPLE * EPS * size:
-        yield TermMismatch(name, _relative_size(away, float(np.abs(theirs).max(initial=0.0))))
+    difference = float(np.where(ours == theirs, 0.0, np.abs(ours - theirs)).max(initial=0.0))
+    if not difference <= ROUNDOFF_MULTIPLE * EPS * size:
+        yield TermMismatch(name, _relative_size(difference, float(np.abs(theirs).max(initial=0.0))))
 
 
-def _relative_size(away: float, size: float) -> float:
-    return away / max(size, np.finfo(float).tiny)
+def _relative_size(difference: float, size: float) -> float:
+    return difference / max(size, np.finfo(float).tiny)
 
 
 def compare_steps(at: ComparisonPoint) -> Iterator[TermMismatch]:
     """Compare masses, inertia, forces and pins."""
-    system, problem, stated = at.problem.system, at.problem, at.reference_step
-    m, start, mass, reach = (
-        stated.step_moment,
+    system, problem, step = at.problem.system, at.problem, at.reference_step
+    m, start, mass, scale = (
+        step.step_moment,
         at.problem.step_start,
         at.scene_terms.declaration.mass,
         at.coordinate_scale,
     )
     dt, most = m.time_step, float(np.abs(mass).max(initial=0.0))
     yield from compare_arrays("masses", system.mass, mass, most)
-    yield from compare_arrays("inertia", system.inertia_diagonal, stated.c * mass / dt**2, stated.c * most / dt**2)
-    yield from compare_arrays("inertial target", problem.inertial_target, stated.inertial_target, reach)
-    yield from compare_arrays("the step's start", start.positions, m.p, reach)
-    yield from compare_arrays("filtered velocities", start.velocity, m.v, reach / dt)
-    yield from compare_arrays("origin of velocities", start.velocity_origin, m.velocity_origin, reach)
+    yield from compare_arrays("inertia", system.inertia_diagonal, step.c * mass / dt**2, step.c * most / dt**2)
+    yield from compare_arrays("inertial target", problem.inertial_target, step.inertial_target, scale)
+    yield from compare_arrays("the step's start", start.positions, m.p, scale)
+    yield from compare_arrays("filtered velocities", start.velocity, m.v, scale / dt)
+    yield from compare_arrays("origin of velocities", start.velocity_origin, m.velocity_origin, scale)
     yield from compare_arrays(
         "rate of velocities",
         [start.velocity_rate, system.velocity_rate],
@@ -134,61 +133,65 @@ def compare_steps(at: ComparisonPoint) -> Iterator[TermMismatch]:
     )
     if start.normal_force_positions is not None:
         yield from compare_arrays(
-            "where friction is pressed", start.normal_force_positions, m.normal_force_positions, reach
+            "where friction is pressed", start.normal_force_positions, m.normal_force_positions, scale
         )
     yield from compare_arrays("times", [start.time, start.stage_time], [m.time, m.stage_time], max(m.stage_time, dt))
     yield from compare_arrays(
         "forces",
         problem.external_force,
-        stated.external_force,
-        stated.force_size * (1.0 + reach / at.scene_terms.min_length()),
+        step.external_force,
+        step.force_size * (1.0 + scale / at.scene_terms.min_length()),
     )
-    if system.pins.vertices.tolist() != stated.vertices:
+    if system.pins.vertices.tolist() != step.vertices:
         yield TermMismatch("pinned vertices", 1.0)
         return
-    soft = max((w for w in stated.weights if np.isfinite(w)), default=0.0)
+    soft = max((w for w in step.weights if np.isfinite(w)), default=0.0)
     found = sorted(
         (*edge, low, high)
         for one in system.length_constraints
         for edge, low, high in zip(one.edges.tolist(), one.min_length.tolist(), one.max_length.tolist(), strict=True)
     )
-    wanted = sorted((*edge, *kept) for one in at.scene_terms.effect_terms for edge, kept in one.exact_lengths.items())
-    yield from compare_arrays("exact lengths", np.reshape(found, (-1, 4)), np.reshape(wanted, (-1, 4)), reach)
-    yield from compare_arrays("weights of pins", system.pins.weight, stated.weights, soft)
-    yield from compare_arrays("targets of pins", problem.pin_targets, stated.pin_targets, at.pin_target_scale)
+    expected = sorted(
+        (*edge, *limits) for one in at.scene_terms.effect_terms for edge, limits in one.exact_lengths.items()
+    )
+    yield from compare_arrays("exact lengths", np.reshape(found, (-1, 4)), np.reshape(expected, (-1, 4)), scale)
+    yield from compare_arrays("weights of pins", system.pins.weight, step.weights, soft)
+    yield from compare_arrays("targets of pins", problem.pin_targets, step.pin_targets, at.pin_target_scale)
 
 
 def compare_energies(at: ComparisonPoint) -> Iterator[TermMismatch]:
     """Compare the energies of each effect, and the objective, their sum."""
-    side, stated, reach = at.scene_terms, at.reference_step, at.coordinate_scale
+    scene_terms, step, scale = at.scene_terms, at.reference_step, at.coordinate_scale
     free = at.direction.copy()
-    free[[i for i, w in zip(stated.vertices, stated.weights, strict=True) if np.isinf(w)]] = 0.0
+    free[[i for i, w in zip(step.vertices, step.weights, strict=True) if np.isinf(w)]] = 0.0
     x, d = to_extended(at.x), to_extended(free)
     parts = [_evaluate_other_terms(at, x, d)]
-    for k, begin in enumerate(side.energy_builders):
-        own = [at.problem.energies[i] for i in side.energy_indices[k]]
+    for k, begin in enumerate(scene_terms.energy_builders):
+        own = [at.problem.energies[i] for i in scene_terms.energy_indices[k]]
         if begin is None:
-            told, wrong = check_own_gradient(own, at.x, free, reach, side.min_length())
-            if wrong is not None:
-                yield TermMismatch(f"{side.format_effect_name(k)} (gradient against its own value)", wrong)
+            reference = read_own_derivatives(own, at.x, free)
         else:
-            told = differentiate_along(begin(stated.step_moment), x, d, _effect_scale(at, k), side.min_length(k))
-            yield from _compare_lagged_friction(at, k, told, x, d)
-            if np.isfinite(told.value) or any(np.isfinite(energy.value(at.x)) for energy in own):
-                yield from _compare_effect(side.format_effect_name(k), told, own, at.x, free)
-        parts.append(told)
+            reference = differentiate_along(
+                begin(step.step_moment), x, d, _effect_scale(at, k), scene_terms.min_length(k)
+            )
+            yield from _compare_lagged_friction(at, k, reference, x, d)
+            if np.isfinite(reference.value) or any(np.isfinite(energy.value(at.x)) for energy in own):
+                yield from _compare_effect(scene_terms.format_effect_name(k), reference, own, at.x, free)
+        parts.append(reference)
     if not all(np.isfinite(part.value) for part in parts):
         return
     # Forces are computed in float64, with a separate sum for each vertex.
-    pulled = ROUNDOFF_MULTIPLE * EPS * float(np.abs(d).sum()) * stated.force_size
-    room = [sum(part.tolerances[k] for part in parts) for k in range(2)]
+    pulled = ROUNDOFF_MULTIPLE * EPS * float(np.abs(d).sum()) * step.force_size
+    tolerances = [sum(part.tolerances[k] for part in parts) for k in range(2)]
     value, slope = at.problem.value(at.x), float((at.problem.gradient(at.x) * free).sum())
-    yield from _compare_values("objective (value)", value, sum(part.value for part in parts), room[0] + reach * pulled)
-    yield from _compare_values("objective (gradient)", slope, sum(part.slope for part in parts), room[1] + pulled)
+    yield from _compare_values(
+        "objective (value)", value, sum(part.value for part in parts), tolerances[0] + scale * pulled
+    )
+    yield from _compare_values("objective (gradient)", slope, sum(part.slope for part in parts), tolerances[1] + pulled)
 
 
 def _compare_lagged_friction(
-    at: ComparisonPoint, k: int, told: DirectionalDerivatives, x: Any, d: Any
+    at: ComparisonPoint, k: int, reference: DirectionalDerivatives, x: Any, d: Any
 ) -> Iterator[TermMismatch]:
     """Compare friction of effect k with normal forces at the step's start and at x."""
     effect, m, begin = (
@@ -203,39 +206,41 @@ def _compare_lagged_friction(
         begin(replace(m, normal_force_positions=x)), x, d, _effect_scale(at, k), at.scene_terms.min_length(k)
     )
     if (
-        not abs(own.slope - told.slope)
-        <= _SETTLED_SLOPE_SHARE * abs(own.slope) + own.tolerances[1] + told.tolerances[1]
+        not abs(own.slope - reference.slope)
+        <= _SETTLED_SLOPE_SHARE * abs(own.slope) + own.tolerances[1] + reference.tolerances[1]
     ):
         yield TermMismatch(
             f"{at.scene_terms.format_effect_name(k)} (friction's pressure)",
-            _relative_size(abs(own.slope - told.slope), abs(own.slope)),
+            _relative_size(abs(own.slope - reference.slope), abs(own.slope)),
         )
 
 
 def _effect_scale(at: ComparisonPoint, k: int) -> float:
     """Return the largest coordinate [m] that effect k depends on, including moving parts."""
-    effect, reach = (
+    effect, scale = (
         at.scene_terms.declaration.effects[k],
         at.coordinate_scale + at.scene_terms.effect_terms[k].coordinate_scale,
     )
     moving = [effect, *getattr(effect, "obstacles", ())]
     late = at.reference_step.step_moment.time + at.reference_step.step_moment.time_step
-    return max([reach, *(bound_roundoff(getattr(one, "motion", None), reach, late) / EPS for one in moving)])
+    return max([scale, *(bound_roundoff(getattr(one, "motion", None), scale, late) / EPS for one in moving)])
 
 
 def _compare_effect(
-    name: str, told: DirectionalDerivatives, own: Sequence[Energy], x: Array, d: Array
+    name: str, reference: DirectionalDerivatives, own: Sequence[Energy], x: Array, d: Array
 ) -> Iterator[TermMismatch]:
     """Compare the energies of one effect with its reference derivatives."""
     gradient = np.zeros_like(x)
     for energy in own:
         energy.add_gradient(x, gradient)
     yield from _compare_values(
-        f"{name} (value)", sum(energy.value(x) for energy in own), told.value, told.tolerances[0]
+        f"{name} (value)", sum(energy.value(x) for energy in own), reference.value, reference.tolerances[0]
     )
-    yield from _compare_values(f"{name} (gradient)", float((gradient * d).sum()), told.slope, told.tolerances[1])
+    yield from _compare_values(
+        f"{name} (gradient)", float((gradient * d).sum()), reference.slope, reference.tolerances[1]
+    )
     bend = sum(_second_derivative(energy, x, d) for energy in own)
-    yield from _compare_values(f"{name} (Hessian)", bend, told.curvature, told.tolerances[2])
+    yield from _compare_values(f"{name} (Hessian)", bend, reference.curvature, reference.tolerances[2])
 
 
 def _second_derivative(energy: Any, x: Array, d: Array) -> float:
@@ -250,21 +255,21 @@ def _second_derivative(energy: Any, x: Array, d: Array) -> float:
     return float(flat @ (energy.sparse_hessian(x) @ flat) + dense @ dense)
 
 
-def _compare_values(name: str, ours: float, theirs: float, room: float) -> Iterator[TermMismatch]:
-    if not abs(ours - theirs) <= room:
+def _compare_values(name: str, ours: float, theirs: float, tolerances: float) -> Iterator[TermMismatch]:
+    if not abs(ours - theirs) <= tolerances:
         yield TermMismatch(name, _relative_size(abs(ours - theirs), abs(theirs)))
 
 
 def _evaluate_other_terms(at: ComparisonPoint, x: Any, d: Any) -> DirectionalDerivatives:
     """Evaluate inertia, the pins' penalties and the forces."""
-    stated = at.reference_step
-    soft = [i for i, w in enumerate(stated.weights) if np.isfinite(w)]
-    held, weight = [stated.vertices[i] for i in soft], to_extended([stated.weights[i] for i in soft])
-    inertia = to_extended(stated.c * at.scene_terms.declaration.mass / stated.step_moment.time_step**2)
+    step = at.reference_step
+    soft = [i for i, w in enumerate(step.weights) if np.isfinite(w)]
+    at_vertices, weight = [step.vertices[i] for i in soft], to_extended([step.weights[i] for i in soft])
+    inertia = to_extended(step.c * at.scene_terms.declaration.mass / step.step_moment.time_step**2)
 
     def values(y: Any) -> Any:
-        away, sag = y - to_extended(stated.inertial_target), y[held] - stated.pin_targets[soft]
-        squares = [inertia / 2 * (away**2).sum(axis=1), weight / 2 * (sag**2).sum(axis=1)]
-        return np.concatenate([*squares, -(y * stated.external_force).sum(axis=1)])
+        difference, sag = y - to_extended(step.inertial_target), y[at_vertices] - step.pin_targets[soft]
+        squares = [inertia / 2 * (difference**2).sum(axis=1), weight / 2 * (sag**2).sum(axis=1)]
+        return np.concatenate([*squares, -(y * step.external_force).sum(axis=1)])
 
     return differentiate_along(values, x, d, max(at.coordinate_scale, at.pin_target_scale), at.coordinate_scale or 1.0)

@@ -79,11 +79,11 @@ def differentiate_along(
     corner = float(np.abs(ahead - 2 * first + behind).sum() / s)
     sums = [float(np.abs(part).sum()) for part in (here, first, second)]
     sums.append(corner / float(s))
-    room = [
+    tolerances = [
         ROUNDOFF_MULTIPLE * EPS * ((1.0 + coordinate_scale / min_length) * sums[k] + coordinate_scale * sums[k + 1])
         for k in range(3)
     ]
-    room[2] += corner + room[1] / EPS * float(np.finfo(np.longdouble).eps / s)
+    tolerances[2] += corner + tolerances[1] / EPS * float(np.finfo(np.longdouble).eps / s)
     return DirectionalDerivatives(
-        float(here.sum()), float(first.sum()), float(second.sum()), (room[0], room[1], room[2])
+        float(here.sum()), float(first.sum()), float(second.sum()), (tolerances[0], tolerances[1], tolerances[2])
     )

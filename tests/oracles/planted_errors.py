@@ -1,4 +1,4 @@
-"""Scenes as files declare them, and ways to lie about how they are stated: what the second opinion has to tell."""
+"""Scenes as files declare them, and errors to plant in the terms of their steps, which the comparison must find."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ GAS_SPEC = {"kind": "gas", "pressure": 200}
 
 
 def build_scene_spec(*effects: dict[str, Any], mesh: dict[str, Any] | None = None, **more: Any) -> SceneSpec:
-    """A cloth (or another mesh) with effects, as a file declares them."""
+    """Build the specification of a cloth, or of another mesh, with effects as a file declares them."""
     given = mesh or {"kind": "grid", "skip_one": True}
     made = tuple(load_target(EFFECT_CLASSES[effect["kind"]]).model_validate(effect) for effect in effects)
     fields: dict[str, Any] = {"mass": 1.0, "time_step": 1 / 30, "frames": 40} | more
@@ -64,13 +64,21 @@ def build_scene_spec(*effects: dict[str, Any], mesh: dict[str, Any] | None = Non
 
 
 def scale_fields(**fields: float) -> Callable[[Any], Any]:
-    """Energies with some fields multiplied."""
+    """Multiply fields of energies."""
     return lambda energy: replace(energy, **{name: by * getattr(energy, name) for name, by in fields.items()})
 
 
 class FormulaMutation(NamedTuple):
-    """What is told: of the class of an energy, changed as they are bound; or by a patch. words: in what the opinion has
-    to disagree."""
+    """A planted error.
+
+    Attributes:
+      effects: effects of the scene.
+      expected_words: words that name the term which must differ.
+      apply_patch: plants the error.
+      integrator: name of the integrator.
+      mesh: mesh of the scene, None for a cloth.
+      size: mesh size.
+    """
 
     effects: list[dict[str, Any]]
     expected_words: str
@@ -81,47 +89,47 @@ class FormulaMutation(NamedTuple):
 
 
 def mutate_energy(kind: type, change: Callable[[Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
-    """Every energy of a class is changed when a scene is built."""
+    """Change every energy of a class when a scene is built."""
 
-    def tell(patch: pytest.MonkeyPatch) -> None:
+    def apply(patch: pytest.MonkeyPatch) -> None:
         made = System.__init__
 
-        def lying(self: System, mass: Any, time_step: float, energies: Any = (), *more: Any, **named: Any) -> None:
-            told = tuple(change(one) if type(one) is kind else one for one in energies)
-            made(self, mass, time_step, told, *more, **named)
+        def with_error(self: System, mass: Any, time_step: float, energies: Any = (), *more: Any, **named: Any) -> None:
+            changed = tuple(change(one) if type(one) is kind else one for one in energies)
+            made(self, mass, time_step, changed, *more, **named)
 
-        patch.setattr(System, "__init__", lying)
+        patch.setattr(System, "__init__", with_error)
 
-    return tell
+    return apply
 
 
 def mutate_step_energy(kind: type, change: Callable[[Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
-    """Every energy of a class is changed when a step begins."""
+    """Change every energy of a class when a step begins."""
 
-    def tell(patch: pytest.MonkeyPatch) -> None:
+    def apply(patch: pytest.MonkeyPatch) -> None:
         true = kind.begin_step
         patch.setattr(kind, "begin_step", lambda self, start: change(true(self, start)))
 
-    return tell
+    return apply
 
 
 def mutate_step_start(kind: type, change: Callable[[Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
-    """Every energy of a class begins its steps at another start."""
+    """Change the start of every step of an energy class."""
 
-    def tell(patch: pytest.MonkeyPatch) -> None:
+    def apply(patch: pytest.MonkeyPatch) -> None:
         true = kind.begin_step
         patch.setattr(kind, "begin_step", lambda self, start: true(self, change(start)))
 
-    return tell
+    return apply
 
 
 def scale_method(kind: type, method: str, factor: float) -> Callable[[pytest.MonkeyPatch], None]:
-    """A method of a class returns so many times what it should, in its last argument where it adds to that."""
+    """Multiply the result of a method of a class, or what it adds to its last argument."""
 
-    def tell(patch: pytest.MonkeyPatch) -> None:
+    def apply(patch: pytest.MonkeyPatch) -> None:
         true = getattr(kind, method)
 
-        def lying(self: Any, p: Positions, *out: Positions) -> Any:
+        def with_error(self: Any, p: Positions, *out: Positions) -> Any:
             if not out:
                 return factor * true(self, p)
             added = np.zeros_like(out[0])
@@ -129,22 +137,22 @@ def scale_method(kind: type, method: str, factor: float) -> Callable[[pytest.Mon
             out[0][:] += factor * added
             return None
 
-        patch.setattr(kind, method, lying)
+        patch.setattr(kind, method, with_error)
 
-    return tell
+    return apply
 
 
 def mutate_contribution(
     target: str, change: Callable[[EffectContribution], EffectContribution]
 ) -> Callable[[pytest.MonkeyPatch], None]:
-    """An effect binds to something else."""
+    """Change the contribution of an effect."""
 
-    def tell(patch: pytest.MonkeyPatch) -> None:
+    def apply(patch: pytest.MonkeyPatch) -> None:
         kind = load_target(EFFECT_CLASSES[target])
         true = kind.build_contribution
         patch.setattr(kind, "build_contribution", lambda *given: change(true(*given)))
 
-    return tell
+    return apply
 
 
 def scale_steady_forces(factor: float) -> Callable[[EffectContribution], EffectContribution]:
@@ -182,20 +190,20 @@ def mutate_integrator(name: str, **changes: Any) -> Callable[[pytest.MonkeyPatch
 
 
 def scale_prediction(name: str, target: float = 1.0, origin: float = 1.0) -> Callable[[pytest.MonkeyPatch], None]:
-    """The target or the origin of an integrator, by how much of the way that it leads from the positions."""
+    """Scale the displacements of an integrator's target and origin from the current positions."""
 
-    def tell(patch: pytest.MonkeyPatch) -> None:
+    def apply(patch: pytest.MonkeyPatch) -> None:
         integrator = INTEGRATORS[name]
         assert isinstance(integrator, SingleStageIntegrator)
         true = integrator.predict_target
 
-        def lying(now: Any, before: Any, dt: float) -> tuple[Positions, Positions]:
+        def with_error(now: Any, before: Any, dt: float) -> tuple[Positions, Positions]:
             p, (aim, began) = now.positions, true(now, before, dt)
             return p + target * (aim - p), p + origin * (began - p)
 
-        mutate_integrator(name, predict_target=lying)(patch)
+        mutate_integrator(name, predict_target=with_error)(patch)
 
-    return tell
+    return apply
 
 
 def patch_attribute(where: Any, name: str, change: Callable[[Any], Any]) -> Callable[[pytest.MonkeyPatch], None]:
@@ -203,7 +211,7 @@ def patch_attribute(where: Any, name: str, change: Callable[[Any], Any]) -> Call
 
 
 def mutate_half_spaces(**changes: Callable[[Any], Any]) -> Callable[[HalfSpaceContact], HalfSpaceContact]:
-    """The half-spaces of a step, changed."""
+    """Change the half-spaces of a step."""
     return lambda energy: replace(
         energy,
         active_planes=energy.active_planes._replace(**{name: of(energy.active_planes) for name, of in changes.items()}),
@@ -211,5 +219,5 @@ def mutate_half_spaces(**changes: Callable[[Any], Any]) -> Callable[[HalfSpaceCo
 
 
 def drop_term(word: str) -> Callable[[Any], Any]:
-    """`StepProblem.evaluate_terms` without a term."""
+    """Return `StepProblem.evaluate_terms` without a term."""
     return lambda true: lambda self, p: {name: value for name, value in true(self, p).items() if name != word}

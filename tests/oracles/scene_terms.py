@@ -81,32 +81,32 @@ def build_scene_terms(spec: SceneSpec, scene: Scene) -> SceneTerms:
     declared = SceneDeclaration(
         mesh, mass, dt, tuple(spec.effects), not getattr(scene.integrator, "has_split_filters", False)
     )
-    bound = [
+    contributions = [
         effect.build_contribution(mesh, mass, dt).adapt_to_integrator(scene.integrator) for effect in declared.effects
     ]
     # The order is that of the scene's energies: those of each effect first, then those derived from all of them.
-    first = [energy for part in bound for energy in part.energies]
-    owners = [k for k, part in enumerate(bound) for _ in part.energies]
-    owners += [k for k, part in enumerate(bound) for derive in part.derived_energies for _ in derive(first)]
-    owned = [[i for i, owner in enumerate(owners) if owner == k] for k in range(len(bound))]
-    outside = {k for k, effect in enumerate(declared.effects) if not _is_shipped(effect)}
-    if any(owned[k] for k in outside):  # nobody knows what damping by stiffness makes of their energies
-        outside |= {k for k, one in enumerate(declared.effects) if one.kind == "rayleigh" and one.stiffness}
-    opinions = list[EffectTerms]()
+    first = [energy for part in contributions for energy in part.energies]
+    owners = [k for k, part in enumerate(contributions) for _ in part.energies]
+    owners += [k for k, part in enumerate(contributions) for derive in part.derived_energies for _ in derive(first)]
+    indices = [[i for i, owner in enumerate(owners) if owner == k] for k in range(len(contributions))]
+    external = {k for k, effect in enumerate(declared.effects) if not _is_shipped(effect)}
+    if any(indices[k] for k in external):  # damping by stiffness is derived from their energies
+        external |= {k for k, one in enumerate(declared.effects) if one.kind == "rayleigh" and one.stiffness}
+    effect_terms = list[EffectTerms]()
     resists: Array = mass / dt**2
-    for k, (effect, part) in enumerate(zip(declared.effects, bound, strict=True)):
-        if k in outside:
-            opinions.append(build_external_effect(part))
+    for k, (effect, part) in enumerate(zip(declared.effects, contributions, strict=True)):
+        if k in external:
+            effect_terms.append(build_external_effect(part))
             resists = resists + sum_diagonals(part.energies, len(mass), dt)
         else:
-            opinions.append(EffectTerms() if part.is_empty else _EFFECT_BUILDERS[effect.kind](effect, declared))
-            if (share := opinions[k].diagonal) is not None:
+            effect_terms.append(EffectTerms() if part.is_empty else _EFFECT_BUILDERS[effect.kind](effect, declared))
+            if (share := effect_terms[k].diagonal) is not None:
                 resists = resists + share
-    begins = [
-        opinion.build_from_diagonal(resists) if opinion.build_from_diagonal else opinion.build_energy
-        for opinion in opinions
+    builders = [
+        terms.build_from_diagonal(resists) if terms.build_from_diagonal else terms.build_energy
+        for terms in effect_terms
     ]
-    return SceneTerms(declared, opinions, begins, owned, outside)
+    return SceneTerms(declared, effect_terms, builders, indices, external)
 
 
 def _compute_masses(spec: SceneSpec, mesh: Mesh) -> Array:

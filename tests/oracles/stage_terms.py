@@ -113,17 +113,17 @@ class _StageRecorder:
         self,
         name: str,
         declared: SceneDeclaration,
-        opinions: Sequence[EffectTerms],
+        effect_terms: Sequence[EffectTerms],
         now: MotionArrays,
         time: float,
         answer: AnswerFunction,
     ) -> None:
-        self.declared, self.opinions, self.answer, self.time = declared, opinions, answer, time
+        self.declared, self.effect_terms, self.answer, self.time = declared, effect_terms, answer, time
         self.dt = to_extended(declared.time_step)
-        pinned = {i: pin for opinion in opinions for i, pin in opinion.pinned_vertices.items()}
+        pinned = {i: pin for terms in effect_terms for i, pin in terms.pinned_vertices.items()}
         self.pins = sorted(pinned.items())
         self.exact = [(i, pin) for i, pin in self.pins if np.isinf(pin.weight)]
-        self.now = self.apply_exact_pins(filter_motion(now, opinions), time)
+        self.now = self.apply_exact_pins(filter_motion(now, effect_terms), time)
         self.lags = _ORDERS.get(name, 2) > 2
         self.reference_steps: list[ReferenceStep] = []
         self.answers: list[Array] = []
@@ -150,21 +150,23 @@ class _StageRecorder:
         """
         until = self.time + float(when) * self.declared.time_step
         origin, led = origin.copy(), target + self.dt**2 / c * expected
-        held = to_extended([pin.position(until) for _, pin in self.pins]).reshape(-1, 3)
+        pin_targets = to_extended([pin.position(until) for _, pin in self.pins]).reshape(-1, 3)
         for k, (i, pin) in enumerate(self.pins):
-            led[i] = held[k]
+            led[i] = pin_targets[k]
             if np.isinf(pin.weight):
-                origin[i] = held[k] - to_extended(pin.velocity(until)) / rate
+                origin[i] = pin_targets[k] - to_extended(pin.velocity(until)) / rate
         x = self.answer(until)
         there = to_extended(x) if self.lags else led
         p, v = (np.asarray(part, float) for part in (there, rate * (there - origin)))
-        force, size = sum_forces(self.opinions, p, v, until)
+        force, size = sum_forces(self.effect_terms, p, v, until)
         q, u = self.now
         moment = StepMoment(self.declared.time_step, float(rate), float(when), self.time, until, q, u, there, origin)
         weights = [pin.weight for _, pin in self.pins]
         vertices = [i for i, _ in self.pins]
         now = [np.asarray(part, float) for part in self.now]
-        self.reference_steps.append(ReferenceStep(float(c), target, force, size, vertices, weights, held, moment, now))
+        self.reference_steps.append(
+            ReferenceStep(float(c), target, force, size, vertices, weights, pin_targets, moment, now)
+        )
         self.answers.append(x)
         return to_extended(x), rate * (to_extended(x) - origin)
 
@@ -183,7 +185,7 @@ class _StageRecorder:
 def solve_stages(
     name: str,
     declared: SceneDeclaration,
-    opinions: Sequence[EffectTerms],
+    effect_terms: Sequence[EffectTerms],
     now: MotionArrays,
     acceleration: Array,
     time: float,
@@ -194,13 +196,13 @@ def solve_stages(
     Args:
       name: name of the integrator.
       declared: declaration of the scene.
-      opinions: reference terms of the effects.
+      effect_terms: reference terms of the effects.
       now: motion at the start.
       acceleration: acceleration (n, 3) [m/s^2] at the start.
       time: time [s] of the start.
       answer: solution of a stage as a function of time.
     """
-    step = _StageRecorder(name, declared, opinions, now, time, answer)
+    step = _StageRecorder(name, declared, effect_terms, now, time, answer)
     run = _generalised_alpha if name in _ALPHA_PARAMETERS else _runge_kutta
     return run(name, step, to_extended(acceleration))
 

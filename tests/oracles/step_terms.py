@@ -60,7 +60,7 @@ class ReferenceStep:
 def build_reference_step(
     integrator: str,
     declared: SceneDeclaration,
-    opinions: Sequence[EffectTerms],
+    effect_terms: Sequence[EffectTerms],
     now: MotionArrays,
     before: MotionArrays | None,
     time: float,
@@ -70,16 +70,16 @@ def build_reference_step(
     Args:
       integrator: name of the integrator.
       declared: declaration of the scene.
-      opinions: reference terms of the effects.
+      effect_terms: reference terms of the effects.
       now: motion at the start.
       before: motion one step earlier, None where there is none.
       time: time [s] of the start.
     """
     dt = declared.time_step
-    now, earlier = filter_motion(now, opinions), filter_motion(before or now, opinions)
+    now, earlier = filter_motion(now, effect_terms), filter_motion(before or now, effect_terms)
     (p, v), (p0, v0) = ((to_extended(a), to_extended(b)) for a, b in (now, earlier))
-    starts = integrator == "own" or (integrator == "bdf2" and before is None)
-    method = "implicit-euler" if starts else integrator
+    begins_with_euler = integrator == "own" or (integrator == "bdf2" and before is None)
+    method = "implicit-euler" if begins_with_euler else integrator
     if method == "implicit-euler":
         c, target, origin, when, ahead = 1.0, p + dt * v, p, 1.0, 0.0
     elif method == "bdf2":
@@ -89,35 +89,37 @@ def build_reference_step(
         c, target, origin, when, ahead = 4.0, p + dt * v / 2, p, 0.5, 0.5
     far = ahead if before else 0.0
     at = [np.asarray(x + far * (x - y), float) for x, y in zip(now, earlier, strict=True)]
-    force, size = sum_forces(opinions, at[0], at[1], time + ahead * dt)
-    pinned = {i: pin for opinion in opinions for i, pin in opinion.pinned_vertices.items()}
+    force, size = sum_forces(effect_terms, at[0], at[1], time + ahead * dt)
+    pinned = {i: pin for terms in effect_terms for i, pin in terms.pinned_vertices.items()}
     vertices = sorted(pinned)
-    held = to_extended([pinned[i].position(time + dt) for i in vertices]).reshape(-1, 3)
-    held = p[vertices] + when * (held - p[vertices]) if when < 1.0 else held
+    pin_targets = to_extended([pinned[i].position(time + dt) for i in vertices]).reshape(-1, 3)
+    pin_targets = p[vertices] + when * (pin_targets - p[vertices]) if when < 1.0 else pin_targets
     moment = StepMoment(dt, c**0.5 / dt, when, time, time + when * dt, p, v, p + ahead * dt * v, origin)
-    return ReferenceStep(c, target, force, size, vertices, [pinned[i].weight for i in vertices], held, moment, now)
+    return ReferenceStep(
+        c, target, force, size, vertices, [pinned[i].weight for i in vertices], pin_targets, moment, now
+    )
 
 
-def sum_forces(opinions: Sequence[EffectTerms], p: Array, v: Array, time: float) -> tuple[Array, float]:
+def sum_forces(effect_terms: Sequence[EffectTerms], p: Array, v: Array, time: float) -> tuple[Array, float]:
     """Sum all forces (n, 3) [N], and the sizes [N] of their round-off.
 
     Args:
-      opinions: reference terms of the effects.
+      effect_terms: reference terms of the effects.
       p: positions (n, 3) [m].
       v: velocities (n, 3) [m/s].
       time: time [s].
     """
     force, size = np.zeros_like(p), 0.0
-    for opinion in opinions:
-        if opinion.evaluate_force:
-            more, its = opinion.evaluate_force(p, v, time)
+    for terms in effect_terms:
+        if terms.evaluate_force:
+            more, its = terms.evaluate_force(p, v, time)
             force, size = force + more, size + its
     return force, size
 
 
-def filter_motion(motion: MotionArrays, opinions: Sequence[EffectTerms]) -> MotionArrays:
+def filter_motion(motion: MotionArrays, effect_terms: Sequence[EffectTerms]) -> MotionArrays:
     """Return the motion at a step's start with filtered velocity."""
     p, v = motion
-    for opinion in opinions:
-        v = opinion.filter_velocity(v) if opinion.filter_velocity else v
+    for terms in effect_terms:
+        v = terms.filter_velocity(v) if terms.filter_velocity else v
     return [p, v]

@@ -1,4 +1,4 @@
-"""The second opinion of contact with obstacles' surfaces: it agrees, and with no other law."""
+"""Contact with obstacles' surfaces: both implementations agree, and a planted error in the law is found."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ def spec(*obstacles: Any, more: tuple[Any, ...] = (), friction: float = 0.0) -> 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4])
 @pytest.mark.parametrize("name", OBSTACLES)
-def test_it_agrees(name: str, friction: float):
+def test_implementations_agree(name: str, friction: float):
     given = spec(*OBSTACLES[name], friction=friction)
     assert verify_terms(given, build_scene(given, 3), "implicit-euler") == "agrees"
 
 
-def test_it_agrees_with_another_integrator_and_beside_self_contact():
+def test_implementations_agree_with_bdf2_and_self_contact():
     given = spec(*OBSTACLES["mesh that turns"], friction=0.4, more=(SelfContactEffect(thickness=0.1),))
     assert verify_terms(given, build_scene(given, 3, "bdf2"), "bdf2") == "agrees"
 
 
-def test_it_agrees_where_an_obstacle_that_rubs_is_gone_in_a_step():
+def test_implementations_agree_where_an_obstacle_with_friction_leaves_in_one_step():
     shot = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=0.1, offset=(5.0, 2.0, 0.0))))
     given = spec(BALL.model_copy(update={"motion": shot}), PlaneObstacle(point=(0, -1, 0)), friction=0.4)
     assert verify_terms(given, build_scene(given, 3), "implicit-euler") == "agrees"
@@ -64,13 +64,13 @@ WRONG = r"disagrees: (objective \(gradient\), by \S+ of its size; )?effects\[1\]
 
 
 @pytest.mark.parametrize("name", OBSTACLES)
-def test_it_knows_another_stiffness(name: str, monkeypatch: pytest.MonkeyPatch):
+def test_another_stiffness_is_found(name: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(collision_primitives, "_STIFFNESS_FRACTION", 0.1001)
     given = spec(*OBSTACLES[name])
     assert re.match(WRONG, verify_terms(given, build_scene(given, 3), "implicit-euler"))
 
 
-def test_it_knows_another_friction():
+def test_another_friction_is_found():
     given = spec(BALL, friction=0.4)
     made = build_scene(given, 3)
     (energy,) = (e for e in made.system.energies if isinstance(e, ObstacleContact))
@@ -78,7 +78,7 @@ def test_it_knows_another_friction():
     assert re.match(WRONG, verify_terms(given, made, "implicit-euler"))
 
 
-def test_it_knows_an_obstacle_that_is_a_step_late():
+def test_an_obstacle_that_is_a_step_late_is_found():
     given = spec(*OBSTACLES["mesh that turns"])
     made = build_scene(given, 3)
     (energy,) = (e for e in made.system.energies if isinstance(e, ObstacleContact))

@@ -1,5 +1,4 @@
-"""The second opinion tells every lie that is planted: in energies, forces, pins, filters, integrators, masses and the
-objective itself."""
+"""The comparison finds each planted error: in energies, forces, pins, filters, integrators, masses and the objective."""
 
 from __future__ import annotations
 
@@ -60,7 +59,7 @@ from tests.oracles.planted_errors import (
 )
 
 PER_VERTEX = {"kind": "wind", "field": "constant", "per": "vertex", "force": (1, 0, 2)}
-LIES: dict[str, FormulaMutation] = {
+PLANTED_ERRORS: dict[str, FormulaMutation] = {
     "springs twice as stiff": FormulaMutation(
         [SPRINGS_SPEC], "springs", mutate_energy(Springs, scale_fields(stiffness=2.0))
     ),
@@ -307,12 +306,12 @@ LIES: dict[str, FormulaMutation] = {
 }
 
 
-@pytest.mark.parametrize("name", LIES)
-def test_a_lie_is_told(name: str, monkeypatch: pytest.MonkeyPatch):
-    lie = LIES[name]
-    spec = build_scene_spec(*lie.effects, mesh=lie.mesh)
-    assert run_reference_check(spec, lie.size, lie.integrator) == "agrees"
-    lie.apply_patch(monkeypatch)
-    found = run_reference_check(spec, lie.size, lie.integrator)
+@pytest.mark.parametrize("name", PLANTED_ERRORS)
+def test_a_planted_error_is_found(name: str, monkeypatch: pytest.MonkeyPatch):
+    error = PLANTED_ERRORS[name]
+    spec = build_scene_spec(*error.effects, mesh=error.mesh)
+    assert run_reference_check(spec, error.size, error.integrator) == "agrees"
+    error.apply_patch(monkeypatch)
+    found = run_reference_check(spec, error.size, error.integrator)
     assert found.startswith("disagrees: ")
-    assert lie.expected_words in found
+    assert error.expected_words in found

@@ -2,9 +2,8 @@
 
 At each point the harness builds one step and takes it, with a solver that returns the point. The comparison covers the
 masses, the inertia and its target, the forces, the pins, and the motion after the step. It also covers the energy of
-each effect, its gradient and its Hessian along a random direction, and the objective, the sum of all terms. A plug-in
-effect has no reference implementation: its energies' gradients are checked against their own values, and its forces,
-pins and filters are not checked.
+each effect, its gradient and its Hessian along a random direction, and the objective, the sum of all terms. An
+effect from user code has no reference implementation; its own terms are used in both steps.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from tests.oracles.scene_terms import SceneTerms, build_scene_terms
 from tests.oracles.stage_terms import STAGED_INTEGRATORS, solve_stages
 from tests.oracles.step_terms import build_reference_step
 
-MATCH, MISMATCH, SELF_CHECK = "agrees", "disagrees", "single opinion"
+MATCH, MISMATCH, NO_REFERENCE = "agrees", "disagrees", "agrees without"
 
 
 def verify_terms(spec: SceneSpec, scene: Scene, integrator: str) -> str:
@@ -43,9 +42,8 @@ def verify_terms(spec: SceneSpec, scene: Scene, integrator: str) -> str:
       scene: scene built from it with the integrator.
       integrator: name of the integrator.
 
-    Returns: `agrees`; `disagrees: term, by relative difference; ...`; or `single opinion: effects` where some effects
-    have
-      no reference implementation.
+    Returns: `agrees`; `disagrees: term, by relative difference; ...`; or `agrees without: effects` where these effects
+      have no reference implementation.
     """
     with np.errstate(all="ignore"):  # what is not finite is compared like all else
         sides = [build_scene_terms(spec, scene)]
@@ -60,8 +58,8 @@ def verify_terms(spec: SceneSpec, scene: Scene, integrator: str) -> str:
     if found:
         worst = sorted(found.items(), key=lambda item: -item[1])
         return f"{MISMATCH}: " + "; ".join(f"{name}, by {by:.2g} of its size" for name, by in worst)
-    single = ", ".join(sides[0].format_effect_name(k) for k in sorted(sides[0].external_effects))
-    return f"{SELF_CHECK}: {single}" if single else MATCH
+    external = ", ".join(sides[0].format_effect_name(k) for k in sorted(sides[0].external_effects))
+    return f"{NO_REFERENCE}: {external}" if external else MATCH
 
 
 class _FixedAnswer:
@@ -92,17 +90,17 @@ def _compare_single_stage(
     if integrator in STAGED_INTEGRATORS:
         yield from _compare_stages(own, scene, integrator, point, time)
         return
-    stated = build_reference_step(integrator, own.declaration, own.effect_terms, now, before, time)
-    m = stated.step_moment
+    reference_step = build_reference_step(integrator, own.declaration, own.effect_terms, now, before, time)
+    m = reference_step.step_moment
     x = np.asarray(m.p + m.stage_fraction * m.time_step * m.v, float) + point.shift
     answer: Any = _FixedAnswer(lambda until: x, with_velocity=integrator == "own")
     run = simulate_scene(
         scene, answer, StopRule(), initial_guess="current", frames=index + 1, initial_state=point.state
     )
     done = next(run)
-    at = ComparisonPoint(own, with_friction_at(stated, done.problem, x), done.problem, x, point.direction)
+    at = ComparisonPoint(own, with_friction_at(reference_step, done.problem, x), done.problem, x, point.direction)
     yield from compare_steps(at)
-    p, v = stated.end_motion(x)
+    p, v = reference_step.end_motion(x)
     after = done.state
     yield from compare_arrays("positions after the step", after.motion.positions, p, at.coordinate_scale)
     yield from compare_arrays(
@@ -129,26 +127,30 @@ def _compare_stages(
 
     a = point.state.acceleration
     assert a is not None
-    wanted = solve_stages(integrator, own.declaration, own.effect_terms, now, a, time, x)
+    expected = solve_stages(integrator, own.declaration, own.effect_terms, now, a, time, x)
     answer: Any = _FixedAnswer(x)
     index = point.state.index
     done = next(
         simulate_scene(scene, answer, StopRule(), initial_guess="current", frames=index + 1, initial_state=point.state)
     )
-    if len(done.stages) != len(wanted.reference_steps):
+    if len(done.stages) != len(expected.reference_steps):
         yield TermMismatch("unknowns of the step (number)", 1.0)
         return
-    reach = 0.0
-    for (problem, _), stated, answered in zip(done.stages, wanted.reference_steps, wanted.answers, strict=True):
-        at = ComparisonPoint(own, with_friction_at(stated, problem, answered), problem, answered, point.direction)
-        reach = max(reach, at.coordinate_scale)
+    scale = 0.0
+    for (problem, _), reference_step, answered in zip(
+        done.stages, expected.reference_steps, expected.answers, strict=True
+    ):
+        at = ComparisonPoint(
+            own, with_friction_at(reference_step, problem, answered), problem, answered, point.direction
+        )
+        scale = max(scale, at.coordinate_scale)
         yield from compare_steps(at)
         yield from compare_energies(at)
-    rate = wanted.reference_steps[0].step_moment.velocity_rate
+    rate = expected.reference_steps[0].step_moment.velocity_rate
     assert done.state.acceleration is not None
     for name, ours, theirs, size in (
-        ("positions after the step", done.state.motion.positions, wanted.end[0], reach),
-        ("velocities after the step", done.state.motion.velocity, wanted.end[1], rate * reach),
-        ("acceleration after the step", done.state.acceleration, wanted.acceleration, rate**2 * reach),
+        ("positions after the step", done.state.motion.positions, expected.end[0], scale),
+        ("velocities after the step", done.state.motion.velocity, expected.end[1], rate * scale),
+        ("acceleration after the step", done.state.acceleration, expected.acceleration, rate**2 * scale),
     ):
         yield from compare_arrays(name, ours, theirs, size)

@@ -352,7 +352,7 @@ def test_a_length_that_is_none_cannot_be_kept():
 
 
 @pytest.mark.parametrize("name", ["cloth", "limits", "pendulum"])
-def test_a_second_opinion_knows_which_lengths_are_exact(name):
+def test_the_reference_terms_have_the_exact_lengths(name):
     spec = load_scene(CONFIGS / f"{name}.yaml")
     bound = build_scene(spec, 5)
     assert verify_terms(spec, bound, "implicit-euler") == "agrees"

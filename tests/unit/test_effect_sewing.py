@@ -68,7 +68,7 @@ def test_each_vertex_is_sewn_to_what_is_nearest():
     assert energy.edges.tolist() == [[0, 25], [1, 25], [2, 25], [3, 29], [4, 29]]
 
 
-def test_the_second_opinion_agrees():
+def test_the_reference_terms_agree():
     assert verify_terms(spec(SEWN), build_scene(spec(SEWN), 5), "implicit-euler") == "agrees"
 
 

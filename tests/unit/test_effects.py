@@ -23,7 +23,7 @@ from springbench.solvers.model.energies.spring_energy import Springs as SpringsE
 from springbench.solvers.registry import load_target
 
 from tests.oracles.scene_declaration import SceneDeclaration
-from tests.oracles.vertex_selection import select_vertices as opinion_of
+from tests.oracles.vertex_selection import select_vertices as reference_selection
 from tests.scene_builders import build_test_scene
 
 MESH = GridMesh(width=2.0, height=1.0, skip_one=True).build_mesh(5)
@@ -195,12 +195,12 @@ HOLED = replace(
         ({"attribute": {"name": "weight", "high": 0.08}, "indices": (9,)}, [0, 1, 2, 9]),
     ],
 )
-def test_holes_and_numbers_of_a_file_choose_vertices_as_the_second_opinion_has_it(selectors, wanted):
+def test_holes_and_numbers_of_a_file_select_the_vertices_of_the_reference(selectors, wanted):
     pins = PinsEffect.model_validate(selectors)
     assert (
         pins.select_vertices(HOLED, "pins").tolist()
         == wanted
-        == opinion_of(SceneDeclaration(HOLED, np.ones(25), DT, ()), pins)
+        == reference_selection(SceneDeclaration(HOLED, np.ones(25), DT, ()), pins)
     )
 
 

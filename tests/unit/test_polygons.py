@@ -133,7 +133,7 @@ def test_forces_on_the_triangles_of_quadrangles_do_not_depend_on_the_first_corne
 
 
 @pytest.mark.parametrize("first", [0, 3])
-def test_the_second_opinion_agrees_on_concave_and_convex_faces(tmp_path, first):
+def test_the_reference_terms_agree_on_concave_and_convex_faces(tmp_path, first):
     faces = [np.roll([1, 2, 3, 4, 5, 6], first), np.roll([4, 3, 7, 5], first)]
     path = obj(tmp_path, [*L, (2.5, 2, 0.5)], *(" ".join(map(str, face)) for face in faces))
     wind = "{kind: wind, per: triangle, velocity: [3, 1, 2], lift: 0.3}"

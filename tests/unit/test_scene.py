@@ -33,7 +33,7 @@ def test_a_mesh_without_masses_needs_a_total_mass():
         build_scene(spec, 3)
 
 
-def test_a_woven_cloth_of_a_mass_per_area_weighs_that_and_the_second_opinion_agrees():
+def test_a_woven_cloth_of_a_mass_per_area_weighs_that_and_the_reference_terms_agree():
     woven = SpringsEffect.model_validate({"stretch": {"warp": 400, "weft": 200, "bias": 10, "direction": (0, 1, 0)}})
     given: dict[str, Any] = {"mass_per_area": 0.2, "time_step": 0.1, "frames": 1, "effects": (woven,)}
     given["path"] = Path("scene.yaml")

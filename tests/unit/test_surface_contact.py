@@ -184,7 +184,7 @@ def test_an_obstacle_that_deforms_along_stored_frames_lifts_the_sheet(tmp_path):
     )
 
 
-def test_the_second_opinion_agrees_on_an_obstacle_that_deforms(tmp_path):
+def test_the_reference_terms_agree_on_an_obstacle_that_deforms(tmp_path):
     effect = SurfaceContactEffect(thickness=0.01, friction=0.3, obstacles=(deforming(tmp_path, 3.0),))
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 1 / 30, "frames": 6, "path": Path("scene.yaml")}
     spec = SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=100.0), effect)})
