@@ -1,4 +1,4 @@
-"""The comparison finds each planted error: in energies, forces, pins, filters, integrators, masses and the objective."""
+"""The comparison finds errors planted in energies, forces, pins, filters, integrators, masses and the objective."""
 
 from __future__ import annotations
 
