@@ -1,13 +1,20 @@
 """Element energy of one vertex at z in contact with one half-space (see `half_space_potential`).
 
-    phi(z) = k/2 min(0, n.z - d)^2 + F h(|u|),   u = (I - nn')(z - a),   h(u) = u^2/(2 s), or u - s/2 beyond
+    phi(z) = k/2 min(0, n.z - d)^2 + F h(|u|),   u = (I - nn')(z - a)
 
-Parameters: n (3), d, a (3), k, F, s, the smoothing length.
+`springbench.solvers.contact.potentials.friction_law` defines h. Parameters: n (3), d, a (3), k, F and the smoothing
+length of h.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from springbench.solvers.contact.potentials.friction_law import (
+    friction_energy_change,
+    friction_stiffness,
+    project_tangentially,
+    smoothed_length,
+)
 from springbench.solvers.jit.kernel_compilation import jit_inner
 from springbench.solvers.model.energies.element_energies import ElementLaw, axial_hessian
 
@@ -21,16 +28,10 @@ def _penetration_depth(parameters, e, z0, z1, z2):
 @jit_inner
 def _tangential_displacement(parameters, e, z0, z1, z2):
     """Return the tangential displacement u."""
-    n0, n1, n2 = parameters[e, 0], parameters[e, 1], parameters[e, 2]
-    u0, u1, u2 = z0 - parameters[e, 4], z1 - parameters[e, 5], z2 - parameters[e, 6]
-    along = n0 * u0 + n1 * u1 + n2 * u2
-    return u0 - along * n0, u1 - along * n1, u2 - along * n2
-
-
-@jit_inner
-def _friction_f0(length, smoothing_length):
-    """Return h of a length."""
-    return 0.5 * length * length / smoothing_length if length <= smoothing_length else length - 0.5 * smoothing_length
+    return project_tangentially(
+        z0 - parameters[e, 4], z1 - parameters[e, 5], z2 - parameters[e, 6],
+        parameters[e, 0], parameters[e, 1], parameters[e, 2],
+    )  # fmt: skip
 
 
 @jit_inner
@@ -39,7 +40,7 @@ def _value(parameters, e, z0, z1, z2):
     total = 0.5 * parameters[e, 7] * depth * depth
     if parameters[e, 8] > 0.0:
         u0, u1, u2 = _tangential_displacement(parameters, e, z0, z1, z2)
-        total += parameters[e, 8] * _friction_f0(np.sqrt(u0 * u0 + u1 * u1 + u2 * u2), parameters[e, 9])
+        total += parameters[e, 8] * smoothed_length(np.sqrt(u0 * u0 + u1 * u1 + u2 * u2), parameters[e, 9])
     return total
 
 
@@ -49,7 +50,7 @@ def _gradient(parameters, e, z0, z1, z2):
     g0, g1, g2 = force * parameters[e, 0], force * parameters[e, 1], force * parameters[e, 2]
     if parameters[e, 8] > 0.0:
         u0, u1, u2 = _tangential_displacement(parameters, e, z0, z1, z2)
-        weight = parameters[e, 8] / max(parameters[e, 9], np.sqrt(u0 * u0 + u1 * u1 + u2 * u2))
+        weight = friction_stiffness(parameters[e, 8], np.sqrt(u0 * u0 + u1 * u1 + u2 * u2), parameters[e, 9])
         g0, g1, g2 = g0 + weight * u0, g1 + weight * u1, g2 + weight * u2
     return g0, g1, g2
 
@@ -62,7 +63,7 @@ def _hessian(parameters, e, z0, z1, z2):
         return axial_hessian(pressed, 0.0, n0, n1, n2)
     u0, u1, u2 = _tangential_displacement(parameters, e, z0, z1, z2)
     length = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
-    weight = parameters[e, 8] / max(parameters[e, 9], length)
+    weight = friction_stiffness(parameters[e, 8], length, parameters[e, 9])
     xx, xy, xz, yy, yz, zz = axial_hessian(pressed, weight, n0, n1, n2)
     if length <= parameters[e, 9]:
         return xx, xy, xz, yy, yz, zz
@@ -82,19 +83,12 @@ def _energy_change(parameters, e, z0, z1, z2, s0, s1, s2):
         deeper = parameters[e, 0] * s0 + parameters[e, 1] * s1 + parameters[e, 2] * s2
     total = 0.5 * parameters[e, 7] * deeper * (before + after)
     if parameters[e, 8] > 0.0:
-        grip, slip = parameters[e, 8], parameters[e, 9]
         u0, u1, u2 = _tangential_displacement(parameters, e, z0, z1, z2)
         w0, w1, w2 = _tangential_displacement(parameters, e, t0, t1, t2)
         one, other = np.sqrt(u0 * u0 + u1 * u1 + u2 * u2), np.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
-        along = parameters[e, 0] * s0 + parameters[e, 1] * s1 + parameters[e, 2] * s2
-        v0, v1, v2 = s0 - along * parameters[e, 0], s1 - along * parameters[e, 1], s2 - along * parameters[e, 2]
+        v0, v1, v2 = project_tangentially(s0, s1, s2, parameters[e, 0], parameters[e, 1], parameters[e, 2])
         both = v0 * (u0 + w0) + v1 * (u1 + w1) + v2 * (u2 + w2)
-        if one <= slip and other <= slip:
-            total += 0.5 * grip * both / slip
-        elif one > slip and other > slip:
-            total += grip * both / (one + other)
-        else:
-            total += grip * (_friction_f0(other, slip) - _friction_f0(one, slip))
+        total += friction_energy_change(parameters[e, 8], one, other, both, parameters[e, 9])
     return total
 
 

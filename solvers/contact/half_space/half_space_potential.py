@@ -3,14 +3,11 @@
     E(x) = sum_i k_i/2 min(0, n_i.x_i - d_i)^2 + F_i h(|u_i|),   u_i = (I - n_i n_i')(x_i - a_i)
 
 n_i, d_i: the half-space that contains the vertex during this step
-(`springbench.solvers.contact.half_space.separating_planes`).
-a_i: position of the vertex if it moved with the obstacle. F_i = mu k_i depth_i, with the depth at `start.pressed`, an
-iterate of this step, or at the step's start if that is None (Li et al. 2020, "Incremental potential contact", section
-5; `springbench.solvers.contact.lagged_friction` iterates it to convergence). h is the length, smoothed where a
-vertex moves by less
-than s = eps_v (t_x - t), the smoothing length, with t_x the time of the stage:
-
-    h(u) = u^2/(2 s) for u <= s,   u - s/2 beyond
+(`springbench.solvers.contact.half_space.separating_planes`). a_i: position of the vertex if it moved with the obstacle.
+F_i = mu k_i depth_i, with the depth at `start.pressed`, an iterate of this step, or at the step's start if that is None
+(Li et al. 2020, "Incremental potential contact", section 5; `springbench.solvers.contact.lagged_friction` iterates it
+to convergence). h is the length, smoothed where a vertex moves by less than the smoothing length s = eps_v (t_x - t),
+with t_x the time of the stage (`springbench.solvers.contact.potentials.friction_law`).
 
 A sticking vertex moves at most at the speed `eps_v`. Half-spaces, depth and friction refer to the end of the step. If
 the stage is the position at another time (`springbench.solvers.model.integrators`), both are moved towards the start
@@ -32,6 +29,7 @@ from springbench.solvers.contact.half_space.half_space_element import HALF_SPACE
 from springbench.solvers.contact.half_space.separating_planes import RoundedBox, SeparatingPlanes
 from springbench.solvers.contact.half_space.vertex_contact import PenaltyRows
 from springbench.solvers.contact.lagged_friction import MAX_FRICTION_ITERATIONS
+from springbench.solvers.contact.potentials.friction_law import evaluate_friction
 from springbench.solvers.model.energies.element_energies import ElementLaw, Elements
 from springbench.solvers.model.rounding_bound import EPS
 from springbench.solvers.model.step_problem import Positions, StepStart
@@ -223,25 +221,21 @@ class HalfSpaceContact:
         """Return the gaps n.x - d [m], (k,)."""
         return _row_dots(self.active_planes.normal, p[self.active_planes.vertices]) - self.active_planes.offset
 
-    def _tangential_displacements(self, p: Positions) -> tuple[NDArray[np.int64], Positions, FloatArray]:
-        """Return the half-spaces with friction (q,), and u (q, 3) and |u| (q,) [m] there."""
+    def _evaluate_friction(self, p: Positions) -> _FrictionState:
         grips, planes = np.flatnonzero(self.active_planes.friction_limit), self.active_planes
         u, n = p[planes.vertices[grips]] - planes.friction_anchor[grips], planes.normal[grips]
         u -= _row_dots(u, n)[:, None] * n
-        return grips, u, np.sqrt(_row_dots(u, u))
+        length, smoothed, stiffness = np.sqrt(_row_dots(u, u)), np.empty(len(grips)), np.empty(len(grips))
+        evaluate_friction(planes.friction_limit[grips], length, self.smoothing_length, smoothed, stiffness)
+        return _FrictionState(grips, u, length, smoothed, stiffness)
 
     def value(self, p: Positions) -> float:
         """Return the energy [J] at p (n, 3)."""
         if self.has_no_active_collisions():
             return 0.0
-        grips, _, length = self._tangential_displacements(p)
-        rounded = np.where(
-            length <= self.smoothing_length,
-            0.5 * length**2 / self.smoothing_length,
-            length - 0.5 * self.smoothing_length,
-        )
+        friction = self._evaluate_friction(p)
         pressed = self.active_planes.stiffness @ np.minimum(0.0, self.compute_gaps(p)) ** 2
-        return 0.5 * float(pressed) + float(self.active_planes.friction_limit[grips] @ rounded)
+        return 0.5 * float(pressed) + float(self.active_planes.friction_limit[friction.planes] @ friction.smoothed)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
         """Add the gradient [N] at p to `out`, (n, 3) each."""
@@ -252,12 +246,8 @@ class HalfSpaceContact:
         self._add_friction_gradient(p, out)
 
     def _add_friction_gradient(self, p: Positions, out: Positions) -> None:
-        planes, (grips, u, length) = self.active_planes, self._tangential_displacements(p)
-        np.add.at(
-            out,
-            planes.vertices[grips],
-            (planes.friction_limit[grips] / np.maximum(self.smoothing_length, length))[:, None] * u,
-        )
+        friction = self._evaluate_friction(p)
+        np.add.at(out, self.active_planes.vertices[friction.planes], friction.stiffness[:, None] * friction.u)
 
     def add_absolute_terms(self, p: Positions, out: FloatArray) -> None:
         """Add the absolute values of the gradient's terms, for the rounding-error bound.
@@ -275,14 +265,10 @@ class HalfSpaceContact:
         reach = size + np.abs(planes.offset)
         presses = self.compute_gaps(p) <= EPS * reach
         np.add.at(out, planes.vertices, np.where(presses, planes.stiffness * reach, 0.0))
-        grips, _, length = self._tangential_displacements(p)
-        anchor = planes.friction_anchor[grips]
-        friction = (
-            planes.friction_limit[grips]
-            / np.maximum(self.smoothing_length, length)
-            * (size[grips] + np.sqrt(_row_dots(anchor, anchor)))
-        )
-        np.add.at(out, planes.vertices[grips], friction)
+        friction = self._evaluate_friction(p)
+        anchor = planes.friction_anchor[friction.planes]
+        terms = friction.stiffness * (size[friction.planes] + np.sqrt(_row_dots(anchor, anchor)))
+        np.add.at(out, planes.vertices[friction.planes], terms)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
         """Return the Hessian [N/m], (3n, 3n), with blocks of vertices in contact."""
@@ -305,8 +291,8 @@ class HalfSpaceContact:
         """
         planes, gap = self.active_planes, self.compute_gaps(p)
         pressed = np.flatnonzero((gap < 0.0) | (self.compute_gaps(trial) < 0.0))
-        grips, u, length = self._tangential_displacements(p)
-        normal, weight = planes.normal[grips], planes.friction_limit[grips] / np.maximum(self.smoothing_length, length)
+        grips, u, length, _, weight = self._evaluate_friction(p)
+        normal = planes.normal[grips]
         sticks = length <= self.smoothing_length
         along = np.divide(u, length[:, None], out=_perpendicular_units(normal), where=~sticks[:, None])
         both = sticks | majorise
@@ -316,6 +302,23 @@ class HalfSpaceContact:
             np.concatenate([planes.stiffness[pressed], weight, weight[both]]),
             np.concatenate([np.maximum(0.0, gap[pressed]), np.zeros(len(grips) + int(both.sum()))]),
         )
+
+
+class _FrictionState(NamedTuple):
+    """Friction at given positions.
+
+    Attributes:
+        planes: indices of the half-spaces with friction (q,).
+        u, length: tangential displacement (q, 3) and its length (q,) [m].
+        smoothed: h of the length (q,) [m].
+        stiffness: force per displacement (q,) [N/m].
+    """
+
+    planes: NDArray[np.int64]
+    u: Positions
+    length: FloatArray
+    smoothed: FloatArray
+    stiffness: FloatArray
 
 
 def _row_dots(a: Positions, b: Positions) -> FloatArray:

@@ -14,6 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from springbench.solvers.contact.potentials.friction_law import (
+    friction_energy_change,
+    friction_stiffness,
+    project_tangentially,
+    smoothed_length,
+)
 from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner
 from springbench.solvers.kernels.spring_local_step import ZERO_LENGTH_SQUARED
 from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
@@ -57,17 +63,12 @@ def _penetration_depth(s, gap):
 
 
 @jit_inner
-def _huber_norm(u, slip):
-    return 0.5 * u * u / slip if u <= slip else u - 0.5 * slip
-
-
-@jit_inner
 def _tangential_displacement(s, k, x):
     """Return u and |u| of a half-space at x."""
-    n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]
-    u0, u1, u2 = x[0] - s.friction_anchor[k, 0], x[1] - s.friction_anchor[k, 1], x[2] - s.friction_anchor[k, 2]
-    along = n0 * u0 + n1 * u1 + n2 * u2
-    u0, u1, u2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
+    u0, u1, u2 = project_tangentially(
+        x[0] - s.friction_anchor[k, 0], x[1] - s.friction_anchor[k, 1], x[2] - s.friction_anchor[k, 2],
+        s.normal[k, 0], s.normal[k, 1], s.normal[k, 2],
+    )  # fmt: skip
     return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
 
 
@@ -85,7 +86,9 @@ def half_space_energy(s, p):
             )
             total += 0.5 * s.stiffness[k] * depth * depth
             if s.friction_limit[k] > 0.0:
-                total += s.friction_limit[k] * _huber_norm(_tangential_displacement(s, k, x)[3], s.smoothing_length[k])
+                total += s.friction_limit[k] * smoothed_length(
+                    _tangential_displacement(s, k, x)[3], s.smoothing_length[k]
+                )
     return total
 
 
@@ -145,7 +148,7 @@ def add_half_spaces(s, i, x, d, level, gradient, block):
             gradient = gradient[0] + force * n0, gradient[1] + force * n1, gradient[2] + force * n2
         if s.friction_limit[k] > 0.0:
             u0, u1, u2, length = _tangential_displacement(s, k, x)
-            weight = s.friction_limit[k] / max(s.smoothing_length[k], length)
+            weight = friction_stiffness(s.friction_limit[k], length, s.smoothing_length[k])
             gradient = gradient[0] + weight * u0, gradient[1] + weight * u1, gradient[2] + weight * u2
             a00, a01, a02, a11, a12, a22 = _add_outer_product(block, -weight, n0, n1, n2)
             block = a00 + weight, a01, a02, a11 + weight, a12, a22 + weight
@@ -210,14 +213,7 @@ def add_half_space_change(s, i, x, d, total):
             u0, u1, u2, length = _tangential_displacement(s, k, x)
             w0, w1, w2, longer = _tangential_displacement(s, k, end)
             both = (w0 - u0) * (w0 + u0) + (w1 - u1) * (w1 + u1) + (w2 - u2) * (w2 + u2)
-            if length <= s.smoothing_length[k] and longer <= s.smoothing_length[k]:
-                total += 0.5 * s.friction_limit[k] * both / s.smoothing_length[k]
-            elif length > s.smoothing_length[k] and longer > s.smoothing_length[k]:
-                total += s.friction_limit[k] * both / (longer + length)
-            else:
-                total += s.friction_limit[k] * (
-                    _huber_norm(longer, s.smoothing_length[k]) - _huber_norm(length, s.smoothing_length[k])
-                )
+            total += friction_energy_change(s.friction_limit[k], length, longer, both, s.smoothing_length[k])
     return total
 
 

@@ -4,7 +4,7 @@ A half-space acts from its surface on, and a sticking vertex begins to slip afte
 
 Friction is relaxed at each trial point, by nonlinear Gauss-Seidel sweeps over the vertices with friction. This is the
 smoother of the truncated nonsmooth Newton method (Gräser and Sander 2019). The local problems are solved exactly,
-since h (`contact.half_space.half_space_potential`) permits a closed form:
+since h (`springbench.solvers.contact.potentials.friction_law`) permits a closed form:
 
     u <- argmin F h(|u|) + Q_ii/2 |u - v|^2,   v = u - r/Q_ii tangentially,   r <- r + Q (u - previous u)
 
@@ -24,6 +24,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact
+from springbench.solvers.contact.potentials.friction_law import (
+    friction_proximal_factor,
+    friction_stiffness,
+    project_tangentially,
+)
 from springbench.solvers.iteration.descent_method import (
     ARMIJO_FRACTION,
     DescentPoint,
@@ -163,22 +168,16 @@ def sweep_friction(planes, smoothing_length, matrix, p, gradient, sweeps):
             if grip[e] <= 0.0 or f < 0:
                 continue
             n0, n1, n2, q = normal[e, 0], normal[e, 1], normal[e, 2], diagonal[f]
-            u0, u1, u2 = p[i, 0] - anchor[e, 0], p[i, 1] - anchor[e, 1], p[i, 2] - anchor[e, 2]
-            along = n0 * u0 + n1 * u1 + n2 * u2
-            u0, u1, u2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
-            g0, g1, g2 = gradient[i, 0], gradient[i, 1], gradient[i, 2]
-            along = n0 * g0 + n1 * g1 + n2 * g2
-            g0, g1, g2 = g0 - along * n0, g1 - along * n1, g2 - along * n2
-            weight = grip[e] / max(smoothing_length, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2))
+            u0, u1, u2 = project_tangentially(
+                p[i, 0] - anchor[e, 0], p[i, 1] - anchor[e, 1], p[i, 2] - anchor[e, 2], n0, n1, n2
+            )
+            g0, g1, g2 = project_tangentially(gradient[i, 0], gradient[i, 1], gradient[i, 2], n0, n1, n2)
+            weight = friction_stiffness(grip[e], np.sqrt(u0 * u0 + u1 * u1 + u2 * u2), smoothing_length)
             v0, v1, v2 = u0 - (g0 - weight * u0) / q, u1 - (g1 - weight * u1) / q, u2 - (g2 - weight * u2) / q
             length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-            kept = (
-                q / (q + grip[e] / smoothing_length)
-                if length <= smoothing_length + grip[e] / q
-                else 1.0 - grip[e] / (q * length)
-            )
+            kept = friction_proximal_factor(grip[e], q, length, smoothing_length)
             d0, d1, d2 = kept * v0 - u0, kept * v1 - u1, kept * v2 - u2
-            after = grip[e] / max(smoothing_length, kept * length)
+            after = friction_stiffness(grip[e], kept * length, smoothing_length)
             p[i, 0], p[i, 1], p[i, 2] = p[i, 0] + d0, p[i, 1] + d1, p[i, 2] + d2
             gradient[i, 0] += after * kept * v0 - weight * u0
             gradient[i, 1] += after * kept * v1 - weight * u1
