@@ -11,7 +11,7 @@ nearest points are selected by comparing all candidates: the interior, every sid
 
 Friction acts on pairs within range at x itself (Li et al. 2020, section 5), with F the barrier's force there:
 
-    mu F h(|u|),   h(u) = u^2/s - u^3/(3 s^2) for u < s,  u - s/3 beyond,   s = creep dt
+    mu F h(|u|),   h(u) = u^2/(2 s) for u <= s,  u - s/2 beyond,   s = creep dt
     u = (I - nn')(z - z^t),   z = sum_i c_i x_i,   z^t = sum_i c_i x_i^t   with dd/dx_i = c_i n
 """
 
@@ -255,10 +255,8 @@ def friction_potential(
     u = (weights[:, :, None] * x[rows]).sum(axis=1) - anchor
     u = u - (u * n).sum(axis=1)[:, None] * n
     square = (u * u).sum(axis=1)
-    sticks = square.real < slip**2
-    held = np.where(sticks, square, slip**2)
-    rounded = held / slip - held * np.sqrt(np.where(held == 0, 1, held)) / (3 * slip**2)
-    return force * np.where(sticks, rounded, np.sqrt(np.where(sticks, 1, square)) - to_extended(slip) / 3)
+    sticks = square.real <= slip**2
+    return force * np.where(sticks, square / (2 * slip), np.sqrt(np.where(sticks, 1, square)) - to_extended(slip) / 2)
 
 
 def _distance_vectors(rows: IndexArray, x: ExtendedArray, edges: bool) -> ExtendedArray:

@@ -5,10 +5,9 @@
 F: the barrier's normal force at `start.pressed`, an iterate of this step, or at the step's start if that is None; c, n:
 coefficients and direction of the closest points there; x^t: positions at the step's start (Li et al. 2020, "Incremental
 potential contact", section 5; `springbench.solvers.contact.lagged_friction` iterates them to convergence). h is the
-length,
-smoothed where a pair slips by less than s in a step; its slope is continuous, and below 1 there:
-
-    h(u) = u^2/s - u^3/(3 s^2)  for u < s,     u - s/3 beyond
+length, smoothed where a pair slips by less than s in a step, by the law of half-spaces
+(`springbench.solvers.contact.potentials.friction_law`). The paper's h, u^2/s - u^3/(3 s^2) for u < s, has a continuous
+second derivative; Newton's method needs no fewer iterations with it, and up to a third more.
 """
 
 from __future__ import annotations
@@ -19,6 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.contact.collisions import Collisions
 from springbench.solvers.contact.potentials import barrier
+from springbench.solvers.contact.potentials.friction_law import (
+    friction_stiffness,
+    project_tangentially,
+    smoothed_length,
+)
 from springbench.solvers.contact.potentials.hessian_blocks import BLOCK_ENTRIES, PackedBlocks, row_offset
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.model.step_problem import Positions
@@ -98,44 +102,21 @@ def combine_positions(vertices, weights, p, out):
 def tangential_displacement(tangential_collisions, p, e):
     """Return the tangential displacement u and |u| [m] of collision e."""
     x, c, n = tangential_collisions.vertices[e], tangential_collisions.coefficients[e], tangential_collisions.normal[e]
-    u0 = combine_coordinate(x, c, p, 0) - tangential_collisions.friction_anchor[e, 0]
-    u1 = combine_coordinate(x, c, p, 1) - tangential_collisions.friction_anchor[e, 1]
-    u2 = combine_coordinate(x, c, p, 2) - tangential_collisions.friction_anchor[e, 2]
-    along = u0 * n[0] + u1 * n[1] + u2 * n[2]
-    u0, u1, u2 = u0 - along * n[0], u1 - along * n[1], u2 - along * n[2]
+    u0, u1, u2 = project_tangentially(
+        combine_coordinate(x, c, p, 0) - tangential_collisions.friction_anchor[e, 0],
+        combine_coordinate(x, c, p, 1) - tangential_collisions.friction_anchor[e, 1],
+        combine_coordinate(x, c, p, 2) - tangential_collisions.friction_anchor[e, 2],
+        n[0], n[1], n[2],
+    )  # fmt: skip
     return u0, u1, u2, np.sqrt(u0 * u0 + u1 * u1 + u2 * u2)
 
 
 @jit_inner
-def friction_f1_over_x(length, smoothing_length):
-    """Return h'(u)/u [1/m]."""
-    return (2.0 - length / smoothing_length) / smoothing_length if length < smoothing_length else 1.0 / length
-
-
-@jit_inner
-def friction_f0(length, smoothing_length):
-    """Return h [m] of a length."""
-    y = min(length / smoothing_length, 1.0)
-    return smoothing_length * (y * y - y * y * y / 3.0) + max(length - smoothing_length, 0.0)
-
-
-@jit_inner
-def friction_f2_terms(u0, u1, u2, length, smoothing_length):
-    """Return h'(u)/u, h''(u) minus that [1/m], and u/|u|."""
-    flat, least = friction_f1_over_x(length, smoothing_length), max(length, 1e-300)
-    return (
-        flat,
-        max(2.0 * (1.0 - length / smoothing_length) / smoothing_length, 0.0) - flat,
-        (u0 / least, u1 / least, u2 / least),
-    )
-
-
-@jit_inner
-def friction_hessian_entry(n, second, a, b):
-    """Return entry (a, b) of the Hessian of h [1/m], tangential to n (3,); second: from `friction_f2_terms`."""
-    flat, more, u = second
-    same = 1.0 if a == b else 0.0
-    return flat * (same - n[a] * n[b]) + more * u[a] * u[b]
+def slip_direction(u0, u1, u2, length, smoothing_length):
+    """Return u/|u| of a collision that slips, and zero of one that sticks."""
+    if length <= smoothing_length:
+        return 0.0, 0.0, 0.0
+    return u0 / length, u1 / length, u2 / length
 
 
 @jit_kernel
@@ -144,7 +125,7 @@ def friction_energy(tangential_collisions, p):
     total, s = 0.0, tangential_collisions.smoothing_length
     for e in range(len(tangential_collisions.vertices)):
         length = tangential_displacement(tangential_collisions, p, e)[3]
-        total += tangential_collisions.friction_limit[e] * friction_f0(length, s)
+        total += tangential_collisions.friction_limit[e] * smoothed_length(length, s)
     return total
 
 
@@ -153,7 +134,7 @@ def add_friction_gradient(tangential_collisions, p, out):
     """Add the friction gradient [N] at p (n, 3) to `out`."""
     for e in range(len(tangential_collisions.vertices)):
         u0, u1, u2, length = tangential_displacement(tangential_collisions, p, e)
-        w = tangential_collisions.friction_limit[e] * friction_f1_over_x(length, tangential_collisions.smoothing_length)
+        w = friction_stiffness(tangential_collisions.friction_limit[e], length, tangential_collisions.smoothing_length)
         for i in range(4):
             v, c = tangential_collisions.vertices[e, i], tangential_collisions.coefficients[e, i]
             out[v, 0] += c * (w * u0)
@@ -171,10 +152,15 @@ def write_friction_hessian(tangential_collisions, p, out):
             out[BLOCK_ENTRIES * e : BLOCK_ENTRIES * (e + 1)],
         )
         u0, u1, u2, length = tangential_displacement(tangential_collisions, p, e)
-        second = friction_f2_terms(u0, u1, u2, length, tangential_collisions.smoothing_length)
+        s = tangential_collisions.smoothing_length
+        slip, stiffness = (
+            slip_direction(u0, u1, u2, length, s),
+            friction_stiffness(tangential_collisions.friction_limit[e], length, s),
+        )
         for a in range(3):
             for b in range(3):
-                h = tangential_collisions.friction_limit[e] * friction_hessian_entry(n, second, a, b)
+                same = 1.0 if a == b else 0.0
+                h = stiffness * (same - n[a] * n[b] - slip[a] * slip[b])
                 for i in range(4):
                     for j in range(i + 1):
                         H[row_offset(i, a) + 3 * j + b] = c[i] * c[j] * h
