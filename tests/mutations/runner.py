@@ -27,7 +27,7 @@ LONGEST = 600.0
 """Seconds after which tests count as hanging, which is noticed too."""
 WHOLE = 3600.0
 PYTEST = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
-ROOMS = ("architecture", "unit", "contracts", "stability", "bench")
+ROOMS = ("architecture", "unit", "oracles", "contracts", "stability", "bench")
 """All tests, the short ones first: the suite ends with the first that the lie makes fail."""
 OF_THE_TABLE = "--ignore=tests/unit/test_mutations.py"
 """Its tests fail where any lie is planted, for its entry then fits no more: they find nothing out."""

@@ -57,8 +57,8 @@ def find_scenes(*folders: str) -> dict[str, Path]:
 SCENES = find_scenes("scenes")
 JUDGED = find_scenes("hard", "hard-long", "exact")
 """Scenes of the published sweeps with `judge: true`."""
-OTHERS = find_scenes("growth", "hessians", "winners")
-CONTACT = find_scenes("hard-touch", "touch")
+OTHERS = find_scenes("hessians", "winners")
+CONTACT = find_scenes("growth", "hard-touch", "touch")
 
 
 def coarse_size(spec: SceneSpec) -> int:
@@ -79,6 +79,7 @@ def test_both_implementations_agree_on_a_judged_scene(name: str):
     assert run_reference_check(spec, spec.default_size or 0) == "agrees"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CONTACT)
 def test_both_implementations_agree_on_a_coarse_scene_with_contact(name: str):
     spec = load_scene(CONTACT[name])

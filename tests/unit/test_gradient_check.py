@@ -181,13 +181,7 @@ def run_scene(folder: Path, more: str, *, judge: bool = True) -> list[dict[str, 
     (run,) = load_config(folder / "scene.yaml", solvers=["newton"], **options).list_runs()
     files = run_pipeline.RunFiles.for_run(run, folder)
     files.rows_path.parent.mkdir(exist_ok=True)
-    absent = {
-        "reference_distance": None,
-        "stationarity": None,
-        "frame": None,
-        "reason": None,
-        "is_local_minimum": None,
-    }
+    absent = {"frame": None, "reason": None}
     rows = run_pipeline.execute_run(run, files, lambda phase: None)
     return [absent | row for row in rows if row["phase"] == "step"]
 

@@ -20,7 +20,7 @@ from tests.mutations.runner import PYTEST, Copy, examine
 def test_there_are_sixty_of_them_and_each_has_a_name_of_its_own():
     assert len(TABLE) >= 60
     assert len({lie.name for lie in TABLE}) == len(TABLE)
-    assert len({(lie.file, lie.fragment, lie.replacement) for lie in TABLE}) == len(TABLE)
+    assert len({(lie.file, lie.fragment, lie.replacement, lie.tests) for lie in TABLE}) == len(TABLE)
 
 
 @pytest.mark.parametrize("lie", TABLE, ids=lambda lie: lie.name)
