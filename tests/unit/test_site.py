@@ -56,17 +56,17 @@ def test_the_overview_shows_times_beside_what_was_simulated(tmp_path: Path):
     for name in ("timing", "net-9-numba-0123456789ab", "net-9-solvers", "net-5-solvers", "net-3-solvers"):
         synthetic_site_rows.write_foreign_picture(tmp_path / "made" / "pictures" / f"{name}.png")
     shown = _select_pictures(locate_folder(tmp_path / "made", tmp_path))
-    assert [one["words"] for one in shown] == ["net 9 solvers", "net 5 solvers", "timing"]
+    assert [one["text"] for one in shown] == ["net 9 solvers", "net 5 solvers", "timing"]
 
 
 def cells(table: dict[str, Any], name: str) -> list[Any]:
     found = table["columns"][name]
-    return found if isinstance(found, list) else [found["of"][k] if k >= 0 else None for k in found["at"]]
+    return found if isinstance(found, list) else [found["values"][k] if k >= 0 else None for k in found["indices"]]
 
 
 def test_every_run_is_a_line_of_the_table(results: Path):
     table = read(results, "made/runs")
-    assert table["n"] == COUNT
+    assert table["num_rows"] == COUNT
     assert sorted(cells(table, "run_id")) == [build_run_columns(k)["run_id"] for k in range(COUNT)]
     first = cells(table, "run_id").index(build_run_columns(0)["run_id"])
     # Steps of 1 and 1.1 times 3.2 ms, and 2 % more a frame: the median of frames 3 and 4.
@@ -82,8 +82,8 @@ def test_every_run_is_a_line_of_the_table(results: Path):
 
 def test_rows_of_other_code_are_marked(results: Path):
     table = read(results, "made/runs")
-    marked = dict(zip(cells(table, "run_id"), cells(table, "by"), strict=True))
-    assert [name for name, how in marked.items() if how == "other code"] == [build_run_columns(1)["run_id"]]
+    marked = dict(zip(cells(table, "run_id"), cells(table, "staleness"), strict=True))
+    assert [name for name, how in marked.items() if how == "stale"] == [build_run_columns(1)["run_id"]]
 
 
 def test_one_cause_is_told_once_with_the_number_of_its_runs(results: Path):
@@ -91,7 +91,7 @@ def test_one_cause_is_told_once_with_the_number_of_its_runs(results: Path):
     made = next(sweep for sweep in index["sweeps"] if sweep["name"] == "made")
     (cause,) = made["failures"]
     assert cause["count"] == sum(is_failing_run(k) for k in range(COUNT)) == 2
-    assert cause["varied"], "their reasons differ in a number"
+    assert cause["has_varied_reasons"], "their reasons differ in a number"
     assert synthetic_site_rows.UNSUPPORTED_REASON in cause["reason"]
     assert made["statuses"] == {"ok": COUNT - 2, "unsupported": 2}
     study = next(sweep for sweep in index["sweeps"] if sweep["name"] == "study")
@@ -109,8 +109,8 @@ def test_causes_differ_in_more_than_numbers_and_names():
 
 def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
     for sweep in read(results, "index")["sweeps"]:
-        assert sweep["made"], sweep["name"]
-        for made in sweep["made"]:
+        assert sweep["provenance"], sweep["name"]
+        for made in sweep["provenance"]:
             assert made["commit"]
             assert made["machine_id"]
             assert made["cpu"]
@@ -128,11 +128,11 @@ def test_the_fastest_is_told_among_those_that_are_equally_accurate():
     for one in found:
         one["label"] = one["run_id"]
     fastest, others, limit = describe_runs(found)
-    assert fastest["words"].startswith("hanging-cloth 8: fastest at equal accuracy is fair, 2 ms a step; slow 2 times")
+    assert fastest["text"].startswith("hanging-cloth 8: fastest at equal accuracy is fair, 2 ms a step; slow 2 times")
     assert fastest["runs"][:2] == ["fair", "slow"]
     words = "not compared with it: hasty (its error is 10 000 times as large), blind (its error is unknown)."
-    assert others["words"].endswith(words.replace(" 000", "\u2009000"))
-    assert "4 of 4 runs ended a step at the limit" in limit["words"]
+    assert others["text"].endswith(words.replace(" 000", "\u2009000"))
+    assert "4 of 4 runs ended a step at the limit" in limit["text"]
 
 
 def test_a_run_s_frames_are_a_script_of_their_own(results: Path):
@@ -154,9 +154,9 @@ def test_the_table_comes_as_parquet_too(results: Path):
 def test_accuracy_s_charts_are_there_with_the_solvers_marks(results: Path):
     chart = read(results, "study/convergence")
     assert {item["label"] for item in chart["items"]} == {"numba", "dense"}
-    assert set(chart["marks"]) == {"numba", "dense"}
-    assert "Liu" in chart["references"]["numba"]["cited"]
-    assert chart["references"]["numba"]["bibtex"].startswith("@misc{liu2013")
+    assert set(chart["styles"]) == {"numba", "dense"}
+    assert "Liu" in chart["citations"]["numba"]["citation"]
+    assert chart["citations"]["numba"]["bibtex"].startswith("@misc{liu2013")
 
 
 def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
@@ -172,13 +172,13 @@ def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
     assert "0099_damaged.json" in told[0]
     chart = read(tmp_path, "bench/gates")
     slower = next(item for item in chart["items"] if item["label"].startswith("slower"))
-    assert (slower["gate"], slower["commit"]) == ("solve", ["0000006"])
+    assert (slower["benchmark"], slower["commit"]) == ("solve", ["0000006"])
     levels = next(item["value"] for item in chart["items"] if item["label"] == "their level")
     assert levels[3] / levels[0] == pytest.approx(1.2, rel=0.02)
     (sweep,) = read(tmp_path, "index")["sweeps"]
-    assert [said.get("filter") for said in sweep["findings"]] == [{"gate": "solve"}, None]
+    assert [said.get("filter") for said in sweep["findings"]] == [{"benchmark": "solve"}, None]
     assert sweep["gates"] == 2
-    assert all(made["commit"] and made["cpu"] == "A processor" for made in sweep["made"])
+    assert all(made["commit"] and made["cpu"] == "A processor" for made in sweep["provenance"])
 
 
 def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: Path):
@@ -194,11 +194,11 @@ def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: 
     synthetic_results.write_speed_results(tmp_path / "speed")
     update_page(tmp_path)
     for name in ("study/convergence", "study/times", "study/work", "study/growth"):
-        told = {item["label"] for item in read(tmp_path, name)["items"] if np.any(item["older"])}
+        told = {item["label"] for item in read(tmp_path, name)["items"] if np.any(item["stale"])}
         assert told == {"newton"}, name
     said = read(tmp_path, "study/profiles")["note"]
     assert "other code than that of the newest rows, in whole or in part: newton." in said
-    told = {item["label"] for item in read(tmp_path, "speed/speed")["items"] if any(item["older"])}
+    told = {item["label"] for item in read(tmp_path, "speed/speed")["items"] if any(item["stale"])}
     assert told == {"numba supernodal"}
 
 
@@ -241,7 +241,7 @@ def test_a_new_run_comes_to_the_page_of_a_thousand_within_its_time(tmp_path: Pat
         before = time.process_time()
         refresh_results_page(tmp_path, made, print, is_quiet=True)
         took.append(time.process_time() - before)
-        assert read(tmp_path, "made/runs")["n"] == number + 1
+        assert read(tmp_path, "made/runs")["num_rows"] == number + 1
     assert min(took) < room * goal
 
 
@@ -251,14 +251,14 @@ def test_sweeps_that_were_never_taken_in_are_named(tmp_path: Path):
     update_page(tmp_path, changed_folders=[tmp_path / "one"])
     index = read(tmp_path, "index")
     assert [sweep["name"] for sweep in index["sweeps"]] == ["one"]
-    assert index["absent"] == ["other"]
+    assert index["unwritten_sweeps"] == ["other"]
 
 
 def test_one_sweep_s_folder_has_a_page_of_its_own(tmp_path: Path):
     folder = synthetic_site_rows.write_site_results(tmp_path, 3)
     assert update_page(folder) == folder / "index.html"
     (sweep,) = read(folder, "index")["sweeps"]
-    assert (sweep["slug"], sweep["up"], sweep["name"]) == ("this", "./", "made")
+    assert (sweep["slug"], sweep["relative_url"], sweep["name"]) == ("this", "./", "made")
 
 
 def test_damaged_rows_keep_no_run_from_ending(tmp_path: Path):
@@ -280,7 +280,7 @@ def test_a_folder_without_rows_is_refused(tmp_path: Path):
 
 
 def test_words_are_kept_once():
-    assert encode_column(["b", "a", "b", None]) == {"of": ["b", "a"], "at": [0, 1, 0, -1]}
+    assert encode_column(["b", "a", "b", None]) == {"values": ["b", "a"], "indices": [0, 1, 0, -1]}
     assert encode_column([1.23456789, None, float("nan"), 2]) == [1.2346, None, None, 2]
 
 

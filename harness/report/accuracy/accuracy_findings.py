@@ -139,15 +139,15 @@ def _build_entry(curve: ConvergenceCurve) -> dict[str, Any]:
         "reason": curve.reason,
         "minimum_index": curve.minimum_index,
         "last_iteration": int(curve.iterations[-1]) if len(curve.iterations) else None,
-        "gap": float(curve.gap[ended[-1]]) if len(ended) else None,
-        "set_up_seconds": _finite_or_none(curve.warm_seconds),
-        "set_up_cold_seconds": _finite_or_none(curve.cold_seconds),
-        "to_gap": {
+        "last_gap": float(curve.gap[ended[-1]]) if len(ended) else None,
+        "setup_seconds": _finite_or_none(curve.warm_seconds),
+        "setup_cold_seconds": _finite_or_none(curve.cold_seconds),
+        "time_to_gap": {
             name: reached
-            and {"iterations": reached.iteration, "seconds": reached.seconds}
+            and {"iteration": reached.iteration, "seconds": reached.seconds}
             | {"lower_quartile": reached.lower, "upper_quartile": reached.upper}
             | {
-                f"with_set_up_over_{n}": _finite_or_none(amortised_seconds(curve, float(name), n))
+                f"with_setup_over_{n}": _finite_or_none(amortised_seconds(curve, float(name), n))
                 for n in AMORTISATION_STEPS
             }
             for name, reached in found.items()

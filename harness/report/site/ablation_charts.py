@@ -48,18 +48,18 @@ def _build_effect_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
         "filters": ["scene"],
         "shape": "points",
         "x": [
-            axis_choice("share", "percent of a step", _PERCENT_AXIS),
+            axis_choice("added_time_share", "percent of a step", _PERCENT_AXIS),
             axis_choice("displacement_max", "mean rest lengths moved"),
         ],
         "y": [axis_choice("effect", "", _NAME_AXIS)],
         "hover": [
             ["effect", "without"],
-            ["share", "percent of a step"],
+            ["added_time_share", "percent of a step"],
             ["displacement_max", "mean rest lengths moved"],
         ],
         "items": [item for item in items if item["effect"]],
-        "marks": _build_styles(rows),
-        "references": _build_references(rows),
+        "styles": _build_styles(rows),
+        "citations": _build_references(rows),
     }
 
 
@@ -69,14 +69,14 @@ def _build_item(some: Sequence[ResultRow]) -> dict[str, Any]:
     shares = {
         name: [round_number(100 * row[column] / whole["seconds"]) for row in without]
         for name, column in (
-            ("share", "added_seconds"),
-            ("share_low", "added_seconds_low"),
-            ("share_high", "added_seconds_high"),
+            ("added_time_share", "added_seconds"),
+            ("added_time_share_low", "added_seconds_low"),
+            ("added_time_share_high", "added_seconds_high"),
         )
     }
     return {
         "label": whole["solver"],
-        "what": f"{whole['scene']}{size}, {whole['frames']} frames",
+        "description": f"{whole['scene']}{size}, {whole['frames']} frames",
         "scene": f"{whole['scene']}{size}",
         "panel": f"{whole['scene']}{size}",
         "parameters": whole["parameters"],
@@ -94,7 +94,7 @@ def _build_overhead_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
     items = [
         {
             "label": solver,
-            "what": f"{scene}, an iteration",
+            "description": f"{scene}, an iteration",
             "scene": scene,
             "panel": scene,
             "parameters": some[0]["parameters"],
@@ -102,7 +102,7 @@ def _build_overhead_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
             "overhead_ratio": [round_number(row["overhead_ratio"]) for row in some],
             "overhead_ratio_low": [round_number(row["overhead_ratio_low"]) for row in some],
             "overhead_ratio_high": [round_number(row["overhead_ratio_high"]) for row in some],
-            "bound": [round_number(row["overhead_ratio_bound"]) for row in some],
+            "overhead_ratio_bound": [round_number(row["overhead_ratio_bound"]) for row in some],
         }
         for (scene, solver), some in priced.items()
     ]
@@ -116,11 +116,11 @@ def _build_overhead_chart(rows: Sequence[ResultRow]) -> dict[str, Any]:
         "hover": [
             ["effect", "effect"],
             ["overhead_ratio", "times as long"],
-            ["bound", "least that reading its numbers allows"],
+            ["overhead_ratio_bound", "least that reading its numbers allows"],
         ],
         "items": items,
-        "marks": _build_styles(rows),
-        "references": _build_references(rows),
+        "styles": _build_styles(rows),
+        "citations": _build_references(rows),
     }
 
 

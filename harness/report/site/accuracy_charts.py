@@ -64,8 +64,8 @@ def build_accuracy_charts(all_data: AccuracyData, folder: Path) -> dict[str, Cha
         if best and (folder / path).is_file():
             pictures[problem.problem_digest] = {
                 "path": path.as_posix(),
-                "of": best.label,
-                "recording": best.recording_path,
+                "reference_label": best.label,
+                "recording_path": best.recording_path,
             }
     made = {
         "convergence": _build_convergence_chart(table, pictures, folder),
@@ -79,7 +79,7 @@ def build_accuracy_charts(all_data: AccuracyData, folder: Path) -> dict[str, Cha
         label: plotly_style(mark)
         for label, mark in assign_label_styles((each.label, each.solver) for each in everyone).items()
     }
-    shared = {"marks": marks, "references": format_references((each.label, each.citation) for each in everyone)}
+    shared = {"styles": marks, "citations": format_references((each.label, each.citation) for each in everyone)}
     made = {name: chart | shared for name, chart in made.items()}
     made |= {
         "winners": winner_chart.build_winner_chart(table),
@@ -91,16 +91,17 @@ def build_accuracy_charts(all_data: AccuracyData, folder: Path) -> dict[str, Cha
 
 def _build_curve_item(table: AccuracyData, curve: ConvergenceCurve, pictures: Mapping[str, ChartItem]) -> ChartItem:
     """Build the fields that all items of a curve share."""
+    guess = INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)
     return {
         "label": curve.label,
-        "what": f"{curve.problem.problem_label}, {INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)}",
+        "description": f"{curve.problem.problem_label}, {guess}",
         "problem": curve.problem.problem_label
         + (" (reference not certified)" if curve.problem.uncertified_reason else ""),
         "parameters": curve.parameters,
-        "panel": INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess),
-        "picture": pictures.get(curve.problem.problem_digest),
-        "recording": curve.recording_path,
-        "older": curve.source_fingerprint != table.newest_fingerprint,
+        "panel": guess,
+        "mesh_picture": pictures.get(curve.problem.problem_digest),
+        "recording_path": curve.recording_path,
+        "stale": curve.source_fingerprint != table.newest_fingerprint,
     }
 
 
@@ -108,23 +109,29 @@ def _build_convergence_chart(table: AccuracyData, pictures: Mapping[str, ChartIt
     items: list[ChartItem] = []
     for curve in table.curves:
         run = _build_curve_item(table, curve, pictures)
-        if run["recording"] and not (folder / run["recording"]).is_file():
-            run["recording"] = ""
+        if run["recording_path"] and not (folder / run["recording_path"]).is_file():
+            run["recording_path"] = ""
         columns = {
             "iteration": curve.iterations,
             "seconds": np.median(curve.seconds, axis=0),
             "gap": np.where(curve.gap > 0, curve.gap, np.nan),
-            "largest": curve.max_vertex_error,
-            "metres": curve.max_vertex_error * curve.problem.mean_rest_length,
+            "max_vertex_error": curve.max_vertex_error,
+            "max_vertex_error_m": curve.max_vertex_error * curve.problem.mean_rest_length,
             "stationarity": curve.stationarity,
         }
         branch = "none" if curve.minimum_index is None else str(curve.minimum_index)
         numbers = {name: _numbers(values) for name, values in columns.items()}
         items.append(
-            {**run, **numbers, "minimum": branch, "status": curve.status, "round_off": curve.problem.roundoff_gap}
+            {
+                **run,
+                **numbers,
+                "minimum_index": branch,
+                "status": curve.status,
+                "roundoff_gap": curve.problem.roundoff_gap,
+            }
         )
-    hover = [["iteration", "iteration"], ["gap", "gap"], ["largest", "largest error, rest lengths"]]
-    hover += [["metres", "largest error, m"], ["stationarity", "stationarity"], ["seconds", "seconds"]]
+    hover = [["iteration", "iteration"], ["gap", "gap"], ["max_vertex_error", "largest error, rest lengths"]]
+    hover += [["max_vertex_error_m", "largest error, m"], ["stationarity", "stationarity"], ["seconds", "seconds"]]
     return {
         "title": "Convergence",
         "note": "Energy gap (g − g*)/(g0 − g*) against the lowest minimum known; vertex errors against the minimum "
@@ -133,11 +140,11 @@ def _build_convergence_chart(table: AccuracyData, pictures: Mapping[str, ChartIt
         "x": [axis_choice("iteration", "iterations"), axis_choice("seconds", "wall seconds")],
         "y": [
             axis_choice("gap", "energy gap"),
-            axis_choice("largest", "largest vertex error, mean rest lengths"),
-            axis_choice("metres", "largest vertex error, m"),
+            axis_choice("max_vertex_error", "largest vertex error, mean rest lengths"),
+            axis_choice("max_vertex_error_m", "largest vertex error, m"),
             axis_choice("stationarity", "stationarity"),
         ],
-        "hover": [*hover, ["minimum", "minimum reached"], ["status", "status"]],
+        "hover": [*hover, ["minimum_index", "minimum reached"], ["status", "status"]],
         "items": items,
     }
 
@@ -157,12 +164,12 @@ def _build_time_chart(table: AccuracyData, pictures: Mapping[str, ChartItem]) ->
             | columns
             | {
                 "target": [format_gap(target) for target in GAP_TARGETS],
-                "alone": _numbers(r.seconds if r and r.seconds > 0 else np.nan for r in found),
+                "step_seconds": _numbers(r.seconds if r and r.seconds > 0 else np.nan for r in found),
                 "iteration": _numbers(r.iteration if r else np.nan for r in found),
-                "set_up": curve.warm_seconds if np.isfinite(curve.warm_seconds) else None,
+                "setup_seconds": curve.warm_seconds if np.isfinite(curve.warm_seconds) else None,
             }
         )
-    shown = [axis_choice("alone", "seconds, the step alone")]
+    shown = [axis_choice("step_seconds", "seconds, the step alone")]
     shown += [
         axis_choice(f"over {n}", f"seconds, set-up over {n} step{'s' if n > 1 else ''}") for n in AMORTISATION_STEPS
     ]
@@ -172,7 +179,12 @@ def _build_time_chart(table: AccuracyData, pictures: Mapping[str, ChartItem]) ->
         "filters": ["problem"],
         "x": [axis_choice("target", "energy gap", {"type": "category"})],
         "y": shown,
-        "hover": [["target", "gap"], ["iteration", "iterations"], ["alone", "seconds alone"], ["set_up", "set-up, s"]],
+        "hover": [
+            ["target", "gap"],
+            ["iteration", "iterations"],
+            ["step_seconds", "seconds alone"],
+            ["setup_seconds", "set-up, s"],
+        ],
         "items": items,
     }
 
@@ -191,12 +203,12 @@ def _build_work_precision_chart(table: AccuracyData) -> ChartItem:
         items.append(
             {
                 "label": label,
-                "what": f"{mesh}, {integrator}, {stop} a step",
+                "description": f"{mesh}, {integrator}, {stop} a step",
                 "scene": mesh,
                 "parameters": members[0].parameters,
                 "panel": integrator,
                 "small": tolerance is None,
-                "older": [work.source_fingerprint != table.newest_fingerprint for work in members],
+                "stale": [work.source_fingerprint != table.newest_fingerprint for work in members],
                 "seconds": _numbers(work.seconds_per_simulated_second for work in members),
                 "error": _numbers(work.error for work in members),
                 "step": [format_time_step(work.time_step) for work in members],
@@ -224,7 +236,7 @@ def _build_profile_chart(table: AccuracyData) -> ChartItem:
                 items.append(
                     {
                         "label": label,
-                        "what": f"{len(values)} problems, to a gap of {format_gap(target)}",
+                        "description": f"{len(values)} problems, to a gap of {format_gap(target)}",
                         "parameters": "{}",
                         "gap": format_gap(target),
                         "panel": kind,
@@ -250,13 +262,13 @@ def _build_scaling_chart(table: AccuracyData) -> ChartItem:
     items = [
         {
             "label": growth.label,
-            "what": f"{growth.scene}, {INITIAL_GUESS_LABELS[growth.initial_guess]}",
+            "description": f"{growth.scene}, {INITIAL_GUESS_LABELS[growth.initial_guess]}",
             "parameters": "{}",
             "scene": growth.scene,
             "panel": INITIAL_GUESS_LABELS[growth.initial_guess],
             "vertices": growth.vertices,
             "seconds": _numbers(growth.seconds),
-            "older": growth.stale,
+            "stale": growth.stale,
             "exponent": "too few sizes" if np.isnan(growth.exponent) else f"{growth.exponent:.2f}",
         }
         for growth in fit_scalings(table, lambda curve: curve.source_fingerprint != table.newest_fingerprint)

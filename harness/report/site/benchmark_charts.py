@@ -77,10 +77,10 @@ def collect_benchmark_provenance(stored: Sequence[StoredBenchmarks]) -> list[Cha
         dates.setdefault((commit, cpu, usable or cores or 0), []).append(one.datetime)
     told: list[ChartItem] = [
         {"machine_id": None, "cpu": cpu, "cores": cores, "memory_gib": None, "operating_system": None, "commit": commit}
-        | {"codes": [], "from": min(when), "to": max(when), "count": len(when)}
+        | {"source_fingerprints": [], "first_started_at": min(when), "last_started_at": max(when), "count": len(when)}
         for (commit, cpu, cores), when in dates.items()
     ]
-    return sorted(told, key=lambda one: str(one["to"]), reverse=True)
+    return sorted(told, key=lambda one: str(one["last_started_at"]), reverse=True)
 
 
 def _build_chart(name: str, gate_histories: Sequence[BenchmarkHistory]) -> ChartItem:
@@ -89,7 +89,7 @@ def _build_chart(name: str, gate_histories: Sequence[BenchmarkHistory]) -> Chart
     return {
         "title": title,
         "note": _CHART_NOTE,
-        "filters": ["gate"],
+        "filters": ["benchmark"],
         "shape": "points",
         "x": [axis_choice("commit", "commit", {"type": "category"})],
         "y": [axis_choice("value", words, {})],
@@ -99,7 +99,7 @@ def _build_chart(name: str, gate_histories: Sequence[BenchmarkHistory]) -> Chart
             for one in gate_histories
             for item in _build_items(one, one.machine_words if machines[one.benchmark_name] > 1 else "")
         ],
-        "marks": {label: plotly_style(mark) for label, mark in _SERIES_STYLES.items()},
+        "styles": {label: plotly_style(mark) for label, mark in _SERIES_STYLES.items()},
         "command": "pytest tests/bench --benchmark-only",
     }
 
@@ -111,7 +111,7 @@ def _build_items(gate: BenchmarkHistory, panel: str) -> Iterable[ChartItem]:
     """
     names = _distinct_commits(gate.points)
     scale = 1.0 if gate.is_ratio else 1e3
-    same = {"what": gate.benchmark_name, "gate": gate.benchmark_name, "panel": panel, "parameters": "{}"}
+    same = {"description": gate.benchmark_name, "benchmark": gate.benchmark_name, "panel": panel, "parameters": "{}"}
     ends = {
         f"value{end}": round_numbers(scale * getattr(p, part) for p in gate.points) for end, part in _INTERVAL_SUFFIXES
     }
@@ -136,7 +136,7 @@ def _build_items(gate: BenchmarkHistory, panel: str) -> Iterable[ChartItem]:
 
 
 def _item_provenance(gate: BenchmarkHistory, commits: Sequence[str | None]) -> ChartItem:
-    return {"made": [{"commit": commit, "cpu": gate.machine_words} for commit in commits]}
+    return {"provenance": [{"commit": commit, "cpu": gate.machine_words} for commit in commits]}
 
 
 _INTERVAL_SUFFIXES = (("", "value"), ("_low", "low"), ("_high", "high"))
@@ -160,9 +160,9 @@ def _describe_changes(gate_histories: Sequence[BenchmarkHistory]) -> Iterable[Ch
             )
             plot = "gates" if one.is_ratio else "gate-times"
             yield {
-                "words": f"{one.benchmark_name} changed by {words}.",
+                "text": f"{one.benchmark_name} changed by {words}.",
                 "plot": plot,
-                "filter": {"gate": one.benchmark_name},
+                "filter": {"benchmark": one.benchmark_name},
             }
     known = [one for one in gate_histories if len(one.points) >= MIN_RESULTS]
     still = sum(not one.level_changes for one in known)
@@ -171,7 +171,7 @@ def _describe_changes(gate_histories: Sequence[BenchmarkHistory]) -> Iterable[Ch
     words = f"{still} of {len(gate_histories)} gates show no change beyond noise."
     if few := len(gate_histories) - len(known):
         words = f"{words[:-1]}; {few} have fewer than the {MIN_RESULTS} results that it takes to tell."
-    yield {"words": words}
+    yield {"text": words}
 
 
 def _format_change(ratio: float) -> str:

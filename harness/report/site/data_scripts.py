@@ -75,10 +75,10 @@ def round_numbers(values: Iterable[Any]) -> list[float | int | None]:
 def encode_column(values: Sequence[Any]) -> Any:
     """Encode a column for the page.
 
-    Numbers stay as they are; strings become a list of distinct ones, `of`, and indices, `at`.
+    Numbers stay as they are; strings become a list of distinct ones, `values`, and `indices`.
     """
     if str not in set(map(type, values)):
         return round_numbers(values)
     known = [word for word, _ in Counter(v for v in values if v is not None).most_common()]
     places = {word: k for k, word in enumerate(known)}
-    return {"of": known, "at": [places.get(value, -1) for value in values]}
+    return {"values": known, "indices": [places.get(value, -1) for value in values]}

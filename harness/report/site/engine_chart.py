@@ -40,7 +40,7 @@ def build_engine_chart(table: AccuracyData) -> dict[str, Any]:
         "x": [axis_choice("seconds", "wall seconds a simulated second")],
         "y": [axis_choice("error", "relative error")],
         "hover": [["setting", "setting"], ["error", "relative error"], ["seconds", "seconds a simulated second"]],
-        "marks": {name: plotly_style(mark) for name, mark in assign_program_styles(table.work_points).items()},
+        "styles": {name: plotly_style(mark) for name, mark in assign_program_styles(table.work_points).items()},
         "items": items,
     }
 
@@ -48,12 +48,12 @@ def build_engine_chart(table: AccuracyData) -> dict[str, Any]:
 def _build_item(table: AccuracyData, mesh: str, name: str, front: list[WorkPoint]) -> dict[str, Any]:
     return {
         "label": name,
-        "what": mesh,
+        "description": mesh,
         "scene": mesh,
         "parameters": "{}",
         "panel": mesh,
         "seconds": round_numbers(work.seconds_per_simulated_second for work in front),
         "error": round_numbers(work.error for work in front),
         "setting": [work.setting_label for work in front],
-        "older": [work.source_fingerprint != table.newest_fingerprint for work in front],
+        "stale": [work.source_fingerprint != table.newest_fingerprint for work in front],
     }

@@ -38,10 +38,10 @@ def group_failures(failed: Iterable[FailedRun]) -> list[dict[str, Any]]:
             "status": group[0].status,
             "reason": group[0].reason,
             "count": len(group),
-            "varied": len({one.reason for one in group}) > 1,
+            "has_varied_reasons": len({one.reason for one in group}) > 1,
             "solvers": Counter(one.solver for one in group).most_common(),
-            "where": Counter(one.scene_label for one in group).most_common(),
-            "run": group[0].run_id,
+            "scenes": Counter(one.scene_label for one in group).most_common(),
+            "run_id": group[0].run_id,
         }
         for group in found
     ]

@@ -25,7 +25,7 @@ def build_liu2013_chart(table: AccuracyData) -> dict[str, Any]:
     items = [
         {
             "label": label,
-            "what": curve,
+            "description": curve,
             "curve": curve,
             "parameters": "{}",
             "iterations": [one.iterations for one in mine],
@@ -47,6 +47,6 @@ def build_liu2013_chart(table: AccuracyData) -> dict[str, Any]:
             *(["iterations", "iterations"], ["error", "relative error"]),
             *(["ratio", "ours over theirs"], ["frames", "our frames"]),
         ],
-        "marks": {name: plotly_style(mark) for name, mark in _SERIES_STYLES.items()},
+        "styles": {name: plotly_style(mark) for name, mark in _SERIES_STYLES.items()},
         "items": items,
     }

@@ -121,7 +121,7 @@ def _write_snapshot_solves(
             continue
         distance = data_scripts.round_number(float(best.max_vertex_error[-1] * best.problem.mean_rest_length))
         reference = store_relative(last.absolute_positions(-1), replay.origin)
-        told = {"of": best.label, "distance": distance, "positions": _encode_array(reference, np.float32)}
+        told = {"reference_label": best.label, "distance": distance, "positions": _encode_array(reference, np.float32)}
         value = _select_iterates(replay, reference) | {"reference": told}
         data_scripts.write_script(targets[name], f"{folder.slug}/solves/{targets[name].stem}", value)
     return {name: f"solves/{target.stem}" for name, target in targets.items() if target.exists()}
@@ -137,8 +137,8 @@ def _select_iterates(replay: RecordingReplay, reference: NDArray[np.float32]) ->
     return _mesh_topology(replay) | {
         "iterations": replay.frames[kept].tolist(),
         "positions": _encode_array(replay.positions[kept], np.float32),
-        "farthest": data_scripts.round_number(farthest),
-        "nearest": data_scripts.round_number(_MIN_DISTANCE_RATIO * farthest),
+        "max_distance": data_scripts.round_number(farthest),
+        "min_distance": data_scripts.round_number(_MIN_DISTANCE_RATIO * farthest),
     }
 
 
@@ -148,7 +148,7 @@ def _mesh_topology(replay: RecordingReplay) -> dict[str, Any]:
     return {
         "triangles": _encode_array(replay.triangles, np.uint32),
         "springs": _encode_array(replay.springs, np.uint32),
-        "length": data_scripts.round_number(float(lengths.mean())) if lengths.any() else 1.0,
+        "mean_rest_length": data_scripts.round_number(float(lengths.mean())) if lengths.any() else 1.0,
     }
 
 

@@ -54,7 +54,7 @@ def update_page(
     for folder in found:
         home = data / folder.slug
         state = _sweep_state(folder, code, with_recordings)
-        if _read_summary(home).get("state") != state:
+        if _read_summary(home).get("fingerprint") != state:
             _write_sweep(
                 home,
                 folder,
@@ -99,7 +99,7 @@ def _write_sweep(data_folder: Path, folder: SweepFolder, content: SweepOverview,
             old.unlink()
     data_folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(data_folder / SUMMARY_FILE) as partial:
-        partial.write_text(json.dumps(content.summary | {"state": state}, allow_nan=False), encoding="utf-8")
+        partial.write_text(json.dumps(content.summary | {"fingerprint": state}, allow_nan=False), encoding="utf-8")
 
 
 def _read_summary(data_folder: Path) -> dict[str, Any]:
@@ -147,12 +147,14 @@ def _write_index(results: Path, data: Path) -> None:
     """
     there = {folder.slug: folder for folder in find_folders(results)}
     known = {slug: _read_summary(data / slug) for slug in there}
-    told = sorted((summary for summary in known.values() if summary), key=lambda s: s["to"] or "", reverse=True)
+    told = sorted(
+        (summary for summary in known.values() if summary), key=lambda s: s["last_started_at"] or "", reverse=True
+    )
     value = {
         "title": results.resolve().name,
-        "place": _command_path(results),
-        "written": datetime.now(UTC).isoformat(timespec="seconds"),
-        "sweeps": [{key: part for key, part in summary.items() if key != "state"} for summary in told],
-        "absent": [there[slug].name for slug, summary in known.items() if not summary],
+        "results_path": _command_path(results),
+        "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "sweeps": [{key: part for key, part in summary.items() if key != "fingerprint"} for summary in told],
+        "unwritten_sweeps": [there[slug].name for slug, summary in known.items() if not summary],
     }
     data_scripts.write_script(data / "index.js", "index", value)

@@ -41,13 +41,13 @@ def build_robustness_chart(folder: SweepFolder) -> dict[str, Any]:
         "outcomes": [{**o._asdict(), "count": sum(cell.outcome == o for cell in cells)} for o in RUN_OUTCOMES],
         "cases": list(dict.fromkeys(cell.case for cell in cells)),
         "solvers": list(dict.fromkeys(cell.solver for cell in cells)),
-        "references": {cell.solver: format_citation(cell.citation) for cell in cells},
+        "citations": {cell.solver: format_citation(cell.citation) for cell in cells},
         "scores": [
             {
                 "solver": s.solver,
-                "right": round_number(s.correct_share),
-                "finite": round_number(s.finite_share),
-                "worst": s.worst_run.error_text,
+                "correct_share": round_number(s.correct_share),
+                "finite_share": round_number(s.finite_share),
+                "worst_error": s.worst_run.error_text,
             }
             for s in score_solvers(cells)
         ],

@@ -31,7 +31,7 @@ def collect_provenance(table: pa.Table, unit: str) -> list[dict[str, Any]]:
     ]
     for name in lacking:
         table = table.append_column(name, pa.nulls(len(table), pa.string()))
-    names = (*_MACHINE_COLUMNS, "codes", "from", "to", "count")
+    names = (*_MACHINE_COLUMNS, "source_fingerprints", "first_started_at", "last_started_at", "count")
     return [dict(zip(names, row, strict=True)) for row in query_table(_PROVENANCE_QUERY.format(unit=unit), table)]
 
 

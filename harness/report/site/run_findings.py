@@ -15,7 +15,7 @@ def describe_runs(run_records: Sequence[RunRecord]) -> list[dict[str, Any]]:
     """Describe runs in sentences, each with the ids of its runs (`equal_accuracy`)."""
     names = {run["run_id"]: run["label"] for run in run_records}
     told = [
-        {"words": words, "runs": runs}
+        {"text": words, "runs": runs}
         for compared in equal_accuracy.compare_runs(map(_to_run_times, run_records))
         for words, runs in equal_accuracy.describe_comparison(compared, names)
     ]
@@ -32,4 +32,4 @@ def _describe_unconverged(run_records: Sequence[RunRecord]) -> Iterator[dict[str
     short = [run for run in done if run["termination_reason"] == "max-iter"]
     if short:
         words = f"{len(short)} of {len(done)} runs ended a step at the limit of iterations: look at residuals."
-        yield {"words": words, "runs": [short[0]["run_id"]], "filter": {"termination_reason": "max-iter"}}
+        yield {"text": words, "runs": [short[0]["run_id"]], "filter": {"termination_reason": "max-iter"}}

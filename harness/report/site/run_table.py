@@ -35,7 +35,7 @@ select run_id, any_value(file) as unit, any_value(family) as family, any_value(c
     any_value(error_requested) as error_requested, any_value(error_estimated) as error_estimated,
     any_value(threads) as threads,
     max(frame) as frames, 1 + max("round") filter (phase = 'step') as rounds,
-    sum(seconds) filter (phase in ('step', 'prepare')) as took,
+    sum(seconds) filter (phase in ('step', 'prepare')) as total_seconds,
     arg_max(positions_digest, frame) filter (positions_digest is not null) as positions_digest,
     max(penetration_depth) as penetration_depth, any_value(machine_id) as machine_id,
     any_value(cpu) as cpu, any_value(cores) as cores,
@@ -83,13 +83,13 @@ def build_run_table(folder: SweepFolder, table: pa.Table) -> list[RunRecord]:
     for run in timed:
         told: RunRecord = {**run._asdict(), **more[run.run_id], "label": names[run.run_id]}
         told["global"] = told.pop("global_")
-        told["plain"] = int(_has_default_parameters(run.solver, run.parameters_json))
+        told["has_default_parameters"] = int(_has_default_parameters(run.solver, run.parameters_json))
         told["options"] = names[run.run_id].removeprefix(run.solver).removeprefix(", ")
         told |= {part[:-1]: int(told["unit"] in files) for part, files in there.items()}
         found.append(told)
     found.sort(key=lambda run: (run["scene"], run["size"] or 0, run["label"]))
     for run, how in zip(found, _classify_staleness(found), strict=True):
-        run["by"] = how
+        run["staleness"] = how
     return found
 
 
@@ -113,11 +113,11 @@ def build_run_script(
     exact = {name: [run[name] for run in run_records] for name in _EXACT_COLUMNS}
     return {
         "slug": folder.slug,
-        "up": folder.relative_url,
-        "n": len(run_records),
+        "relative_url": folder.relative_url,
+        "num_rows": len(run_records),
         "columns": {name: encode_column(values) for name, values in columns.items()} | exact,
-        "marks": {label: plotly_style(mark) for label, mark in marks.items()},
-        "references": format_references((run["solver"], run["citation"]) for run in run_records),
+        "styles": {label: plotly_style(mark) for label, mark in marks.items()},
+        "citations": format_references((run["solver"], run["citation"]) for run in run_records),
     }
 
 
@@ -125,7 +125,8 @@ def format_references(pairs: Any) -> dict[str, dict[str, str]]:
     """Format references by solver, as a line and as BibTeX."""
     known = {solver: reference for solver, reference in pairs if reference}
     return {
-        s: {"cited": format_citation(reference), "bibtex": format_bibtex([reference])} for s, reference in known.items()
+        s: {"citation": format_citation(reference), "bibtex": format_bibtex([reference])}
+        for s, reference in known.items()
     }
 
 
@@ -133,7 +134,19 @@ _EXACT_COLUMNS = ("time_step", "residual_rtol", "error_requested")
 """Columns that commands need to the last digit."""
 
 _PAGE_COLUMNS = (
-    *("run_id", "unit", "scene", "size", "solver", "label", "options", "plain", "family", "vertices", "springs"),
+    *(
+        "run_id",
+        "unit",
+        "scene",
+        "size",
+        "solver",
+        "label",
+        "options",
+        "has_default_parameters",
+        "family",
+        "vertices",
+        "springs",
+    ),
     *(
         "integrator",
         "time_step",
@@ -175,13 +188,13 @@ _PAGE_COLUMNS = (
         "recording",
         "mesh",
         "replay",
-        "by",
+        "staleness",
         "machine_id",
         "cpu",
         "commit",
         "source_fingerprint",
         "started_at",
-        "took",
+        "total_seconds",
         "plugins",
         "versions",
     ),
@@ -213,16 +226,16 @@ def _file_stems(folder: Path, suffix: str) -> set[str]:
 
 
 def _classify_staleness(run_records: Sequence[RunRecord]) -> list[str]:
-    """Classify each run as `other code`, `earlier commit` or current ("").
+    """Classify each run as `stale`, `earlier commit` or current ("").
 
-    `other code` is relative to the newest run of its scene and solver, `earlier commit` relative to the newest run of
+    `stale` is relative to the newest run of its scene and solver, `earlier commit` relative to the newest run of
     all.
     """
     newest: dict[Any, RunRecord] = {}
     for run in sorted(run_records, key=lambda run: run["started_at"] or ""):
         newest[run["scene"], run["solver"]] = newest[None] = run
     return [
-        "other code"
+        "stale"
         if run["source_fingerprint"] != newest[run["scene"], run["solver"]]["source_fingerprint"]
         else "earlier commit"
         if run["commit"] != newest[None]["commit"]

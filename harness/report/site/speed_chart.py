@@ -54,8 +54,8 @@ def build_speed_chart(table: pa.Table) -> tuple[dict[str, Any], list[str]]:
         "y": list(_AXIS_CHOICES.values()),
         "hover": [*hover, ["binding_limit", "limit that binds"], ["roofline_fraction", "share of that limit reached"]],
         "items": [_build_item(scene, label, some, newest) for (scene, label), some in lines.items()],
-        "marks": {label: plotly_style(mark) for label, mark in marks.items()},
-        "references": format_references((f.label, reference.get(f.solver)) for f in timed),
+        "styles": {label: plotly_style(mark) for label, mark in marks.items()},
+        "citations": format_references((f.label, reference.get(f.solver)) for f in timed),
         "command": "springbench roofline CONFIG --rerun",
     }, describe_speed(found)
 
@@ -66,13 +66,13 @@ def _build_item(scene: str, label: str, some: list[SpeedFigures], newest_fingerp
     columns["speedup"] = [round_number(f.speedup and f.speedup.estimate) for f in some]
     ends = {f"speedup_{end}": [round_number(getattr(f.speedup, end, None)) for f in some] for end in ("low", "high")}
     threads = f"{some[0].threads} thread{'s' if some[0].threads > 1 else ''}"
-    told = {"label": label, "what": f"{scene}, {threads}", "scene": scene, "panel": scene, "parameters": "{}"}
+    told = {"label": label, "description": f"{scene}, {threads}", "scene": scene, "panel": scene, "parameters": "{}"}
     return (
         told
         | columns
         | ends
         | {
             "binding_limit": [f.binding_limit for f in some],
-            "older": [f.source_fingerprint != newest_fingerprint for f in some],
+            "stale": [f.source_fingerprint != newest_fingerprint for f in some],
         }
     )

@@ -85,13 +85,13 @@ def build_overview(
     summary: dict[str, Any] = {
         "slug": folder.slug,
         "name": folder.name,
-        "up": folder.relative_url,
+        "relative_url": folder.relative_url,
         "kinds": there,
         "config": row_provenance.find_config(folder.path),
         "scenes": row_provenance.find_scene_files(folder.path),
-        "made": made,
-        "from": min((one["from"] or "" for one in made), default=""),
-        "to": max((one["to"] or "" for one in made), default=""),
+        "provenance": made,
+        "first_started_at": min((one["first_started_at"] or "" for one in made), default=""),
+        "last_started_at": max((one["last_started_at"] or "" for one in made), default=""),
         "plots": [{"id": name, "title": title} for each in told for name, title in each.plots],
         "findings": [said for each in told for said in each.findings],
         "failures": [cause for each in told for cause in each.failures],
@@ -129,16 +129,16 @@ def _build_run_section(
     found = run_table.build_run_table(folder, table)
     scripts: dict[str, Any] = {}
     findings = [
-        {"words": words} for words in of_devices(table, row_provenance.find_config(folder.path))
+        {"text": words} for words in of_devices(table, row_provenance.find_config(folder.path))
     ] + describe_runs(found)
     if speed_chart.has_machine_limits(table):
         scripts["speed"], said = speed_chart.build_speed_chart(table)
-        findings = [{"words": words} for words in said]
+        findings = [{"text": words} for words in said]
     outcomes: dict[str, Any] = {}
     if robustness_chart.has_verification(table):
         scripts["hard"] = robustness_chart.build_robustness_chart(folder)
         outcomes = robustness_chart.outcomes_by_run(scripts["hard"])
-        findings = [{"words": f"{scripts['hard']['headline']}.", "plot": "hard"}, *findings[-1:]]
+        findings = [{"text": f"{scripts['hard']['headline']}.", "plot": "hard"}, *findings[-1:]]
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     _mark_recordings(folder, data_folder, found, with_recordings, print_message)
     scripts["runs"] = run_table.build_run_script(folder, found, outcomes)
@@ -148,10 +148,10 @@ def _build_run_section(
     facts = {
         "runs": len(found),
         "statuses": Counter(run["status"] for run in found),
-        "took": sum(run["took"] or 0.0 for run in found),
+        "total_seconds": sum(run["total_seconds"] or 0.0 for run in found),
         "solvers": sorted({run["solver"] for run in found}),
         "sizes": sorted({run["size"] for run in found if run["size"]}),
-        "other": sum(run["by"] == "other code" for run in found),
+        "num_stale_runs": sum(run["staleness"] == "stale" for run in found),
     }
     bad = group_failures(one for one in failed if one.status != "ok")
     return _PageSection(scripts, plots, findings, bad, row_provenance.collect_provenance(table, "run_id"), facts)
@@ -200,7 +200,7 @@ def _write_run_parquet(path: Path, run_records: Sequence[dict[str, Any]]) -> Non
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as partial:
         pq.write_table(
-            pa.Table.from_pylist([{k: v for k, v in r.items() if k != "settings"} for r in run_records]), partial
+            pa.Table.from_pylist([{k: v for k, v in r.items() if k != "options_json"} for r in run_records]), partial
         )
 
 
@@ -225,10 +225,10 @@ def _build_accuracy_section(
         }
         facts["replays"] = write_recordings(folder, data_folder, kept)
     chapters = summarise_findings(table)
-    told = [{"words": w, "chapter": name} for name, some in chapters.items() if name != "Methods" for w in some]
+    told = [{"text": w, "chapter": name} for name, some in chapters.items() if name != "Methods" for w in some]
     failed = [FailedRun(row["where"], row["solver"], row["status"], row["reason"]) for row in list_failures(table)]
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
-    facts |= {"curves": len(table.curves), "works": len(table.work_points)}
+    facts |= {"curves": len(table.curves), "work_points": len(table.work_points)}
     return _PageSection(
         scripts,
         plots,
@@ -245,7 +245,7 @@ def _build_ablation_section(
     table = _read_rows(folder, "ablation", print_message)
     scripts, words = ablation_charts.build_ablation_charts(table.to_pylist())
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
-    said = [{"words": f"{one}.", "chapter": "Effects"} for one in words]
+    said = [{"text": f"{one}.", "chapter": "Effects"} for one in words]
     return _PageSection(
         dict(scripts),
         plots,
@@ -264,7 +264,7 @@ def _build_benchmark_section(
     known = benchmark_charts.read_benchmark_files(find_benchmark_files(folder.path), print_message)
     scripts, found = benchmark_charts.build_benchmark_charts(known)
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
-    facts = {"gates": len({item["gate"] for chart in scripts.values() for item in chart["items"]})}
+    facts = {"gates": len({item["benchmark"] for chart in scripts.values() for item in chart["items"]})}
     return _PageSection(scripts, plots, found, [], benchmark_charts.collect_benchmark_provenance(known), facts)
 
 
@@ -292,7 +292,7 @@ def _select_pictures(folder: SweepFolder) -> list[dict[str, str]]:
     times = [path for path in found if path.stem == "timing"]
     shown = [*[path for path in found if path.stem != "timing"][: _MAX_PICTURES - len(times)], *times]
     return [
-        {"path": p.relative_to(folder.path).as_posix(), "words": _HASH_SUFFIX.sub("", p.stem).replace("-", " ")}
+        {"path": p.relative_to(folder.path).as_posix(), "text": _HASH_SUFFIX.sub("", p.stem).replace("-", " ")}
         for p in shown
     ]
 

@@ -38,13 +38,22 @@ def build_winner_chart(table: AccuracyData) -> dict[str, Any]:
         "note": " ".join([_CHART_NOTE, *describe_self_converged(table.work_points)]),
         "shape": "points",
         "filters": [],
-        "x": [axis_choice("number", "stiffness number k dt²/m")],
+        "x": [axis_choice("stiffness_number", "stiffness number k dt²/m")],
         "y": [axis_choice("error", "relative error")],
         "hover": [
-            *(["scene", "scene"], ["error", "error"], ["number", "stiffness number"], ["setting", "cheapest"]),
-            *(["price", "processor seconds a simulated second"], ["next", "next family"], ["ahead", "which takes"]),
+            *(
+                ["scene", "scene"],
+                ["error", "error"],
+                ["stiffness_number", "stiffness number"],
+                ["setting", "cheapest"],
+            ),
+            *(
+                ["cpu_seconds_per_simulated_second", "processor seconds a simulated second"],
+                ["runner_up_family", "next family"],
+                ["lead_ratio", "which takes"],
+            ),
         ],
-        "marks": {name: plotly_style(mark) for name, mark in looks.items()},
+        "styles": {name: plotly_style(mark) for name, mark in looks.items()},
         "items": [_build_item(table, vertices, name, mine) for (vertices, name), mine in of.items()],
     }
 
@@ -53,21 +62,21 @@ def _build_item(table: AccuracyData, vertices: int, name: str, winner_cells: lis
     best = [cell.cheapest_by_family[name] for cell in winner_cells]
     return {
         "label": name,
-        "what": f"{format_count(vertices)} vertices",
+        "description": f"{format_count(vertices)} vertices",
         "parameters": "{}",
         "panel": f"{format_count(vertices)} vertices",
         "large": True,
-        "number": round_numbers(cell.stiffness_number for cell in winner_cells),
+        "stiffness_number": round_numbers(cell.stiffness_number for cell in winner_cells),
         "error": round_numbers(cell.error for cell in winner_cells),
         "scene": [cell.scene for cell in winner_cells],
         "setting": [work.setting_label for work in best],
-        "price": round_numbers(work.cpu_seconds_per_simulated_second for work in best),
-        "next": [_runner_up_family(cell) for cell in winner_cells],
-        "ahead": [
+        "cpu_seconds_per_simulated_second": round_numbers(work.cpu_seconds_per_simulated_second for work in best),
+        "runner_up_family": [_runner_up_family(cell) for cell in winner_cells],
+        "lead_ratio": [
             f"{cell.lead_ratio:.2g} times as much" if len(cell.cheapest_by_family) > 1 else None
             for cell in winner_cells
         ],
-        "older": [work.source_fingerprint != table.newest_fingerprint for work in best],
+        "stale": [work.source_fingerprint != table.newest_fingerprint for work in best],
     }
 
 

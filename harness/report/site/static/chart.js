@@ -7,7 +7,7 @@ springbench.chart = (() => {
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
 
   const figure = value => (typeof value === "string" ? value : number(value));
-  const older = (item, k) => Boolean(Array.isArray(item.older) ? item.older[k] : item.older);
+  const older = (item, k) => Boolean(Array.isArray(item.stale) ? item.stale[k] : item.stale);
 
   function told(chart, item, k) {
     const rows = chart.hover.map(([column, words]) => {
@@ -15,7 +15,7 @@ springbench.chart = (() => {
       return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, figure(value)));
     });
     if (older(item, k)) rows.push(element("tr", {}, element("td", {}, "code"), element("td", {}, "other than the newest rows'")));
-    return [element("b", {}, item.label), item.what, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
+    return [element("b", {}, item.label), item.description, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
   }
 
   // Next to the point and inside the window, never wider than a tooltip.
@@ -31,7 +31,7 @@ springbench.chart = (() => {
   addEventListener("hashchange", hide);
 
   function trace(chart, item, x, y, panel, tail) {
-    const mark = own(chart.marks, item.label), ink = colour(mark.color), points = chart.shape === "points";
+    const mark = own(chart.styles, item.label), ink = colour(mark.color), points = chart.shape === "points";
     const ends = ["", "_low", "_high"].map(end => item[`${x.column}${end}`]), upright = ["", "_low", "_high"].map(end => item[`${y.column}${end}`]);
     const bars = some => (some[1] && some[2] ? {
       type: "data", symmetric: false, color: ink, thickness: 1.2, width: 3,
@@ -98,7 +98,7 @@ springbench.chart = (() => {
       for (const item of items) {
         if ((item.panel ?? "") !== panel || hidden.has(item.label)) continue;
         traces.push(trace(chart, item, x, y, panel, tail));
-        if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour(own(chart.marks, item.label).color)));
+        if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour(own(chart.styles, item.label).color)));
       }
     });
     zoom(layout, where().query.get(zoomKey));
@@ -151,9 +151,9 @@ springbench.chart = (() => {
   // Labels with their markers; each toggles a series.
   function legend(labels, chart, items, hidden, onChange) {
     return labels.map(label => {
-      const source = own(chart.references, label), drawn = items.some(item => item.label === label && item[chart.x[0].column].some(v => v !== null));
+      const source = own(chart.citations, label), drawn = items.some(item => item.label === label && item[chart.x[0].column].some(v => v !== null));
       return element("li", {}, element("button", {
-        type: "button", "aria-pressed": String(!hidden.has(label)), title: source?.cited,
+        type: "button", "aria-pressed": String(!hidden.has(label)), title: source?.citation,
         onclick: event => {
           const next = new Set(hidden);
           if (event.shiftKey || event.detail === 2) {
@@ -162,7 +162,7 @@ springbench.chart = (() => {
           } else if (!next.delete(label)) next.add(label);
           onChange(next);
         },
-      }, glyph(own(chart.marks, label)), element("span", {}, label, !drawn && element("span.muted", {}, " – nothing to draw"))));
+      }, glyph(own(chart.styles, label)), element("span", {}, label, !drawn && element("span.muted", {}, " – nothing to draw"))));
     });
   }
 

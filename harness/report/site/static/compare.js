@@ -50,13 +50,13 @@
     const drawings = [];
     for (const [column, words, how] of CURVES) {
       const items = rows.map((row, k) => series[k] && {
-        label: labels[k], what: "", frame: series[k].frame, [column]: column === "max_strain" ? series[k].max_strain.map(v => v && 100 * v) : series[k][column],
+        label: labels[k], description: "", frame: series[k].frame, [column]: column === "max_strain" ? series[k].max_strain.map(v => v && 100 * v) : series[k][column],
         ...(column === "step_ms" ? { step_ms_low: series[k].lower, step_ms_high: series[k].upper } : {}),
       }).filter(item => item && item[column].some(v => v !== null));
       if (!items.length) continue;
       const plot = element("div.plot.small", { tabIndex: 0, role: "group", "aria-label": `Plot: ${words} by frame. Arrow keys go through its points.` });
       box.append(plot);
-      const chart = { marks, hover: [["frame", "frame"], [column, words]] };
+      const chart = { styles: marks, hover: [["frame", "frame"], [column, words]] };
       drawings.push(() => springbench.chart.draw(plot, chart, items, { column: "frame", title: "frame", axis: {} }, { column, title: words, axis: how }, { small: true, zoomKey: `zoom-${column}` }));
     }
     for (const draw of drawings) await draw();  // all of them have their places now
@@ -82,7 +82,7 @@
       const q = floats(found.positions), far = new Float32Array(q.length / 3);
       for (let i = 0; i < far.length; i++) far[i] = Math.hypot(q[3 * i] - p[3 * i], q[3 * i + 1] - p[3 * i + 1], q[3 * i + 2] - p[3 * i + 2]);
       const most = far.reduce((a, b) => Math.max(a, b), 0), drawn = springbench.mesh(view, shape, `Last frame of ${title(row)}, coloured by its distance from the first run`);
-      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(base.length ? most / base.length : 0)} mean rest lengths${most < 1e-6 * view.radius ? "; recordings are of single precision, and tell no less" : ""}`),
+      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(base.mean_rest_length ? most / base.mean_rest_length : 0)} mean rest lengths${most < 1e-6 * view.radius ? "; recordings are of single precision, and tell no less" : ""}`),
         springbench.scaleBox("0", `${number(most || 0)} m`)));
       drawn.show(q, far.map(v => (most ? v / most : 0)));
     }

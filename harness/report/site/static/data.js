@@ -11,14 +11,14 @@ Object.assign(springbench, (() => {
     const table = await data(`${sweep.slug}/runs`), names = Object.keys(table.columns);
     const read = names.map(name => {
       const column = table.columns[name];
-      return Array.isArray(column) ? k => column[k] : k => (column.at[k] < 0 ? null : column.of[column.at[k]]);
+      return Array.isArray(column) ? k => column[k] : k => (column.indices[k] < 0 ? null : column.values[column.indices[k]]);
     });
-    const rows = Array.from({ length: table.n }, (_, k) => {
+    const rows = Array.from({ length: table.num_rows }, (_, k) => {
       const row = { sweep: sweep.name, slug: sweep.slug };
       for (let c = 0; c < names.length; c++) row[names[c]] = read[c](k);
       row.key = `${sweep.slug}/${row.run_id}`;
-      row.mark = own(table.marks, row.label);
-      row.cited = own(table.references, row.solver)?.cited;
+      row.mark = own(table.styles, row.label);
+      row.citation = own(table.citations, row.solver)?.citation;
       return row;
     });
     tables.set(sweep.slug, rows);
@@ -38,9 +38,9 @@ Object.assign(springbench, (() => {
   }
 
   const sweepOf = slug => index.sweeps.find(sweep => sweep.slug === slug);
-  const references = async slug => (await data(`${slug}/runs`)).references;
-  const picture = row => (row.picture ? link(sweepOf(row.slug).up, `pictures/${row.unit}.png`) : "");
-  const recording = row => (row.recording ? link(sweepOf(row.slug).up, `recordings/${row.unit}.rrd`) : "");
+  const references = async slug => (await data(`${slug}/runs`)).citations;
+  const picture = row => (row.picture ? link(sweepOf(row.slug).relative_url, `pictures/${row.unit}.png`) : "");
+  const recording = row => (row.recording ? link(sweepOf(row.slug).relative_url, `recordings/${row.unit}.rrd`) : "");
   const title = row => `${row.scene}${row.size ? ` ${row.size}` : ""}, ${row.label}`;
 
   // Quote a word for the shell.
@@ -50,7 +50,7 @@ Object.assign(springbench, (() => {
   function command(row) {
     const sweep = sweepOf(row.slug), scene = own(sweep.scenes, row.scene);
     const whole = `springbench run ${quoted(sweep.config || `${sweep.name}.yaml`)}`;
-    if (!scene || !row.plain || row.plugins) return `${whole} --rerun`;
+    if (!scene || !row.has_default_parameters || row.plugins) return `${whole} --rerun`;
     const chosen = row.error_requested !== null && row.error_requested !== undefined;
     const stated = {
       iterations: row.max_iterations, tolerance: row.residual_rtol === 0 ? "auto" : row.residual_rtol, integrator: row.integrator, "first-guess": row.initial_guess,
@@ -64,7 +64,7 @@ Object.assign(springbench, (() => {
   }
 
   // Return the path of a results file as commands refer to it.
-  const called = file => quoted(`${index.place === "." ? "" : `${index.place}/`}${plain(file).replace(/^\.\//, "")}`);
+  const called = file => quoted(`${index.results_path === "." ? "" : `${index.results_path}/`}${plain(file).replace(/^\.\//, "")}`);
   function plain(file) {
     try {
       return decodeURIComponent(file);

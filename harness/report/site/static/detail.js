@@ -13,8 +13,8 @@ Object.assign(springbench, (() => {
   // The reference of a method: authors, year and DOI, and BibTeX to copy.
   function method(reference) {
     if (!reference) return null;
-    const doi = /doi:(\S+)$/.exec(reference.cited);
-    const words = doi ? reference.cited.slice(0, doi.index).replace(/, $/, "") : reference.cited;
+    const doi = /doi:(\S+)$/.exec(reference.citation);
+    const words = doi ? reference.citation.slice(0, doi.index).replace(/, $/, "") : reference.citation;
     return element("p.method", {}, words, doi && ", ", doi && element("a", { href: `https://doi.org/${doi[1]}`, rel: "noreferrer" }, `doi:${doi[1]}`), " ",
       reference.bibtex && element("button.quiet", { type: "button", onclick: () => copy(reference.bibtex) }, "Copy BibTeX"));
   }
@@ -64,7 +64,7 @@ Object.assign(springbench, (() => {
     }
     const source = own(await references(row.slug), row.solver), src = picture(row), sweep = sweepOf(row.slug);
     put(panel, shut, element("h2", {}, glyph(row.mark), ` ${row.scene}${row.size ? ` ${row.size}` : ""}`), element("p.label", {}, row.label),
-      element("p.states", {}, state(row.status), row.outcome && state(row.outcome), row.by && element("span.code", {}, row.by)),
+      element("p.states", {}, state(row.status), row.outcome && state(row.outcome), row.staleness && element("span.code", {}, row.staleness)),
       row.reason && element("p.reason", {}, row.reason),
       src && element("a.shot", { href: src }, element("img", { src, alt: `The run's last frame and earlier ones: ${title(row)}` })),
       replay(row.run_id, recording(row), row.replay && `site/data/${encodeURIComponent(row.slug)}/recordings/${encodeURIComponent(row.unit)}.js`, title(row)),
@@ -76,7 +76,7 @@ Object.assign(springbench, (() => {
         ["code", element("span", {}, element("code", {}, commit(row.commit)), ` (sources ${row.source_fingerprint})`)], ["machine", `${row.cpu || "unknown"} (${(row.machine_id || "").slice(0, 6)})`],
         ["on", (row.started_at || "").replace("T", " ").slice(0, 16)], ["timed", row.timing], ["own code", row.plugins],
       ]),
-      element("p", {}, element("a", { href: link(sweep.up, `rows/${row.unit}.parquet`) }, "Its rows (Parquet)"), " · ",
+      element("p", {}, element("a", { href: link(sweep.relative_url, `rows/${row.unit}.parquet`) }, "Its rows (Parquet)"), " · ",
         element("a", { href: springbench.address("compare", { sel: key }) }, "Frame by frame")));
   }
 

@@ -16,8 +16,8 @@ springbench.map = (chart, sweep) => {
     }, found[3] || "\u00a0"));
   }
 
-  const head = element("tr", {}, element("th", {}, element("b", {}, "case")), ...chart.solvers.map(name => element("th", { scope: "col", title: own(chart.references, name) }, element("span", {}, name))));
-  const shares = [["right", s => (s.right === null ? "" : `${Math.round(100 * s.right)} %`)], ["finite", s => (s.finite === null ? "" : `${Math.round(100 * s.finite)} %`)], ["worst", s => s.worst]].map(([name, words]) =>
+  const head = element("tr", {}, element("th", {}, element("b", {}, "case")), ...chart.solvers.map(name => element("th", { scope: "col", title: own(chart.citations, name) }, element("span", {}, name))));
+  const shares = [["right", s => (s.correct_share === null ? "" : `${Math.round(100 * s.correct_share)} %`)], ["finite", s => (s.finite_share === null ? "" : `${Math.round(100 * s.finite_share)} %`)], ["worst", s => s.worst_error]].map(([name, words]) =>
     element("tr", {}, element("th", { scope: "row" }, element("b", {}, name)), ...chart.scores.map(s => element("td.share", {}, words(s)))));
   let family = "";
   const rows = chart.cases.flatMap(name => {

@@ -94,33 +94,33 @@ Object.assign(springbench, (() => {
     box.onkeydown = event => { if (event.key === "Escape" && event.target.tagName !== "INPUT") close(); };
     const figures = springbench.definitions(chart.hover.map(([column, words]) => [words, Array.isArray(item[column]) ? item[column][k] : item[column]])
       .map(([words, value]) => [words, typeof value === "number" ? number(value) : value]));
-    const made = item.made?.[k] || sweep.made[0] || {}, command = chart.command.replace("CONFIG", springbench.quoted(sweep.config || "CONFIG.yaml"));
+    const made = item.provenance?.[k] || sweep.provenance[0] || {}, command = chart.command.replace("CONFIG", springbench.quoted(sweep.config || "CONFIG.yaml"));
     const settings = Object.entries(JSON.parse(item.parameters || "{}")).map(pair => pair.join(" ")).join(", ");
-    const scrub = element("div"), file = item.recording && link(sweep.up, item.recording), replay = own(sweep.replays, item.recording);
-    put(box, shut, element("h2", {}, springbench.glyph(own(chart.marks, item.label)), ` ${item.label}`), element("p.label", {}, item.what),
+    const scrub = element("div"), file = item.recording_path && link(sweep.relative_url, item.recording_path), replay = own(sweep.replays, item.recording_path);
+    put(box, shut, element("h2", {}, springbench.glyph(own(chart.styles, item.label)), ` ${item.label}`), element("p.label", {}, item.description),
       settings && element("p.muted", {}, settings), scrub,
       element("div.cols", {},
         element("div", {}, element("h3", {}, "At this point"), figures),
         element("div", {}, element("h3", {}, "Do it again"), springbench.commandBox(command, "Command that repeats the measurement"),
-          springbench.method(own(chart.references, item.label)),
-          file && element("h3", {}, `Recording of ${item.label}'s solve`), file && springbench.replayBox(item.recording, file, replay && link("site/data/", `${sweep.slug}/${replay}.js`), `${item.label}: ${item.what}`),
-          element("p.muted", {}, `Made by code ${springbench.commit(made.commit)} on ${made.cpu || "an unknown machine"}${sweep.made.length > 1 && !item.made ? `, and by ${sweep.made.length - 1} more (see the overview)` : ""}.`)),
-        item.picture && element("figure", {}, element("a", { href: link(sweep.up, item.picture.path) }, element("img", { src: link(sweep.up, item.picture.path), alt: `The step's mesh, by ${item.picture.of}` })),
-          element("figcaption", {}, `Not this point: the mesh where ${item.picture.of} came nearest the minimum of this step.`))));
+          springbench.method(own(chart.citations, item.label)),
+          file && element("h3", {}, `Recording of ${item.label}'s solve`), file && springbench.replayBox(item.recording_path, file, replay && link("site/data/", `${sweep.slug}/${replay}.js`), `${item.label}: ${item.description}`),
+          element("p.muted", {}, `Made by code ${springbench.commit(made.commit)} on ${made.cpu || "an unknown machine"}${sweep.provenance.length > 1 && !item.provenance ? `, and by ${sweep.provenance.length - 1} more (see the overview)` : ""}.`)),
+        item.mesh_picture && element("figure", {}, element("a", { href: link(sweep.relative_url, item.mesh_picture.path) }, element("img", { src: link(sweep.relative_url, item.mesh_picture.path), alt: `The step's mesh, by ${item.mesh_picture.reference_label}` })),
+          element("figcaption", {}, `Not this point: the mesh where ${item.mesh_picture.reference_label} came nearest the minimum of this step.`))));
     await scrubber(scrub, sweep, item, k);
   }
 
   // The mesh of the iterate next to the reference's, coloured by distance, and a slider over the iterates.
   async function scrubber(box, sweep, item, k) {
-    const name = own(sweep.solves, item.recording), at = item.iteration?.[k];
+    const name = own(sweep.solves, item.recording_path), at = item.iteration?.[k];
     if (!name) {
-      if (item.recording) box.append(element("p.muted", {}, "The meshes of its iterates are not in this page: ", element("code", {}, "springbench report"), " takes them from the recordings."));
+      if (item.recording_path) box.append(element("p.muted", {}, "The meshes of its iterates are not in this page: ", element("code", {}, "springbench report"), " takes them from the recordings."));
       return;
     }
     const found = await data(`${sweep.slug}/${name}`), all = floats(found.positions), best = floats(found.reference.positions), n = best.length / 3;
     const view = camera(best), shape = { springs: whole(found.springs), triangles: whole(found.triangles) };
-    const left = mesh(view, shape, `Mesh of an iterate of ${item.label}`), right = mesh(view, shape, `Mesh of the reference, by ${found.reference.of}`);
-    const low = Math.log10(found.nearest), high = Math.log10(found.farthest), words = element("p", { role: "status" });
+    const left = mesh(view, shape, `Mesh of an iterate of ${item.label}`), right = mesh(view, shape, `Mesh of the reference, by ${found.reference.reference_label}`);
+    const low = Math.log10(found.min_distance), high = Math.log10(found.max_distance), words = element("p", { role: "status" });
     const slider = element("input", { type: "range", min: 0, max: found.iterations.length - 1, step: 1, "aria-label": "Iteration" });
     const show = () => {
       const j = Number(slider.value), p = all.subarray(3 * n * j, 3 * n * (j + 1)), values = new Float32Array(n);
@@ -137,8 +137,8 @@ Object.assign(springbench, (() => {
     slider.oninput = () => { show(); keep({ at: found.iterations[Number(slider.value)] }); };
     const wanted = where().query.has("at") ? Number(where().query.get("at")) : at ?? found.iterations.at(-1);
     slider.value = found.iterations.reduce((b, v, j) => (Math.abs(v - wanted) < Math.abs(found.iterations[b] - wanted) ? j : b), 0);
-    box.append(words, slider, element("div.scrub", {}, element("figure", {}, left.canvas, element("figcaption", {}, `the iterate of ${item.label}, by its distance from the reference`), scaleBox(`${number(found.nearest)} m`, `${number(found.farthest)} m`)),
-      element("figure", {}, right.canvas, element("figcaption", {}, `the reference: the last iterate of ${found.reference.of}, ${number(found.reference.distance)} m from the certified minimum`))));
+    box.append(words, slider, element("div.scrub", {}, element("figure", {}, left.canvas, element("figcaption", {}, `the iterate of ${item.label}, by its distance from the reference`), scaleBox(`${number(found.min_distance)} m`, `${number(found.max_distance)} m`)),
+      element("figure", {}, right.canvas, element("figcaption", {}, `the reference: the last iterate of ${found.reference.reference_label}, ${number(found.reference.distance)} m from the certified minimum`))));
     right.show(best);
     show();
   }

@@ -7,25 +7,25 @@
     const told = [];
     if (sweep.runs) told.push(many(sweep.runs, "run"));
     if (sweep.curves) told.push(many(sweep.curves, "solve"));
-    if (sweep.works) told.push(many(sweep.works, "simulation"));
+    if (sweep.work_points) told.push(many(sweep.work_points, "simulation"));
     if (sweep.ablations) told.push(many(sweep.ablations, "verdict"));
     if (sweep.gates) told.push(many(sweep.gates, "gate"));
     if (sweep.sizes?.length) told.push(`size${sweep.sizes.length > 1 ? `s ${sweep.sizes[0]} to ${sweep.sizes.at(-1)}` : ` ${sweep.sizes[0]}`}`);
-    if (sweep.took) told.push(`${duration(sweep.took)} timed`);
+    if (sweep.total_seconds) told.push(`${duration(sweep.total_seconds)} timed`);
     return told.join(" · ");
   }
 
   function outcome(sweep) {
     const told = Object.entries(sweep.statuses || {}).map(([status, n]) => state(status, `${count(n)} ${status}`));
-    if (sweep.other) told.push(element("span.state.mild", {}, element("span", { "aria-hidden": "true" }, "↻ "), `${count(sweep.other)} by other code`));
+    if (sweep.num_stale_runs) told.push(element("span.state.mild", {}, element("span", { "aria-hidden": "true" }, "↻ "), `${count(sweep.num_stale_runs)} by other code`));
     return told;
   }
 
   function made(sweep) {
-    return sweep.made.slice(0, 3).map(m => element("div", {},
+    return sweep.provenance.slice(0, 3).map(m => element("div", {},
       `${m.cpu || "unknown processor"}, ${many(m.cores || 0, "core")}${m.memory_gib ? `, ${m.memory_gib} GiB` : ""}`, element("br"),
       element("span.muted", {}, `code `, element("code", {}, commit(m.commit)),
-        `${m.machine_id ? ` · machine ${m.machine_id.slice(0, 6)}` : ""} · ${day(m.from) === day(m.to) ? day(m.to) : `${day(m.from)} to ${day(m.to)}`}`)));
+        `${m.machine_id ? ` · machine ${m.machine_id.slice(0, 6)}` : ""} · ${day(m.first_started_at) === day(m.last_started_at) ? day(m.last_started_at) : `${day(m.first_started_at)} to ${day(m.last_started_at)}`}`)));
   }
 
   function way(sweep, finding) {
@@ -40,7 +40,7 @@
     const some = sweep.findings, list = element("ul.findings");
     const line = finding => {
       const one = way(sweep, finding), run = finding.runs?.length > 1 && address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${finding.runs[0]}` });
-      return element("li", {}, finding.words.replace(/\|/g, " "), one && " ",
+      return element("li", {}, finding.text.replace(/\|/g, " "), one && " ",
         run && element("a", { href: run }, "the run"), run && ", ",
         one && element("a", { href: one }, finding.plot === "hard" ? "the map" : finding.plot ? "the plot" : finding.runs?.length > 1 ? "compare" : "show"));
     };
@@ -55,10 +55,10 @@
     const rows = sweep.failures.map(cause => {
       const who = some => some.slice(0, 4).map(([name, n]) => (n > 1 ? `${name} (${count(n)})` : name)).join(", ")
         + (some.length > 4 ? ` and ${some.length - 4} more` : "");
-      const link = cause.run && address("runs", { sweep: sweep.slug, status: cause.status, run: `${sweep.slug}/${cause.run}` });
+      const link = cause.run_id && address("runs", { sweep: sweep.slug, status: cause.status, run: `${sweep.slug}/${cause.run_id}` });
       return element("tr", {}, element("td.num", {}, count(cause.count)), element("td", {}, state(cause.status)),
-        element("td.reason", {}, cause.reason, cause.varied && element("span.muted", {}, " and the like"), link && " ", link && element("a", { href: link }, "show")),
-        element("td", {}, who(cause.solvers)), element("td", {}, who(cause.where)));
+        element("td.reason", {}, cause.reason, cause.has_varied_reasons && element("span.muted", {}, " and the like"), link && " ", link && element("a", { href: link }, "show")),
+        element("td", {}, who(cause.solvers)), element("td", {}, who(cause.scenes)));
     });
     const head = ["runs", "status", "cause", "solvers", "where"].map((words, k) => element(k ? "th" : "th.num", { scope: "col" }, words));
     return [element("h3", {}, "What did not succeed"), element("div.scroll", { tabIndex: 0, role: "region", "aria-label": "What did not succeed" },
@@ -68,8 +68,8 @@
   function pictures(sweep) {
     if (!sweep.pictures.length) return null;
     return element("div.pictures", {}, ...sweep.pictures.map(p => element("figure", {},
-      element("a", { href: link(sweep.up, p.path) }, element("img", { src: link(sweep.up, p.path), alt: `Picture: ${p.words}`, loading: "lazy", decoding: "async" })),
-      element("figcaption", {}, p.words))));
+      element("a", { href: link(sweep.relative_url, p.path) }, element("img", { src: link(sweep.relative_url, p.path), alt: `Picture: ${p.text}`, loading: "lazy", decoding: "async" })),
+      element("figcaption", {}, p.text))));
   }
 
   function card(sweep) {
@@ -89,10 +89,10 @@
     const runs = index.sweeps.reduce((sum, s) => sum + (s.runs || 0), 0);
     const failed = index.sweeps.reduce((sum, s) => sum + s.failures.reduce((n, f) => n + f.count, 0), 0);
     const line = [many(index.sweeps.length, "set of results", "sets of results"), runs && many(runs, "run"), failed && `${count(failed)} did not succeed`,
-      `written ${index.written.slice(0, 16).replace("T", " ")} UTC`].filter(Boolean).join(" · ");
+      `written ${index.written_at.slice(0, 16).replace("T", " ")} UTC`].filter(Boolean).join(" · ");
     put(content, element("div.page", {}, element("h1", {}, index.title), element("p.muted", {}, line),
       ...index.sweeps.map(card),
-      index.absent.length > 0 && element("p.muted", {}, `Not on this page yet: ${index.absent.join(", ")}. `, element("code", {}, "springbench report"), " takes them in.")));
+      index.unwritten_sweeps.length > 0 && element("p.muted", {}, `Not on this page yet: ${index.unwritten_sweeps.join(", ")}. `, element("code", {}, "springbench report"), " takes them in.")));
     return { update() {} };
   };
 })();

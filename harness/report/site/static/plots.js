@@ -28,14 +28,14 @@
       some.sort((a, b) => a.vertices - b.vertices);
       const column = name => some.map(row => row[name]);
       return {
-        label: some[0].label, what: some[0].scene, scene: some[0].scene, panel: some[0].scene, runs: column("key"), vertices: column("vertices"), size: column("size"), step: column("step"),
+        label: some[0].label, description: some[0].scene, scene: some[0].scene, panel: some[0].scene, runs: column("key"), vertices: column("vertices"), size: column("size"), step: column("step"),
         step_low: column("lower"), step_high: column("upper"), least: column("least"), warm: column("warm"), local: column("local"), global: column("global"),
         num_iterations: column("num_iterations"), residual: column("residual"), max_strain: some.map(row => row.max_strain === null ? null : 100 * row.max_strain),
-        older: some.map(row => row.by === "other code"),
+        stale: some.map(row => row.staleness === "stale"),
       };
     });
     const hover = [["vertices", "vertices"], ["step", "ms a step"], ["least", "least ms"], ["num_iterations", "iterations"], ["residual", "last residual"], ["max_strain", "largest strain, %"]];
-    return { ...OF_RUNS[id], filters: ["scene"], hover, items, marks: table.marks, references: Object.fromEntries(items.map(item => [item.label, own(table.references, item.label.split(",")[0])])) };
+    return { ...OF_RUNS[id], filters: ["scene"], hover, items, styles: table.styles, citations: Object.fromEntries(items.map(item => [item.label, own(table.citations, item.label.split(",")[0])])) };
   }
 
   const plotsOf = sweep => [...(sweep.runs ? Object.entries(OF_RUNS).map(([id, { title }]) => ({ id, title })) : []), ...sweep.plots];
@@ -61,9 +61,9 @@
         last = `${drawn}\n${sweep.slug}/${plot.id}`;
         const chart = await load(sweep, plot.id);
         title.textContent = chart.title;
-        const mixed = chart.items?.some(item => (Array.isArray(item.older) ? item.older.some(Boolean) : item.older));
+        const mixed = chart.items?.some(item => (Array.isArray(item.stale) ? item.stale.some(Boolean) : item.stale));
         note.textContent = [chart.note, mixed && "Hollow marks: measured by other code than the newest rows."].filter(Boolean).join(" ");
-        by.textContent = `${sweep.name}: ${springbench.madeBy(sweep.made)}.`;
+        by.textContent = `${sweep.name}: ${springbench.madeBy(sweep.provenance)}.`;
         top.hidden = sweeps.length < 2;
         top.replaceChildren(element("label.field", {}, element("span", {}, "Results"), element("select", { onchange: event => { location.hash = address("plots", { sweep: event.target.value }); } },
           ...sweeps.map(one => element("option", { value: one.slug, selected: one === sweep }, one.name)))));
@@ -88,7 +88,7 @@
       const one = (axes, name) => axes.find(a => a.column === name) || axes[0], x = one(chart.x, next.get("x")), y = one(chart.y, next.get("y"));
       const items = chart.items.filter(item => chart.filters.every(key => chosen[key] === "all" || item[key] === chosen[key]));
       const hidden = new Set((next.get("off") || "").split("~").filter(Boolean)), labels = [...new Set(items.map(item => item.label))];
-      const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper", gate: "Gate" };
+      const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper", benchmark: "Benchmark" };
       const plotBox = anew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one, plus and minus zoom, Home shows all.` }) : current.plotBox;
       const names = element("ul.legend", { "aria-label": "Solvers" }, ...springbench.chart.legend(labels, chart, items, hidden, off => change({ off: [...off].join("~") })));
       choice.replaceChildren(...chart.filters.filter(key => distinct(key).length > 1).map(key => pick(words[key] || key, key, distinct(key), chosen[key])),
@@ -130,7 +130,7 @@
 
   function csv(items, x, y) {
     const quote = v => (v === null || v === undefined ? "" : /[",]/.test(String(v)) ? `"${String(v).replaceAll('"', '""')}"` : v);
-    const lines = items.flatMap(item => item[x.column].map((value, k) => [item.label, item.what, value, item[y.column][k]].map(quote).join(",")));
+    const lines = items.flatMap(item => item[x.column].map((value, k) => [item.label, item.description, value, item[y.column][k]].map(quote).join(",")));
     return [["solver", "what", x.title, y.title].map(quote).join(","), ...lines].join("\n") + "\n";
   }
 })();

@@ -7,7 +7,7 @@
     const src = picture(row);
     return src ? element("img", { src, alt: "", loading: "lazy", decoding: "async", width: 64, height: 36 }) : element("span.noshot");
   };
-  const marked = row => (row.by ? element("span.code", { title: row.by === "other code" ? "made by other code than the newest run of its scene and solver" : "made by an earlier commit than the newest run" }, row.by) : "");
+  const marked = row => (row.staleness ? element("span.code", { title: row.staleness === "stale" ? "made by other code than the newest run of its scene and solver" : "made by an earlier commit than the newest run" }, row.staleness) : "");
   const DOUBT = "the process was interrupted while steps were timed: its least time is nearest to the truth";
   const doubt = row => (row.preempted ? element("span.doubt", { title: DOUBT }, " !") : "");
 
@@ -18,8 +18,8 @@
     { id: "sweep", width: "minmax(96px, 1fr)", spare: 5, title: "Results", show: row => row.sweep },
     { id: "scene", width: "minmax(120px, 2fr)", title: "Scene", show: row => row.scene },
     { id: "size", width: "58px", title: "Size", numeric: true, show: row => row.size || "–" },
-    { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", { title: row.cited }, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
-    { id: "status", width: "minmax(118px, 1fr)", title: "Status", show: row => element("span", {}, state(row.status), row.by && " ", marked(row)) },
+    { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", { title: row.citation }, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
+    { id: "status", width: "minmax(118px, 1fr)", title: "Status", show: row => element("span", {}, state(row.status), row.staleness && " ", marked(row)) },
     { id: "outcome", width: "minmax(116px, 1fr)", title: "Judged", show: row => (row.outcome ? state(row.outcome) : "–") },
     { id: "termination_reason", width: "92px", spare: 3, title: "Stopped by", meaning: "what ended the last step's iterations", show: row => words(row, "termination_reason") || "–" },
     { id: "num_iterations", width: "64px", spare: 6, title: "Iter.", meaning: "median iterations a step", numeric: true, show: row => number(row.num_iterations) },
@@ -30,7 +30,7 @@
     { id: "max_strain", width: "78px", spare: 1, title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.max_strain) },
     { id: "strain_p99", width: "78px", spare: 2, title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_p99) },
   ];
-  const FACETS = [["sweep", "Results"], ["scene", "Scene"], ["size", "Size"], ["solver", "Solver"], ["status", "Status"], ["outcome", "Judged"], ["termination_reason", "Stopped by"], ["by", "Code"]];
+  const FACETS = [["sweep", "Results"], ["scene", "Scene"], ["size", "Size"], ["solver", "Solver"], ["status", "Status"], ["outcome", "Judged"], ["termination_reason", "Stopped by"], ["staleness", "Code"]];
   const LIMITS = [["residual", "Residual at most"], ["step", "ms a step at most"], ["max_strain", "Strain at most (%)"]];
 
   const value = (row, key) => (key === "sweep" ? row.slug : String(row[key] ?? ""));
@@ -60,7 +60,7 @@
   }
 
   function csv(rows) {
-    const names = Object.keys(rows[0] || {}).filter(name => !["mark", "key", "slug", "cited"].includes(name));
+    const names = Object.keys(rows[0] || {}).filter(name => !["mark", "key", "slug", "citation"].includes(name));
     const cell = v => (v === null || v === undefined ? "" : /[",\n]/.test(String(v)) ? `"${String(v).replaceAll('"', '""')}"` : String(v));
     return [names.join(","), ...rows.map(row => names.map(name => cell(row[name])).join(","))].join("\n") + "\n";
   }
