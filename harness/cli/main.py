@@ -1,4 +1,4 @@
-"""Command line: `springbench run`, `speed`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect` and more.
+"""Command line: `springbench run`, `roofline`, `accuracy`, `recommend`, `list`, `query`, `schema`, `inspect` and more.
 
 Exit codes: 0 success, 1 a failed run or a performance regression, 2 a mistake of the user, 3 an inconclusive regression
 test, 130 stopped by Ctrl-C.
@@ -55,8 +55,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-ConfigArgument = Annotated[Path, typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON).")]
-RecordingsArgument = Annotated[list[Path], typer.Argument(help="Recordings (.rrd), or folders of them.")]
+ConfigArgument = Annotated[Path, typer.Argument(help="Sweep or scene (YAML), or scene of the assignment (JSON).")]
+RecordingsArgument = Annotated[list[Path], typer.Argument(help="Recordings (.rrd) or folders of them.")]
 
 
 def _print_version(requested: bool) -> None:
@@ -82,27 +82,27 @@ def run(
     config: ConfigArgument,
     results: ResultsOption = Path("results"),
     solver: Annotated[
-        list[str] | None, typer.Option(help="For a scene: solvers, the recommended one if left out; repeatable.")
+        list[str] | None, typer.Option(help="For a scene: solver; repeatable. The recommended one by default.")
     ] = None,
-    size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
+    size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh size; repeatable.")] = None,
     error_target: ErrorOption = None,
     t_end: EndTimeOption = None,
     verify: VerifyOption = False,
     compare: CompareOption = False,
     positions: Annotated[
-        Path | None, typer.Option(help="Store the positions after every step (float64, .npz) of one run.")
+        Path | None, typer.Option(help="File (.npz) for the positions of one run after each step, float64.")
     ] = None,
     rerun: RerunOption = False,
     rerun_stale: RerunStaleOption = False,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=1024, help="How many processes do runs; one is timed at a time.")
+        int | None, typer.Option(min=1, max=1024, help="Number of worker processes; one run is timed at a time.")
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option(help="Do runs by Dask: a scheduler's address, local:N, or a batch system's file.")
+        str | None, typer.Option(help="Run on Dask: address of a scheduler, local:N, or file of a batch system.")
     ] = None,
     in_process: InProcessOption = False,
 ) -> None:
-    """Run what is missing of a sweep, or of the one scene in a file."""
+    """Run the missing runs of a sweep, or of one scene."""
     from springbench.harness.config.config_loader import load_config
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.sweep_runner import run_sweep
@@ -183,7 +183,7 @@ def _report_sweep(sweep: SweepPlan, table: pa.Table, config: Path, results: Path
 
 @app.command()
 def accuracy(
-    config: Annotated[Path, typer.Argument(help="An accuracy config (YAML).")],
+    config: Annotated[Path, typer.Argument(help="Accuracy config (YAML).")],
     results: ResultsOption = Path("results"),
     rerun: RerunOption = False,
     rerun_stale: RerunStaleOption = False,
@@ -219,9 +219,9 @@ def accuracy(
 
 @app.command()
 def report(
-    results: Annotated[Path, typer.Argument(help="A folder of results, or that of one sweep.")] = Path("results"),
+    results: Annotated[Path, typer.Argument(help="Folder of results, or of one sweep.")] = Path("results"),
     viewer: Annotated[
-        bool, typer.Option("--viewer/--without-viewer", help="Put Rerun's viewer into the page, 19 MB.")
+        bool, typer.Option("--viewer/--no-viewer", help="Include the Rerun viewer in the page (19 MB).")
     ] = True,
 ) -> None:
     """Write the page of all results, `index.html`, and maps of solvers x cases.
@@ -263,16 +263,16 @@ app.command()(regress)
 
 @app.command()
 def query(
-    sql: Annotated[str, typer.Argument(help="A query over the tables `rows`, `accuracy`, `ablation`.")],
+    sql: Annotated[str, typer.Argument(help="Query over the tables `rows`, `accuracy` and `ablation`.")],
     results: RowsOption = Path("results"),
     csv: Annotated[bool, typer.Option("--csv", help="Print CSV.")] = False,
-    seconds: Annotated[float, typer.Option(help="Processor time that the answer may take.")] = 15.0,
+    cpu_limit: Annotated[float, typer.Option(help="Limit of CPU time [s].")] = 15.0,
 ) -> None:
     """Run an SQL query over the rows of all sweeps."""
     from springbench.harness.report.machine_footer import COMPARISON_NOTE
     from springbench.harness.report.sql_query import MAX_CSV_ROWS, MAX_SHOWN_ROWS, run_query
 
-    found = run_query(sql, results, max_rows=MAX_CSV_ROWS if csv else MAX_SHOWN_ROWS, cpu_seconds=seconds)
+    found = run_query(sql, results, max_rows=MAX_CSV_ROWS if csv else MAX_SHOWN_ROWS, cpu_seconds=cpu_limit)
     if found.is_truncated:
         more = "" if csv else "; --csv prints more"
         _say(f"only the first {len(found.values):,} rows of the answer are shown{more}")
@@ -294,9 +294,9 @@ def schema() -> None:
 @app.command()
 def inspect(
     recordings: RecordingsArgument,
-    frame: Annotated[int | None, typer.Option(help="The frame to export; the last one if left out.")] = None,
-    export: Annotated[Path | None, typer.Option(help="Write one frame's mesh to this file (.vtp, ...).")] = None,
-    csv: Annotated[Path | None, typer.Option(help="Write the scalars to this file.")] = None,
+    frame: Annotated[int | None, typer.Option(help="Frame to export; the last one by default.")] = None,
+    export: Annotated[Path | None, typer.Option(help="File for the mesh of one frame (.vtp, ...).")] = None,
+    csv: Annotated[Path | None, typer.Option(help="File for the scalars (CSV).")] = None,
 ) -> None:
     """Print the content of recordings without a viewer, or compare two of them."""
     from springbench.harness.report.recording_inspection import inspect_recordings as inspect_recordings

@@ -17,25 +17,28 @@ from typer.core import TyperGroup
 _RESULTS_SETTINGS: Any = {
     "parser": remote_storage.parse_location,
     "metavar": "PATH|URL",
-    "help": "The folder that holds a folder for each sweep.",
+    "help": "Folder with a subfolder for each sweep.",
 }
 ResultsOption = Annotated[Path, typer.Option(callback=remote_storage.sync_results, **_RESULTS_SETTINGS)]
 RowsOption = Annotated[Path, typer.Option(callback=remote_storage.fetch_rows, **_RESULTS_SETTINGS)]
-RerunOption = Annotated[bool, typer.Option("--rerun", help="Do all, also what is there.")]
+RerunOption = Annotated[bool, typer.Option("--rerun", help="Repeat completed runs.")]
 RerunStaleOption = Annotated[
-    bool, typer.Option("--rerun-stale", help="Do also what is there by other code than today's.")
+    bool,
+    typer.Option("--rerun-stale", help="Repeat completed runs whose results are stale: their source code has changed."),
 ]
 InProcessOption = Annotated[
-    bool, typer.Option("--in-process", help="Do all in this process, without limits, as a debugger wants it.")
+    bool, typer.Option("--in-process", help="Run in this process, without limits of time and memory, for debugging.")
 ]
 ErrorOption = Annotated[
     float | None,
-    typer.Option("--error", help="For a scene: its relative error at the end; solver and steps are chosen."),
+    typer.Option("--error", help="For a scene: relative error of the final positions; selects solver and steps."),
 ]
-EndTimeOption = Annotated[float | None, typer.Option(help="With --error: simulated seconds; all frames if left out.")]
-VerifyOption = Annotated[bool, typer.Option("--verify", help="With --error: let the reference grade it.")]
+EndTimeOption = Annotated[float | None, typer.Option(help="With --error: simulated time [s]; all frames by default.")]
+VerifyOption = Annotated[
+    bool, typer.Option("--verify", help="With --error: measure the error against the reference solution.")
+]
 CompareOption = Annotated[
-    bool, typer.Option("--compare", help="With --error: time other libraries' integrators beside it.")
+    bool, typer.Option("--compare", help="With --error: also time integrators of other libraries.")
 ]
 
 

@@ -90,7 +90,7 @@ def run_query(sql: str, results: Path, *, max_rows: int = MAX_SHOWN_ROWS, cpu_se
         InputError: if there are no rows, if the query exceeds a limit, or, with DuckDB's message, if it is invalid.
     """
     if not 0.0 < cpu_seconds <= 1e6:
-        raise InputError(InputMistake(f"came {cpu_seconds:g}; wanted a number of seconds above 0", key="--seconds"))
+        raise InputError(InputMistake(f"came {cpu_seconds:g}; wanted a number of seconds above 0", key="--cpu-limit"))
     folders = {table: row_store.find_row_folders(results, table, "*/") for table in _TABLE_SCHEMAS}
     every = list(chain(*folders.values()))
     files = sum(len(row_store.list_unit_files(folder)) for folder in every)
@@ -100,7 +100,7 @@ def run_query(sql: str, results: Path, *, max_rows: int = MAX_SHOWN_ROWS, cpu_se
     try:
         return sandbox.call_in_sandbox(_run_with_retries, sql, folders, max_rows, limits=limits)
     except sandbox.SandboxError as error:
-        raise InputError(f"query: {error}; ask for less, or give it more with --seconds") from None
+        raise InputError(f"query: {error}; request less, or raise --cpu-limit") from None
 
 
 def _run_with_retries(sql: str, folders: dict[str, list[Path]], max_rows: int) -> QueryResult:

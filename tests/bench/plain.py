@@ -27,7 +27,12 @@ def refuse_energy(bundles, shares, number, x, right, out):
 
 def energy(bundles, number, x, measure):
     """Half of each spring's k |v|^2, and what holds each vertex."""
-    own, neighbour, kinds, weights = bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights
+    own, neighbour, kinds, weights = (
+        bundles.row_offset,
+        bundles.neighbour_offset,
+        bundles.weight_offset,
+        bundles.weights,
+    )
     total = 0.0
     for lane in range(LANES):
         i = own[LANES * number + lane]

@@ -76,7 +76,11 @@ def recompiled(kernel: Any, plain: dict[str, Callable[..., Any]]) -> Any:
             names[name] = ModuleType(name)
             found = {key: part for key, part in plain.items() if hasattr(value, key)}
             vars(names[name]).update(vars(value) | {key: _compiled(part) for key, part in found.items()})
-        elif hasattr(value, "py_func") and value.__module__.startswith("springbench.solvers.") and _reaches(value, set(plain)):
+        elif (
+            hasattr(value, "py_func")
+            and value.__module__.startswith("springbench.solvers.")
+            and _reaches(value, set(plain))
+        ):
             names[name] = recompiled(value, plain)
     copy = FunctionType(function.__code__, function.__globals__ | names, function.__name__, function.__defaults__)
     return _compiled(copy)
@@ -167,7 +171,11 @@ def of_vbd() -> Iterator[Case]:
     """Over colours."""
     blocks, spaces, beside, right, _, work, p, _ = given(vbd_sweeps, "run_iterations", solving("vbd"))
     yield Case(
-        "sweep", vbd_sweeps._sweep_vertices, (blocks, spaces, beside, right, p, work), {"vbd_newton_step": plain.newton}, (4,)
+        "sweep",
+        vbd_sweeps._sweep_vertices,
+        (blocks, spaces, beside, right, p, work),
+        {"vbd_newton_step": plain.newton},
+        (4,),
     )
 
 
@@ -206,7 +214,10 @@ def of_rows() -> Iterator[Case]:
     """Over sparse rows, of Q and of the levels above it."""
     Q, b = system()
     cg, rows = ConjugateGradients(Q), {"sparse_row_product": plain.gather}
-    for what, name, found in (("product with Q", "multiply_sparse_and_dot", (4,)), ("smoothing, float32", "chebyshev_step", (7, 9))):
+    for what, name, found in (
+        ("product with Q", "multiply_sparse_and_dot", (4,)),
+        ("smoothing, float32", "chebyshev_step", (7, 9)),
+    ):
         arguments = given(multigrid_kernels, name, lambda: cg.solve(b, np.empty_like(b)))
         yield Case(what, getattr(multigrid_kernels, name), arguments, rows, found)
 
@@ -228,7 +239,13 @@ def of_eights() -> Iterator[Case]:
     space = collisions.allocate_collisions(len(pairs.vertices), made.thickness, made.reach)
     slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
     arguments = pairs, collisions.pad_positions(p), np.empty((9, 8)), slots, space
-    yield Case("closest points of pairs", collisions.gather_collisions, arguments, {"compute_packet_distances": plain.eight}, (2, 3))
+    yield Case(
+        "closest points of pairs",
+        collisions.gather_collisions,
+        arguments,
+        {"compute_packet_distances": plain.eight},
+        (2, 3),
+    )
 
 
 CASES = {

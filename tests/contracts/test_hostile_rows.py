@@ -26,7 +26,7 @@ from tests.contracts.hostile_rows import LEFT_OUT, SHOWN, rows_with, write_cases
 
 
 def reported(folder: Path) -> Outcome:
-    found = attempt(folder, ["report", "results", "--without-viewer"])
+    found = attempt(folder, ["report", "results", "--no-viewer"])
     assert not found.error, found.error
     assert "Traceback" not in found.said
     assert not found.outside

@@ -126,7 +126,7 @@ def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -
     folder.mkdir(parents=True)
     for unit in {row["run_id"] for row in kept}:
         parquet_rows.write_rows(folder / f"{unit}.parquet", [row for row in kept if row["run_id"] == unit])
-    done = CliRunner().invoke(app, ["report", str(tmp_path / "r"), "--without-viewer"])
+    done = CliRunner().invoke(app, ["report", str(tmp_path / "r"), "--no-viewer"])
     assert done.exit_code == 0, done.output
     said = " ".join(done.output.split())
     picture = tmp_path / "r" / "gpu" / "pictures" / "devices.png"

@@ -60,11 +60,11 @@ def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tm
     assert next(iter(table.columns[2].cells)) == "unsupported"
 
 
-@pytest.mark.parametrize("also", [["--pairs"], ["--solver", "newton"]], ids=" ".join)
+@pytest.mark.parametrize("also", [["--with-pairs"], ["--solver", "newton"]], ids=" ".join)
 def test_what_is_of_one_solver_is_refused(cloth: Path, also: list[str]):
     refused = CliRunner().invoke(app, ["ablate", str(cloth), "--all-solvers", *also])
     assert refused.exit_code == 2
-    assert "neither --solver nor --pairs" in refused.output
+    assert "cannot be combined with --solver or --with-pairs" in refused.output
 
 
 def test_what_has_no_effect_beside_the_plain_ones_has_no_price(cloth: Path):

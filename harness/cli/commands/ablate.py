@@ -24,15 +24,16 @@ DEFAULT_NUM_ROUNDS = 5
 
 def ablate(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
+    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
     results: ResultsOption = Path("results"),
     solver: Annotated[
-        str | None, typer.Option(help=f"{DEFAULT_ABLATION_SOLVER}, to {DEFAULT_ABLATION_TOLERANCE:g}, if left out.")
+        str | None,
+        typer.Option(help=f"Solver; {DEFAULT_ABLATION_SOLVER} to {DEFAULT_ABLATION_TOLERANCE:g} by default."),
     ] = None,
-    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
-    pairs: Annotated[bool, typer.Option("--pairs", help="Leave out each pair of effects too.")] = False,
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
+    with_pairs: Annotated[bool, typer.Option("--with-pairs", help="Also omit each pair of effects.")] = False,
     all_solvers: Annotated[
-        bool, typer.Option("--all-solvers", help="What each effect alone adds to an iteration, by every solver.")
+        bool, typer.Option("--all-solvers", help="Measure the overhead of each effect per iteration, for all solvers.")
     ] = False,
     rerun: RerunOption = False,
     rerun_stale: RerunStaleOption = False,
@@ -48,7 +49,7 @@ def ablate(
     from springbench.harness.results.folder_ownership import claim_folder
 
     if all_solvers:
-        _measure_overheads(context, scene, results, solver, size, pairs, rerun, rerun_stale, in_process)
+        _measure_overheads(context, scene, results, solver, size, with_pairs, rerun, rerun_stale, in_process)
         return
     usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1} | ({} if solver else {"tolerance": DEFAULT_ABLATION_TOLERANCE})
     sweep = load_config(
@@ -60,7 +61,7 @@ def ablate(
         folder,
         create_display(get_error_console()),
         print_message,
-        with_pairs=pairs,
+        with_pairs=with_pairs,
         rerun=rerun,
         rerun_stale=rerun_stale,
         isolated=not in_process,
@@ -84,7 +85,7 @@ def _measure_overheads(
     results: Path,
     solver: str | None,
     size: int | None,
-    pairs: bool,
+    with_pairs: bool,
     rerun: bool,
     rerun_stale: bool,
     in_process: bool,
@@ -99,8 +100,8 @@ def _measure_overheads(
     from springbench.harness.results.folder_ownership import claim_folder
     from springbench.solvers.registry import SOLVERS, load_target
 
-    if solver is not None or pairs:
-        raise InputError("--all-solvers: takes neither --solver nor --pairs; leave them out, or do without it")
+    if solver is not None or with_pairs:
+        raise InputError("--all-solvers: cannot be combined with --solver or --with-pairs; omit them")
     minimising = [name for name, target in SOLVERS.items() if load_target(target).is_minimiser]
     usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1, "tolerance": DEFAULT_OVERHEAD_TOLERANCE}
     sweep = load_config(scene, solvers=minimising, sizes=[size] if size else [], **usual | context.obj)

@@ -20,7 +20,7 @@ ResultsFolder = Annotated[Path, typer.Argument(callback=remote_storage.sync_resu
 
 def compact(
     results: ResultsFolder,
-    days: Annotated[float, typer.Option(help="Pack what was written so many days ago or more; 0 is all.")] = 0.0,
+    min_age_days: Annotated[float, typer.Option(help="Minimum age of packed rows [days]; 0 packs all.")] = 0.0,
 ) -> None:
     """Pack the rows of many runs into one file.
 
@@ -28,14 +28,16 @@ def compact(
     """
     from springbench.harness.experiments.archive.compaction import compact_results as pack
 
-    if not 0.0 <= days < 1e6:
-        raise InputError(InputMistake(f"came {days:g}; wanted a number of days, 0 or more", key="--days"))
-    pack(results, print_message, min_age_days=days)
+    if not 0.0 <= min_age_days < 1e6:
+        raise InputError(
+            InputMistake(f"came {min_age_days:g}; wanted a number of days, 0 or more", key="--min-age-days")
+        )
+    pack(results, print_message, min_age_days=min_age_days)
 
 
 def merge(
-    sources: Annotated[list[Path], typer.Argument(help="Folders of results, or those of sweeps.")],
-    into: Annotated[Path, typer.Option("-o", "--into", help="The folder that has all of them afterwards.")],
+    sources: Annotated[list[Path], typer.Argument(help="Folders of results or of sweeps.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the merged results.")],
 ) -> None:
     """Merge folders of results.
 
@@ -43,7 +45,7 @@ def merge(
     """
     from springbench.harness.experiments.archive.result_merge import merge_results as bring_together
 
-    found = bring_together(sources, into, print_message)
+    found = bring_together(sources, output, print_message)
     print_message(f"{found.num_written} units of rows written, {found.num_existing} were there")
     for line in found.conflicts:
         print_message(f"conflict, on one machine and by one code: {line} positions differ")
@@ -56,8 +58,8 @@ def merge(
 
 def publish(
     results: ResultsFolder,
-    output: Annotated[Path, typer.Option("-o", "--output", help="The archive to write (.zip).")],
-    license: Annotated[str, typer.Option(help="What others may do with it: a name or a URL.")] = "",
+    output: Annotated[Path, typer.Option("-o", "--output", help="Archive to write (.zip).")],
+    license: Annotated[str, typer.Option(help="License: a name or a URL.")] = "",
 ) -> None:
     """Write results, their configs and checksums to one archive.
 
@@ -70,10 +72,11 @@ def publish(
 
 
 def verify_archive(
-    archive: Annotated[Path, typer.Argument(help="What `springbench publish` wrote (.zip).")],
-    seed: Annotated[int | None, typer.Option(help="Chooses the runs; another each time if left out.")] = None,
-    own_code: Annotated[
-        bool, typer.Option("--own-code", help="Do also runs that need code from the archive: read it first.")
+    archive: Annotated[Path, typer.Argument(help="Archive of `springbench publish` (.zip).")],
+    seed: Annotated[int | None, typer.Option(help="Seed that selects the runs; random by default.")] = None,
+    with_user_code: Annotated[
+        bool,
+        typer.Option("--with-user-code", help="Also repeat runs that execute code from the archive; review it first."),
     ] = False,
 ) -> None:
     """Verify the checksums of an archive, and repeat a random tenth of its runs.
@@ -94,7 +97,7 @@ def verify_archive(
             print_message(f"{archive} is not what was published; nothing of it was run")
             raise typer.Exit(1)
         print_message("all checksums hold")
-        found, claims = checks.load_published_runs(folder, print_message, with_user_code=own_code)
+        found, claims = checks.load_published_runs(folder, print_message, with_user_code=with_user_code)
         runs = checks.select_runnable(found, print_message)
         chance = randbelow(10**6) if seed is None else seed
         taken = checks.sample_runs(runs, chance)

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 
 def export_script(
-    config: Annotated[Path, typer.Argument(help="An accuracy config (YAML).")],
-    point: Annotated[str, typer.Argument(help="A point's name, or its last letters; all are listed if left out.")] = "",
-    output: Annotated[Path, typer.Option("-o", "--output", help="The folder for the script and its data.")] = Path(),
+    config: Annotated[Path, typer.Argument(help="Accuracy config (YAML).")],
+    point: Annotated[str, typer.Argument(help="Name of a point, or its last characters; lists all by default.")] = "",
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the script and its data.")] = Path(),
 ) -> None:
     """Export a script that repeats one simulation with an external engine alone."""
     from springbench.harness.config.accuracy_loader import load_accuracy

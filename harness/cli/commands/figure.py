@@ -11,20 +11,22 @@ from springbench.harness.errors import InputError, InputMistake
 
 
 def figure(
-    kind: Annotated[str, typer.Argument(help="What to draw: convergence, times, timing, hard, run and others.")],
-    results: Annotated[Path, typer.Argument(help="The results of a config, such as results/accuracy.")],
-    width: Annotated[str, typer.Option(help="The figure's width: 85mm, 8.5cm, 3.35in, 241pt.")] = "85mm",
-    formats: Annotated[str, typer.Option("--format", help="Any of pdf, svg, png.")] = "pdf,svg,png",
+    kind: Annotated[str, typer.Argument(help="Kind: convergence, times, timing, hard, run and others.")],
+    results: Annotated[Path, typer.Argument(help="Results of a config, such as results/accuracy.")],
+    width: Annotated[str, typer.Option(help="Width of the figure: 85mm, 8.5cm, 3.35in, 241pt.")] = "85mm",
+    formats: Annotated[str, typer.Option("--format", help="Formats: any of pdf, svg, png.")] = "pdf,svg,png",
     size: Annotated[
-        float, typer.Option("--font-size", help="Points; ticks have one less, and never less than 6.")
+        float, typer.Option("--font-size", help="Font size [pt]; ticks are one point smaller, at least 6.")
     ] = 8.0,
-    panels: Annotated[str, typer.Option(help="Parts of panels' names: gap:time, or two by a comma.")] = "",
+    panels: Annotated[
+        str, typer.Option(help="Panels by parts of their names: gap:time, or two separated by a comma.")
+    ] = "",
     without_title: Annotated[
-        bool, typer.Option("--without-title", help="Leave title and origin to the caption; the files keep them.")
+        bool, typer.Option("--no-title", help="Omit title and provenance from the figure; the files contain them.")
     ] = False,
     transparent: Annotated[bool, typer.Option("--transparent", help="Draw no background.")] = False,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="The folder; RESULTS/figures if left out.")
+        Path | None, typer.Option("-o", "--output", help="Output folder; RESULTS/figures by default.")
     ] = None,
 ) -> None:
     """Draw a figure for print, with its data as CSV and a script."""

@@ -19,8 +19,8 @@ _SOLVER, _TOLERANCE = "hybrid", "1e-4"
 
 
 def gallery(
-    scenes: Annotated[list[Path], typer.Argument(help="Scenes (YAML), in the order of the sheet.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The picture to write (.png).")] = Path("scenes.png"),
+    scenes: Annotated[list[Path], typer.Argument(help="Scenes (YAML) in the order of the sheet.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write (.png).")] = Path("scenes.png"),
 ) -> None:
     """Draw a sheet of scenes, each at its default size and last frame."""
     from springbench.harness.report.gallery_sheet import draw_gallery_sheet

@@ -25,7 +25,7 @@ _FIXED_COLUMNS = ("iterations", "frames", "threads")
 def list_command(
     config: Annotated[
         Path | None,
-        typer.Argument(help="A sweep or a scene (YAML), or an assignment's scene (JSON); all names if left out."),
+        typer.Argument(help="Sweep or scene (YAML), or scene of the assignment (JSON); lists names by default."),
     ] = None,
     results: ResultsOption = Path("results"),
 ) -> None:

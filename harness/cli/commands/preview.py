@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 def preview(
-    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
-    size: Annotated[int | None, typer.Option(help="The mesh's size; the scene's default size if left out.")] = None,
+    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="The picture to write (.png); SCENE.png here if left out.")
+        Path | None, typer.Option("-o", "--output", help="Picture to write (.png); SCENE.png by default.")
     ] = None,
 ) -> None:
     """Draw a scene at its start, and list selected vertices and possible selectors."""

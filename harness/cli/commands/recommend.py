@@ -11,18 +11,18 @@ from springbench.harness.console import get_error_console, get_output_console, p
 
 
 def recommend(
-    scene: Annotated[Path, typer.Argument(help="A scene (YAML), or an assignment's scene (JSON).")],
-    error: Annotated[float, typer.Option(help="The error wanted, relative to the displacement from the start.")],
-    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default if left out.")] = None,
+    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
+    error: Annotated[float, typer.Option(help="Target error, relative to the displacement from the start.")],
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
     t_end: Annotated[
         float | None,
         typer.Option(
-            help="After how many simulated seconds the error counts; if left out 1, or less where the motion cannot be "
+            help="Simulated time [s] at which the error is measured; 1 by default, or less if the motion cannot be "
             "predicted for so long."
         ),
     ] = None,
-    time_limit: Annotated[float, typer.Option(help="Wall seconds that a simulation may take.")] = 5.0,
-    budget: Annotated[float, typer.Option(help="Wall seconds that all simulations together may take.")] = 60.0,
+    time_limit: Annotated[float, typer.Option(help="Limit of a simulation's wall time [s].")] = 5.0,
+    budget: Annotated[float, typer.Option(help="Limit of the wall time of all simulations [s].")] = 60.0,
     results: ResultsOption = Path("results"),
 ) -> None:
     """Find and check the cheapest integrator, time step, tolerance and solver for an error."""

@@ -13,9 +13,9 @@ from springbench.harness.errors import InputError, InputMistake
 
 
 def roofline(
-    config: Annotated[Path, typer.Argument(help="A sweep (YAML).")],
+    config: Annotated[Path, typer.Argument(help="Sweep (YAML).")],
     results: ResultsOption = Path("results"),
-    budget: Annotated[float, typer.Option(help="Seconds that a candidate may take at a size.")] = 210.0,
+    budget: Annotated[float, typer.Option(help="Time budget of a candidate at one size [s].")] = 210.0,
     rerun: RerunOption = False,
     rerun_stale: RerunStaleOption = False,
     in_process: InProcessOption = False,

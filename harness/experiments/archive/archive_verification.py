@@ -269,7 +269,7 @@ def load_published_runs(
             )
         safe = [one for one in repeated if with_user_code or not one.run.find_plugins()]
         if left := len(repeated) - len(safe):
-            print_message(f"{sweep.name}: {left} runs need code from the archive: read it, then give --own-code")
+            print_message(f"{sweep.name}: {left} runs need code from the archive: read it, then give --with-user-code")
         runs += safe
     return runs, claims
 

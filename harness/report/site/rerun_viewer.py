@@ -188,9 +188,7 @@ def _fetch_with_retries(url: str) -> bytes:
                 return answer.read()
         except (urllib.error.URLError, ConnectionError) as error:
             if time.monotonic() > until:
-                raise RunFailed(
-                    f"the viewer does not answer at {url}: {error}; --without-viewer leaves it out"
-                ) from None
+                raise RunFailed(f"the viewer does not answer at {url}: {error}; --no-viewer omits it") from None
             time.sleep(0.05)
 
 
