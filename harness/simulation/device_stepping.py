@@ -55,7 +55,7 @@ class ReplayingDeviceSolver(DelegatingSolver):
         one: Any = (
             self._prepared.select_solver(problem) if isinstance(self._prepared, AlternatingSolver) else self._prepared
         )
-        found, marks = one.replay(problem, next(self._left))
+        found, marks = one.replay_iterations(problem, next(self._left))
         for name, value in compute_event_seconds(marks).items():
             self._told[name] = self._told.get(name, 0.0) + value
         return found

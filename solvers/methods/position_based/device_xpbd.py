@@ -149,7 +149,7 @@ class PreparedDeviceXpbd(DeviceSolver):
     description: str
 
     stats: dict[str, float] = field(default_factory=dict[str, float])
-    own: ClassVar[bool] = False
+    is_substepping: ClassVar[bool] = False
 
     def upload_problem(self, problem: StepProblem, initial_guess: Positions) -> DeviceStep:
         """Upload a step problem; the initial guess is not used."""
@@ -159,7 +159,7 @@ class PreparedDeviceXpbd(DeviceSolver):
             up(problem.external_force),
             upload_pin_targets(problem, self.stream),
         )
-        here = (up(start.positions), up(start.velocity)) if self.own else (target, target)
+        here = (up(start.positions), up(start.velocity)) if self.is_substepping else (target, target)
         return DeviceStep(target, force, target, pins, target, target, *here, (start.time, start.stage_time))
 
     def allocate_state(self) -> DeviceSolverState:
