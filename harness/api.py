@@ -117,8 +117,8 @@ class Simulation:
         *,
         size: int | None = None,
         integrator: IntegratorName | UserCodeName = "implicit-euler",
-        max_iterations: int = DEFAULT_STOP_RULE["iterations"],
-        rtol: float | None = DEFAULT_STOP_RULE["tolerance"],
+        max_iterations: int = DEFAULT_STOP_RULE["max_iterations"],
+        rtol: float | None = DEFAULT_STOP_RULE["rtol"],
         initial_guess: InitialGuess | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:

@@ -182,7 +182,11 @@ class ProgressCounter(SilentDisplay):
 def _build_runs(folder: Path, part: int) -> list[RunSpec]:
     """The runs of a config, of which several make the sweep: none may ask for more than `MOST`."""
     each = MAX_CONFIG_RUNS // len(SOLVER_NAMES) // len(MESH_SIZES)
-    options = {"iterations": list(range(1 + each * part, 1 + each * (part + 1))), "rounds": 1, "frames": FRAME_COUNT}
+    options = {
+        "max_iterations": list(range(1 + each * part, 1 + each * (part + 1))),
+        "rounds": 1,
+        "frames": FRAME_COUNT,
+    }
     options |= {"record": False, "pictures": False}
     asked = {"scenes": ["scene.yaml"], "sizes": list(MESH_SIZES), "solvers": list(SOLVER_NAMES), "options": options}
     (folder / "sweep.yaml").write_text(json.dumps(asked))

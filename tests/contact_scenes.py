@@ -63,7 +63,7 @@ def collect_steps(
     scene: Scene, frames: int, *, solver: Solver | None = None, stop: StopRule = DESCENT_STOP
 ) -> list[SimulationStep]:
     return list(
-        simulate_scene(scene, prepare(scene, solver or NewtonSolver()), stop, initial_guess="current", frames=frames)
+        simulate_scene(scene, prepare(scene, solver or NewtonSolver()), stop, initial_guess="previous", frames=frames)
     )
 
 

@@ -83,7 +83,7 @@ def build_moving_problem(scene: Scene, integrator: str = "implicit-euler") -> St
         integrators.Motion(stretch * rest + 0.01 * rng.normal(size=rest.shape), 0.3 * rng.normal(size=rest.shape))
         for stretch in (1.05, 1.04)
     )
-    return build_problem(with_integrator(scene, integrator), MotionState(now, before, 3), "current")
+    return build_problem(with_integrator(scene, integrator), MotionState(now, before, 3), "previous")
 
 
 def with_integrator(scene: Scene, name: str) -> Scene:
@@ -100,7 +100,7 @@ def compute_rest_shape(
     stated = build_problem(
         long,
         MotionState(integrators.Motion(scene.mesh.rest_positions, np.zeros_like(scene.mesh.rest_positions)), None, 0),
-        "current",
+        "previous",
     )
     solution = (solver or NewtonSolver()).prepare(long.system).solve(stated, StopRule(iterations, rtol))
     assert solution.termination_reason != "max-iter", "the static solve has not converged"

@@ -58,7 +58,7 @@ default_size: 4
 effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
 """
 SWEEP_TEMPLATE = "scenes: [scene.yaml]\nsolvers: [mine, sparse]\noptions: {%s}\n"
-SWEEP_OPTIONS = "rounds: 1, iterations: 5, record: false, pictures: false"
+SWEEP_OPTIONS = "rounds: 1, max_iterations: 5, record: false, pictures: false"
 
 _MODULE_NUMBERS = count()
 

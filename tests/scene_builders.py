@@ -107,13 +107,13 @@ def _build_pins(part: str, weight: float | str) -> PinsEffect:
     return PinsEffect.model_validate({"at": [part], "weight": weight})
 
 
-def build_first_problem(scene: Scene, initial_guess: str = "current") -> StepProblem:
+def build_first_problem(scene: Scene, initial_guess: str = "previous") -> StepProblem:
     """The problem of a scene's first step."""
     return build_problem(scene, build_initial_state(scene), initial_guess)
 
 
 def simulate_trajectory(
-    scene: Scene, solver: Solver, frames: int, *, initial_guess: str = "current", iterations: int = 50
+    scene: Scene, solver: Solver, frames: int, *, initial_guess: str = "previous", iterations: int = 50
 ):
     """The positions (frames, n, 3) [m] after each step."""
     steps = simulate_scene(

@@ -90,7 +90,7 @@ def build_curve_rows(
     snapshot: str,
     solver: str,
     *,
-    initial_guess: str = "current",
+    initial_guess: str = "previous",
     minimum_index: int = 0,
     **more: Any,
 ) -> Iterator[dict[str, Any]]:
@@ -101,7 +101,7 @@ def build_curve_rows(
     )
     row |= {"frame": 7, "initial_guess": initial_guess, **more}
     yield row | {"kind": "prepare", "seconds": [method["setup"] * size**2] * 3, "cold_seconds": 1.0}
-    start = {"current": 1.0, "inertial": 0.2}[initial_guess]
+    start = {"previous": 1.0, "inertial": 0.2}[initial_guess]
     floor = 0.1 * minimum_index / ENERGY_DROP
     for k, gap in zip(RECORDED_ITERATIONS, compute_gaps(method["rate"], RECORDED_ITERATIONS, start), strict=True):
         g, stamp = LOWEST_ENERGY + ENERGY_DROP * (gap + floor), method["cost"] * size**2 * k
@@ -129,7 +129,7 @@ def build_failure_row(scene: str, size: int, snapshot: str, solver: str, status:
     row = build_shared_columns(
         scene, size, solver=solver, parameters="{}", problem_digest=f"{scene}-{size}-{snapshot}", snapshot=snapshot
     )
-    return row | {"kind": "curve", "initial_guess": "current", "status": status, "reason": reason}
+    return row | {"kind": "curve", "initial_guess": "previous", "status": status, "reason": reason}
 
 
 INTEGRATOR_ORDERS = {"implicit-euler": (1, 8.0), "bdf2": (2, 20.0), "midpoint": (2, 6.0)}
@@ -176,13 +176,13 @@ def build_full_rows() -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for scene, sizes in (("net", (10, 24, 48)), ("curtain", (21,)), ("block", (8,))):
         for size in sizes:
-            for moment in ("early", "middle", "violent"):
-                doubtful = scene == "block" and moment == "violent"
+            for moment in ("early", "middle", "peak"):
+                doubtful = scene == "block" and moment == "peak"
                 rows += build_snapshot_rows(
                     scene, size, moment, certified=not doubtful, minima_count=1 + (scene == "curtain")
                 )
                 for solver in SYNTHETIC_METHODS:
-                    for guess in ("current", "inertial"):
+                    for guess in ("previous", "inertial"):
                         branch = int(scene == "curtain" and solver == "newton" and guess == "inertial")
                         rows += build_curve_rows(scene, size, moment, solver, initial_guess=guess, minimum_index=branch)
                 if scene == "block":

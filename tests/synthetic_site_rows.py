@@ -33,7 +33,7 @@ def build_run_columns(number: int) -> dict[str, Any]:
     return {
         "run_id": f"{number:012x}", FILE_COLUMN: label, "sweep": "made", "scene": scene, "size": size, "solver": solver,
         "parameters": "{}", "vertices": size * size, "springs": 4 * size * size, "time_step": step,
-        "integrator": "implicit-euler", "initial_guess": "current", "max_iterations": 50, "threads": 1,
+        "integrator": "implicit-euler", "initial_guess": "previous", "max_iterations": 50, "threads": 1,
         "source_fingerprint": "old" if number == 1 else "new", "status": "ok",
         "started_at": f"2026-11-{1 + number % 20:02d}T10:00:00+00:00", **_MACHINE_COLUMNS,
         **read_solver_metadata(solver),

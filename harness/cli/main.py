@@ -246,7 +246,7 @@ def report(
     _say(f"the page is {page}; a browser opens it, and needs no network for it")
 
 
-app.command(cls=build_command_class("frames", "iterations", "tolerance", "rounds"))(ablate)
+app.command(cls=build_command_class("frames", "max_iterations", "rtol", "rounds"))(ablate)
 app.command("list")(list_command)
 app.command()(roofline)
 app.command()(recommend)

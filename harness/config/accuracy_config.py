@@ -19,12 +19,12 @@ from springbench.harness.scenes.scene_spec import FrameCount, InitialGuess, Inte
 from springbench.harness.schema.base_model import ConfigModel, OneOrMany
 from springbench.solvers.plugins.plugin_discovery import PluginName, identify_code, select_plugins
 
-SnapshotName = Literal["early", "middle", "violent"] | FrameCount
+SnapshotName = Literal["early", "middle", "peak"] | FrameCount
 """A snapshot of the scene that is found from its own run, or the number of a frame."""
 
 
 def format_snapshot(moment: str | int) -> str:
-    """Format a snapshot for rows: early, middle, violent or frame-k."""
+    """Format a snapshot for rows: early, middle, peak or frame-k."""
     return f"frame-{moment}" if isinstance(moment, int) else moment
 
 
@@ -47,11 +47,13 @@ class AccuracyStudyConfig(build_list_model("integrator", "time_step"), build_sin
 
 
 class CurveStudyConfig(
-    AccuracyStudyConfig, build_list_model(first_guess=("current", "inertial")), build_single_model(iterations=2000)
+    AccuracyStudyConfig,
+    build_list_model(initial_guess=("previous", "inertial")),
+    build_single_model(max_iterations=2000),
 ):
     """Convergence of minimising solvers on step snapshots; a curve ends at convergence."""
 
-    moment: OneOrMany[SnapshotName] = ("early", "middle", "violent")
+    snapshot: OneOrMany[SnapshotName] = ("early", "middle", "peak")
     """Steps to take snapshots of: moments found from the scene's run, or numbers of frames."""
     recordings: bool = False
     """Whether the solve from the first initial guess is recorded, to view its iterates on the mesh."""
@@ -60,7 +62,7 @@ class CurveStudyConfig(
 class WorkStudyConfig(AccuracyStudyConfig, build_list_model(*STEP_OPTIONS)):
     """Error and wall time of whole trajectories."""
 
-    horizon: Annotated[float, Field(gt=0, le=1e4)] = 1.0
+    t_end: Annotated[float, Field(gt=0, le=1e4)] = 1.0
     """Simulated time [s]; a multiple of every time step."""
 
 
@@ -119,10 +121,10 @@ class CurveSpec:
     """Specification of the curves of one solver on one step snapshot."""
 
     case: BenchmarkCase
-    moment: str | int
+    snapshot: str | int
     solver: SolverSpec
     initial_guesses: tuple[InitialGuess, ...]
-    iterations: int
+    max_iterations: int
     recordings: bool
     measurement: MeasurementSettings
 
@@ -131,7 +133,7 @@ class CurveSpec:
         return [
             "curve",
             *self.case.build_identity(),
-            self.moment,
+            self.snapshot,
             identify_code(self.solver.name),
             dict(self.solver.parameters),
         ]
@@ -142,7 +144,7 @@ class CurveSpec:
 
     def compute_unit_id(self, machine: str) -> str:
         """Compute 12 hex digits from everything that determines result and timing."""
-        how = [asdict(self.measurement), self.initial_guesses, self.iterations, self.recordings]
+        how = [asdict(self.measurement), self.initial_guesses, self.max_iterations, self.recordings]
         return _compute_hash([machine, self.describe_point(), how])
 
     def build_file_stem(self) -> str:
@@ -151,12 +153,14 @@ class CurveSpec:
         It is the same for other measurement settings, so that a new measurement replaces the file.
         """
         solver = sanitise_name(self.solver.name)
-        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{solver}-{_compute_hash(self.describe_point())}"
+        return (
+            f"{self.case.scene_name}-{self.case.size}-{self.snapshot}-{solver}-{_compute_hash(self.describe_point())}"
+        )
 
     def build_problem_stem(self) -> str:
         """Build the stem of the file of the step itself."""
-        problem = [*self.case.build_identity(), self.moment]
-        return f"{self.case.scene_name}-{self.case.size}-{self.moment}-{_compute_hash(problem)}"
+        problem = [*self.case.build_identity(), self.snapshot]
+        return f"{self.case.scene_name}-{self.case.size}-{self.snapshot}-{_compute_hash(problem)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +171,7 @@ class WorkSpec:
     """
 
     case: BenchmarkCase
-    horizon: float
+    t_end: float
     solver: SolverSpec
     options: Mapping[str, Any]
     measurement: MeasurementSettings
@@ -176,7 +180,7 @@ class WorkSpec:
         """Describe what is measured as plain data, without the measurement settings."""
         stop = [*self.options.values(), self.measurement.threads]
         solver = [identify_code(self.solver.name), dict(self.solver.parameters)]
-        return ["work", *self.case.build_identity(), self.horizon, *solver, *stop]
+        return ["work", *self.case.build_identity(), self.t_end, *solver, *stop]
 
     def find_plugins(self) -> list[PluginName]:
         """Find the user code that is measured: that of the case, and the solver."""

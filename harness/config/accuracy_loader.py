@@ -139,30 +139,30 @@ class _StudyExpansion:
     def expand_curves(self, study: CurveStudyConfig, at: ConfigKey) -> Iterator[CurveSpec]:
         """Expand a study into one curve for each problem and minimising solver."""
         how = MeasurementSettings(study.threads, study.rounds, study.time_limit)
-        if "coarse" in study.first_guess:
+        if "coarse-to-fine" in study.initial_guess:
             problem = "a curve's clock begins at its first guess, and this one is a solve itself; compare it in a sweep"
-            self.document.add_mistake(f"coarse: {problem}", (*at, "first_guess"))
+            self.document.add_mistake(f"coarse-to-fine: {problem}", (*at, "initial_guess"))
         solvers = [solver for solver in self._select_solvers(study, at) if solver.is_minimiser]
-        for case, moment, solver in product(self._expand_cases(study, at), study.moment, solvers):
+        for case, moment, solver in product(self._expand_cases(study, at), study.snapshot, solvers):
             if isinstance(moment, int) and moment > case.scene.frames:
                 problem = f"frame {moment} is not among the {case.scene.frames} frames of {case.scene_name}"
-                self.document.add_mistake(problem, (*at, "moment"))
+                self.document.add_mistake(problem, (*at, "snapshot"))
             recordings = study.recordings
-            yield CurveSpec(case, moment, solver, study.first_guess, study.iterations, recordings, how)
+            yield CurveSpec(case, moment, solver, study.initial_guess, study.max_iterations, recordings, how)
 
     def expand_work(self, study: WorkStudyConfig, at: ConfigKey) -> Iterator[WorkSpec]:
         how = MeasurementSettings(study.threads, study.rounds, study.time_limit)
         for case in self._expand_cases(study, at):
             dt = case.scene.time_step
-            steps = study.horizon / dt
+            steps = study.t_end / dt
             if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:  # round-off of the quotient, and no more
-                problem = f"{study.horizon:g} s is no multiple of the time step {dt:.6g} s of {case.scene_name}"
-                self.document.add_mistake(problem, (*at, "horizon"))
+                problem = f"{study.t_end:g} s is no multiple of the time step {dt:.6g} s of {case.scene_name}"
+                self.document.add_mistake(problem, (*at, "t_end"))
             lists = [getattr(study, name) for name in STEP_OPTIONS]
             for solver, values in product(self._select_solvers(study, at), product(*lists)):
                 options = dict(zip(STEP_OPTIONS, values, strict=True))
-                options["first_guess"] = options["first_guess"] or case.scene.choose_initial_guess(case.integrator)
-                yield WorkSpec(case, study.horizon, solver, options, how)
+                options["initial_guess"] = options["initial_guess"] or case.scene.choose_initial_guess(case.integrator)
+                yield WorkSpec(case, study.t_end, solver, options, how)
 
     def _expand_cases(self, study: AccuracyStudyConfig, at: ConfigKey) -> list[BenchmarkCase]:
         found: list[BenchmarkCase] = []

@@ -122,7 +122,7 @@ def _load_any(
     if not assignment and "mesh" not in document.data:
         raise InputError(InputMistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
     scene = convert_assignment_scene(path) if assignment else build_scene_from_document(document)
-    if not assignment and not {*DEFAULT_STOP_RULE, "accuracy"} & options.keys():
+    if not assignment and not {*DEFAULT_STOP_RULE, "error_target"} & options.keys():
         asked = DEFAULT_STOP_RULE | asked
     usual = ASSIGNMENT_SOLVER if assignment else DEFAULT_SOLVER
     keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [usual]}
@@ -218,7 +218,7 @@ def convert_assignment_scene(path: Path) -> SceneSpec:
         time_step=ASSIGNMENT_TIME_STEP,
         frames=ASSIGNMENT_FRAMES,
         effects=tuple(load_target(effect_table.EFFECT_CLASSES[effect["kind"]])(**effect) for effect in effects),
-        first_guess="assignment",
+        initial_guess="assignment",
         path=path,
     )
 
@@ -243,7 +243,7 @@ def build_scene_from_document(document: ConfigDocument) -> SceneSpec:
     return SceneSpec(
         **vars(fields) | parts,
         path=document.path,
-        own=own,
+        plugins=own,
         key_lines={format_key(key): line for key, line in document.lines.items()},
     )
 
@@ -359,9 +359,11 @@ def _expand_sweep(document: ConfigDocument, scenes: dict[str, SceneSpec]) -> Swe
 
 def require_fixed_steps(runs: Iterable[RunSpec]) -> None:
     """Raise InputError for a run with an error target, whose step size is not fixed."""
-    if any(run.accuracy is not None for run in runs):
+    if any(run.error_target is not None for run in runs):
         raise InputError(
-            InputMistake("chooses the steps of each run, which `springbench run` does; leave it out", key="accuracy")
+            InputMistake(
+                "chooses the steps of each run, which `springbench run` does; leave it out", key="error_target"
+            )
         )
 
 
@@ -378,7 +380,7 @@ def check_scene_parts(
         scene: scene to check.
         sizes: mesh sizes of its runs.
     """
-    if not scene.own:
+    if not scene.plugins:
         return find_scene_mistakes(scene, sizes)
     document.user_code.on_import(f"{BINDING_PREFIX}{name}")
     return find_scene_mistakes(scene, sizes) if document.user_code.imports_code else []

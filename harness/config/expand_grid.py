@@ -76,11 +76,11 @@ class GridExpansion:
         kept = {name: getattr(self.fields.options, name) for name in FixedOptions.model_fields}
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
-            if chosen["accuracy"] is not None:
+            if chosen["error_target"] is not None:
                 chosen |= {name: RunOptions.model_fields[name].default for name in ERROR_TARGET_OPTIONS[:-1]} | {
-                    "first_guess": None
+                    "initial_guess": None
                 }
-            chosen["first_guess"] = chosen["first_guess"] or scene.choose_initial_guess(chosen["integrator"])
+            chosen["initial_guess"] = chosen["initial_guess"] or scene.choose_initial_guess(chosen["integrator"])
             chosen |= {name: getattr(scene, name) for name in SCENE_OPTIONS if chosen[name] is None}
             yield RunSpec.model_construct(
                 sweep=self.name,
@@ -145,17 +145,17 @@ class GridExpansion:
     def _check_error_target(self) -> None:
         """Check that options do not conflict with an error target or with verification."""
         options = self.fields.options
-        if None not in options.accuracy:
+        if None not in options.error_target:
             for name in ERROR_TARGET_OPTIONS:
                 if name in options.model_fields_set:
-                    self.document.add_mistake("is chosen for the `accuracy` asked; leave it out", ("options", name))
-        if options.timing == "rough" and options.record:
-            problem = "has no pass after which a recording's colours are known; give `record: false`, or another timing"
+                    self.document.add_mistake("is chosen by the `error_target`; leave it out", ("options", name))
+        if options.timing == "none" and options.record:
+            problem = "none has no pass that gives the colours of a recording; set `record: false`, or another timing"
             self.document.add_mistake(problem, ("options", "timing"))
         entries = [options, *self.fields.include]
-        if options.judge and any(AUTO in one.tolerance or set(one.accuracy) != {None} for one in entries):
-            problem = "grades steps by a tolerance that is stated; give one, and no `accuracy`, or leave `judge` out"
-            self.document.add_mistake(problem, ("options", "judge"))
+        if options.verify and any(AUTO in one.rtol or set(one.error_target) != {None} for one in entries):
+            problem = "needs a number or null as `rtol` and no `error_target`; change these, or leave `verify` out"
+            self.document.add_mistake(problem, ("options", "verify"))
 
     def _check_frames(self, runs: Sequence[RunSpec]) -> None:
         for i, frame in enumerate(self.fields.options.convergence_frames or ()):

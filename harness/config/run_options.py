@@ -40,9 +40,9 @@ _NULL_IS_SCENE_VALUE = "null takes the scene's"
 class RunOptions(ConfigModel):
     """Options of a run that can be varied, one value of each."""
 
-    iterations: Annotated[IterationLimit, RunOption("{} it.", "max_iterations")] = 50
+    max_iterations: Annotated[IterationLimit, RunOption("{} it.", "max_iterations")] = 50
     """Iteration limit of a step."""
-    tolerance: Annotated[RelativeTolerance | Literal["auto"], RunOption("tol. {}", "residual_rtol")] = None
+    rtol: Annotated[RelativeTolerance | Literal["auto"], RunOption("tol. {}", "residual_rtol")] = None
     """Relative tolerance of a step's iterations; null performs all of them. auto: the remaining residual adds at most a
     tenth to the step's own local error, estimated by an embedded method or by differences of the velocity.
     """
@@ -50,17 +50,17 @@ class RunOptions(ConfigModel):
     """Time integrator."""
     time_step: Annotated[TimeStep, RunOption("dt {:.3g}", "time_step", _NULL_IS_SCENE_VALUE)]
     """Time step [s]."""
-    first_guess: Annotated[
+    initial_guess: Annotated[
         InitialGuess,
         RunOption(
             "{}",
             "initial_guess",
-            "null is `assignment` for JSON scenes, `motion` (extrapolated positions) for integrators that evaluate "
-            "forces at their stages, else `current`",
+            "null is `assignment` for JSON scenes, `extrapolated` for integrators that evaluate "
+            "forces at their stages, else `previous`",
         ),
     ]
-    """Initial guess of a step's iteration. coarse: the solution of the same step on a mesh of half the size, which is
-    solved first, within the step's time.
+    """Initial guess of a step's iteration. coarse-to-fine: the solution of the same step on a mesh of half the size,
+    which is solved first, within the step's time.
     """
     threads: Annotated[ThreadCount | Literal["auto"], RunOption("{} thr.", "threads")] = 1
     """Threads of Numba and of BLAS; auto: the number of idle cores."""
@@ -68,19 +68,19 @@ class RunOptions(ConfigModel):
     """Number of steps."""
     rounds: Annotated[RoundCount, RunOption("{} rounds")] = 2
     """Number of repetitions of the timed part."""
-    accuracy: Annotated[RelativeError, RunOption("error {}", "error_requested")] = None
+    error_target: Annotated[RelativeError, RunOption("error {}", "error_requested")] = None
     """Target for the relative error of the final positions. It selects integrator, steps and tolerance for the solver;
     null uses the given values.
     """
 
 
 DEFAULT_SOLVER: Final = "hybrid"
-DEFAULT_STOP_RULE: dict[str, Any] = {"iterations": 500, "tolerance": 1e-4}
+DEFAULT_STOP_RULE: dict[str, Any] = {"max_iterations": 500, "rtol": 1e-4}
 """Default stop rule of a single scene, without a sweep and in Python: the recommended solver is run to a tolerance. The
 defaults of a sweep, those of `RunOptions`, are the assignment's.
 """
 
-ERROR_TARGET_OPTIONS: tuple[str, ...] = ("integrator", "iterations", "tolerance", "first_guess")
+ERROR_TARGET_OPTIONS: tuple[str, ...] = ("integrator", "max_iterations", "rtol", "initial_guess")
 """Options that an error target selects."""
 
 
@@ -96,7 +96,7 @@ SCENE_OPTIONS = tuple(name for name, option in RUN_OPTIONS.items() if option.nul
 """Options whose default the scene defines."""
 
 
-STEP_OPTIONS: tuple[str, ...] = ("first_guess", "iterations", "tolerance")
+STEP_OPTIONS: tuple[str, ...] = ("initial_guess", "max_iterations", "rtol")
 """Options that define how a step is solved, for any kind of step."""
 
 _TYPE_HINTS, _DESCRIPTIONS = get_type_hints(RunOptions, include_extras=True), read_field_descriptions(RunOptions)

@@ -48,13 +48,13 @@ class FixedOptions(ConfigModel):
     """Whether a Rerun recording is written for each run."""
     pictures: bool = True
     """Whether pictures are drawn from the recordings."""
-    judge: bool = False
+    verify: bool = False
     """Whether the reference evaluator verifies each step's result in the rows, for `springbench report`; for small
     meshes."""
-    timing: Literal["exclusive", "shared", "rough"] = "exclusive"
+    timing: Literal["exclusive", "shared", "none"] = "exclusive"
     """exclusive: while a run is timed, no other springbench process computes on the machine; shared: several runs are
-    timed concurrently, each on reserved cores, and their rows state that; rough: there is no timed pass, the steps are
-    computed once with instrumentation, and the times include it. rough is for questions other than times, without
+    timed concurrently, each on reserved cores, and their rows state that; none: there is no timed pass, the steps are
+    computed once with instrumentation, and the times include it. none is for questions other than times, without
     recordings.
     """
     time_limit: float | None = Field(default=3600.0, gt=0, le=1e7)
@@ -185,7 +185,7 @@ class RunSpec(FixedOptions, RunOptions):
     @property
     def num_passes(self) -> int:
         """Number of passes over the steps: warm-up, timed rounds, and instrumentation."""
-        return 1 if self.timing == "rough" else self.rounds + 2
+        return 1 if self.timing == "none" else self.rounds + 2
 
     def build_identity(self) -> str:
         """Build canonical JSON of everything that determines the run's result and timing on one machine.
@@ -201,8 +201,8 @@ class RunSpec(FixedOptions, RunOptions):
         settings["integrator"] = identify_code(self.integrator)
         if self.timing == "exclusive":  # as it always was before there was another
             del settings["timing"]
-        if self.accuracy is None:
-            del settings["accuracy"]
+        if self.error_target is None:
+            del settings["error_target"]
         return json.dumps(settings, sort_keys=True, separators=(",", ":"))
 
     def compute_run_id(self, machine: str) -> str:

@@ -18,7 +18,7 @@ SolverName = Literal[
 ]  # fmt: skip
 IntegratorName = Literal[
     "implicit-euler", "bdf2", "midpoint", "generalised-alpha", "hht", "newmark", "sdirk-2", "tr-bdf2", "sdirk-3",
-    "esdirk-3", "sdirk-4", "esdirk-4", "own",
+    "esdirk-3", "sdirk-4", "esdirk-4", "substepping",
 ]  # fmt: skip
 ReportName = Literal["certificates", "medians", "timing"]
 UserCodeName = NewType("UserCodeName", str)
@@ -48,21 +48,21 @@ class SceneKeys(TypedDict, total=False):
 class OptionKeys(TypedDict, total=False):
     """Options of a sweep, as in `springbench.harness.config.sweep_config.SweepOptions`."""
 
-    iterations: OneOrSequence[int]
-    tolerance: OneOrSequence[float | Literal["auto"] | None]
+    max_iterations: OneOrSequence[int]
+    rtol: OneOrSequence[float | Literal["auto"] | None]
     integrator: OneOrSequence[IntegratorName | UserCodeName]
     time_step: OneOrSequence[NumberOrText | None]
-    first_guess: OneOrSequence[InitialGuess | None]
+    initial_guess: OneOrSequence[InitialGuess | None]
     threads: OneOrSequence[int | Literal["auto"]]
     frames: OneOrSequence[int | None]
     rounds: OneOrSequence[int]
-    accuracy: OneOrSequence[float | None]
+    error_target: OneOrSequence[float | None]
     convergence_frames: Sequence[int] | None
     strain_range: float | None
     record: bool
     pictures: bool
-    judge: bool
-    timing: Literal["exclusive", "shared", "rough"]
+    verify: bool
+    timing: Literal["exclusive", "shared", "none"]
     time_limit: float | None
     memory_limit: float | None
 

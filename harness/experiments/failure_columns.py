@@ -57,12 +57,12 @@ def build_energy_growth_columns(
     step = by_frame[growth.first_frame]
     if (
         step["termination_reason"] == "max-iter"
-        and step["num_iterations"] >= run.iterations
-        and run.integrator != "own"
+        and step["num_iterations"] >= run.max_iterations
+        and run.integrator != "substepping"
     ):
         said += f"{run.solver.name} leaves the step unsolved; take more iterations, a tolerance, or another solver"
     else:
-        integrates = run.integrator == "own" or not is_minimiser(
+        integrates = run.integrator == "substepping" or not is_minimiser(
             load_solver_class(run)
         )  # a method with steps of its own
         method = run.solver.name if integrates else run.integrator

@@ -37,7 +37,7 @@ def build_specification_columns(run: RunSpec) -> dict[str, Any]:
         else None,
         **run.solver.metadata_columns,
         **{option.column: getattr(run, name) for name, option in RUN_OPTIONS.items() if option.column},
-        "residual_rtol": convert_tolerance(run.tolerance),
+        "residual_rtol": convert_tolerance(run.rtol),
         "threads": machine_info.choose_threads(run.threads).count,
     }
 

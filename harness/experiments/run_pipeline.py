@@ -139,14 +139,14 @@ def _run_passes(
 
     The timing session is checked for disturbances at the end.
     """
-    if run.accuracy is not None:
-        return _run_error_controlled(run, run.accuracy, files, tick, positions, timing_session)
+    if run.error_target is not None:
+        return _run_error_controlled(run, run.error_target, files, tick, positions, timing_session)
     with timing_session.lock_for_preparation():
         scene = build_scene(run.scene, run.size, run.integrator)
     counts = {"vertices": len(scene.mesh.rest_positions), "springs": len(scene.all_springs.edges)}
     settings = _build_settings(run)
     with _hold_timing_lock(run, tick) as how:
-        if run.timing == "rough":
+        if run.timing == "none":
             measured, told = prepare_untimed(scene, _build_solver(run)), None
         else:
             measured, told = _measure_rows(scene, _build_solver(run), settings, tick)
@@ -154,7 +154,7 @@ def _run_passes(
     timing_session.finish_timing()
     by_frame, stands = _run_instrumentation_pass(run, files, scene, measured, settings, tick, positions)
     told = told or timing_rows.build_timing_rows(measured)
-    require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.tolerance, float))
+    require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.rtol, float))
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.stats.items()}
     facts |= {
         "solver_description": measured.prepared.description,
@@ -175,7 +175,7 @@ def _find_modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
 
 
 def _build_status_columns(run: RunSpec, scene: Scene, by_frame: Mapping[int, Mapping[str, Any]]) -> dict[str, str]:
-    stands = _build_formula_check_columns(scene, run.frames) if run.judge else {"status": "ok"}
+    stands = _build_formula_check_columns(scene, run.frames) if run.verify else {"status": "ok"}
     growth = EnergyGrowth.from_rows(by_frame) if stands["status"] == "ok" else None
     return stands | (build_energy_growth_columns(run, growth, by_frame) if growth else {})
 
@@ -264,7 +264,7 @@ def _run_instrumentation_pass(
     with ExitStack() as cleanup:
         recorder = None
         if run.record:
-            assert measured.final_positions is not None  # a sweep that is rough and records is refused
+            assert measured.final_positions is not None  # a sweep with `timing: none` and `record` is rejected
             seconds = [t.seconds for t in measured.timings if t.phase == "step"]
             facts = {"status": "ok", "milliseconds_per_step": compute_ms_per_step(seconds)}
             recorder = _open_recorder(run, files, scene, facts, measured.final_positions)
@@ -365,7 +365,7 @@ def _list_solver_files(run: RunSpec) -> frozenset[Path]:
 
 
 def _build_settings(run: RunSpec) -> SteppingSettings:
-    return SteppingSettings(build_stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+    return SteppingSettings(build_stop_rule(run.max_iterations, run.rtol), run.initial_guess, run.frames, run.rounds)
 
 
 def _build_solver(run: RunSpec) -> Solver:
@@ -381,9 +381,9 @@ class _MotionKey:
 
 
 def _build_verifier(run: RunSpec, scene: Scene) -> StepVerifier | None:
-    if not run.judge:
+    if not run.verify:
         return None
-    key = (run.scene.scene_digest, run.size, run.integrator, run.first_guess, run.frames)
+    key = (run.scene.scene_digest, run.size, run.integrator, run.initial_guess, run.frames)
     return StepVerifier(scene, _compute_reference(_MotionKey(key, run)), is_minimiser=is_minimiser(_build_solver(run)))
 
 
@@ -397,7 +397,7 @@ def _compute_reference(motion: _MotionKey) -> NDArray[np.float64] | None:
     scene = build_scene(run.scene, run.size, run.integrator)
     try:
         return compute_reference_positions(
-            scene, load_target(SOLVERS["newton"])(), initial_guess=run.first_guess, frames=run.frames
+            scene, load_target(SOLVERS["newton"])(), initial_guess=run.initial_guess, frames=run.frames
         )
     except Exception:  # the row of Newton's method itself says what it was
         return None
@@ -417,7 +417,7 @@ def _open_recorder(
         **{
             name: value for name, value in build_specification_columns(run).items() if value is not None
         },  # a property has no null
-        "residual_rtol": convert_tolerance(run.tolerance) or 0.0,
+        "residual_rtol": convert_tolerance(run.rtol) or 0.0,
         "vertices": len(scene.mesh.rest_positions),
         "springs": len(scene.all_springs.edges),
         "frames": run.frames,

@@ -53,7 +53,9 @@ class RunUnit:
     @property
     def cost_estimate(self) -> RunCost:
         """Estimated cost: vertices times steps times iterations."""
-        return RunCost(self.run.solver.name, (self.run.size or 32) ** 2 * self.num_progress_steps * self.run.iterations)
+        return RunCost(
+            self.run.solver.name, (self.run.size or 32) ** 2 * self.num_progress_steps * self.run.max_iterations
+        )
 
     @property
     def task_limits(self) -> TaskLimits:
@@ -72,7 +74,7 @@ class RunUnit:
     @property
     def affinity_group(self) -> Hashable:
         """Key of runs that are verified by one reference solution."""
-        return (self.run.scene.scene_digest, self.run.size, self.run.integrator) if self.run.judge else None
+        return (self.run.scene.scene_digest, self.run.size, self.run.integrator) if self.run.verify else None
 
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Execute the run and return its outcome as text."""

@@ -129,7 +129,7 @@ class KnownMinima:
 
 def find_minima(problem: StepProblem, solver: Solver) -> KnownMinima:
     """Find the minima that Newton's method reaches from current positions and inertial target."""
-    guesses = (apply_initial_guess(problem, name).initial_guess for name in ("current", "inertial"))
+    guesses = (apply_initial_guess(problem, name).initial_guess for name in ("previous", "inertial"))
     return collect_minima(refine_minimum(problem, guess, solver) for guess in guesses)
 
 

@@ -122,7 +122,7 @@ def build_ode_scene(spec: SceneSpec, size: int) -> Scene:
     except NotIntegrable:
         if not scene.velocity_filters:
             raise
-        scene = build_exact_scene(spec, size, "own")
+        scene = build_exact_scene(spec, size, "substepping")
         OdeField(scene)
     return scene
 

@@ -149,7 +149,7 @@ def estimate_growth(spec: SceneSpec, size: int, t_end: float) -> PerturbationGro
 
 def _build_motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, OdeState, AdvanceFunction]:
     """Build the scene, its start, and the function that advances both motions."""
-    scene = build_exact_scene(spec.with_time_step(interval), size, "own", show_warnings=False)
+    scene = build_exact_scene(spec.with_time_step(interval), size, "substepping", show_warnings=False)
     if not scene.varying_forces and not scene.pin_motions:
         try:
             ready = prepare(scene, BlanesMoan6(refine=_NUM_REFINEMENTS))
@@ -164,7 +164,7 @@ def _build_motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, O
                     p, v = (part.copy() for part in field.unpack_state(k * interval, y))
                     begun = steps.MotionState(Motion(p, v), None, k)
                     (done,) = simulate_scene(
-                        scene, ready, StopRule(1), initial_guess="current", frames=k + 1, initial_state=begun
+                        scene, ready, StopRule(1), initial_guess="previous", frames=k + 1, initial_state=begun
                     )
                     ends += [part[scene.system.free_vertices].ravel() for part in done.state.motion]
                 return np.concatenate(ends)

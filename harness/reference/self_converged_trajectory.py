@@ -154,7 +154,7 @@ def _sample_motion(scene: Scene, times: Sequence[float], until: float) -> _Sampl
         raise NotConverged("the times are no whole numbers of steps")
     kept: dict[int, tuple[Positions, Positions]] = {}
     run = simulate_scene(
-        scene, prepare(scene, NewtonSolver()), _SOLVED_STOP_RULE, initial_guess="current", frames=wanted[-1]
+        scene, prepare(scene, NewtonSolver()), _SOLVED_STOP_RULE, initial_guess="previous", frames=wanted[-1]
     )
     for step in run:
         if not np.isfinite(step.positions).all():

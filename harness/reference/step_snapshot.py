@@ -5,7 +5,7 @@ measured on three snapshots:
 
     early     a tenth of the run, and the second step at least, before which BDF2 has no history
     middle    half of the run
-    violent   the step with the largest decrease g(current positions) - g(minimum), which is about the kinetic energy
+    peak      the step with the largest decrease g(current positions) - g(minimum), which is about the kinetic energy
               in free motion, and more where the motion is stopped by springs or contact
 """
 
@@ -31,7 +31,7 @@ from springbench.harness.simulation.time_loop import (
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import DirichletPins, Positions, Solver, StepProblem, StepStart, StopRule
 
-SNAPSHOT_NAMES = ("early", "middle", "violent")
+SNAPSHOT_NAMES = ("early", "middle", "peak")
 REFERENCE_STOP_RULE = StopRule(500, 1e-12)
 """Stop rule of the reference run: Newton's method reaches the last digits in one more iteration."""
 
@@ -111,7 +111,7 @@ def run_reference(
         scene,
         prepare(scene, solver),
         REFERENCE_STOP_RULE,
-        initial_guess="current",
+        initial_guess="previous",
         frames=num_steps,
         initial_state=initial_state,
     )
@@ -138,7 +138,7 @@ def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dic
     return {
         "early": max(first, -(-num_steps // 10)),
         "middle": max(first, (num_steps + 1) // 2),
-        "violent": first + int(np.argmax(violence[first - 1 :])) if len(violence) >= first else 1,
+        "peak": first + int(np.argmax(violence[first - 1 :])) if len(violence) >= first else 1,
     }
 
 

@@ -48,7 +48,7 @@ RUN_COLUMNS = (
         "initial_guess",
         _TEXT,
         "",
-        "initial guess of each step's iteration: assignment, current, inertial, motion or coarse",
+        "initial guess of each step's iteration: assignment, previous, inertial, extrapolated or coarse-to-fine",
     ),
     ColumnSpec("max_iterations", _INT, "", "iteration limit of a step"),
     ColumnSpec(

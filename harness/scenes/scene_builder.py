@@ -191,9 +191,9 @@ def _make_coarser_builder(spec: SceneSpec, size: int, integrator: str) -> Callab
 
 
 def _build_mesh(spec: SceneSpec, size: int) -> Mesh:
-    if "mesh" not in spec.own:
+    if "mesh" not in spec.plugins:
         return spec.mesh.build_mesh(size)
-    plugin, _ = spec.own["mesh"]
+    plugin, _ = spec.plugins["mesh"]
     try:
         with scene_plugins.attribute_errors(plugin, "generate"):
             made: Any = spec.mesh.build_mesh(size)
@@ -203,7 +203,7 @@ def _build_mesh(spec: SceneSpec, size: int) -> Mesh:
 
 
 def _build_contribution(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> EffectContribution:
-    effect, (plugin, _) = spec.effects[i], spec.own.get(f"effects[{i}]", (None, None))
+    effect, (plugin, _) = spec.effects[i], spec.plugins.get(f"effects[{i}]", (None, None))
     try:
         given = mesh, mass, spec.time_step
         bound = (
@@ -242,7 +242,9 @@ def _require_unique(spec: SceneSpec, parts: list[EffectContribution]) -> None:
 def _require_end_of_step_stages(parts: list[EffectContribution], method: integrators.AnyIntegrator, name: str) -> None:
     """Raise InputError if an effect requires stages at the end of the step and the integrator has others."""
     there = [
-        n for n, known in integrators.INTEGRATORS.items() if getattr(known, "stage_fraction", 0.0) == 1.0 and n != "own"
+        n
+        for n, known in integrators.INTEGRATORS.items()
+        if getattr(known, "stage_fraction", 0.0) == 1.0 and n != "substepping"
     ]
     for i, part in enumerate(parts):
         if part.end_of_step_reasons and getattr(method, "stage_fraction", 0.0) != 1.0:

@@ -27,7 +27,7 @@ from springbench.solvers.plugins.plugin_discovery import PluginName, PluginTable
 NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 """Pattern of the names of scenes and sweeps; they become file names in the results."""
 
-InitialGuess = Literal["assignment", "current", "inertial", "motion", "coarse"]
+InitialGuess = Literal["assignment", "previous", "inertial", "extrapolated", "coarse-to-fine"]
 
 
 def registered_name(table: PluginTable) -> Any:
@@ -146,11 +146,11 @@ class SceneSpec(SceneFields):
     """SHA-256 of a mesh from a file; empty for a generated mesh, which its parameters and size determine."""
     effects: SkipValidation[tuple[SceneEffect, ...]] = ()
     """Effects on the mesh; only listed effects are simulated."""
-    first_guess: InitialGuess = "current"
+    initial_guess: InitialGuess = "previous"
     """Initial guess of a step unless a sweep sets it; see `choose_initial_guess`."""
     path: Path
     """Source file of the scene, for messages."""
-    own: SkipValidation[Mapping[str, tuple[PluginName, Mapping[str, Any]]]] = Field(default_factory=dict)
+    plugins: SkipValidation[Mapping[str, tuple[PluginName, Mapping[str, Any]]]] = Field(default_factory=dict)
     """Plug-ins by location (`mesh`, `effects[0]`, ...), with the parameters from the scene file."""
     key_lines: SkipValidation[Mapping[str, int]] = Field(default_factory=dict)
     """Line numbers of the keys in that file, for messages."""
@@ -158,19 +158,19 @@ class SceneSpec(SceneFields):
     def choose_initial_guess(self, integrator: str) -> InitialGuess:
         """Return the default initial guess for an integrator: extrapolated for multi-stage integrators."""
         method = integrators.INTEGRATORS.get(integrator, integrators.IMPLICIT_EULER)
-        says = self.first_guess != "current" or isinstance(method, integrators.SingleStageIntegrator)
-        return self.first_guess if says else "motion"
+        says = self.initial_guess != "previous" or isinstance(method, integrators.SingleStageIntegrator)
+        return self.initial_guess if says else "extrapolated"
 
     def keep_effects(self, effect_indices: Sequence[int]) -> dict[str, Any]:
         """Return the fields `effects` and `plugins` of the scene restricted to effects with these indices."""
-        own = {place: told for place, told in self.own.items() if place == "mesh"}
+        plugins = {place: told for place, told in self.plugins.items() if place == "mesh"}
         places = {f"effects[{i}]": f"effects[{k}]" for k, i in enumerate(effect_indices)}
-        own |= {places[place]: told for place, told in self.own.items() if place in places}
-        return {"effects": tuple(self.effects[i] for i in effect_indices), "own": own}
+        plugins |= {places[place]: told for place, told in self.plugins.items() if place in places}
+        return {"effects": tuple(self.effects[i] for i in effect_indices), "plugins": plugins}
 
     def find_plugins(self) -> list[PluginName]:
         """Find the user code of the scene: mesh and effects."""
-        return [plugin for plugin, _ in self.own.values()]
+        return [plugin for plugin, _ in self.plugins.values()]
 
     def load_plugins(self) -> SceneSpec:
         """Return the scene with plug-ins loaded, which imports their code; raise InputError on failure."""
@@ -199,7 +199,7 @@ class SceneSpec(SceneFields):
         """SHA-256 of everything that determines a run; mesh files count by content, not by name."""
         content = self.model_dump(mode="json", include={"mass", "time_step", "velocity", "camera", "mesh", "effects"})
         content["mesh"] = self.mesh_digest or content["mesh"]
-        for place, (plugin, given) in self.own.items():  # which need not be imported to be told apart
+        for place, (plugin, given) in self.plugins.items():  # which need not be imported to be told apart
             told = [plugin.identify_code(), dict(given)]
             if place == "mesh":
                 content["mesh"] = told

@@ -235,7 +235,7 @@ class _AdaptiveIntegration:
         scene, prepared = self._ladder.prepare_level(self._level)
         h, time = scene.system.time_step, self._tick_time(self._ticks)
         done = StageSequence(scene, self._now, self._acceleration, time).solve_stages(
-            prepared, self._build_stop_rule(h), INITIAL_GUESSES["motion"]
+            prepared, self._build_stop_rule(h), INITIAL_GUESSES["extrapolated"]
         )
         self._iterations += sum(done.iteration_counts)
         ratio = self._error_ratio(done)

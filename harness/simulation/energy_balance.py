@@ -255,12 +255,12 @@ def compute_frame_balances(scene: Scene, motions: Iterable[Motion]) -> Iterator[
     """Yield the balance after each frame of a motion, however it was integrated.
 
     Args:
-      scene: the scene with the integrator `own`, whose time step is the frame.
+      scene: the scene with the integrator `substepping`, whose time step is the frame.
       motions: motion after each frame.
     """
     balance, state = EnergyBalance(scene), build_initial_state(scene)
     for motion in motions:
-        problem = build_problem(scene, state, "current")
+        problem = build_problem(scene, state, "previous")
         solution = Solution(motion.positions, 1, np.nan, np.nan, "max-iter", motion.velocity)
         state = MotionState(motion, None, state.index + 1)
         step = SimulationStep(problem, solution, state, (1,), ((problem, solution),), StopRule(1))

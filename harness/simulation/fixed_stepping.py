@@ -57,7 +57,7 @@ class FixedImplicitStepper(Stepper):
         )
         began, steps = perf_counter(), self.frames * parts
         for step in simulate_scene(
-            scene, ready, AutoTolerance(MAX_SOLVE_ITERATIONS), initial_guess="motion", frames=steps
+            scene, ready, AutoTolerance(MAX_SOLVE_ITERATIONS), initial_guess="extrapolated", frames=steps
         ):
             iterations += step.num_iterations
             if step.index % parts == 0:

@@ -84,7 +84,7 @@ class FixedSubstepping(_SubsteppingSolver, Protocol):
 class AdaptiveSubstepper(Stepper):
     """Stepping by a solver with adaptive substeps within frames.
 
-    The step of the scene is a frame, and its integrator is `own`.
+    The step of the scene is a frame, and its integrator is `substepping`.
     """
 
     scene: Scene
@@ -112,7 +112,7 @@ class AdaptiveSubstepper(Stepper):
         reached = list[float]()
         seen, h, told = [state.motion], None, np.zeros((self.frames * pieces, 3))
         for k in range(len(told)):
-            stated = build_problem(scene, state, "current")
+            stated = build_problem(scene, state, "previous")
             try:
                 p, v, each = ready.step(stated, h)
             except RuntimeError as error:

@@ -123,7 +123,7 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
     method, system = (IMPLICIT_EULER, _build_first_system(scene)) if starts else (usual, scene.system)
     target, origin = method.predict_target(now, before, dt)
     when, ahead = time + method.stage_fraction * dt, method.extrapolation_fraction * dt
-    led = (now.velocity - before.velocity) / dt if initial_guess == "motion" and state.previous_motion else None
+    led = (now.velocity - before.velocity) / dt if initial_guess == "extrapolated" and state.previous_motion else None
     begun = StepStart(
         now.positions,
         now.velocity,
@@ -320,9 +320,9 @@ def _guess_extrapolated(step_problem: StepProblem) -> StepProblem:
 
 INITIAL_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
     "assignment": _guess_assignment,
-    "current": _guess_previous,
+    "previous": _guess_previous,
     "inertial": _guess_inertial,
-    "motion": _guess_extrapolated,
+    "extrapolated": _guess_extrapolated,
 }
 
 
@@ -334,7 +334,7 @@ def apply_initial_guess(step_problem: StepProblem, initial_guess: str) -> StepPr
     return intersection_free_guess(INITIAL_GUESSES[initial_guess](step_problem))
 
 
-COARSE_TO_FINE = "coarse"
+COARSE_TO_FINE = "coarse-to-fine"
 """Initial guess that depends on more than the problem: the solution on a coarser mesh."""
 COARSE_SOLVER = "hybrid"
 """Solver on coarser meshes, by name, so that runs without this guess do not depend on its code."""
@@ -356,15 +356,17 @@ def _guess_coarse_to_fine(scene: Scene, state: MotionState, step_problem: StepPr
     if level is None:
         if scene.build_coarser is None:
             raise Unsupported(
-                "first_guess: coarse needs the scene on a mesh of half the size, and there is none: the mesh is from a "
-                f"file, or smaller than {2 * MIN_COARSENING_SIZE - 1}, or effects name "
+                "initial_guess: coarse-to-fine needs the scene on a mesh of half the size, and there is none: the mesh "
+                f"is from a file, or smaller than {2 * MIN_COARSENING_SIZE - 1}, or effects name "
                 "vertices by `indices` or `every`; take "
-                "current, inertial or motion"
+                "previous, inertial or extrapolated"
             )
         try:
             coarse = scene.build_coarser()
         except InputError as error:
-            raise Unsupported(f"first_guess: coarse needs the scene on a mesh of half the size: {error}") from error
+            raise Unsupported(
+                f"initial_guess: coarse-to-fine needs the scene on a mesh of half the size: {error}"
+            ) from error
         level = _COARSE_LEVELS[scene] = CoarseLevel.from_scenes(
             scene, coarse, prepare(coarse, load_target(SOLVERS[COARSE_SOLVER])())
         )
@@ -373,7 +375,7 @@ def _guess_coarse_to_fine(scene: Scene, state: MotionState, step_problem: StepPr
         level.restrict_motion(state.previous_motion) if state.previous_motion else None,
         state.index,
     )
-    below = build_problem(level.scene, there, COARSE_TO_FINE if level.scene.build_coarser else "current")
+    below = build_problem(level.scene, there, COARSE_TO_FINE if level.scene.build_coarser else "previous")
     found = level.prepared.solve(below, _COARSE_STOP_RULE).positions
     guess = step_problem.current_positions + level.prolong_displacement(found - below.current_positions)
     return replace(step_problem, initial_guess=_place_pins(step_problem.system, guess, step_problem.pin_targets))
@@ -383,7 +385,7 @@ def _select_stage_guess(initial_guess: str) -> GuessFunction:
     """Return the initial guess of each stage of a step that has several; raises Unsupported."""
     if initial_guess == COARSE_TO_FINE:
         raise Unsupported(
-            "first_guess: coarse is for integrators with one stage per step (implicit-euler, bdf2, midpoint); "
-            "use motion, current or inertial"
+            "initial_guess: coarse-to-fine is for integrators with one stage per step (implicit-euler, bdf2, "
+            "midpoint); use extrapolated, previous or inertial"
         )
     return INITIAL_GUESSES[initial_guess]

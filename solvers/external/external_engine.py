@@ -101,8 +101,8 @@ class EngineNetwork:
             supports_damping: whether the engine supports dashpots and drag on vertices.
 
         Raises:
-            Unsupported: for other energies, integrators other than `own` and implicit Euler, and unpinned vertices
-                without mass.
+            Unsupported: for other energies, integrators other than `substepping` and implicit Euler, and unpinned
+                vertices without mass.
         """
         vertex_terms.require_implicit_euler(system, engine)
         vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), engine)

@@ -81,7 +81,7 @@ frames: 2
 default_size: 4
 effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
 """
-SWEEP = "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {rounds: 1, iterations: 3, pictures: false}\n"
+SWEEP = "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {rounds: 1, max_iterations: 3, pictures: false}\n"
 
 
 class Call(NamedTuple):

@@ -54,7 +54,7 @@ class Scored:
     error: Callable[[Positions], float]
 
 
-def gap(spec: SceneSpec, size: int, frame: int, guess: str = "current") -> Scored:
+def gap(spec: SceneSpec, size: int, frame: int, guess: str = "previous") -> Scored:
     """A frozen step, graded by the energy gap; that of the first guess is 1."""
     frozen = STORE.load_frames(spec, size, [frame])[frame]
     lowest, problem = STORE.find_minima(frozen).lowest.objective, frozen.build_problem(guess)
@@ -169,7 +169,7 @@ def simulated(name: str, way: Way) -> Work:
 
     def work() -> Positions:
         p = built.mesh.rest_positions
-        for step in simulate_scene(built, prepared, way.stop, initial_guess="current", frames=frames):
+        for step in simulate_scene(built, prepared, way.stop, initial_guess="previous", frames=frames):
             p = step.positions
         return p
 

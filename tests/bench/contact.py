@@ -30,7 +30,7 @@ def fallen(*effects: ContactEffect, size: int, frames: int) -> Work:
     scene = build_scene(spec, size)
     prepared = prepare("numba", scene)
     return lambda: last(
-        step.solution for step in simulate_scene(scene, prepared, STOP, initial_guess="current", frames=frames)
+        step.solution for step in simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=frames)
     )
 
 

@@ -82,7 +82,7 @@ def cloth(path: str, size: int) -> StepProblem:
     """The third step of a cloth from rest."""
     made = build_scene(load_scene(CONFIGS / path), size)
     *_, last = simulate_scene(
-        made, prepare(made, HybridNewton()), StopRule(500, 1e-6), initial_guess="current", frames=3
+        made, prepare(made, HybridNewton()), StopRule(500, 1e-6), initial_guess="previous", frames=3
     )
     return last.problem
 
@@ -93,7 +93,7 @@ def cube(size: int, modulus: float) -> StepProblem:
         BlockMesh(height=1.0, depth=1.0), SpringsEffect(stretch=modulus), size=size, mass=1000.0, time_step=0.01
     )
     flat = made.mesh.rest_positions * [1.0, 0.0, 1.0]
-    return build_problem(made, MotionState(Motion(flat, np.zeros_like(flat)), None, 0), "current")
+    return build_problem(made, MotionState(Motion(flat, np.zeros_like(flat)), None, 0), "previous")
 
 
 def chain() -> StepProblem:

@@ -77,7 +77,7 @@ def steps(config: Path, only: str) -> Iterator[tuple[SnapshotEvaluation, list[Cu
     store = open_reference_store(ROOT / "results")
     asked: dict[tuple[str, str, str | int], list[CurveSpec]] = {}
     for spec in load_accuracy(config).curves:
-        asked.setdefault((spec.case.title, spec.case.integrator, spec.moment), []).append(spec)
+        asked.setdefault((spec.case.title, spec.case.integrator, spec.snapshot), []).append(spec)
     known: set[str] = set()
     for (title, _, moment), specs in asked.items():
         if all(word in f"{title} {moment}" for word in only.split()):
@@ -108,7 +108,7 @@ def racer(
         return None
     needs, seconds = dict[float, int](), dict[float, float]()
     iterates, spent = prepared.iterates(problem), 0.0
-    for number in range(1, spec.iterations + 1):
+    for number in range(1, spec.max_iterations + 1):
         began = thread_time()
         p = next(iterates)
         spent += thread_time() - began

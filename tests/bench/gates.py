@@ -78,7 +78,7 @@ def prepare(solver: str, scene: Scene, **parameters: str) -> PreparedLocalGlobal
 
 def steps(scene: Scene, prepared: PreparedSolver, frames: int) -> list[SimulationStep]:
     """The scene's first steps."""
-    return list(simulate_scene(scene, prepared, STOP, initial_guess="current", frames=frames))
+    return list(simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=frames))
 
 
 def simulated(solver: str, size: int, frames: int) -> Work:
@@ -86,7 +86,7 @@ def simulated(solver: str, size: int, frames: int) -> Work:
     scene = sheet(size)
     prepared = prepare(solver, scene)
     return lambda: last(
-        step.solution for step in simulate_scene(scene, prepared, STOP, initial_guess="current", frames=frames)
+        step.solution for step in simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=frames)
     )
 
 
@@ -147,7 +147,7 @@ def record(scene: Scene, prepared: PreparedSolver, frames: int, path: Path) -> P
     )
     recorder = RerunRecorder(path, info)
     stored = np.empty((frames, *scene.mesh.rest_positions.shape))
-    settings = SteppingSettings(STOP, "current", frames, 1)
+    settings = SteppingSettings(STOP, "previous", frames, 1)
     observe_run(
         scene,
         prepared,

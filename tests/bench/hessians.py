@@ -74,7 +74,9 @@ def measured(path: Path) -> dict[IndefiniteStrategy, Tally]:
     edges = sum(len(getattr(energy, "edges", ())) for energy in made.system.energies)
     tallies: dict[IndefiniteStrategy, Tally] = {rule: Tally() for rule in RULES}
     runs: dict[IndefiniteStrategy, Iterator[SimulationStep]] = {
-        rule: simulate_scene(made, prepare(made, NewtonSolver(rule)), STOP, initial_guess="current", frames=spec.frames)
+        rule: simulate_scene(
+            made, prepare(made, NewtonSolver(rule)), STOP, initial_guess="previous", frames=spec.frames
+        )
         for rule in RULES
     }
     for _ in range(spec.frames):

@@ -51,15 +51,15 @@ def took(run: RunSpec) -> Took:
     """Do a run, and look at each of its steps when the clocks stand."""
     with limit_threads(1):
         scene = build_scene(run.scene, run.size, run.integrator)
-        stop = build_stop_rule(run.iterations, run.tolerance)
+        stop = build_stop_rule(run.max_iterations, run.rtol)
         assert isinstance(stop, StopRule), "a tolerance by the step's own error has no yardstick to be relative to"
         began = process_time()
         prepared = prepare(scene, load_target(SOLVERS[str(run.solver.name)])(**run.solver.parameters))
         ready = process_time() - began
-        first = build_problem(scene, build_initial_state(scene), run.first_guess)
+        first = build_problem(scene, build_initial_state(scene), run.initial_guess)
         prepared.solve(first, StopRule(1, stop.rtol))
         oracle, step, wall, iterations, left = ReferenceEvaluator(scene.system), 0.0, 0.0, 0, 0.0
-        steps = simulate_scene(scene, prepared, stop, initial_guess=run.first_guess, frames=run.frames)
+        steps = simulate_scene(scene, prepared, stop, initial_guess=run.initial_guess, frames=run.frames)
         for _ in range(run.frames):
             began, then = process_time(), perf_counter()
             done = next(steps)
@@ -83,12 +83,12 @@ def main() -> None:
     smallest: dict[tuple[str, str, str], Took] = {}
     print("run | vertices | prepare s | step s | wall s | iterations | left | peak GiB | growth")
     for run in load_sweep(asked.config).list_runs():
-        title = f"{run.title} {run.first_guess}"
+        title = f"{run.title} {run.initial_guess}"
         if asked.only not in title:
             continue
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
             t = alone.submit(took, run).result()
-        least = smallest.setdefault((run.scene_name, run.solver.name, run.first_guess), t)
+        least = smallest.setdefault((run.scene_name, run.solver.name, run.initial_guess), t)
         growth = f"{log(t.step / least.step) / log(t.vertices / least.vertices):.2f}" if least is not t else ""
         line = f"{title} | {t.vertices:,} | {t.prepare:.2f} | {t.step:.3g} | {t.wall:.3g}"
         print(f"{line} | {t.iterations:.1f} | {t.left:.2e} | {t.peak:.2f} | {growth}", flush=True)

@@ -46,7 +46,7 @@ def told(path: Path, solver: Solver) -> str:
 
     iterations, ended = 0, True
     with patch.object(Hessian, "matvec", counting), patch.object(newton_cg, "_compiled_factor", lambda metric: None):
-        for step in simulate_scene(made, prepare(made, solver), STOP, initial_guess="current", frames=spec.frames):
+        for step in simulate_scene(made, prepare(made, solver), STOP, initial_guess="previous", frames=spec.frames):
             iterations += step.solution.num_iterations
             ended &= step.solution.termination_reason != "max-iter"
     took = f"{'' if ended else '>'}{iterations}"

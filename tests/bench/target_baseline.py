@@ -121,9 +121,11 @@ def _find_fixed_steps(
     best, again, bounds = TargetBaseline("", inf, inf), None, list[TargetBaseline]()
     for integrator, solver, tolerance in _list_combinations(performance_target.target):
         limit = min(MAX_SIMULATION_SECONDS, _TIME_FACTOR * best.seconds)
-        stop = build_stop_rule(performance_target.target.iterations, tolerance)
-        ended = f", tolerance {tolerance:g}" if tolerance else f", {performance_target.target.iterations} iterations"
-        ended = "" if integrator == "own" else ended
+        stop = build_stop_rule(performance_target.target.max_iterations, tolerance)
+        ended = (
+            f", tolerance {tolerance:g}" if tolerance else f", {performance_target.target.max_iterations} iterations"
+        )
+        ended = "" if integrator == "substepping" else ended
         nearest = None
         for k in range(_MAX_REFINEMENTS):
             fixed = _FixedSteps(integrator, solver, stop, ended, round(error_target.num_frames * sqrt(2.0) ** k))
@@ -153,17 +155,22 @@ def _find_fixed_steps(
 def _list_combinations(performance_target: PerformanceTarget) -> list[tuple[str, str, float | None]]:
     """Return the combinations of integrators, solvers and tolerances.
 
-    Solvers with their own integrator come first, since they are the quickest to run; they are listed once, as `own`.
+    Solvers with their own integrator come first, since they are the quickest to run; they are listed once, as
+    `substepping`.
     """
     alone = {
         name: find_solver_info(load_target(SOLVER_TABLE[name]), name).is_substepping
         for name in performance_target.solver
     }
     every = performance_target.integrator or ()
-    own = [("own", solver, None) for solver in performance_target.solver if alone[solver] and "own" in every]
-    others = [name for name in every if name != "own"]
+    own = [
+        ("substepping", solver, None)
+        for solver in performance_target.solver
+        if alone[solver] and "substepping" in every
+    ]
+    others = [name for name in every if name != "substepping"]
     rest = product(
-        others, (solver for solver in performance_target.solver if not alone[solver]), performance_target.tolerance
+        others, (solver for solver in performance_target.solver if not alone[solver]), performance_target.rtol
     )
     return [*own, *rest]
 

@@ -39,9 +39,9 @@ class PerformanceTarget(ConfigModel):
     """Baseline instead of `third_party`: fixed step sizes by these integrators ..."""
     solver: OneOrMany[str] = ()
     """... these solvers ..."""
-    tolerance: OneOrMany[RelativeTolerance] = (1e-1, 1e-2, 1e-4)
+    rtol: OneOrMany[RelativeTolerance] = (1e-1, 1e-2, 1e-4)
     """... and these tolerances; the step size is reduced until the error is the requested one."""
-    iterations: IterationLimit = 500
+    max_iterations: IterationLimit = 500
     """Iteration limit of such a step."""
     verify: bool = False
     """Whether errors are measured against the reference solution; then the requested error must be met, too."""

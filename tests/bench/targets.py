@@ -162,7 +162,10 @@ def _measure_target(
         else None
     )
     answer = search_cheapest_method(error_target, performance_target.error, seen, print_message)
-    best, free = answer.best_trial, error_target.build_scene(error_target.frame_seconds, "own").system.free_vertices
+    best, free = (
+        answer.best_trial,
+        error_target.build_scene(error_target.frame_seconds, "substepping").system.free_vertices,
+    )
     end = best.trajectory.positions[-1]
     other = find_baseline(
         performance_target,

@@ -70,7 +70,7 @@ def test_a_tolerance_takes_as_many_iterations_as_stored(solver: str, size: int, 
     scene = sheet(size)
     stop = StopRule(max_iterations=1000, rtol=1e-3)
     with limit_threads(THREADS):  # dense products of this size lose more by a second thread than they gain
-        steps = list(simulate_scene(scene, prepare(solver, scene), stop, initial_guess="current", frames=2))
+        steps = list(simulate_scene(scene, prepare(solver, scene), stop, initial_guess="previous", frames=2))
     # Here an iteration changes the residual by 0.1 to 1 %, round-off by 1e-9: the number is the same everywhere.
     assert [step.solution.num_iterations for step in steps] == iterations
     assert {step.solution.termination_reason for step in steps} == {"converged"}
@@ -132,7 +132,7 @@ def test_an_accuracy_takes_as_many_iterations_as_stored(
     scene, stop = sheet(size), StopRule(max_iterations=1000, rtol=1e-6)
     with limit_threads(THREADS):
         prepared = load_target(SOLVERS[solver])().prepare(scene.system)
-        found = list(simulate_scene(scene, prepared, stop, initial_guess="current", frames=3))
+        found = list(simulate_scene(scene, prepared, stop, initial_guess="previous", frames=3))
     assert {step.solution.termination_reason for step in found} == {"converged"}
     # Newton's method converges quadratically, where round-off decides nothing. The hybrid begins with L-BFGS in
     # float32, whose path may end an iteration earlier or later in each of its rounds on another processor, and where
@@ -165,8 +165,8 @@ def arrays(work: Callable[[], object], size: int) -> int:
 def test_a_step_allocates_as_many_arrays_as_stored(solver: str, stated: int, solved: int, whole: int):
     scene = sheet(64)
     prepared = prepare(solver, scene)
-    posed = build_problem(scene, build_initial_state(scene), "current")
-    assert arrays(lambda: build_problem(scene, build_initial_state(scene), "current"), 64) == stated
+    posed = build_problem(scene, build_initial_state(scene), "previous")
+    assert arrays(lambda: build_problem(scene, build_initial_state(scene), "previous"), 64) == stated
     assert arrays(lambda: prepared.solve(posed, STOP), 64) == solved
     assert arrays(lambda: steps(scene, prepared, 1), 64) == whole
 

@@ -120,7 +120,7 @@ def given(module: Any, name: str, work: Callable[[], object]) -> tuple[Any, ...]
 def solving(solver: str) -> Callable[[], object]:
     """A solver's first step of the sheet of 64 x 64 vertices."""
     scene = sheet(SIZE)
-    stated, prepared = build_problem(scene, build_initial_state(scene), "current"), prepare(solver, scene)
+    stated, prepared = build_problem(scene, build_initial_state(scene), "previous"), prepare(solver, scene)
     return lambda: prepared.solve(stated, STOP)
 
 

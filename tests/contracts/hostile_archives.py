@@ -192,7 +192,7 @@ CHANGES: dict[str, Callable[[Content], None]] = {
     "a config of brackets": put(CONFIG, "[" * 100_000),
     "a config of Python": put(CONFIG, "!!python/object/apply:os.system [touch evil]"),
     "a config of a device": put(CONFIG, "scenes: [/dev/zero]\nsizes: [4]\nsolvers: [sparse]\n"),
-    "a config of 1e6 runs": put(CONFIG, SWEEP + f"options: {{iterations: {list(range(1, 1001))}}}\n"),
+    "a config of 1e6 runs": put(CONFIG, SWEEP + f"options: {{max_iterations: {list(range(1, 1001))}}}\n"),
     "a config of code that hangs": put(CONFIG, SWEEP.replace("sparse", "./hang.py:Solver")),
     "no scene": without("configs/sweep/cloth.yaml"),
     "a way to no config": put("results/sweep/.config", ""),

@@ -439,6 +439,6 @@ def write(folder: Path, case: Hostile) -> Path:
     limit = 6 if LIMIT in case.said else 120
     (folder / "sweep.yaml").write_text(
         f"scenes: {scenes}\nsolvers: {solvers}\n{reports}options: {{integrator: {integrators}, rounds: 1, "
-        "iterations: 3, record: false, pictures: false, time_limit: " + f"{limit}, memory_limit: 1}}\n"
+        "max_iterations: 3, record: false, pictures: false, time_limit: " + f"{limit}, memory_limit: 1}}\n"
     )
     return folder / "sweep.yaml"

@@ -97,7 +97,7 @@ def most_in_a_step(made: Scene, prepared: PreparedSolver) -> int:
     allocates now and then."""
     most = []
     for _turn in range(4):
-        run = simulate_scene(made, prepared, StopRule(5), initial_guess="current", frames=3)
+        run = simulate_scene(made, prepared, StopRule(5), initial_guess="previous", frames=3)
         for _ in range(2):
             next(run)
         gc.collect()

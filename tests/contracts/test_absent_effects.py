@@ -74,7 +74,7 @@ from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 from springbench.solvers.model.step_problem import StopRule
 made = build_scene(load_scene(Path({scene!r})), 10)
-steps = simulate_scene(made, prepare(made, SparseLocalGlobal()), StopRule(10), initial_guess="current", frames=5)
+steps = simulate_scene(made, prepare(made, SparseLocalGlobal()), StopRule(10), initial_guess="previous", frames=5)
 digests = [hashlib.sha256(step.positions.tobytes()).hexdigest() for step in steps]
 print(json.dumps({{"modules": sorted(sys.modules), "digests": digests}}))
 """

@@ -36,9 +36,9 @@ CONFIG = """
 scenes: [cloth.yaml]
 solvers: [sparse, newton, symplectic-euler]
 curves:
-  - {size: 4, moment: [early, violent], iterations: 60, rounds: 2, time_limit: 100, recordings: true}
+  - {size: 4, snapshot: [early, peak], max_iterations: 60, rounds: 2, time_limit: 100, recordings: true}
 work:
-  - {size: 4, horizon: 0.2, time_step: [1/30, 1/60], iterations: 20, rounds: 2, time_limit: 100}
+  - {size: 4, t_end: 0.2, time_step: [1/30, 1/60], max_iterations: 20, rounds: 2, time_limit: 100}
 """
 UNITS = 2 * 2 + 2 * 3
 TIMES = (
@@ -99,11 +99,11 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
 
 def test_each_curve_is_of_a_problem_whose_minimum_is_certified(home: Home) -> None:
     problems = {row["problem_digest"]: row for row in home.rows("snapshot")}
-    assert {row["snapshot"] for row in problems.values()} == {"early", "violent"}
+    assert {row["snapshot"] for row in problems.values()} == {"early", "peak"}
     minima = {(row["problem_digest"], row["minimum_id"]): row for row in home.rows("minimum")}
     curves = home.rows("curve")
     assert {(row["solver"], row["initial_guess"]) for row in curves} == {
-        (solver, guess) for solver in ("sparse", "newton") for guess in ("current", "inertial")
+        (solver, guess) for solver in ("sparse", "newton") for guess in ("previous", "inertial")
     }
     for row in curves:
         minimum = minima[row["problem_digest"], row["minimum_id"]]
@@ -117,7 +117,7 @@ def test_newton_s_method_reaches_the_minimum_by_energy_and_by_position(home: Hom
     lowest = {row["problem_digest"]: row["objective"] for row in home.rows("minimum", minimum_index=0)}
     start = {row["problem_digest"]: row["objective_initial"] for row in home.rows("snapshot")}
     length = {row["problem_digest"]: row["mean_rest_length"] for row in home.rows("snapshot")}
-    for guess in ("current", "inertial"):
+    for guess in ("previous", "inertial"):
         for problem, g in lowest.items():
             curve = home.rows("curve", solver="newton", initial_guess=guess, problem_digest=problem)
             first, last = curve[0], curve[-1]
@@ -126,13 +126,13 @@ def test_newton_s_method_reaches_the_minimum_by_energy_and_by_position(home: Hom
             assert last["objective"] - g <= 1e-9 * (start[problem] - g)  # where a curve ends
             # An energy gap of 1e-9 is an error of its root, 3e-5 of the way that is to go.
             assert last["position_error_max_m"] < 1e-3 * length[problem]
-            if guess == "current":
+            if guess == "previous":
                 assert (first["iteration"], first["objective"]) == (0, start[problem])
                 assert first["stationarity"] == pytest.approx(1.0, rel=1e-12)  # by its definition, but for round-off
 
 
 def test_a_recording_shows_the_mesh_at_each_graded_iterate(home: Home) -> None:
-    curve = home.rows("curve", solver="sparse", initial_guess="current", snapshot="violent")
+    curve = home.rows("curve", solver="sparse", initial_guess="previous", snapshot="peak")
     replay = read_replay(home.folder / curve[0]["recording_path"])
     assert replay.frames.tolist() == [row["iteration"] for row in curve]
     assert np.isfinite(replay.positions).all()
@@ -167,7 +167,7 @@ def test_a_config_that_was_stopped_goes_on_where_it_was(home: Home, tmp_path: Pa
 
 
 def test_what_is_asked_otherwise_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
-    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
+    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, peak]", "early"))
     assert made.run() == 2
     files = set(made.written())
     made.config.write_text(made.config.read_text().replace("rounds: 2", "rounds: 1"))
@@ -180,7 +180,7 @@ def test_what_is_not_asked_for_any_more_stays_and_is_not_counted(tmp_path: Path)
     made = Home(tmp_path, CONFIG.partition("work:")[0])
     made.run()
     before = set(made.written())
-    made.config.write_text(made.config.read_text().replace("[early, violent]", "early"))
+    made.config.write_text(made.config.read_text().replace("[early, peak]", "early"))
     files = run_accuracy_study(
         load_accuracy(made.config), made.folder, SilentDisplay(), lambda line: None, isolated=False
     )
@@ -191,7 +191,7 @@ def test_what_is_not_asked_for_any_more_stays_and_is_not_counted(tmp_path: Path)
 
 
 def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
-    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "[2, early, middle]"))
+    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, peak]", "[2, early, middle]"))
     (tmp_path / "cloth.yaml").write_text(SCENE.replace("frames: 8", "frames: 2"))
     made.run()
     assert {row["snapshot"] for row in made.rows("curve")} == {"frame-2"}
@@ -207,7 +207,7 @@ def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
         "refine_minimum",
         lambda problem, p, solver: replace(certify_minimum(problem, p), kind=INACCURATE),
     )
-    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, violent]", "early"))
+    made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, peak]", "early"))
     made.run()
     (problem,) = made.rows("snapshot")
     assert (problem["status"], problem["reason"]) == ("uncertified", "it ended on a saddle")
@@ -261,13 +261,13 @@ def test_a_solver_that_crashes_is_a_row_and_the_others_are_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(SOLVERS, "crashing", f"{__name__}:Crashing")
-    config = CONFIG.partition("work:")[0].replace("[sparse,", "[crashing,").replace("[early, violent]", "early")
+    config = CONFIG.partition("work:")[0].replace("[sparse,", "[crashing,").replace("[early, peak]", "early")
     made = Home(tmp_path, config)
     assert made.run(isolated=True) == 2
     (problem,) = made.rows("snapshot")
     lost = made.rows("curve", solver="crashing")
     assert [(row["problem_digest"], row["initial_guess"]) for row in lost] == [
-        (problem["problem_digest"], guess) for guess in ("current", "inertial")
+        (problem["problem_digest"], guess) for guess in ("previous", "inertial")
     ]
     for row in lost:
         assert row["status"] == "failed"

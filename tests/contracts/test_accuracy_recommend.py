@@ -37,8 +37,8 @@ effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, at: [ends
 """
 REFINEMENTS = (1, 4)
 WAYS = [
-    {"solver": ["sparse"], "tolerance": 1e-3, "iterations": 200, "integrator": ["implicit-euler", "midpoint"]},
-    {"solver": ["sparse"], "iterations": 5},
+    {"solver": ["sparse"], "rtol": 1e-3, "max_iterations": 200, "integrator": ["implicit-euler", "midpoint"]},
+    {"solver": ["sparse"], "max_iterations": 5},
 ]
 COUNT = len(REFINEMENTS) * 3
 

@@ -85,7 +85,7 @@ class Boosting(AdaptiveSubstepper):
 
 
 def test_a_motion_that_gains_energy_says_so_in_its_row_and_its_exit_code(tmp_path, monkeypatch):
-    few = [("own", SolverSpec("dormand-prince-8", {}))]
+    few = [("substepping", SolverSpec("dormand-prince-8", {}))]
     module = "springbench.harness.experiments.error_control.candidate_methods"
     monkeypatch.setattr(f"{module}.list_candidate_methods", lambda: few)
     monkeypatch.setattr(f"{module}.AdaptiveSubstepper", Boosting)
@@ -102,7 +102,7 @@ def test_a_motion_that_gains_energy_says_so_in_its_row_and_its_exit_code(tmp_pat
 
 def test_the_rows_of_a_sweep_to_an_error_have_the_energy_of_each_frame(tmp_path, monkeypatch):
     (tmp_path / "scene.yaml").write_text((SCENES / "single-spring.yaml").read_text())
-    options = "options: {frames: 5, accuracy: 1e-3, record: %s, pictures: false, timing: shared}\n"
+    options = "options: {frames: 5, error_target: 1e-3, record: %s, pictures: false, timing: shared}\n"
     (tmp_path / "sweep.yaml").write_text(f"scenes: [scene.yaml]\nsolvers: [dormand-prince-8]\n{options % 'true'}")
     (spec,) = load_config(tmp_path / "sweep.yaml").list_runs()
     files = RunFiles.for_run(spec, tmp_path)
@@ -118,7 +118,9 @@ def test_the_rows_of_a_sweep_to_an_error_have_the_energy_of_each_frame(tmp_path,
 
 
 def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, monkeypatch):
-    few = [("own", SolverSpec(name, {})) for name in ("velocity-verlet", "blanes-moan-4", "rodas")]  # the last is dear
+    few = [
+        ("substepping", SolverSpec(name, {})) for name in ("velocity-verlet", "blanes-moan-4", "rodas")
+    ]  # the last is dear
     monkeypatch.setattr(
         "springbench.harness.experiments.error_control.candidate_methods.list_candidate_methods", lambda: few
     )

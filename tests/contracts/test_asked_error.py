@@ -83,7 +83,7 @@ SWINGING = chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD)
 
 @pytest.mark.parametrize("integrator", ["tr-bdf2", "esdirk-3", "esdirk-4", "sdirk-4"])
 def test_a_closer_tolerance_gives_a_smaller_error_by_more_steps_and_few_factors(integrator):
-    truth = integrate_motion(build_scene(SWINGING, 5, "own"), [END])
+    truth = integrate_motion(build_scene(SWINGING, 5, "substepping"), [END])
     paths = [implicit(SWINGING, integrator).integrate_motion(tolerance) for tolerance in (1e-3, 1e-6)]
     coarse, fine = (truth.measure_error(0, path.positions[-1]) for path in paths)
     assert fine < 0.1 * coarse  # a thousandth to the power 3/4 or 2/3 is a hundredth, steps being halves
@@ -107,7 +107,7 @@ def test_a_tolerance_is_changed_by_the_order_of_a_step():
 def test_frames_lie_on_the_motion_though_steps_are_longer_than_they_are():
     path = implicit(SWINGING, "esdirk-4").integrate_motion(3e-4)
     assert path.step_size_range[1] > END / FRAMES
-    truth = integrate_motion(build_scene(SWINGING, 5, "own"), list(np.linspace(0.0, END, FRAMES + 1)[1:]))
+    truth = integrate_motion(build_scene(SWINGING, 5, "substepping"), list(np.linspace(0.0, END, FRAMES + 1)[1:]))
     away = np.abs(path.positions[1:] - truth.positions).max()
     assert away < 0.03 * np.abs(truth.positions[-1] - path.positions[0]).max()  # h^4/384 of a cubic, and its tolerance
 
@@ -158,7 +158,7 @@ def test_the_error_is_never_above_the_one_that_was_asked_for_whichever_way_wins(
     told = list[str]()
     seen, truth = (
         compute_predictability_horizon(asked, error, told.append),
-        integrate_motion(asked.build_scene(asked.frame_seconds, "own"), [horizon]),
+        integrate_motion(asked.build_scene(asked.frame_seconds, "substepping"), [horizon]),
     )
     for way in prepare_candidate_methods(asked, told.append):
         monkeypatch.setattr(
@@ -174,8 +174,8 @@ def test_the_error_is_never_above_the_one_that_was_asked_for_whichever_way_wins(
 
 
 def steps_of(spec: SceneSpec, size: int) -> list[Any]:
-    scene = build_scene(spec, size, "own")
-    return [*simulate_scene(scene, prepare(scene, VelocityVerlet()), StopRule(1), initial_guess="current", frames=10)]
+    scene = build_scene(spec, size, "substepping")
+    return [*simulate_scene(scene, prepare(scene, VelocityVerlet()), StopRule(1), initial_guess="previous", frames=10)]
 
 
 def perturbed(spec: SceneSpec, size: int, times: list[float]) -> np.ndarray:
@@ -286,7 +286,7 @@ def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():
 def test_ways_are_what_solvers_and_integrators_say_of_themselves():
     assert {(integrator, solver.name) for integrator, solver in list_candidate_methods()} == {
         *((integrator, solver) for solver in ("lbfgs", "newton") for integrator in ("esdirk-4", "midpoint")),
-        *(("own", solver) for solver in OWN),
+        *(("substepping", solver) for solver in OWN),
     }
 
 
@@ -301,8 +301,10 @@ def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_
     held = () if effect is MOVED else (HELD,)
     told, asked = list[str](), ErrorTarget(chain(SpringsEffect(stretch=40.0), effect, *held), 5, 0.1, 2)
     found = prepare_candidate_methods(asked, told.append)
-    assert {way.solver: way.stepper.order for way in found if way.integrator == "own"} == dict.fromkeys(OWN[:3], 1)
-    assert {way.integrator for way in found} == {"own", "esdirk-4", "midpoint"}
+    assert {way.solver: way.stepper.order for way in found if way.integrator == "substepping"} == dict.fromkeys(
+        OWN[:3], 1
+    )
+    assert {way.integrator for way in found} == {"substepping", "esdirk-4", "midpoint"}
     assert [line.split(":")[0].removeprefix("  not by ") for line in told] == OWN[3:]
     assert all(what in line for line in told)
 
@@ -311,12 +313,12 @@ def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_er
     """Of order 2: the step that a hundredth of the error asks for is a tenth."""
     even, truth = (
         FixedSubstepper(
-            build_scene(SWINGING, 5, "own"),
+            build_scene(SWINGING, 5, "substepping"),
             VelocityVerlet(),
             FRAMES,
-            lambda h: build_scene(SWINGING.with_time_step(h), 5, "own"),
+            lambda h: build_scene(SWINGING.with_time_step(h), 5, "substepping"),
         ),
-        integrate_motion(build_scene(SWINGING, 5, "own"), [END]),
+        integrate_motion(build_scene(SWINGING, 5, "substepping"), [END]),
     )
     assert even.initial_setting(1e-3) == even.scale_setting(1.0, 100.0) == 1.0
     assert even.scale_setting(4.0, 0.01) == pytest.approx(40.0)
@@ -331,9 +333,12 @@ def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_er
 def test_forces_of_the_speed_are_even_within_pieces_of_a_frame_as_short_as_the_error_asks_for():
     spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(law="quadratic", coefficient=0.5), HELD)
     even = FixedSubstepper(
-        build_scene(spec, 5, "own"), VelocityVerlet(), FRAMES, lambda h: build_scene(spec.with_time_step(h), 5, "own")
+        build_scene(spec, 5, "substepping"),
+        VelocityVerlet(),
+        FRAMES,
+        lambda h: build_scene(spec.with_time_step(h), 5, "substepping"),
     )
-    truth = integrate_motion(build_scene(spec, 5, "own"), [END])
+    truth = integrate_motion(build_scene(spec, 5, "substepping"), [END])
     assert even.scale_setting(2.0, 0.25) == 8.0
     coarse, fine = (even.integrate_motion(setting) for setting in (2.0, 16.0))
     assert coarse.positions.shape == fine.positions.shape == (FRAMES + 1, 5, 3)
@@ -342,8 +347,8 @@ def test_forces_of_the_speed_are_even_within_pieces_of_a_frame_as_short_as_the_e
 
 
 def test_a_rosenbrock_method_keeps_to_an_error_that_is_asked_for():
-    truth = integrate_motion(build_scene(SWINGING, 5, "own"), [END])
-    scene = build_scene(SWINGING, 5, "own")
+    truth = integrate_motion(build_scene(SWINGING, 5, "substepping"), [END])
+    scene = build_scene(SWINGING, 5, "substepping")
     coarse, fine = (
         AdaptiveSubstepper(scene, Rodas(), FRAMES).integrate_motion(tolerance) for tolerance in (1e-3, 1e-6)
     )
@@ -374,10 +379,10 @@ def test_contact_is_refused_with_what_can_be_had(monkeypatch):
         ErrorTarget.from_scene(spec, 5, END)
     asked = ErrorTarget(chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD), 5, END, FRAMES)
     found = estimate_by_step_doubling(asked.build_scene, END, FRAMES, time_budget=0.5)
-    error = integrate_motion(asked.build_scene(asked.frame_seconds, "own"), [END]).measure_error
+    error = integrate_motion(asked.build_scene(asked.frame_seconds, "substepping"), [END]).measure_error
     scene, steps = asked.build_scene(found.time_step, "implicit-euler"), round(END / found.time_step)
     path = simulate_scene(
-        scene, prepare(scene, NewtonSolver()), StopRule(50, 1e-9), initial_guess="current", frames=steps
+        scene, prepare(scene, NewtonSolver()), StopRule(50, 1e-9), initial_guess="previous", frames=steps
     )
     true = error(0, [step.positions for step in path][-1])
     assert found.relative_change == pytest.approx(0.5 * true, rel=0.3)  # h - h/2, and what is of order 2

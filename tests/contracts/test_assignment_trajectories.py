@@ -103,7 +103,7 @@ def written(folder: Path, name: str) -> Path:
 def test_a_scene_moves_as_the_assignment_moves_it(name, backend, tmp_path):
     spec = load_scene(written(tmp_path, name))
     made = build_scene(spec, 0)
-    found = simulate_trajectory(made, backend, FRAMES, initial_guess=spec.first_guess)
+    found = simulate_trajectory(made, backend, FRAMES, initial_guess=spec.initial_guess)
     wanted = assignment(*SCENES[name])
     assert np.abs(found - wanted).max() <= AGREEMENT * made.mesh.bounding_box_diagonal
     assert np.abs(wanted - wanted[0]).max() > 0.01 * made.mesh.bounding_box_diagonal  # it does move
@@ -121,4 +121,4 @@ def test_a_scene_is_read_as_the_assignment_reads_it(name, tmp_path):
     np.testing.assert_allclose(made.system.mass, mass, rtol=1e-12)  # a cotangent near a right angle
     assert sorted(made.system.pins.vertices + 1) == sorted(scene["b"])
     assert set(made.system.pins.weight) == {1e10}
-    assert (made.system.time_step, spec.frames, spec.first_guess) == (1 / 30, FRAMES, "assignment")
+    assert (made.system.time_step, spec.frames, spec.initial_guess) == (1 / 30, FRAMES, "assignment")

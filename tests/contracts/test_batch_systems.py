@@ -23,7 +23,8 @@ pytest.importorskip("dask_jobqueue", reason="pip install 'springbench[cluster]'"
 
 ROOT = Path(__file__).resolve().parents[2]
 SWEEP = (
-    "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {frames: 2, rounds: 1, iterations: [5, 6, 7], record: false}\n"
+    "scenes: [scene.yaml]\nsolvers: [sparse]\n"
+    "options: {frames: 2, rounds: 1, max_iterations: [5, 6, 7], record: false}\n"
 )
 
 SUBMIT = """#!/bin/sh

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.long
 SWEEP = """
 scenes: [scene.yaml]
 solvers: [sparse]
-options: {frames: 4, rounds: 1, iterations: [5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16], record: false}
+options: {frames: 4, rounds: 1, max_iterations: [5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16], record: false}
 """
 
 FAR = """

@@ -108,7 +108,7 @@ def test_of_four_workers_of_a_machine_one_is_timed_at_a_time(tmp_path: Path, sha
     (tmp_path / "noting.py").write_text(SOLVER_SOURCE.replace("pass  # while solving", NOTE.format(noted=str(noted))))
     (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     sweep = tmp_path / "sweep.yaml"
-    options = f"frames: {FRAMES}, rounds: {ROUNDS}, iterations: {list(range(1, RUNS + 1))}, record: false"
+    options = f"frames: {FRAMES}, rounds: {ROUNDS}, max_iterations: {list(range(1, RUNS + 1))}, record: false"
     sweep.write_text(f"scenes: [scene.yaml]\nsolvers: ['./noting.py:Mine']\noptions: {{{options}, pictures: false}}\n")
     quiet: Any = {"dashboard_address": None, "silence_logs": 50, "local_directory": tmp_path}
     with LocalCluster(n_workers=4, threads_per_worker=1, **quiet) as started, Client(started) as client:
@@ -166,7 +166,7 @@ def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(
     (tmp_path / "counted.py").write_text(SOLVER_SOURCE.replace("pass  # while solving", TELL.format(told=str(told))))
     (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     sweep = tmp_path / "sweep.yaml"
-    options = f"frames: 2, rounds: 1, iterations: {list(range(1, MANY + 1))}, record: false, pictures: false"
+    options = f"frames: 2, rounds: 1, max_iterations: {list(range(1, MANY + 1))}, record: false, pictures: false"
     sweep.write_text(f"scenes: [scene.yaml]\nsolvers: ['./counted.py:Mine']\noptions: {{{options}}}\n")
     quiet: Any = {"dashboard_address": None, "silence_logs": 50, "local_directory": tmp_path}
     over, killed = threading.Event(), list[int]()

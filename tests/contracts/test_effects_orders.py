@@ -107,7 +107,7 @@ def test_every_effect_states_it() -> None:
 
 @pytest.mark.parametrize(
     "integrator",
-    [pytest.param(i, marks=[pytest.mark.long] * (i not in MEASURED)) for i in INTEGRATORS if i != "own"],
+    [pytest.param(i, marks=[pytest.mark.long] * (i not in MEASURED)) for i in INTEGRATORS if i != "substepping"],
 )
 @pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.long] * (e == "gas")) for e in SMOOTH])
 def test_integrators_keep_their_order_up_to_it(effect, integrator):

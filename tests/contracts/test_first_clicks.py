@@ -20,7 +20,7 @@ SWEEP = """
 scenes: [scenes/hanging-cloth.yaml]
 sizes: [4, 8]
 solvers: [dense, sparse]
-options: {frames: 3, rounds: 2, iterations: 20}
+options: {frames: 3, rounds: 2, max_iterations: 20}
 """
 """Both solvers take the same iterates, so that all are equally accurate; which is the faster only the rows tell."""
 

@@ -23,7 +23,7 @@ effects:
   - {kind: gravity}
   - {kind: pins, at: [top_corners]}
 """
-SWEEP = "{scenes: [cloth.yaml], sizes: [16], solvers: [sparse, dense], options: {iterations: 4, rounds: 1, %s}}"
+SWEEP = "{scenes: [cloth.yaml], sizes: [16], solvers: [sparse, dense], options: {max_iterations: 4, rounds: 1, %s}}"
 WALL = 200.0
 """Seconds after which a start counts as one that lingers: it takes a few, and used to wait for two threads of 30 s each
 and longer on a machine that is idle."""

@@ -100,9 +100,9 @@ def test_a_pipe_is_refused_instead_of_waited_for(folder: Path) -> None:
     [
         (["--solver", "numbat"], "did you mean 'numba'"),
         (["--size", "0"], "sizes[0]"),
-        (["--iterations", "-1"], "options.iterations"),
-        (["--tolerance", "nan"], "options.tolerance"),
-        (["--first-guess", "best"], "options.first_guess"),
+        (["--max-iterations", "-1"], "options.max_iterations"),
+        (["--rtol", "nan"], "options.rtol"),
+        (["--initial-guess", "best"], "options.initial_guess"),
         (["--threads", "0"], "options.threads"),
     ],
     ids=str,

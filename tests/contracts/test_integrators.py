@@ -35,7 +35,7 @@ from springbench.solvers.registry import SOLVERS, load_target
 
 CONVERGED = StopRule(100, 1e-13)
 
-integrators = pytest.mark.parametrize("name", [name for name in INTEGRATORS if name != "own"])
+integrators = pytest.mark.parametrize("name", [name for name in INTEGRATORS if name != "substepping"])
 
 
 def made(

@@ -42,7 +42,7 @@ SWEEP = """
 scenes: [cloth.yaml]
 sizes: [6]
 solvers: [%s]
-options: {iterations: 10, rounds: 2, pictures: %s}
+options: {max_iterations: 10, rounds: 2, pictures: %s}
 """
 
 # One process imports what the command needs, and a copy of it runs each command.

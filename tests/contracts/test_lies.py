@@ -97,7 +97,7 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[l
     """Does a run of the busy solver; its rows, and its files."""
     monkeypatch.setitem(SOLVERS, "busy", f"{__name__}:Busy")
     (tmp_path / "scene.yaml").write_text(SCENE)
-    (spec,) = load_config(tmp_path / "scene.yaml", solvers=["busy"], iterations=3, rounds=1).list_runs()
+    (spec,) = load_config(tmp_path / "scene.yaml", solvers=["busy"], max_iterations=3, rounds=1).list_runs()
     files = RunFiles.for_run(spec, tmp_path)
     files.rows_path.parent.mkdir()
     return lambda: (execute_run(spec, files, lambda phase: None), files)

@@ -51,13 +51,13 @@ effects: [{kind: springs, stretch: 200}, {kind: hum, force: 0.5}, {kind: pins, a
 SWEEP = """
 scenes: [chain.yaml]
 solvers: [mine, sparse]
-options: {tolerance: 1e-8, iterations: 3000, record: false, pictures: false, judge: true, rounds: 1}
+options: {rtol: 1e-8, max_iterations: 3000, record: false, pictures: false, verify: true, rounds: 1}
 """
 ACCURACY = """
 scenes: [chain.yaml]
 solvers: [mine, sparse]
-curves: [{moment: 1, first_guess: current, rounds: 1, iterations: 200}]
-work: [{horizon: 0.1, rounds: 1}]
+curves: [{snapshot: 1, initial_guess: previous, rounds: 1, max_iterations: 200}]
+work: [{t_end: 0.1, rounds: 1}]
 """
 
 

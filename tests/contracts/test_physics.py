@@ -39,7 +39,7 @@ def moving(
         prepare(made, CompiledLocalGlobal()),
         MotionState(Motion(made.mesh.rest_positions, velocity), None, 0),
     )
-    run = simulate_scene(made, prepared, stop, initial_guess="current", frames=steps, initial_state=state)
+    run = simulate_scene(made, prepared, stop, initial_guess="previous", frames=steps, initial_state=state)
     return [
         (state.motion.positions, velocity),
         *((now.positions, now.velocity) for now in (s.state.motion for s in run)),
@@ -162,7 +162,7 @@ def test_a_step_never_ends_with_more_than_it_had(backend, iterations):
     velocity = 2.0 * np.random.default_rng(3).normal(size=FREE.mesh.rest_positions.shape)
     state = MotionState(Motion(FREE.mesh.rest_positions, velocity), None, 0)
     prepared, stop = backend.prepare(FREE.system), StopRule(iterations)
-    for step in simulate_scene(FREE, prepared, stop, initial_guess="current", frames=30, initial_state=state):
+    for step in simulate_scene(FREE, prepared, stop, initial_guess="previous", frames=30, initial_state=state):
         (p, v), (after, v_after) = state.motion, step.state.motion
         had = springs.value(p) + 0.5 * mass @ np.sum(v**2, axis=1)
         has = springs.value(after) + 0.5 * mass @ np.sum((v_after - v) ** 2, axis=1)

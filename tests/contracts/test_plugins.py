@@ -103,7 +103,7 @@ def configs(folder: Path, names: dict[str, str]) -> Path:
     )
     (folder / "sweep.yaml").write_text(
         f"scenes: [scene.yaml]\nsolvers: [{{name: '{names['solver']}', patience: 5}}]\nreports: ['{names['report']}']\n"
-        f"options: {{integrator: '{names['integrator']}', rounds: 1, iterations: 3, pictures: false}}\n"
+        f"options: {{integrator: '{names['integrator']}', rounds: 1, max_iterations: 3, pictures: false}}\n"
     )
     return folder / "sweep.yaml"
 

@@ -46,7 +46,7 @@ def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: s
     size, folder = (QUICK | LONG | TOUCH)[name], CONFIGS / ("touch" if name in TOUCH else "scenes")
     asked = {
         "solvers": [DEFAULT_ABLATION_SOLVER],
-        "tolerance": DEFAULT_ABLATION_TOLERANCE,
+        "rtol": DEFAULT_ABLATION_TOLERANCE,
         "sizes": [size] if size else [],
         "rounds": 1,
         "threads": 1,

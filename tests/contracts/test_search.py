@@ -58,7 +58,7 @@ class Tolerant(Formula):
 def found(monkeypatch: pytest.MonkeyPatch, error: float, told: list[str], **followers: Stepper) -> SearchResult:
     """The answer among ways of these names, the last of which tells the errors of all."""
     exact = Tolerant(lambda steps: 5.0 * steps**-4.0, 0.5, 4)
-    named = [Method("own", name, one) for name, one in {**followers, "exact": exact}.items()]
+    named = [Method("substepping", name, one) for name, one in {**followers, "exact": exact}.items()]
     monkeypatch.setattr(
         "springbench.harness.experiments.error_control.method_search.prepare_candidate_methods", lambda *_: named
     )
@@ -112,7 +112,9 @@ def test_a_way_that_takes_longer_than_the_next_promises_is_tried_after_it(monkey
 
 def test_an_error_that_no_way_comes_near_is_refused_with_the_nearest(monkeypatch):
     lows = {"a": 0.3, "b": 0.2}
-    named = [Method("own", k, Formula(lambda steps, low=low: low + 1.0 / steps**2, 1e-3)) for k, low in lows.items()]
+    named = [
+        Method("substepping", k, Formula(lambda steps, low=low: low + 1.0 / steps**2, 1e-3)) for k, low in lows.items()
+    ]
     monkeypatch.setattr(
         "springbench.harness.experiments.error_control.method_search.prepare_candidate_methods", lambda *_: named
     )
@@ -128,4 +130,4 @@ def test_an_error_that_no_way_comes_near_is_refused_with_the_nearest(monkeypatch
 
 def _truth() -> Trial:
     follower = Formula(lambda steps: 0.0, 1e-3)
-    return Trial(Method("own", "truth", follower), 1.0, follower.integrate_motion(1.0), 0.0, 2)
+    return Trial(Method("substepping", "truth", follower), 1.0, follower.integrate_motion(1.0), 0.0, 2)

@@ -65,7 +65,7 @@ def test_a_sheet_that_falls_onto_itself_passes_through_nowhere(name):
     made, touched = upside_down(APART), 0
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     rule = StopRule(60, 1e-3)
-    for step in simulate_scene(made, prepare(made, solver(name)), rule, initial_guess="motion", frames=14):
+    for step in simulate_scene(made, prepare(made, solver(name)), rule, initial_guess="extrapolated", frames=14):
         assert count_intersections(made, step.positions, 0.0) == 0
         assert not energy.find_violated_pairs(step.positions)
         touched = max(touched, len(energy.hessian_blocks(step.positions).vertices))
@@ -74,7 +74,9 @@ def test_a_sheet_that_falls_onto_itself_passes_through_nowhere(name):
 
 def test_without_the_effect_it_does_pass_through():
     made, (apart,) = upside_down(), upside_down(APART).intersection_checks
-    steps = simulate_scene(made, prepare(made, NewtonSolver()), StopRule(60, 1e-3), initial_guess="motion", frames=14)
+    steps = simulate_scene(
+        made, prepare(made, NewtonSolver()), StopRule(60, 1e-3), initial_guess="extrapolated", frames=14
+    )
     assert any(apart.find_intersections(step.positions, 0.0) for step in steps)
     assert count_intersections(made, made.mesh.rest_positions, 0.0) is None
 
@@ -84,7 +86,7 @@ def begun() -> tuple[Scene, MotionState]:
     """A step in which it touches."""
     made = upside_down(APART)
     rule = StopRule(60, 1e-3)
-    *_, last = simulate_scene(made, prepare(made, NewtonSolver()), rule, initial_guess="motion", frames=9)
+    *_, last = simulate_scene(made, prepare(made, NewtonSolver()), rule, initial_guess="extrapolated", frames=9)
     return made, last.state
 
 
@@ -128,7 +130,7 @@ def test_sheets_that_all_but_touch_fall_as_one(name):
     # Gaps of a billionth of the range are 1e15 N/m stiff: of 30 mm that all fall, too few digits were left for them.
     spec = load_scene(CONFIGS / "hard-touch" / "coplanar-sheets.yaml")
     made = build_scene(spec, 4)
-    steps = simulate_scene(made, prepare(made, solver(name)), StopRule(20, 1e-4), initial_guess="current", frames=2)
+    steps = simulate_scene(made, prepare(made, solver(name)), StopRule(20, 1e-4), initial_guess="previous", frames=2)
     assert all(step.solution.termination_reason == "converged" for step in steps)
 
 
@@ -140,7 +142,9 @@ def test_where_nothing_is_near_the_motion_is_that_without(name):
         made = build_test_scene(
             GridMesh(), SpringsEffect(stretch=100.0, shear=20.0), GravityEffect(), pins, *effects, size=7
         )
-        steps = simulate_scene(made, prepare(made, solver(name)), StopRule(50, 1e-4), initial_guess="motion", frames=3)
+        steps = simulate_scene(
+            made, prepare(made, solver(name)), StopRule(50, 1e-4), initial_guess="extrapolated", frames=3
+        )
         runs.append([step.positions for step in steps])
     np.testing.assert_array_equal(*runs)
 
@@ -154,7 +158,7 @@ def test_two_free_sheets_that_collide_keep_their_momentum():
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     rule = StopRule(100, 1e-11)
     for step in simulate_scene(
-        made, prepare(made, NewtonSolver()), rule, initial_guess="motion", frames=6, initial_state=state
+        made, prepare(made, NewtonSolver()), rule, initial_guess="extrapolated", frames=6, initial_state=state
     ):
         touched += len(energy.hessian_blocks(step.positions).vertices)
         # Forces of pairs add up to nothing; what is left is the solve's tolerance.
@@ -208,7 +212,7 @@ def test_a_fine_mesh_with_edges_below_the_thickness_runs():
     )
     assert made.mesh.spacing < fine.thickness
     for step in simulate_scene(
-        made, prepare(made, NewtonSolver()), StopRule(30, 1e-4), initial_guess="current", frames=2
+        made, prepare(made, NewtonSolver()), StopRule(30, 1e-4), initial_guess="previous", frames=2
     ):
         assert count_intersections(made, step.positions, 0.0) == 0
 

@@ -20,7 +20,7 @@ from tests.plugin_solvers import SCENE_SOURCE
 ROOT = Path(__file__).resolve().parents[2]
 RUNS = 4
 SWEEP = f"scenes: [scene.yaml]\nsizes: {list(range(3, 3 + RUNS))}\nsolvers: [sparse]\n" + (
-    "options: {frames: 40, rounds: 1, iterations: 20, record: false, pictures: false}\n"
+    "options: {frames: 40, rounds: 1, max_iterations: 20, record: false, pictures: false}\n"
 )
 
 

@@ -69,7 +69,7 @@ effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, at: [firs
     "accuracy.yaml": """
 scenes: [odd.yaml]
 solvers: ["./mine.py:Mine", sparse]
-work: [{horizon: 0.1, iterations: 20}]
+work: [{t_end: 0.1, max_iterations: 20}]
 """,
     "sweep.yaml": """
 scenes: [odd.yaml]
@@ -82,7 +82,7 @@ COMMANDS = {
     "accuracy": "accuracy accuracy.yaml",
     "recommend": "recommend odd.yaml --error 0.9 --t-end 0.1 --budget 10",
     "roofline": "roofline sweep.yaml --budget 0.1",
-    "ablate": "ablate odd.yaml --tolerance 0.1",
+    "ablate": "ablate odd.yaml --rtol 0.1",
     "gallery": "gallery odd.yaml -o sheet.png",
     "run to an error": "run odd.yaml --error 0.1 --t-end 0.1",
     "preview": "preview odd.yaml -o picture.png",

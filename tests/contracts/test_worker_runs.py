@@ -122,7 +122,9 @@ def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeyp
     assert sys.modules[module].seen == os.getpid()
 
 
-LONG = "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {frames: 100000, rounds: 1, iterations: 50, record: false}\n"
+LONG = (
+    "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {frames: 100000, rounds: 1, max_iterations: 50, record: false}\n"
+)
 
 
 @pytest.mark.parametrize("how", mark_rare_cases([signal.SIGKILL, signal.SIGTERM, signal.SIGINT], [signal.SIGKILL]))
@@ -161,7 +163,7 @@ def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.Monk
     note = tmp_path / "note"
     does = f"import os; open({str(note)!r}, 'a').write(str(os.getpid()) + ' ')"
     made = write_plugin_solver(
-        tmp_path, monkeypatch, solve_code=does, options=SWEEP_OPTIONS + ", tolerance: [1e-2, 1e-3, 1e-4]"
+        tmp_path, monkeypatch, solve_code=does, options=SWEEP_OPTIONS + ", rtol: [1e-2, 1e-3, 1e-4]"
     )
     assert (told := ran(made, "--workers", "1")).exit_code == 0, told.output
     workers = set(note.read_text().split())
@@ -178,7 +180,7 @@ def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_mea
     monkeypatch.setattr(
         sweep_pictures, "draw_sweep_pictures", leave
     )  # where it draws: that process is a fork of this one
-    made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, iterations: 5")
+    made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, max_iterations: 5")
     told = ran(made)
     assert told.exit_code == 1
     assert "the process that draws ended its process with exit code 3" in " ".join(told.output.split())

@@ -91,13 +91,13 @@ def ran(made: Scene, solver: Any, changes: Frames | tuple[float, float] = (0.0, 
     state = build_initial_state(made)
     p, v = state.motion
     state = replace(state, motion=Motion(p + changes[0], v + changes[1] / made.system.time_step))
-    run = simulate_scene(made, prepared, STOP, initial_guess="current", frames=FRAMES, initial_state=state)
+    run = simulate_scene(made, prepared, STOP, initial_guess="previous", frames=FRAMES, initial_state=state)
     return np.array([step.positions for step in run])
 
 
 def _fall(made: Scene, p: Positions) -> float:
     """What the objective of the first step falls by to p [J]."""
-    stated = build_problem(made, build_initial_state(made), "current")
+    stated = build_problem(made, build_initial_state(made), "previous")
     return -StepObjective(FixedObjective(made.system), stated).objective_change(p, stated.initial_guess)[0]
 
 

@@ -22,7 +22,7 @@ SWEEP = """
 scenes: [cloth.yaml]
 sizes: [3]
 solvers: [{name: vbd, device: cuda, spectral_radius: 0}, {name: vbd, spectral_radius: 0}]
-options: {iterations: 40, tolerance: 1.0e-2, rounds: 1, frames: 2, threads: 1, pictures: false, convergence_frames: []}
+options: {max_iterations: 40, rtol: 1.0e-2, rounds: 1, frames: 2, threads: 1, pictures: false, convergence_frames: []}
 """
 
 

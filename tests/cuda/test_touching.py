@@ -31,7 +31,7 @@ def touching(name: str) -> StepProblem:
     p, v = state.motion.positions.copy(), state.motion.velocity - [0.3, 1.0, 0.1]
     for _ in range(40):  # down to it, by no more than the distance at a time
         p[:, 1] -= energy.obstacles[0].signed_distance(p, 0.0).min() - energy.min_distance + INSIDE
-    found = build_problem(made, MotionState(state.motion._replace(positions=p, velocity=v), None, 0), "current")
+    found = build_problem(made, MotionState(state.motion._replace(positions=p, velocity=v), None, 0), "previous")
     (energy,) = (energy for energy in found.energies if isinstance(energy, HalfSpaceContact))
     end = iterates(VertexBlockDescent(), found, ITERATIONS)[-1]
     assert (energy.compute_gaps(end) < 0.0).any()
@@ -56,7 +56,7 @@ def test_a_host_iterates_the_normal_forces_of_friction_and_timed_steps_repeat_it
         size=3,
         velocity=(0.5, -8.0, 0.0),
     )
-    settings = SteppingSettings(StopRule(2), "current", 2, 1)
+    settings = SteppingSettings(StopRule(2), "previous", 2, 1)
     found = wrap_device_solver(prepare(made, VertexBlockDescent(device="cuda", precision="float64")))
     assert found is not None
     first = list(iterate_steps(made, found, settings))

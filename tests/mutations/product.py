@@ -29,7 +29,9 @@ def main(solver: str) -> None:
     with TemporaryDirectory() as home:
         folder = Path(home)
         (folder / "scene.yaml").write_text(SCENE)
-        (run,) = load_config(folder / "scene.yaml", solvers=[solver], iterations=60, rounds=1, threads=1).list_runs()
+        (run,) = load_config(
+            folder / "scene.yaml", solvers=[solver], max_iterations=60, rounds=1, threads=1
+        ).list_runs()
         files = RunFiles.for_run(run, folder)
         files.rows_path.parent.mkdir()
         first = execute_run(run, files, lambda phase: None)[0]

@@ -78,7 +78,7 @@ def build_reference_step(
     dt = declared.time_step
     now, earlier = filter_motion(now, effect_terms), filter_motion(before or now, effect_terms)
     (p, v), (p0, v0) = ((to_extended(a), to_extended(b)) for a, b in (now, earlier))
-    begins_with_euler = integrator == "own" or (integrator == "bdf2" and before is None)
+    begins_with_euler = integrator == "substepping" or (integrator == "bdf2" and before is None)
     method = "implicit-euler" if begins_with_euler else integrator
     if method == "implicit-euler":
         c, target, origin, when, ahead = 1.0, p + dt * v, p, 1.0, 0.0

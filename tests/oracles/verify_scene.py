@@ -93,9 +93,9 @@ def _compare_single_stage(
     reference_step = build_reference_step(integrator, own.declaration, own.effect_terms, now, before, time)
     m = reference_step.step_moment
     x = np.asarray(m.p + m.stage_fraction * m.time_step * m.v, float) + point.shift
-    answer: Any = _FixedAnswer(lambda until: x, with_velocity=integrator == "own")
+    answer: Any = _FixedAnswer(lambda until: x, with_velocity=integrator == "substepping")
     run = simulate_scene(
-        scene, answer, StopRule(), initial_guess="current", frames=index + 1, initial_state=point.state
+        scene, answer, StopRule(), initial_guess="previous", frames=index + 1, initial_state=point.state
     )
     done = next(run)
     at = ComparisonPoint(own, with_friction_at(reference_step, done.problem, x), done.problem, x, point.direction)
@@ -131,7 +131,7 @@ def _compare_stages(
     answer: Any = _FixedAnswer(x)
     index = point.state.index
     done = next(
-        simulate_scene(scene, answer, StopRule(), initial_guess="current", frames=index + 1, initial_state=point.state)
+        simulate_scene(scene, answer, StopRule(), initial_guess="previous", frames=index + 1, initial_state=point.state)
     )
     if len(done.stages) != len(expected.reference_steps):
         yield TermMismatch("unknowns of the step (number)", 1.0)

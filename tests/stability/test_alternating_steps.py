@@ -38,7 +38,7 @@ def test_each_step_is_one_of_its_length_from_where_the_last_one_ended(name: str)
     assert scene.alternate_scene is not None
     alone = [solver.prepare(part.system) for part in (scene, scene.alternate_scene)]
     state, time = build_initial_state(scene), 0.0  # added up here, multiplied there: some eps apart
-    for step in simulate_scene(scene, prepare(scene, solver), STOP, initial_guess="current", frames=FRAMES):
+    for step in simulate_scene(scene, prepare(scene, solver), STOP, initial_guess="previous", frames=FRAMES):
         dt, begun = LENGTHS[state.index % 2], step.problem.step_start
         assert (step.problem.system.time_step, begun.time) == (dt, pytest.approx(time, rel=1e-15))
         np.testing.assert_array_equal(step.problem.inertial_target, state.motion.positions + dt * state.motion.velocity)
@@ -67,7 +67,7 @@ def test_each_step_is_judged_by_the_matrix_of_its_length():
     scene = made("midpoint")
     judge = StepVerifier(scene, None, is_minimiser=True)
     for step in simulate_scene(
-        scene, prepare(scene, NewtonSolver()), StopRule(100), initial_guess="current", frames=FRAMES
+        scene, prepare(scene, NewtonSolver()), StopRule(100), initial_guess="previous", frames=FRAMES
     ):
         found = judge(step)
         assert found["stationarity_above_roundoff"] == 0.0
@@ -115,7 +115,7 @@ def test_what_measures_at_one_time_step_refuses_two_by_the_key(command: str, tmp
     config, options = FILE, ["--error", "0.1"] if command == "recommend" else []
     if command == "accuracy":
         config = tmp_path / "config.yaml"
-        config.write_text(f"scenes: [{FILE}]\nsolvers: [newton]\nwork: [{{horizon: 1, time_step: [0.1]}}]\n")
+        config.write_text(f"scenes: [{FILE}]\nsolvers: [newton]\nwork: [{{t_end: 1, time_step: [0.1]}}]\n")
     answer = CliRunner().invoke(app, [command, str(config), "--results", str(tmp_path / "results"), *options])
     assert answer.exit_code == 2, (answer.output, answer.exception)
     assert f"{FILE}:7: alternate_time_step: " in answer.output.replace("\n", "")

@@ -36,7 +36,7 @@ effects: [{{kind: springs, stretch: 1.0e+12}}, {{kind: gravity}}, {{kind: pins, 
 SWEEP = """
 scenes: [scene.yaml]
 solvers: [broken, sparse]
-options: {pictures: false, rounds: 1, iterations: 5}
+options: {pictures: false, rounds: 1, max_iterations: 5}
 """
 
 

@@ -39,7 +39,7 @@ UNIQUE = (
 def answers(case: str, stop: StopRule) -> tuple[StepProblem, dict[str, Solution]]:
     """The first step of a case, and the answers of the minimisers that take it."""
     made, found = scene(case), {}
-    stated = build_problem(made, build_initial_state(made), "current")
+    stated = build_problem(made, build_initial_state(made), "previous")
     for name, solver in MINIMISERS.items():
         try:
             found[name] = prepare(made, solver).solve(stated, stop)

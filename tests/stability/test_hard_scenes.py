@@ -115,7 +115,7 @@ def test_a_hard_scene_is_refused_by_name_or_stays_finite_descends_and_repeats_it
         return
     again, state = prepare(made, solver), build_initial_state(made)
     for frame in range(1, FRAMES + 1):
-        stated = build_problem(made, state, "current")
+        stated = build_problem(made, state, "previous")
         if solver.is_monotone:
             iterates = [stated.initial_guess, *(p.copy() for p in islice(prepared.iterates(stated), ITERATIONS))]
             values = [stated.value(p) for p in iterates]
@@ -136,7 +136,7 @@ def test_a_hard_scene_is_refused_by_name_or_stays_finite_descends_and_repeats_it
 
 
 def steps(made: Scene, solver: Solver, iterations: int) -> list[SimulationStep]:
-    run = simulate_scene(made, prepare(made, solver), StopRule(iterations), initial_guess="current", frames=FRAMES)
+    run = simulate_scene(made, prepare(made, solver), StopRule(iterations), initial_guess="previous", frames=FRAMES)
     return list(run)
 
 

@@ -62,7 +62,7 @@ def at_a_saddle(saddle: str, integrator: str) -> tuple[Scene, StepProblem]:
     made = replace(made, integrator=method, system=replace(made.system, inertia_factor=method.inertia_factor))
     made = replace(made, pin_targets=p[made.system.pins.vertices])
     still = Motion(p, np.zeros_like(p))
-    stated = build_problem(made, MotionState(still, still, 1), "current")
+    stated = build_problem(made, MotionState(still, still, 1), "previous")
     return made, replace(stated, external_force=stated.external_force + stated.gradient(p))
 
 
@@ -141,7 +141,7 @@ def ends(case: str, solver: Solver, frames: int) -> list[str]:
     made = build_scene(spec, spec.default_size or 0)
     judge, wrong = StepVerifier(made, None, is_minimiser=True), []
     stop = StopRule(20_000, 1e-6) if case in VALLEY else STOP
-    for step in simulate_scene(made, prepare(made, solver), stop, initial_guess="current", frames=frames):
+    for step in simulate_scene(made, prepare(made, solver), stop, initial_guess="previous", frames=frames):
         assert np.isfinite(step.positions).all()
         found = judge(step)
         if not (found["is_local_minimum"] and found["stationarity_above_roundoff"] <= TOLERANCE_SLACK * 1e-6):

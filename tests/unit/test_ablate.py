@@ -66,7 +66,7 @@ def by_name(rows: Sequence[dict[str, Any]], kind: str = "ablated") -> dict[str, 
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
-    return rows_of(CLOTH, tmp_path_factory.mktemp("cloth"), pairs=True, iterations=20)
+    return rows_of(CLOTH, tmp_path_factory.mktemp("cloth"), pairs=True, max_iterations=20)
 
 
 def test_every_effect_is_left_out_once_and_every_pair_on_request(tmp_path: Path):
@@ -125,14 +125,14 @@ def test_pairs_are_told_of_under_both_names(told):
 
 
 def test_a_scene_that_cannot_be_without_an_effect_says_so(tmp_path: Path):
-    told = rows_of(HELD, tmp_path, iterations=5)
+    told = rows_of(HELD, tmp_path, max_iterations=5)
     assert by_name(told)["springs"]["status"] == "unsolvable"
     assert "impossible without it (" in describe_effect(by_name(told)["springs"], told)
     assert by_name(told)["gravity"]["status"] == "ok"
 
 
 def test_the_error_of_the_solver_falls_with_its_iterations_and_that_of_the_step_does_not(tmp_path: Path):
-    few, many = (rows_of(CLOTH, tmp_path, iterations=count) for count in (2, 500))
+    few, many = (rows_of(CLOTH, tmp_path, max_iterations=count) for count in (2, 500))
     before, after = (by_name(told, "error") for told in (few, many))
     assert after["solver"]["displacement_max"] < 1e-3 * before["solver"]["displacement_max"]
     assert after["time-step"]["displacement_max"] == pytest.approx(
@@ -203,7 +203,18 @@ def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: 
     for handler in list((log := logging.getLogger("springbench")).handlers):  # of another test, written elsewhere
         log.removeHandler(handler)
     (scene := tmp_path / "cloth.yaml").write_text(CLOTH)
-    asked = ["ablate", str(scene), "--results", str(tmp_path), "--frames", "4", "--rounds", "2", "--iterations", "5"]
+    asked = [
+        "ablate",
+        str(scene),
+        "--results",
+        str(tmp_path),
+        "--frames",
+        "4",
+        "--rounds",
+        "2",
+        "--max-iterations",
+        "5",
+    ]
     told = CliRunner().invoke(app, asked)
     assert told.exit_code == 0, told.output
     assert "air-drag: " in told.stderr

@@ -29,9 +29,9 @@ CONFIG = """
 scenes: [cloth.yaml, other.yaml]
 solvers: [numba, {name: newton}, xpbd]
 curves:
-  - {scene: cloth, size: 4, moment: [early, 3], rounds: 7}
+  - {scene: cloth, size: 4, snapshot: [early, 3], rounds: 7}
 work:
-  - {scene: other, size: [4, 5], solver: xpbd, horizon: 0.5, time_step: [1/30, 1/60], tolerance: [null, 0.1]}
+  - {scene: other, size: [4, 5], solver: xpbd, t_end: 0.5, time_step: [1/30, 1/60], rtol: [null, 0.1]}
 """
 
 
@@ -49,30 +49,28 @@ def loaded(folder: Path, text: str) -> AccuracyPlan:
 
 def test_a_study_of_curves_asks_for_each_moment_and_solver_that_minimises(folder: Path) -> None:
     units = loaded(folder, CONFIG).curves
-    assert [(u.moment, u.solver.name) for u in units] == [
+    assert [(u.snapshot, u.solver.name) for u in units] == [
         ("early", "numba"),
         ("early", "newton"),
         (3, "numba"),
         (3, "newton"),
     ]
     assert {(u.case.scene_name, u.case.size, u.initial_guesses, u.measurement.rounds) for u in units} == {
-        ("cloth", 4, ("current", "inertial"), 7)
+        ("cloth", 4, ("previous", "inertial"), 7)
     }
 
 
 def test_studies_take_every_first_guess_that_is_no_solve_and_reports_have_words_for_each(folder: Path) -> None:
     *guesses, coarse = get_args(InitialGuess)
     assert coarse == COARSE_TO_FINE
-    asked = CONFIG.replace("rounds: 7", f"rounds: 7, first_guess: [{', '.join(guesses)}]")
+    asked = CONFIG.replace("rounds: 7", f"rounds: 7, initial_guess: [{', '.join(guesses)}]")
     assert {unit.initial_guesses for unit in loaded(folder, asked).curves} == {tuple(guesses)}
     assert set(INITIAL_GUESS_LABELS) == set(INITIAL_GUESSES) == set(guesses)
 
 
 def test_a_study_of_work_asks_for_all_combinations(folder: Path) -> None:
     units = loaded(folder, CONFIG).work
-    found = {
-        (u.case.scene_name, u.case.size, u.case.scene.time_step, u.options["tolerance"], u.solver.name) for u in units
-    }
+    found = {(u.case.scene_name, u.case.size, u.case.scene.time_step, u.options["rtol"], u.solver.name) for u in units}
     assert found == {
         ("other", size, dt, tolerance, "xpbd")
         for size in (4, 5)
@@ -83,7 +81,7 @@ def test_a_study_of_work_asks_for_all_combinations(folder: Path) -> None:
 
 
 def test_what_two_studies_ask_for_is_measured_as_the_first_says(folder: Path) -> None:
-    twice = CONFIG.replace("work:", "  - {scene: cloth, size: 4, moment: early, solver: newton, rounds: 2}\nwork:")
+    twice = CONFIG.replace("work:", "  - {scene: cloth, size: 4, snapshot: early, solver: newton, rounds: 2}\nwork:")
     once, both = loaded(folder, CONFIG), loaded(folder, twice)
     assert [(u.build_file_stem(), u.measurement) for u in both.curves] == [
         (u.build_file_stem(), u.measurement) for u in once.curves
@@ -105,17 +103,17 @@ def test_a_changed_scene_is_another_point(folder: Path) -> None:
 
 
 MISTAKES = [
-    ("moment: [early", "momnt: [early", 5, "did you mean 'moment'"),
+    ("snapshot: [early", "snapsot: [early", 5, "did you mean 'snapshot'"),
     ("scene: cloth", "scene: clod", 5, "did you mean 'cloth'"),
     ("solver: xpbd", "solver: xpdb", 7, "did you mean 'xpbd'"),
     ("early, 3", "erly, 3", 5, "'early'"),
     ("early, 3", "early, 6", 5, "frame 6 is not among the 5 frames of cloth"),
     ("size: 4,", "", 5, "is missing; the scene cloth needs a mesh size"),
     ("size: 4,", "size: 9999,", 5, "at most"),
-    ("horizon: 0.5", "horizon: 0.51", 7, "is no multiple of the time step 0.0333333 s"),
-    ("horizon: 0.5", "horizon: 0", 7, "greater than 0"),
+    ("t_end: 0.5", "t_end: 0.51", 7, "is no multiple of the time step 0.0333333 s"),
+    ("t_end: 0.5", "t_end: 0", 7, "greater than 0"),
     ("rounds: 7", "time_limit: -1", 5, "greater than 0"),
-    ("rounds: 7", "first_guess: [coarse]", 5, "this one is a solve itself"),
+    ("rounds: 7", "initial_guess: [coarse-to-fine]", 5, "this one is a solve itself"),
     ("cloth.yaml, ", "clod.yaml, ", 2, "there is no file"),
     ("{name: newton}", "{name: newton, order: 2}", 3, "unknown key"),
 ]
@@ -155,7 +153,7 @@ def test_the_paper_is_reproduced_with_its_curtains() -> None:
     frames = {key: set() for key in PAPER}
     for unit in units:
         if unit.solver.name == "numba":
-            frames[unit.case.scene_name, unit.case.size].add(unit.moment)
+            frames[unit.case.scene_name, unit.case.size].add(unit.snapshot)
     assert all(found == set(range(1, 51)) for found in frames.values())
     cases = {(unit.case.scene_name, unit.case.size): unit.case for unit in units}
     for key, k in PAPER.items():

@@ -21,7 +21,7 @@ def specs() -> list[WorkSpec]:
             BenchmarkCase("scene", SimpleNamespace(time_step=dt), 4, "implicit-euler"),  # type: ignore[arg-type]
             1.0,
             SolverSpec(solver, {}),
-            {"first_guess": "current", "iterations": 9, "tolerance": tolerance},
+            {"initial_guess": "previous", "max_iterations": 9, "rtol": tolerance},
             MeasurementSettings(1, rounds=1, time_limit=1e3),
         )
         for solver in SOLVERS
@@ -37,7 +37,7 @@ def table(seed: int) -> dict[Any, dict[str, Any]]:
         a, b, c, d = (10.0 ** random.uniform(*at) for at in ((-2, 1), (-3, 0), (-1, 2), (-2, 0)))
         p, q, stable = random.choice((1, 2, 4)), random.uniform(0.5, 1.0), random.choice((1.0, 0.11))
         for one in (one for one in specs() if one.solver.name == solver):
-            dt, tolerance = one.case.scene.time_step, one.options["tolerance"]
+            dt, tolerance = one.case.scene.time_step, one.options["rtol"]
             error = a * dt**p + b * tolerance
             cost = c * dt**-q * (1.0 + d * TOLERANCES.index(tolerance))
             row = {"status": "ok", "error": error, "seconds_per_simulated_second": cost}
@@ -46,7 +46,7 @@ def table(seed: int) -> dict[Any, dict[str, Any]]:
 
 
 def key(spec: WorkSpec) -> tuple[Any, ...]:
-    return spec.solver.name, spec.case.scene.time_step, spec.options["tolerance"]
+    return spec.solver.name, spec.case.scene.time_step, spec.options["rtol"]
 
 
 class Measured:

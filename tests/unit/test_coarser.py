@@ -45,7 +45,7 @@ def test_vertices_that_both_meshes_have_keep_their_values(tmp_path):
 def test_the_guess_is_nearer_to_the_minimum_and_saves_iterations(tmp_path):
     scene = made(tmp_path)
     state, ready = build_initial_state(scene), prepare(scene, Lbfgs())
-    current, coarse = (build_problem(scene, state, guess) for guess in ("current", "coarse"))
+    current, coarse = (build_problem(scene, state, guess) for guess in ("previous", "coarse-to-fine"))
     np.testing.assert_array_equal(coarse.initial_guess[scene.system.pins.vertices], coarse.pin_targets)
     wanted = ready.solve(current, StopRule(2000, 1e-8)).positions
     away = [np.abs(stated.initial_guess - wanted).max() for stated in (current, coarse)]
@@ -53,13 +53,16 @@ def test_the_guess_is_nearer_to_the_minimum_and_saves_iterations(tmp_path):
     first, second = (ready.solve(stated, StopRule(2000, 1e-3)) for stated in (current, coarse))
     assert first.termination_reason == second.termination_reason == "converged"
     assert second.num_iterations < first.num_iterations
-    np.testing.assert_array_equal(coarse.initial_guess, build_problem(scene, state, "coarse").initial_guess)
+    np.testing.assert_array_equal(coarse.initial_guess, build_problem(scene, state, "coarse-to-fine").initial_guess)
 
 
 def test_it_goes_on_from_step_to_step(tmp_path):
     scene = made(tmp_path, integrator="bdf2")
     rule, ready = StopRule(2000, 1e-4), prepare(scene, Lbfgs())
-    runs = [list(simulate_scene(scene, ready, rule, initial_guess=guess, frames=3)) for guess in ("current", "coarse")]
+    runs = [
+        list(simulate_scene(scene, ready, rule, initial_guess=guess, frames=3))
+        for guess in ("previous", "coarse-to-fine")
+    ]
     assert {step.solution.termination_reason for steps in runs for step in steps} == {"converged"}
     # It falls by 15 cm, and wrinkles of some millimetres choose their side by the guess.
     np.testing.assert_allclose(*(steps[-1].positions for steps in runs), rtol=0, atol=5e-3)
@@ -71,7 +74,7 @@ def test_it_goes_on_from_step_to_step(tmp_path):
         ({"size": 16}, "smaller than 17"),
         ({"pins": "indices: [0]"}, "effects name vertices by `indices` or `every`"),
         ({"pins": "every: 7"}, "effects name vertices by `indices` or `every`"),
-        ({"integrator": "sdirk-2"}, "coarse is for integrators with one stage per step"),
+        ({"integrator": "sdirk-2"}, "coarse-to-fine is for integrators with one stage per step"),
         ({"pins": "box: {low: [0.02, -1, 0.02], high: [0.03, 1, 0.03]}", "size": 41}, "no vertex of the mesh lies in"),
     ],
     ids=["small", "indices", "every", "several unknowns", "an empty box"],
@@ -79,10 +82,10 @@ def test_it_goes_on_from_step_to_step(tmp_path):
 def test_where_there_is_no_coarser_mesh_it_is_refused(tmp_path, given, why):
     scene = made(tmp_path, **given)
     with pytest.raises(Unsupported, match=why):
-        build_problem(scene, build_initial_state(scene), "coarse")
+        build_problem(scene, build_initial_state(scene), "coarse-to-fine")
 
 
 def test_a_scene_of_one_size_has_none(tmp_path):
     scene = replace(made(tmp_path), build_coarser=None)
     with pytest.raises(Unsupported, match="the mesh is from a file"):
-        build_problem(scene, build_initial_state(scene), "coarse")
+        build_problem(scene, build_initial_state(scene), "coarse-to-fine")

@@ -28,7 +28,7 @@ SWEEP = """
 scenes: [cloth.yaml]
 sizes: [3]
 solvers: [{name: vbd, device: cuda}, vbd]
-options: {iterations: 2, rounds: 1, frames: 1, threads: 1, pictures: false}
+options: {max_iterations: 2, rounds: 1, frames: 1, threads: 1, pictures: false}
 """
 
 

@@ -41,7 +41,11 @@ def gaps(p: np.ndarray) -> np.ndarray:
 def test_a_seam_closes_when_it_should_and_stays_closed(solver):
     made = build_scene(spec(SEWN), 5)
     steps = simulate_scene(
-        made, prepare(made, load_target(SOLVERS[solver])()), StopRule(300, 1e-6), initial_guess="motion", frames=14
+        made,
+        prepare(made, load_target(SOLVERS[solver])()),
+        StopRule(300, 1e-6),
+        initial_guess="extrapolated",
+        frames=14,
     )
     open_ = [float(gaps(step.positions).max()) for step in steps]
     assert open_[0] == pytest.approx(0.2, abs=1e-12)  # they begin at the end of this step
@@ -55,7 +59,11 @@ def test_with_self_contact_the_panels_meet_and_pass_nowhere():
     made = build_scene(spec(SEWN, SelfContactEffect(thickness=0.01)), 5)
     last = made.mesh.rest_positions
     for step in simulate_scene(
-        made, prepare(made, load_target(SOLVERS["newton"])()), StopRule(50, 1e-4), initial_guess="motion", frames=14
+        made,
+        prepare(made, load_target(SOLVERS["newton"])()),
+        StopRule(50, 1e-4),
+        initial_guess="extrapolated",
+        frames=14,
     ):
         assert count_intersections(made, step.positions, 0.0) == 0
         last = step.positions

@@ -42,7 +42,7 @@ engines = pytest.mark.parametrize("name", ENGINES)
 CONFIG = """
 scenes: [net.yaml]
 solvers: [newton, {engine}]
-work: [{{size: 3, horizon: 0.1, integrator: own, iterations: 20}}]
+work: [{{size: 3, t_end: 0.1, integrator: substepping, max_iterations: 20}}]
 """
 NET = """
 mesh: {kind: net, width: 2.0, height: 2.0}
@@ -53,7 +53,7 @@ effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [corn
 """
 
 
-def made(*effects: Any, mesh: Any = None, size: int = 4, integrator: str = "own", **given: Any) -> Scene:
+def made(*effects: Any, mesh: Any = None, size: int = 4, integrator: str = "substepping", **given: Any) -> Scene:
     path = Path("scene.yaml")
     spec = SceneSpec(mesh=mesh or GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=path, **given)
     return build_scene(spec, size, integrator)
@@ -138,7 +138,7 @@ def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, dampi
         HANGING[2],
     )
     scene = made(*parts, size=3, velocity=(0.3, 0.0, -0.2))
-    stated = build_problem(scene, build_initial_state(scene), "current")
+    stated = build_problem(scene, build_initial_state(scene), "previous")
     wind = replace(
         stated, external_force=stated.external_force + np.random.default_rng(0).normal(size=stated.external_force.shape)
     )
@@ -156,7 +156,7 @@ def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, dampi
 def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
     scene = made(GravityEffect(), EtherDragEffect(rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
     found = ready("mujoco", scene.system).solve(
-        build_problem(scene, build_initial_state(scene), "current"), StopRule(400)
+        build_problem(scene, build_initial_state(scene), "previous"), StopRule(400)
     )
     free = scene.system.unpinned_mask
     assert found.velocity is not None
@@ -168,7 +168,7 @@ def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
 def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
     pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
     scene = made(SpringsEffect(stretch=500.0), GravityEffect(), pins, mesh=ChainMesh(), size=2)
-    stated = build_problem(scene, build_initial_state(scene), "current")
+    stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("pypbd", scene.system).solve(stated, StopRule(substeps))
     wanted = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps))
     # It may compute in single precision.
@@ -188,7 +188,7 @@ def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, A
     size, velocity = (2 if wanted == "xpbd" else 4), (0.3, 0.1, -0.2)  # its XPBD moves along all springs at once
     effects = SpringsEffect(stretch=500.0), GravityEffect(), pins
     scene = made(*effects, mesh=ChainMesh(), size=size, velocity=velocity)
-    stated = build_problem(scene, build_initial_state(scene), "current")
+    stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("newton-physics", scene.system, **parameters).solve(stated, StopRule(substeps)).positions
     if wanted == "semi-implicit":
         should = semi_implicit(scene, stated, substeps, damping=0.0)[0]
@@ -196,7 +196,7 @@ def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, A
         should = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps)).positions
     else:
         same = made(*effects, mesh=ChainMesh(), size=size, velocity=velocity, integrator="implicit-euler")
-        step = build_problem(same, build_initial_state(same), "current")
+        step = build_problem(same, build_initial_state(same), "previous")
         should = load_target(SOLVERS["newton"])().prepare(same.system).solve(step, StopRule(100, 1e-12)).positions
     assert np.abs(found - stated.current_positions).max() > 100 * 2e-6
     np.testing.assert_allclose(found, should, rtol=0, atol=2e-6)  # float32
@@ -205,13 +205,13 @@ def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, A
 def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linearised_step():
     effects = HANGING[:2], PinsEffect.model_validate({"at": ["top_corners"], "weight": "exact"})
     scene = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2))
-    stated = build_problem(scene, build_initial_state(scene), "current")
+    stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("taichi", scene.system, iterations=30, tolerance=1e-9).solve(stated, StopRule(1)).positions
     same = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2), integrator="implicit-euler")
     should = (
         load_target(SOLVERS["newton"])()
         .prepare(same.system)
-        .solve(build_problem(same, build_initial_state(same), "current"), StopRule(100, 1e-12))
+        .solve(build_problem(same, build_initial_state(same), "previous"), StopRule(100, 1e-12))
     )
     np.testing.assert_allclose(found, should.positions, rtol=0, atol=1e-9)
     once = ready("taichi", scene.system, iterations=1).solve(stated, StopRule(1)).positions
@@ -239,7 +239,7 @@ def test_newton_physics_says_where_there_is_no_device():
 def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_number(name: str, weight: float | str):
     pins = PinsEffect.model_validate({"at": ["top_corners"], "weight": weight})
     scene = made(*HANGING[:2], pins)
-    stated = build_problem(scene, build_initial_state(scene), "current")
+    stated = build_problem(scene, build_initial_state(scene), "previous")
     prepared = ready(name, scene.system)
     kept = stated.step_start.positions.copy()
     other = falling(build_random_problem(0))

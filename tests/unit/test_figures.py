@@ -117,7 +117,7 @@ def test_faults_are_found() -> None:
 
 
 def test_the_legend_has_the_order_of_the_curves(results: dict[str, Path]) -> None:
-    asked = FigureOptions(selectors=(("net", "10", "gap", "time"), ("net", "10", "current", "gap", "iterations")))
+    asked = FigureOptions(selectors=(("net", "10", "gap", "time"), ("net", "10", "previous", "gap", "iterations")))
     figure, _ = compose_kind("convergence", results["convergence"], asked)
     (legend,) = figure.legends
     lines = {str(line.get_label()): line for line in figure.axes[0].lines}

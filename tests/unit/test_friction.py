@@ -93,7 +93,7 @@ def steps(
     made: Scene, frames: int, solver: Solver | None = None, stop: StopRule = EXACTLY, state: MotionState | None = None
 ) -> list[SimulationStep]:
     prepared = prepare(made, solver or NewtonSolver())
-    return list(simulate_scene(made, prepared, stop, initial_guess="current", frames=frames, initial_state=state))
+    return list(simulate_scene(made, prepared, stop, initial_guess="previous", frames=frames, initial_state=state))
 
 
 def motion(made: Scene, run: list[SimulationStep]) -> np.ndarray:
@@ -171,7 +171,7 @@ def test_a_sheet_on_a_sheet_has_the_steps_own_pressure_too():
     begun = MotionState(build_initial_state(made).motion._replace(velocity=velocity), None, 0)
     run = list(
         simulate_scene(
-            made, prepare(made, NewtonSolver()), EXACTLY, initial_guess="current", frames=3, initial_state=begun
+            made, prepare(made, NewtonSolver()), EXACTLY, initial_guess="previous", frames=3, initial_state=begun
         )
     )
     for step in run:
@@ -204,7 +204,7 @@ class Counted:
 
 def solves(made: Scene, frames: int) -> tuple[list[StepProblem], list[SimulationStep]]:
     counted: Any = Counted(prepare(made, NewtonSolver()))
-    return counted.problems, list(simulate_scene(made, counted, EXACTLY, initial_guess="current", frames=frames))
+    return counted.problems, list(simulate_scene(made, counted, EXACTLY, initial_guess="previous", frames=frames))
 
 
 def test_rounds_are_done_where_friction_acts_and_nowhere_else():
@@ -266,7 +266,7 @@ SLID, STUCK, BETWEEN = (2e-3, -2e-3), (1e-7, 1e-4), (1e-3, -1e-3)
 def test_rounds_that_repeat_end_where_most_friction_acts_and_say_what_is_left(cycle, rounds, end, change):
     made = pebble(1e3)
     recited: Any = Recited(*cycle)
-    solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "current"), EXACTLY)
+    solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "previous"), EXACTLY)
     assert recited.solves == len(solved.iteration_counts) == rounds
     assert tuple(solved.solution.positions[0, :2]) == end
     assert solved.convergence is not None
@@ -278,7 +278,7 @@ def test_rounds_that_repeat_end_where_most_friction_acts_and_say_what_is_left(cy
 def test_rounds_that_converge_however_slowly_are_not_cut_short(factor):
     made = pebble(SLIPS, friction_rounds=20)
     recited: Any = Recited(*((2e-3, -2e-3 * (1.0 + 0.5 * factor**k)) for k in range(20)))
-    solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "current"), EXACTLY)
+    solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "previous"), EXACTLY)
     assert solved.convergence is not None
     assert solved.convergence.num_iterations == 20 or solved.convergence.relative_change <= 1e-4
     assert solved.convergence.num_iterations > 8

@@ -111,7 +111,7 @@ def test_solvers_are_compared_on_a_scene_and_one_may_be_the_users_own(tmp_path: 
     test = """
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 def test_named(paired_benchmark):
-    paired_benchmark.compare_solvers("cloth.yaml", "sparse", {"name": "dense"}, max_ratio=1e6, iterations=20)
+    paired_benchmark.compare_solvers("cloth.yaml", "sparse", {"name": "dense"}, max_ratio=1e6, max_iterations=20)
 def test_own(paired_benchmark):
     paired_benchmark.compare_solvers("cloth.yaml", SparseLocalGlobal(), "sparse", max_ratio=1e6, agreement_rtol=0.0)
 def test_other_answers(paired_benchmark):

@@ -177,7 +177,7 @@ def run_scene(folder: Path, more: str, *, judge: bool = True) -> list[dict[str, 
     """Rows of the steps of a short run with Newton's method."""
     (folder / "magnet.py").write_text(USER_CODE)
     (folder / "scene.yaml").write_text(SCENE.format(more=more))
-    options = {"tolerance": 1e-6, "rounds": 1, "judge": judge, "record": False, "iterations": 200}
+    options = {"rtol": 1e-6, "rounds": 1, "verify": judge, "record": False, "max_iterations": 200}
     (run,) = load_config(folder / "scene.yaml", solvers=["newton"], **options).list_runs()
     files = run_pipeline.RunFiles.for_run(run, folder)
     files.rows_path.parent.mkdir(exist_ok=True)

@@ -84,7 +84,7 @@ def test_a_stretched_spring_is_a_minimum_and_a_compressed_one_is_not():
 
 def walked(made: Scene, judge: StepVerifier, tolerance: float) -> list[dict]:
     prepared = NewtonSolver().prepare(made.system)
-    steps = simulate_scene(made, prepared, StopRule(200, tolerance), initial_guess="current", frames=4)
+    steps = simulate_scene(made, prepared, StopRule(200, tolerance), initial_guess="previous", frames=4)
     return [judge(step) for step in steps]
 
 
@@ -98,7 +98,7 @@ def test_the_doubt_of_a_curvature_is_four_roundings_of_its_sums():
 
 def test_a_converged_run_is_stationary_and_where_the_reference_is():
     made = build_cloth(4)
-    known = compute_reference_positions(made, NewtonSolver(), initial_guess="current", frames=4)
+    known = compute_reference_positions(made, NewtonSolver(), initial_guess="previous", frames=4)
     assert np.isfinite(known).all()
     for row in walked(made, StepVerifier(made, known, is_minimiser=True), 1e-8):
         assert row["stationarity"] <= 1.1e-8
@@ -213,7 +213,7 @@ def test_a_solver_is_scored_by_the_cases_that_it_does_not_refuse():
 SCENE = "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\n"
 SCENE += "effects: [{kind: gravity}, {kind: springs, stretch: 10}, {kind: pins, at: [first]}]\n"
 SWEEP = "scenes: [scene.yaml]\nsolvers: [newton, xpbd, {name: numba, precision: float32}, numba]\n"
-SWEEP += "options: {tolerance: 1e-6, rounds: 1, judge: true, pictures: false, record: %s}\n"
+SWEEP += "options: {rtol: 1e-6, rounds: 1, verify: true, pictures: false, record: %s}\n"
 
 
 def test_a_judged_sweep_becomes_a_map_whose_cells_name_their_runs(tmp_path: Path):
@@ -240,7 +240,7 @@ def test_results_that_were_not_judged_are_refused(tmp_path: Path):
     (tmp_path / "rows").mkdir()
     row = {"run_id": "x", "scene": "net", "size": 4, "solver": "sparse", "started_at": "2026", "phase": "step"}
     parquet_rows.write_rows(tmp_path / "rows" / "x.parquet", [row | {"round": 0, "status": "ok"}])
-    with pytest.raises(InputError, match="judge: true"):
+    with pytest.raises(InputError, match="verify: true"):
         read_verified_runs(tmp_path)
 
 

@@ -15,7 +15,7 @@ SWEEP = """
 scenes: [{scene}]
 sizes: [5, 6]
 solvers: [sparse, {{name: lbfgs, pairs: 3}}, {{name: lbfgs, pairs: 5}}]
-options: {{tolerance: [1e-2, 1e-3], frames: 2}}
+options: {{rtol: [1e-2, 1e-3], frames: 2}}
 """
 SCENE = Path(__file__).resolve().parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
 
@@ -25,7 +25,7 @@ def test_runs_are_listed_with_the_settings_in_which_they_differ(tmp_path: Path):
     (tmp_path / "sweep.yaml").write_text(SWEEP.format(scene=SCENE.name))
     listed = CliRunner().invoke(app, ["list", str(tmp_path / "sweep.yaml"), "--results", str(tmp_path)])
     heading, _, *lines = listed.stdout.splitlines()[:-1]
-    columns = ["run", "scene", "size", "solver", "iterations", "tolerance", "threads", "frames", "pairs", "state"]
+    columns = ["run", "scene", "size", "solver", "max_iterations", "rtol", "threads", "frames", "pairs", "state"]
     assert heading.split() == columns
     without_hash = {line.split(maxsplit=1)[1] for line in lines}
     assert len(without_hash) == len(lines) == 2 * 3 * 2

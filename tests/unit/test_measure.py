@@ -33,7 +33,7 @@ from tests.scene_builders import build_test_scene
 
 FRAMES, ROUNDS, ITERATIONS = 3, 2, 4
 MADE = build_test_scene(ChainMesh(), GravityEffect(), size=4)
-SETTINGS = SteppingSettings(StopRule(ITERATIONS), "current", FRAMES, ROUNDS)
+SETTINGS = SteppingSettings(StopRule(ITERATIONS), "previous", FRAMES, ROUNDS)
 TAKES = {"prepare": 0.004, "solve": 0.008, "local": 0.001, "global": 0.002}
 """Seconds that each part sleeps at least."""
 

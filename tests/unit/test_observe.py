@@ -32,7 +32,7 @@ def test_weight_points_down_and_what_a_plane_answers_points_up(tmp_path: Path):
     (run,) = load_config(tmp_path / "scene.yaml", solvers=["newton"]).list_runs()
     scene = build_scene(run.scene, run.size)
     *_, last = iterate_steps(
-        scene, prepare(scene, NewtonSolver()), SteppingSettings(StopRule(50, 1e-10), run.first_guess, 60, 1)
+        scene, prepare(scene, NewtonSolver()), SteppingSettings(StopRule(50, 1e-10), run.initial_guess, 60, 1)
     )
     forces = collect_forces(last)
     np.testing.assert_allclose(forces["external"], [[0, -9.81, 0]] * 2, rtol=0, atol=1e-12)

@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_command_line_gives_numbers_as_numbers(folder: Path) -> None:
-    given = ["run", str(folder / "cloth.yaml"), "--frames", "1", "--tolerance", "1e-2", "--threads", "auto"]
+    given = ["run", str(folder / "cloth.yaml"), "--frames", "1", "--rtol", "1e-2", "--threads", "auto"]
     done = CliRunner().invoke(app, [*given, "--size", "4", "--in-process", "--results", str(folder / "results")])
     assert done.exit_code == 0, done.output
 
@@ -50,18 +50,18 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
         raise InputError("enough")
 
     monkeypatch.setattr(config_loader, "load_config", loaded)
-    values = {"iterations": "7", "tolerance": "1e-3", "integrator": "bdf2", "time_step": "1/60", "frames": "0x3"}
-    values |= {"first_guess": "inertial", "threads": "auto", "rounds": "1"}
-    assert set(values) == set(RUN_OPTIONS) - {"accuracy"}, "which would choose most of them"
+    values = {"max_iterations": "7", "rtol": "1e-3", "integrator": "bdf2", "time_step": "1/60", "frames": "0x3"}
+    values |= {"initial_guess": "inertial", "threads": "auto", "rounds": "1"}
+    assert set(values) == set(RUN_OPTIONS) - {"error_target"}, "which would choose most of them"
     given = [part for name, text in values.items() for part in (f"--{name.replace('_', '-')}", text)]
     assert CliRunner().invoke(app, ["run", str(folder / "cloth.yaml"), *given]).exit_code == 2
     (run,) = asked.pop("runs")
-    assert asked == {**values, "iterations": 7, "tolerance": 1e-3, "frames": 3, "rounds": 1}
-    assert (run.iterations, run.tolerance, run.time_step, run.frames, run.rounds) == (7, 1e-3, 1 / 60, 3, 1)
-    assert (run.integrator, run.first_guess, run.threads) == ("bdf2", "inertial", "auto")
+    assert asked == {**values, "max_iterations": 7, "rtol": 1e-3, "frames": 3, "rounds": 1}
+    assert (run.max_iterations, run.rtol, run.time_step, run.frames, run.rounds) == (7, 1e-3, 1 / 60, 3, 1)
+    assert (run.integrator, run.initial_guess, run.threads) == ("bdf2", "inertial", "auto")
 
 
-@pytest.mark.parametrize(("key", "value"), [("tolerance", None), ("threads", 2), ("size", [4, 8])])
+@pytest.mark.parametrize(("key", "value"), [("rtol", None), ("threads", 2), ("size", [4, 8])])
 def test_an_entry_states_what_it_lists_and_nothing_else(key: str, value: object) -> None:
     entry = IncludeEntry.model_validate({key: value})
     assert entry.get_values(key) == (tuple(value) if isinstance(value, list) else (value,))
@@ -74,12 +74,12 @@ SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [{}]\noptions: {{frames: 4, 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ("accuracy: 1e-2, integrator: bdf2", "options.integrator: is chosen for the `accuracy` asked"),
-        ("accuracy: [1e-2, 1e-3], tolerance: 1e-3", "options.tolerance: is chosen for the `accuracy` asked"),
-        ("accuracy: 2.0", "options.accuracy"),
-        ("accuracy: 1e-2, judge: true", "options.judge: grades steps by a tolerance that is stated"),
-        ("tolerance: auto, judge: true", "options.judge: grades steps by a tolerance that is stated"),
-        ("tolerance: automatic", "options.tolerance"),
+        ("error_target: 1e-2, integrator: bdf2", "options.integrator: is chosen by the `error_target`"),
+        ("error_target: [1e-2, 1e-3], rtol: 1e-3", "options.rtol: is chosen by the `error_target`"),
+        ("error_target: 2.0", "options.error_target"),
+        ("error_target: 1e-2, verify: true", "options.verify: needs a number or null as `rtol`"),
+        ("rtol: auto, verify: true", "options.verify: needs a number or null as `rtol`"),
+        ("rtol: automatic", "options.rtol"),
     ],
 )
 def test_what_an_error_or_auto_leaves_no_choice_of_is_refused(folder: Path, options: str, said: str) -> None:
@@ -90,16 +90,18 @@ def test_what_an_error_or_auto_leaves_no_choice_of_is_refused(folder: Path, opti
 
 
 def test_an_error_asked_beside_stated_steps_is_one_run_and_has_no_part_in_the_others_names(folder: Path) -> None:
-    (folder / "sweep.yaml").write_text(SWEEP.format("newton", "accuracy: [null, 1e-2], integrator: [bdf2, midpoint]"))
+    (folder / "sweep.yaml").write_text(
+        SWEEP.format("newton", "error_target: [null, 1e-2], integrator: [bdf2, midpoint]")
+    )
     (folder / "plain.yaml").write_text(SWEEP.format("newton", "integrator: [bdf2, midpoint]"))
     runs, plain = load_config(folder / "sweep.yaml").list_runs(), load_config(folder / "plain.yaml").list_runs()
-    assert [run.accuracy for run in runs] == [None, 0.01, None]
-    assert [run.build_identity() for run in runs if run.accuracy is None] == [run.build_identity() for run in plain]
+    assert [run.error_target for run in runs] == [None, 0.01, None]
+    assert [run.build_identity() for run in runs if run.error_target is None] == [run.build_identity() for run in plain]
 
 
 def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -> None:
     (folder / "cloth.yaml").write_text(f"{CLOTH}  - {{kind: gravity}}\n  - {{kind: pins, at: [top_corners]}}\n")
-    (folder / "sweep.yaml").write_text(SWEEP.format("dormand-prince-8, xpbd", "accuracy: 1e-3, pictures: false"))
+    (folder / "sweep.yaml").write_text(SWEEP.format("dormand-prince-8, xpbd", "error_target: 1e-3, pictures: false"))
     done = CliRunner().invoke(
         app, ["run", str(folder / "sweep.yaml"), "--in-process", "--results", str(folder / "results")]
     )
@@ -109,12 +111,14 @@ def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -
     found = [row for row in parquet_rows.read_rows([file]).to_pylist() if row["phase"] == "step"]
     assert [row["frame"] for row in found] == [1, 2, 3, 4]
     assert all(0.0 < row["error_estimated"] <= row["error_requested"] == 1e-3 for row in found)
-    assert all(row["num_accepted_steps"] > 0 and row["seconds"] > 0 and row["integrator"] == "own" for row in found)
+    assert all(
+        row["num_accepted_steps"] > 0 and row["seconds"] > 0 and row["integrator"] == "substepping" for row in found
+    )
     assert found[-1]["recording_digest"], "the recording was read back"
 
 
 def test_speed_compares_steps_as_they_are_stated(folder: Path) -> None:
-    for options in ("accuracy: 1e-2", "tolerance: auto"):
+    for options in ("error_target: 1e-2", "rtol: auto"):
         (folder / "sweep.yaml").write_text(SWEEP.format("newton", options))
         done = CliRunner().invoke(app, ["roofline", str(folder / "sweep.yaml"), "--results", str(folder / "results")])
         assert done.exit_code == 2, done.output

@@ -30,7 +30,7 @@ SCENES = HARD.with_name("scenes")
 def case(name: str) -> tuple[Scene, StepProblem]:
     spec = load_scene(HARD / f"{name}.yaml")
     made = build_scene(spec, spec.default_size or 0)
-    return made, build_problem(made, build_initial_state(made), "current")
+    return made, build_problem(made, build_initial_state(made), "previous")
 
 
 def solved(stated: StepProblem) -> Positions:
@@ -112,7 +112,7 @@ def test_conjugate_gradients_give_four_digits_over_levels_of_multigrid(
     scene: str, size: int, monkeypatch: pytest.MonkeyPatch
 ):
     made = build_scene(load_scene(SCENES / f"{scene}.yaml"), size)
-    stated, far = build_problem(made, build_initial_state(made), "current"), made.mesh.rest_positions**3
+    stated, far = build_problem(made, build_initial_state(made), "previous"), made.mesh.rest_positions**3
     exact = [ReferenceEvaluator(made.system).compute_residual(stated, p) for p in (stated.current_positions, far)]
     monkeypatch.setattr(oracle_module, "MAX_DIRECT_NNZ", 0)
     oracle = ReferenceEvaluator(made.system)

@@ -118,7 +118,7 @@ def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: 
         "cli/main.py",
         "error_control/method_search.py",
     }
-    to_error = collect_source_parts(run.model_copy(update={"accuracy": 0.1}))
+    to_error = collect_source_parts(run.model_copy(update={"error_target": 0.1}))
     assert {"error_controlled_run.py"} == {
         file.name for part in to_error - collect_source_parts(run) for file in list_source_files(part)
     }

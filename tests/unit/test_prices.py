@@ -39,7 +39,7 @@ def cloth(tmp_path: Path) -> Path:
 
 
 def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tmp_path: Path):
-    sweep = load_config(cloth, solvers=["newton", "dense"], rounds=4, tolerance=1e-6, threads=1)
+    sweep = load_config(cloth, solvers=["newton", "dense"], rounds=4, rtol=1e-6, threads=1)
     paths = measure_all_overheads(sweep, tmp_path, create_display(get_error_console()), print_message, isolated=False)
     told = {(row["name"], row["solver"]): row for path in paths for row in read_ablation(path)}
     assert set(told) == {(e, s) for e in ("bending", "air-drag", "all") for s in ("newton", "dense")}

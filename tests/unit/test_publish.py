@@ -32,7 +32,7 @@ SWEEP = """
 scenes: [cloth.yaml]
 sizes: [4]
 solvers: [sparse, dense]
-options: {rounds: 1, record: false, pictures: false, iterations: 3}
+options: {rounds: 1, record: false, pictures: false, max_iterations: 3}
 """
 
 

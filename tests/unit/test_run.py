@@ -81,7 +81,7 @@ def test_a_method_that_minimises_nothing_may_be_asked_for_a_tolerance(tmp_path: 
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.01\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}, "
         "{kind: springs, stretch: 100}, {kind: pins, at: [first]}]\n"
     )
-    (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).list_runs()
+    (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver], rtol=1e-6).list_runs()
     files = RunFiles.for_run(spec, tmp_path)
     files.rows_path.parent.mkdir()
     found = execute_run(spec, files, lambda phase: None)
@@ -95,7 +95,7 @@ def test_a_scene_at_rest_is_recorded_with_no_iterations(tmp_path: Path, solver: 
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\n"
         "effects: [{kind: springs, stretch: 10}]\n"
     )
-    (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver], tolerance=1e-6).list_runs()
+    (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver], rtol=1e-6).list_runs()
     files = RunFiles.for_run(spec, tmp_path)
     files.rows_path.parent.mkdir()
     found = execute_run(spec, files, lambda phase: None)

@@ -30,7 +30,7 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def solved(scene) -> list[tuple[StepProblem, Solution]]:
     prepared = prepare(scene, NewtonSolver())
-    run = simulate_scene(scene, prepared, STOP, initial_guess="current", frames=FRAMES)
+    run = simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=FRAMES)
     return [(step.problem, prepared.solve(step.problem, STOP)) for step in run]
 
 

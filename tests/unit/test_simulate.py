@@ -94,7 +94,7 @@ def test_the_assignments_first_guess_leaves_pins_where_the_penalty_left_them():
 
 
 def test_the_current_first_guess_puts_pins_on_target():
-    guess = build_problem(MADE, STATE, "current").initial_guess
+    guess = build_problem(MADE, STATE, "previous").initial_guess
     np.testing.assert_array_equal(guess, [MADE.mesh.rest_positions[0], *NOW.positions[1:]])
 
 
@@ -121,7 +121,7 @@ def test_forces_are_taken_at_the_start_of_the_step():
         seen.append((p.copy(), v.copy(), t))
         return np.ones_like(p)
 
-    stated = build_problem(replace(MADE, varying_forces=(force, force)), STATE, "current")
+    stated = build_problem(replace(MADE, varying_forces=(force, force)), STATE, "previous")
     (p, v, t), _ = seen
     np.testing.assert_array_equal(p, NOW.positions)
     np.testing.assert_array_equal(v, NOW.velocity)
@@ -139,7 +139,7 @@ def test_filters_change_the_velocity_before_inertia_and_forces_see_it():
     made = replace(
         MADE, varying_forces=(force,), velocity_filters=(lambda v: 0.5 * v, lambda v: v + np.array([1.0, 0.0, 0.0]))
     )
-    stated = build_problem(made, STATE, "current")
+    stated = build_problem(made, STATE, "previous")
     wanted = 0.5 * NOW.velocity + [1.0, 0.0, 0.0]  # in the order of the effects
     np.testing.assert_allclose(stated.inertial_target, NOW.positions + DT * wanted, rtol=1e-14)
     np.testing.assert_allclose(seen[0], wanted, rtol=1e-14)
@@ -170,7 +170,7 @@ class Slow(Pushed):
 
 def test_a_steps_seconds_hold_its_solve_and_nothing_between_steps():
     prepared, clock = Slow(), Stopwatch(PhaseWatch())
-    run = iterate_steps(MADE, prepared, SteppingSettings(StopRule(), "current", 3, 1), clock)
+    run = iterate_steps(MADE, prepared, SteppingSettings(StopRule(), "previous", 3, 1), clock)
     for _ in range(3):
         began = perf_counter()
         next(run)
@@ -181,7 +181,7 @@ def test_a_steps_seconds_hold_its_solve_and_nothing_between_steps():
 
 def test_steps_are_done_only_when_asked_for():
     prepared = Pushed()
-    run = simulate_scene(MADE, prepared, StopRule(), initial_guess="current", frames=1000)
+    run = simulate_scene(MADE, prepared, StopRule(), initial_guess="previous", frames=1000)
     next(run)
     assert len(prepared.asked) == 1
 

@@ -35,7 +35,7 @@ def test_a_sound_solver_is_ok_and_graded_by_the_oracle(tmp_path: Path, monkeypat
 def test_a_run_is_judged_whose_solver_says_no_more_than_the_readme_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    found = rows_of(write_plugin_solver(tmp_path, monkeypatch, options=SWEEP_OPTIONS + ", judge: true"), tmp_path)
+    found = rows_of(write_plugin_solver(tmp_path, monkeypatch, options=SWEEP_OPTIONS + ", verify: true"), tmp_path)
     steps = [row for row in found if row["phase"] == "step"]
     assert len(steps) == 3
     for row in steps:
@@ -159,7 +159,7 @@ def test_of_a_solver_that_does_not_minimise_is_said_what_it_leaves_of_a_step(tmp
     """Springs that turn: XPBD ends elsewhere than at the minimum, however many iterations it takes."""
     (tmp_path / "scene.yaml").write_text(TURNING)
     (tmp_path / "rows").mkdir()
-    asked: dict[str, Any] = {"solvers": ["xpbd", "newton"], "rounds": 1, "record": False, "iterations": 2000}
+    asked: dict[str, Any] = {"solvers": ["xpbd", "newton"], "rounds": 1, "record": False, "max_iterations": 2000}
     found = list[dict[str, Any]]()
     for spec in load_config(tmp_path / "scene.yaml", **asked).list_runs():
         found += execute_run(spec, RunFiles.for_run(spec, tmp_path), lambda phase: None)

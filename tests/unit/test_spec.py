@@ -39,7 +39,7 @@ SWEEP = """
 scenes: [cloth.yaml, file.yaml]
 sizes: [4, 8]
 solvers: [sparse, dense]
-options: {iterations: [10, 20]}
+options: {max_iterations: [10, 20]}
 """
 
 
@@ -56,7 +56,7 @@ def sweep_of(folder: Path, text: str) -> SweepPlan:
 
 
 def points(runs: list[RunSpec]) -> list[tuple[str, int, str, int]]:
-    return [(run.scene_name, run.size, run.solver.name, run.iterations) for run in runs]
+    return [(run.scene_name, run.size, run.solver.name, run.max_iterations) for run in runs]
 
 
 GRID = [
@@ -73,10 +73,10 @@ KEPT = {
     "{solver: dense}": lambda s, n, v, i: v != "dense",
     "{solver: dense, size_above: 4}": lambda s, n, v, i: not (v == "dense" and n > 4),
     "{size_below: 8, scene: cloth}": lambda s, n, v, i: not (s == "cloth" and n < 8),
-    "{scene: cloth, size: [4, 8], iterations: 10}": lambda s, n, v, i: not (s == "cloth" and i == 10),
-    "{scene: file}, {iterations: 20}": lambda s, n, v, i: s != "file" and i != 20,
-    "{tolerance: null, iterations: 10}": lambda s, n, v, i: i != 10,
-    "{first_guess: current, frames: 5, solver: sparse}": lambda s, n, v, i: v != "sparse",
+    "{scene: cloth, size: [4, 8], max_iterations: 10}": lambda s, n, v, i: not (s == "cloth" and i == 10),
+    "{scene: file}, {max_iterations: 20}": lambda s, n, v, i: s != "file" and i != 20,
+    "{rtol: null, max_iterations: 10}": lambda s, n, v, i: i != 10,
+    "{initial_guess: previous, frames: 5, solver: sparse}": lambda s, n, v, i: v != "sparse",
 }
 
 
@@ -88,11 +88,11 @@ def test_a_grid_point_that_matches_all_keys_of_an_exclude_is_left_out(folder: Pa
 
 ADDED = {
     "{scene: cloth, size: 16, solver: dense}": [("cloth", 16, "dense", 10)],
-    "{size: [16, 24], solver: dense, iterations: [5, 6]}": [
+    "{size: [16, 24], solver: dense, max_iterations: [5, 6]}": [
         *[("cloth", size, "dense", its) for size in (16, 24) for its in (5, 6)],
         *[("file", 0, "dense", its) for its in (5, 6)],
     ],
-    "{scene: file, iterations: 7}": [("file", 0, "sparse", 7), ("file", 0, "dense", 7)],
+    "{scene: file, max_iterations: 7}": [("file", 0, "sparse", 7), ("file", 0, "dense", 7)],
     "{scene: cloth, size: 8}": [],
 }
 
@@ -110,7 +110,7 @@ def test_an_include_survives_the_excludes(folder: Path) -> None:
 def test_what_a_sweep_leaves_out_comes_from_the_scene_or_the_defaults(folder: Path) -> None:
     (run,) = load_config(folder / "cloth.yaml", sizes=[4]).list_runs()
     assert (run.sweep, run.scene_name, run.size) == ("cloth", "cloth", 4)
-    assert (run.first_guess, run.threads) == ("current", "auto")
+    assert (run.initial_guess, run.threads) == ("previous", "auto")
     assert (run.frames, run.rounds, run.convergence_frames, run.strain_range) == (5, 2, None, None)
     assert run.scene.time_step == 1 / 30
     assert run.record
@@ -118,7 +118,7 @@ def test_what_a_sweep_leaves_out_comes_from_the_scene_or_the_defaults(folder: Pa
 
 
 def stop(run: RunSpec) -> tuple[str, int, Any]:
-    return run.solver.name, run.iterations, run.tolerance
+    return run.solver.name, run.max_iterations, run.rtol
 
 
 def test_one_scene_is_solved_to_a_tolerance_by_the_recommended_solver_as_in_python(folder: Path) -> None:
@@ -133,10 +133,10 @@ def test_one_scene_is_solved_to_a_tolerance_by_the_recommended_solver_as_in_pyth
     assert stop(run) == tuple(usual[name].default for name in ("solver", "max_iterations", "rtol"))
 
 
-@pytest.mark.parametrize("options", [{"iterations": 7}, {"tolerance": None}, {"tolerance": 1e-3}, {"accuracy": 1e-2}])
+@pytest.mark.parametrize("options", [{"max_iterations": 7}, {"rtol": None}, {"rtol": 1e-3}, {"error_target": 1e-2}])
 def test_what_is_stated_of_how_steps_end_means_what_it_means_in_a_sweep(folder: Path, options: dict[str, Any]) -> None:
     (run,) = load_config(folder / "cloth.yaml", sizes=[4], **options).list_runs()
-    assert stop(run) == ("hybrid", options.get("iterations", 50), options.get("tolerance"))
+    assert stop(run) == ("hybrid", options.get("max_iterations", 50), options.get("rtol"))
 
 
 def test_options_of_the_command_line_make_the_grid_of_a_lone_scene(folder: Path) -> None:
@@ -158,9 +158,9 @@ def identified(folder: Path, text: str = "", machine: str = "machine", **options
 
 CHANGES = {
     "frames": {"frames": 6},
-    "iterations": {"iterations": 51},
-    "tolerance": {"tolerance": 1e-3},
-    "first guess": {"first_guess": "inertial"},
+    "iterations": {"max_iterations": 51},
+    "tolerance": {"rtol": 1e-3},
+    "first guess": {"initial_guess": "inertial"},
     "threads": {"threads": 2},
     "rounds": {"rounds": 3},
     "solver": {"solvers": ["dense"]},
@@ -292,9 +292,9 @@ def test_an_assignment_file_is_the_scene_with_its_conventions(name: str) -> None
     assert scene.system.mass.sum() == pytest.approx(mass, rel=0.05 if name == "flag" else 1e-12)
     assert np.array_equal(scene.constant_force, np.tile([0.0, -9.8, 0.0], (vertices, 1)))
     assert scene.varying_forces == ()
-    assert (spec.time_step, spec.frames, spec.first_guess) == (1 / 30, 30, "assignment")
+    assert (spec.time_step, spec.frames, spec.initial_guess) == (1 / 30, 30, "assignment")
     (run,) = load_config(ASSIGNMENT / f"{name}.json").list_runs()
-    assert (run.first_guess, stop(run), run.size) == ("assignment", ("numba", 50, None), 0)
+    assert (run.initial_guess, stop(run), run.size) == ("assignment", ("numba", 50, None), 0)
 
 
 def test_mistakes_of_two_scenes_are_reported_together(folder: Path) -> None:

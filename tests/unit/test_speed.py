@@ -44,7 +44,7 @@ ROUNDS = 3
 
 def run(solver: str, **parameters: Any) -> RunSpec:
     """A run of the yardstick cloth under another solver's name."""
-    (made,) = load_config(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1, iterations=50).list_runs()
+    (made,) = load_config(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1, max_iterations=50).list_runs()
     return made.replace_options(solver=SolverSpec(solver, parameters))
 
 
@@ -186,7 +186,7 @@ SWEEP = """
 scenes: [yardstick-cloth.yaml]
 sizes: [5, 4]
 solvers: [dense, sparse]
-options: {iterations: 4, rounds: 2, record: false, pictures: false}
+options: {max_iterations: 4, rounds: 2, record: false, pictures: false}
 """
 
 

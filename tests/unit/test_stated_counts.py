@@ -26,8 +26,8 @@ def said(page: str) -> str:
 
 
 def test_the_first_page_counts_solvers_engines_and_integrators():
-    integrators = len(set(INTEGRATORS) - {"own"})
-    assert SUBSTEPPING is INTEGRATORS["own"]
+    integrators = len(set(INTEGRATORS) - {"substepping"})
+    assert SUBSTEPPING is INTEGRATORS["substepping"]
     words = f"any of {WORDS[len(OURS)]} solvers, {WORDS[len(ENGINES)]} outside engines and {WORDS[integrators]} time"
     assert words in said("README.md")
 

@@ -66,8 +66,8 @@ def contact(made: Scene) -> ObstacleContact:
 def touching(friction: float = 0.0) -> tuple[ObstacleContact, Positions]:
     """The contact in a step, and positions where it presses, and slips."""
     made = draped(friction=friction)
-    *_, last = simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="current", frames=8)
-    stated = build_problem(made, last.state, "current")
+    *_, last = simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="previous", frames=8)
+    stated = build_problem(made, last.state, "previous")
     (energy,) = (e for e in stated.energies if isinstance(e, ObstacleContact))
     p = last.positions + random_displacement(0, last.positions, 1e-5)
     assert len(energy.hessian_blocks(p).vertices) > 20
@@ -121,7 +121,7 @@ OBSTACLES = {
 def test_nothing_passes_through_any_obstacle(name):
     made = draped(OBSTACLES[name])
     touched = 0
-    for step in simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="current", frames=12):
+    for step in simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="previous", frames=12):
         assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
         touched += len(contact(made).hessian_blocks(step.positions).vertices)
     assert touched > 20
@@ -142,7 +142,7 @@ def test_an_obstacle_that_moves_pushes_the_sheet_and_never_passes_it(name, sidew
     state = MotionState(Motion(begun.positions, begun.velocity + np.array([sideways, 0.0, 0.0])), None, 0)
     prepared = prepare(made, load_target(SOLVERS[name])())
     highest = 0.0
-    for step in simulate_scene(made, prepared, RULE, initial_guess="current", frames=12, initial_state=state):
+    for step in simulate_scene(made, prepared, RULE, initial_guess="previous", frames=12, initial_state=state):
         highest = float(step.positions[:, 1].max())
         assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
         assert not any(
@@ -167,7 +167,7 @@ def deforming(path: Path, rate: float) -> MeshObstacle:
 def test_an_obstacle_that_deforms_along_stored_frames_lifts_the_sheet(tmp_path):
     one = deforming(tmp_path, 30.0)
     made, highest = draped(one, friction=0.3, size=6), 0.0
-    for step in simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="current", frames=8):
+    for step in simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="previous", frames=8):
         assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
         highest = float(step.positions[:, 1].max())
     assert highest > 0.2
@@ -204,7 +204,7 @@ def test_what_is_squeezed_between_obstacles_is_said():
     press = PlaneObstacle(point=(0.0, 0.05, 0.0), normal=(0.0, -1.0, 0.0), motion=down)
     made = draped(PlaneObstacle(point=(0, -0.05, 0)), press, size=4)
     with pytest.raises(NoClearance, match="obstacles leave no room"):
-        list(simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="current", frames=12))
+        list(simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="previous", frames=12))
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,9 @@ def slide(tangent: float) -> tuple[np.ndarray, float]:
     made = build_test_scene(
         GridMesh(width=0.2, height=0.2), SpringsEffect(stretch=100.0, shear=20.0), down, floor, size=3, time_step=DT
     )
-    steps = simulate_scene(made, prepare(made, NewtonSolver()), StopRule(100, 1e-6), initial_guess="motion", frames=80)
+    steps = simulate_scene(
+        made, prepare(made, NewtonSolver()), StopRule(100, 1e-6), initial_guess="extrapolated", frames=80
+    )
     speeds = np.array([step.state.motion.velocity[:, 0].mean() for step in steps])
     return speeds, g * (np.sin(angle) - MU * np.cos(angle))
 
@@ -302,7 +304,12 @@ def test_sheets_that_collide_with_friction_keep_their_momentum():
     state, mass = MotionState(Motion(p, v), None, 0), made.system.mass
     before, after = mass @ v, v
     for step in simulate_scene(
-        made, prepare(made, NewtonSolver()), StopRule(100, 1e-11), initial_guess="motion", frames=8, initial_state=state
+        made,
+        prepare(made, NewtonSolver()),
+        StopRule(100, 1e-11),
+        initial_guess="extrapolated",
+        frames=8,
+        initial_state=state,
     ):
         # Forces of pairs add up to nothing; what is left is the solve's tolerance.
         after = step.state.motion.velocity

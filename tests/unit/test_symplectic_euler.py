@@ -50,7 +50,7 @@ def motions(made: Scene, velocity: np.ndarray, frames: int, substeps: int | None
     prepared = ready(made.system)
     prepared = replace(prepared, num_substeps=substeps or prepared.num_substeps)
     state = MotionState(Motion(made.mesh.rest_positions, velocity), None, 0)
-    run = simulate_scene(made, prepared, STOP, initial_guess="current", frames=frames, initial_state=state)
+    run = simulate_scene(made, prepared, STOP, initial_guess="previous", frames=frames, initial_state=state)
     return [state.motion, *(step.state.motion for step in run)]
 
 

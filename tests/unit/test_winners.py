@@ -42,7 +42,7 @@ ROWS = (
     row("numba", "implicit-euler", 0.05, 0.1),
     row("newton", "midpoint", 2e-3, 0.4),
     row("newton", "midpoint", 2e-5, 4.0),
-    row("rodas", "own", 5e-4, 0.3, is_minimiser=False, family="linearly implicit"),
+    row("rodas", "substepping", 5e-4, 0.3, is_minimiser=False, family="linearly implicit"),
     row("newton", "sdirk-4", 1e-9, 0.01, status="uncertified"),
 )
 

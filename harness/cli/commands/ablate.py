@@ -51,7 +51,7 @@ def ablate(
     if all_solvers:
         _measure_overheads(context, scene, results, solver, size, with_pairs, rerun, rerun_stale, in_process)
         return
-    usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1} | ({} if solver else {"tolerance": DEFAULT_ABLATION_TOLERANCE})
+    usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1} | ({} if solver else {"rtol": DEFAULT_ABLATION_TOLERANCE})
     sweep = load_config(
         scene, solvers=[solver or DEFAULT_ABLATION_SOLVER], sizes=[size] if size else [], **usual | context.obj
     )
@@ -103,7 +103,7 @@ def _measure_overheads(
     if solver is not None or with_pairs:
         raise InputError("--all-solvers: cannot be combined with --solver or --with-pairs; omit them")
     minimising = [name for name, target in SOLVERS.items() if load_target(target).is_minimiser]
-    usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1, "tolerance": DEFAULT_OVERHEAD_TOLERANCE}
+    usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1, "rtol": DEFAULT_OVERHEAD_TOLERANCE}
     sweep = load_config(scene, solvers=minimising, sizes=[size] if size else [], **usual | context.obj)
     folder = claim_folder(results / sweep.name, scene)
     paths = measure_all_overheads(

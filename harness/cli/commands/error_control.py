@@ -129,7 +129,7 @@ def _execute_error_control(
         + (f"; more exact than asked, for {answer.note}" if answer.note else "")
     )
     print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
-    scene = asked.build_scene(asked.frame_seconds, "own")
+    scene = asked.build_scene(asked.frame_seconds, "substepping")
     status = answer.build_status_columns(answer.compute_balances(scene))
     if status["status"] != "ok":
         print_message(f"{status['status']}: {status['reason']}")

@@ -60,7 +60,7 @@ def export_script(
 
 def _format_point(spec: WorkSpec) -> tuple[str, ...]:
     words = " ".join(f"{key}={value}" for key, value in spec.solver.parameters.items())
-    return spec.build_file_stem(), spec.case.title, spec.case.integrator, str(spec.options["iterations"]), words
+    return spec.build_file_stem(), spec.case.title, spec.case.integrator, str(spec.options["max_iterations"]), words
 
 
 def _write_script(name: str, spec: WorkSpec, folder: Path, tick: ProgressCallback) -> dict[str, str]:
@@ -77,14 +77,14 @@ def _write_script(name: str, spec: WorkSpec, folder: Path, tick: ProgressCallbac
     if acts := _list_external_changes(scene):
         raise RunFailed(f"{name}: between frames springbench sets {' and '.join(acts)}; take another point")
     engine: ExternalEngine = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters)
-    frames, substeps = round(spec.horizon / spec.case.scene.time_step), int(spec.options["iterations"])
-    begun = build_problem(scene, build_initial_state(scene), "current")
+    frames, substeps = round(spec.t_end / spec.case.scene.time_step), int(spec.options["max_iterations"])
+    begun = build_problem(scene, build_initial_state(scene), "previous")
     try:
         network = EngineNetwork.from_system(scene.system, engine.solver_name, supports_damping=engine.supports_damping)
         texts = engine.write_script(name, network, begun, substeps, frames)
         with machine_info.limit_threads(1):
             run = simulate_scene(
-                scene, prepare(scene, engine), StopRule(substeps), initial_guess="current", frames=frames
+                scene, prepare(scene, engine), StopRule(substeps), initial_guess="previous", frames=frames
             )
             end = [step.positions for step in run][-1]
     except Unsupported as refused:

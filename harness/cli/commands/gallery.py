@@ -69,7 +69,7 @@ def _simulate_tile(run: RunSpec, tick: ProgressCallback) -> Any:
     solver = load_target(SOLVERS[_SOLVER])()
     first = p = build_initial_state(scene).motion.positions
     with machine_info.limit_threads(1):
-        settings = SteppingSettings(StopRule(200, float(_TOLERANCE)), run.first_guess, run.frames, 1)
+        settings = SteppingSettings(StopRule(200, float(_TOLERANCE)), run.initial_guess, run.frames, 1)
         for step in iterate_steps(scene, prepare(scene, solver), settings):
             p = step.positions
     origin = compute_local_origin(scene.mesh.rest_positions)

@@ -18,7 +18,7 @@ from springbench.harness.console import format_plain_table
 if TYPE_CHECKING:
     from springbench.harness.config.sweep_config import RunSpec
 
-_FIXED_COLUMNS = ("iterations", "frames", "threads")
+_FIXED_COLUMNS = ("max_iterations", "frames", "threads")
 """Options that always have a column, even if all runs agree in them."""
 
 

@@ -58,7 +58,7 @@ def recommend(
         f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best_method.work_spec.case.size or ''}".rstrip()
     )
     folder = results / f"recommend-{scene.stem}" / "pictures"
-    t_end = found.best_method.work_spec.horizon
+    t_end = found.best_method.work_spec.t_end
     name = f"ways-{scene.stem}-{found.best_method.work_spec.case.size}-{error:g}-{t_end:g}".replace(".", "_")
     facts = [f"{t_end:g} s simulated", "time stepping and solver together"]
     facts += [] if integrated else [f"by a {found.checked_method.reference_kind} reference"]

@@ -82,7 +82,7 @@ def regress(
         verdict = _run_gates_file(paths[0], _build_options(budget, None, None).budget)
     else:
         run_options = {"solvers": solver or [], "sizes": size or []}
-        limits = {"iterations": iterations, "tolerance": tolerance}
+        limits = {"max_iterations": iterations, "rtol": tolerance}
         run_options |= {name: value for name, value in limits.items() if value is not None}
         options = _build_options(budget, max_ratio, clock)
         verdict = _compare_with_revision(baseline or "", paths, gate_name, options, run_options)

@@ -35,8 +35,8 @@ def roofline(
         raise InputError(InputMistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))
     sweep = load_sweep(config)
     require_fixed_steps(sweep.list_runs())
-    if any(run.tolerance == AUTO for run in sweep.list_runs()):
-        raise InputError(InputMistake("needs the steps before; give a number, or null", config, key="tolerance"))
+    if any(run.rtol == AUTO for run in sweep.list_runs()):
+        raise InputError(InputMistake("needs the steps before; give a number, or null", config, key="rtol"))
     folder = claim_folder(results / sweep.name, config)
     found = compute_speed_figures(
         run_roofline(

@@ -123,7 +123,9 @@ def run_ablation(
 
 def _measure_ablation(run: RunSpec, with_pairs: bool, tick: ProgressCallback) -> list[ResultRow]:
     """Measure all variants and build the rows. Errors for the full scene are raised unchanged."""
-    settings = SteppingSettings(build_stop_rule(run.iterations, run.tolerance), run.first_guess, run.frames, run.rounds)
+    settings = SteppingSettings(
+        build_stop_rule(run.max_iterations, run.rtol), run.initial_guess, run.frames, run.rounds
+    )
     solver: Solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters)
     with machine_info.limit_threads(machine_info.choose_threads(run.threads).count):
         found = time_interleaved(

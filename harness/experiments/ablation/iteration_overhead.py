@@ -193,7 +193,7 @@ def measure_overhead(
     found = ConfidenceInterval(np.nan, np.nan, np.nan)
     while len(pairs) < max_rounds:
         runs = [
-            _TimedRun(iter(simulate_scene(*it, stop_rule, initial_guess="current", frames=NUM_WARMUP_STEPS + frames)))
+            _TimedRun(iter(simulate_scene(*it, stop_rule, initial_guess="previous", frames=NUM_WARMUP_STEPS + frames)))
             for it in (with_effect, baseline)
         ]
         enough = False
@@ -224,7 +224,7 @@ def _limit_iterations(baseline: PreparedScene, stop_rule: StopCriterion) -> Stop
 
     The reduced number of iterations takes a quarter of that time.
     """
-    run = _TimedRun(iter(simulate_scene(*baseline, stop_rule, initial_guess="current", frames=NUM_WARMUP_STEPS)))
+    run = _TimedRun(iter(simulate_scene(*baseline, stop_rule, initial_guess="previous", frames=NUM_WARMUP_STEPS)))
     for k in range(NUM_WARMUP_STEPS):  # what the first compiles does not count
         run.run_step(is_counted=k == NUM_WARMUP_STEPS - 1)
     return (

@@ -48,7 +48,7 @@ class OverheadUnit(EffectUnit):
         """Measure the overhead of each effect and return the rows."""
         run = self.run
         solver: Solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters)
-        stop, told = build_stop_rule(run.iterations, run.tolerance), list[ResultRow]()
+        stop, told = build_stop_rule(run.max_iterations, run.rtol), list[ResultRow]()
         plain = build_scene(select_effects(run.scene), run.size)
         counts = {"vertices": len(plain.mesh.rest_positions), "springs": len(plain.all_springs.edges)}
         with machine_info.limit_threads(machine_info.choose_threads(run.threads).count):

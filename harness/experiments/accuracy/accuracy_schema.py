@@ -50,7 +50,7 @@ ACCURACY_COLUMNS = (
         "",
         "digest of the step snapshot, of the reference trajectory, or of the problem with a requested error",
     ),
-    ColumnSpec("snapshot", _TEXT, "", "name of the step snapshot: early, middle, violent, or frame-k"),
+    ColumnSpec("snapshot", _TEXT, "", "name of the step snapshot: early, middle, peak, or frame-k"),
     ColumnSpec("frame", _INT, "", "step of the snapshot, from 1"),
     ColumnSpec("stiffness_ratio", _REAL, "", "k dt^2/m of the median stiffness and the mean mass of the free vertices"),
     ColumnSpec("mean_rest_length", _REAL, "m", "mean rest length of the springs with stiffness"),

@@ -206,7 +206,7 @@ def _build_curve_units(curves: Sequence[CurveSpec], results: AccuracyResults) ->
 
 
 def _build_work_units(work: Sequence[WorkSpec], results: AccuracyResults) -> Iterator[WorkPrecisionUnit]:
-    for spec in sorted(work, key=lambda spec: (spec.case.scene_name, spec.case.size, spec.horizon)):
+    for spec in sorted(work, key=lambda spec: (spec.case.scene_name, spec.case.size, spec.t_end)):
         yield WorkPrecisionUnit(spec, results)
 
 

@@ -109,13 +109,13 @@ class SnapshotUnit:
                 raise
             except Exception as error:  # no solver can be graded here; the other steps go on
                 found = [_build_missing_snapshot_row(spec, ended(error))]
-                told.append(f"{spec.moment}: {found[0]['status']}: {found[0]['reason']}")
+                told.append(f"{spec.snapshot}: {found[0]['status']}: {found[0]['reason']}")
             else:
                 if step.step_snapshot.digest in known:
                     continue
                 known.add(step.step_snapshot.digest)
             _write_snapshot_rows(path, self.results, found)
-            tick(str(spec.moment))
+            tick(str(spec.snapshot))
         return "; ".join(told) or "ok"
 
     def write_lost_rows(self, task_loss: TaskFailure) -> str:
@@ -134,7 +134,7 @@ def _build_missing_snapshot_row(spec: CurveSpec, failure_columns: ResultRow) -> 
     """Build the row of a snapshot that could not be found."""
     return (
         failure_columns
-        | {"kind": "snapshot", "snapshot": format_snapshot(spec.moment)}
+        | {"kind": "snapshot", "snapshot": format_snapshot(spec.snapshot)}
         | _build_case_columns(spec.case)
         | build_provenance_columns()
     )
@@ -254,7 +254,7 @@ class WorkPrecisionUnit:
     def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write the row of a lost unit, and return the outcome as text."""
         spec = self.spec
-        row: ResultRow = {"kind": "work", "status": task_loss.status, "reason": str(task_loss), "t_end": spec.horizon}
+        row: ResultRow = {"kind": "work", "status": task_loss.status, "reason": str(task_loss), "t_end": spec.t_end}
         return _write_unit_rows(self.results, spec, [row | build_option_columns(spec)])
 
 
@@ -302,7 +302,7 @@ class _ReferenceRequest:
     def for_trajectory(cls, spec: WorkSpec, results: AccuracyResults) -> _ReferenceRequest:
         """Build the key of a trajectory, which is equal for all time steps."""
         return cls(
-            (spec.case.scene.with_time_step(1.0).scene_digest, spec.case.size, spec.horizon, results.folder),
+            (spec.case.scene.with_time_step(1.0).scene_digest, spec.case.size, spec.t_end, results.folder),
             spec,
             results.reference_store,
         )
@@ -310,7 +310,7 @@ class _ReferenceRequest:
 
 @lru_cache(maxsize=1)
 def _load_snapshot_evaluation(request: _ReferenceRequest) -> SnapshotEvaluation:
-    return SnapshotEvaluation.load_snapshot(request.spec.case, request.spec.moment, request.reference_store)
+    return SnapshotEvaluation.load_snapshot(request.spec.case, request.spec.snapshot, request.reference_store)
 
 
 @lru_cache(maxsize=1)
@@ -328,7 +328,7 @@ def load_reference_trajectory(spec: WorkSpec, reference_store: ReferenceStore) -
         reference_store: store of the reference solutions.
     """
     try:
-        return reference_store.load_trajectory(spec.case.scene, spec.case.size, [spec.horizon], error=1.0)
+        return reference_store.load_trajectory(spec.case.scene, spec.case.size, [spec.t_end], error=1.0)
     except InputError:
         raise
     except Exception as error:

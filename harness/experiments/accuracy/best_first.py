@@ -160,7 +160,7 @@ def _outcome(row: Mapping[str, Any]) -> tuple[float, float]:
 
 def _limited(spec: WorkSpec, best: float) -> WorkSpec:
     """Return the specification with a time limit of SLOWER times the best cost."""
-    limit = max(LEAST_LIMIT, SLOWER * best * spec.horizon)
+    limit = max(LEAST_LIMIT, SLOWER * best * spec.t_end)
     return replace(spec, measurement=replace(spec.measurement, time_limit=min(spec.measurement.time_limit, limit)))
 
 
@@ -168,10 +168,10 @@ def _methods(work: Iterable[WorkSpec]) -> list[_Method]:
     """Group the settings by everything except time step and tolerance."""
     by_method: dict[str, list[WorkSpec]] = {}
     for spec in work:
-        others = {name: value for name, value in spec.options.items() if name != "tolerance"}
+        others = {name: value for name, value in spec.options.items() if name != "rtol"}
         by_method.setdefault(repr((spec.solver, spec.case.integrator, others)), []).append(spec)
     found = list[_Method]()
     for specs in by_method.values():
-        specs.sort(key=lambda spec: (-spec.case.scene.time_step, -(spec.options["tolerance"] or 0.0)))
+        specs.sort(key=lambda spec: (-spec.case.scene.time_step, -(spec.options["rtol"] or 0.0)))
         found.append(_Method([list(same) for _, same in groupby(specs, lambda spec: spec.case.scene.time_step)]))
     return found

@@ -83,9 +83,9 @@ def build_candidate_grid() -> list[dict[str, Any]]:
         name for name, solver in first.items() if not is_minimiser(solver) or told[name].family == LOCAL_GLOBAL_FAMILY
     ]
     return [
-        {"solver": implicit, "tolerance": [1e-1, 1e-2, 1e-3], "iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
-        {"solver": fixed, "iterations": 50},
-        {"solver": own, "iterations": 1, "integrator": ["own"]},
+        {"solver": implicit, "rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
+        {"solver": fixed, "max_iterations": 50},
+        {"solver": own, "max_iterations": 1, "integrator": ["substepping"]},
     ]
 
 
@@ -113,8 +113,8 @@ class MeasuredMethod:
         u = self.work_spec
         if find_solver_info(load_target(SOLVER_TABLE[u.solver.name]), u.solver.name).is_substepping:
             return f"solver {u.solver.name}, {self.solver_description}, in each frame of {u.case.scene.time_step:.6g} s"
-        tolerance = u.options["tolerance"]
-        stop = f"{u.options['iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
+        tolerance = u.options["rtol"]
+        stop = f"{u.options['max_iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
         return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
 
     def format_command(self, scene: Path) -> str:
@@ -122,7 +122,7 @@ class MeasuredMethod:
         u, made = self.work_spec, load_target(SOLVER_TABLE[self.work_spec.solver.name])
         if made(**u.solver.parameters) != made():
             return ""
-        steps = round(u.horizon / u.case.scene.time_step)
+        steps = round(u.t_end / u.case.scene.time_step)
         given: dict[str, Any] = {"size": u.case.size or None, "solver": u.solver.name, "integrator": u.case.integrator}
         given |= {"time-step": repr(u.case.scene.time_step), "frames": steps, **u.options}
         said = ((name.replace("_", "-"), value) for name, value in given.items() if value is not None)
@@ -208,7 +208,7 @@ def recommend_method(
     )
     store = open_reference_store(results)
     asked: AccuracyPlan = isolated(partial(_plan_study, path, scene, size, max_error, t_end, time_limit, store))
-    t_end = asked.work[0].horizon
+    t_end = asked.work[0].t_end
     ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
     omitted: Omitted | None = None
     if not any(way.error <= max_error and way.sweep != asked.name for way in ways):
@@ -331,7 +331,7 @@ def _build_study(path: Path, scene: SceneSpec, size: int, t_end: float, time_lim
     """Build the study that is measured where no rows exist."""
     steps = max(1, round(t_end / scene.time_step))
     time_steps = [t_end / round(steps * factor) for factor in TIME_STEP_REFINEMENTS if round(steps * factor)]
-    shared = {"horizon": t_end, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
+    shared = {"t_end": t_end, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
     work: list[dict[str, Any]] = [shared | way for way in build_candidate_grid()]
     solvers = list(dict.fromkeys(name for way in work for name in way["solver"]))
     data = {"scenes": [path.name], "solvers": solvers, "work": work}

@@ -206,7 +206,7 @@ def _measure_curve(
         step.step_snapshot.build_problem(initial_guess),
         step.reference_evaluator,
         known[0].objective if known else None,
-        max_iterations=spec.iterations,
+        max_iterations=spec.max_iterations,
         time_limit=spec.measurement.time_limit,
         num_rounds=spec.measurement.rounds,
     )
@@ -216,7 +216,7 @@ def _measure_curve(
     shared: ResultRow = {
         "kind": "curve",
         "initial_guess": initial_guess,
-        "max_iterations": spec.iterations,
+        "max_iterations": spec.max_iterations,
         "status": curve.status,
         "reason": curve.reason or None,
         "preempted": curve.preempted,

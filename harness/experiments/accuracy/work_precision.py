@@ -45,7 +45,7 @@ def build_work_rows(
         trajectory: reference up to the horizon, or the error that prevents it.
         tick: called after each round.
     """
-    shared: ResultRow = {"kind": "work", "status": "ok", **build_option_columns(spec), "t_end": spec.horizon}
+    shared: ResultRow = {"kind": "work", "status": "ok", **build_option_columns(spec), "t_end": spec.t_end}
     try:
         if isinstance(trajectory, Exception):
             raise trajectory
@@ -58,7 +58,7 @@ def build_work_rows(
 def build_option_columns(spec: WorkSpec) -> ResultRow:
     """Build the columns of a simulation's options."""
     columns = {RUN_OPTIONS[name].column: value for name, value in spec.options.items()}
-    return columns | {"residual_rtol": convert_tolerance(spec.options["tolerance"])}
+    return columns | {"residual_rtol": convert_tolerance(spec.options["rtol"])}
 
 
 def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: Callable[[], None]) -> ResultRow:
@@ -72,7 +72,7 @@ def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: C
         "solver_description": prepared.description,
     }
     row["stiffness_ratio"] = compute_stiffness_ratio(scene.system, scene.all_springs.stiffness)
-    frames = round(spec.horizon / case.scene.time_step)
+    frames = round(spec.t_end / case.scene.time_step)
     seconds: list[float] = []
     row["preempted"] = False
     p, *_ = _simulate_timed(
@@ -88,7 +88,7 @@ def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: C
     away = (p - trajectory.positions[-1])[scene.system.free_vertices]
     row["error"], row["reference_kind"] = trajectory.measure_error(-1, p), trajectory.reference_kind
     row["end_error_rms_m"] = float(np.sqrt(np.einsum("ij,ij->i", away, away).mean()))
-    row |= {"seconds": seconds, "seconds_per_simulated_second": float(np.median(seconds)) / spec.horizon}
+    row |= {"seconds": seconds, "seconds_per_simulated_second": float(np.median(seconds)) / spec.t_end}
     trajectory.require_accuracy(row["error"])
     return row
 
@@ -105,9 +105,9 @@ def _simulate_timed(
     """
     seconds, iterations, p, watch = 0.0, 0, scene.mesh.rest_positions, PhaseWatch(spec.measurement.threads)
     clock = Stopwatch(watch)
-    stop = build_stop_rule(spec.options["iterations"], spec.options["tolerance"])
+    stop = build_stop_rule(spec.options["max_iterations"], spec.options["rtol"])
     time_limit = spec.measurement.time_limit if time_limit is None else time_limit
-    run = simulate_scene(scene, prepared, stop, initial_guess=spec.options["first_guess"], frames=frames)
+    run = simulate_scene(scene, prepared, stop, initial_guess=spec.options["initial_guess"], frames=frames)
     for _ in range(frames):
         with clock:
             step = next(run)

@@ -294,13 +294,13 @@ def _find_run_spec(config: Path, run_rows: Sequence[ResultRow], *, with_user_cod
     """
     steps = [row for row in run_rows if row["phase"] == "step"]
     first = (steps or run_rows)[0]
-    names = ("iterations", "tolerance", "integrator", "time_step", "first_guess")
+    names = ("max_iterations", "rtol", "integrator", "time_step", "initial_guess")
     options = {name: first[RUN_OPTIONS[name].column] for name in names}
     options |= {"frames": _find_max(steps, "frame"), "rounds": 1 + _find_max(steps, "round")}
-    options["tolerance"] = AUTO if options["tolerance"] == 0.0 else options["tolerance"]
+    options["rtol"] = AUTO if options["rtol"] == 0.0 else options["rtol"]
     if first["error_requested"] is not None:
         options = {name: options[name] for name in ("time_step", "frames", "rounds")} | {
-            "accuracy": first["error_requested"]
+            "error_target": first["error_requested"]
         }
     sizes = [first["size"]] if first["size"] else []
     scene = {"solvers": [first["solver"]], "sizes": sizes, **options}
@@ -342,7 +342,7 @@ _LOADED_RUNS: dict[tuple[Path, str, bool], list[RunSpec]] = {}
 def _verify_options(published_run: PublishedRun) -> VerifiedClaim | None:
     """Return a failed claim if a run's names or options differ from its config."""
     left_out = {"threads", *read_solver_metadata(published_run.run.solver.name)}  # of the machine, and of the code
-    if published_run.run.accuracy is not None:
+    if published_run.run.error_target is not None:
         left_out |= {"integrator", "time_step", "residual_rtol", "max_iterations", "initial_guess"}  # are chosen
     asked_for = {
         name: value for name, value in build_specification_columns(published_run.run).items() if name not in left_out

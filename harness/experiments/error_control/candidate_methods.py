@@ -110,7 +110,7 @@ class Method:
 
 def format_method_name(integrator: str, solver: str) -> str:
     """Return the name of a method for messages."""
-    return solver if integrator == "own" else f"{integrator} with {solver}"
+    return solver if integrator == "substepping" else f"{integrator} with {solver}"
 
 
 def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
@@ -130,14 +130,14 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
         for name, one in INTEGRATORS.items()
         if isinstance(one, SingleStageIntegrator) and not one.needs_history
     }
-    even = max((name for name in single if name != "own"), key=single.__getitem__)
+    even = max((name for name in single if name != "substepping"), key=single.__getitem__)
     tried = {
-        name: ("own",) if one.is_substepping else (best, even)
+        name: ("substepping",) if one.is_substepping else (best, even)
         for name, one in told.items()
         if one.supports_error_control
     }
     found = [(integrator, SolverSpec(name, {})) for name, several in tried.items() for integrator in several]
-    return sorted(found, key=lambda pair: pair[0] != "own")
+    return sorted(found, key=lambda pair: pair[0] != "substepping")
 
 
 def list_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
@@ -148,7 +148,7 @@ def list_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
     """
     one = find_solver_info(load_target(SOLVER_TABLE[solver.name]), solver.name)
     if one.is_substepping:
-        return [("own", solver)]
+        return [("substepping", solver)]
     if not is_minimiser(load_target(SOLVER_TABLE[solver.name])):
         raise Unsupported(f"{solver.name}: tells no error of its steps and does not minimise those of an integrator")
     return [(name, solver) for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order]
@@ -185,7 +185,7 @@ def _build_stepper(
     error_target: ErrorTarget, integrator: str, solver: SolverSpec, frames: int | None = None
 ) -> Stepper:
     made, frames = load_target(SOLVER_TABLE[solver.name])(**solver.parameters), frames or error_target.num_frames
-    if integrator == "own":
+    if integrator == "substepping":
         scene, even = (
             error_target.build_scene(error_target.frame_seconds, integrator),
             find_solver_info(load_target(SOLVER_TABLE[solver.name]), solver.name).has_fixed_step,
@@ -200,6 +200,6 @@ def _build_stepper(
 
 
 def _warm_up(error_target: ErrorTarget, integrator: str, solver: SolverSpec) -> None:
-    size = error_target.build_scene(error_target.frame_seconds, "own").mesh.bounding_box_diagonal or 1.0
+    size = error_target.build_scene(error_target.frame_seconds, "substepping").mesh.bounding_box_diagonal or 1.0
     once = _build_stepper(error_target, integrator, solver, 1)
     once.integrate_motion(once.initial_setting(_WARMUP_TOLERANCE * size))

@@ -1,4 +1,4 @@
-"""Error-controlled run of a sweep (`accuracy`) with a given solver.
+"""Error-controlled run of a sweep (`error_target`) with a given solver.
 
 Integrator and step size are chosen.
 """
@@ -130,4 +130,4 @@ def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> 
             raise RunFailed("a round ended at other positions than the one before")
         for _ in range(run.frames):
             tick("timed pass")
-    return ErrorControlledRun(asked.build_scene(asked.frame_seconds, "own"), answer, error, tuple(rounds), said)
+    return ErrorControlledRun(asked.build_scene(asked.frame_seconds, "substepping"), answer, error, tuple(rounds), said)

@@ -125,7 +125,7 @@ class SearchResult:
     note: str
 
     def compute_balances(self, scene: Scene) -> dict[int, EnergyGain]:
-        """Return the energy balance after each frame; the scene has the integrator `own` and frames as time steps."""
+        """Return the energy balance after each frame; `scene` has the integrator `substepping` and frames as steps."""
         path = self.best_trial.trajectory
         motions = map(Motion, path.positions[1:], path.velocities[1:])
         return dict(enumerate(compute_frame_balances(scene, motions), start=1))
@@ -204,7 +204,7 @@ class _MethodSearch:
             growth,
             print_message,
         )
-        self._free_vertices = error_target.build_scene(error_target.frame_seconds, "own").system.free_vertices
+        self._free_vertices = error_target.build_scene(error_target.frame_seconds, "substepping").system.free_vertices
 
     def find_cheapest(self, candidates: Sequence[tuple[str, SolverSpec]]) -> SearchResult:
         self._print_message("ways to the error:")

@@ -71,7 +71,7 @@ def estimate_by_step_doubling(
 def _simulate_to_end(scene: Scene, frames: int, deadline: float) -> Positions | None:
     """Return the positions at the end of the motion; None after the deadline."""
     for step in simulate_scene(
-        scene, prepare(scene, NewtonSolver()), _CONVERGED_STOP_RULE, initial_guess="current", frames=frames
+        scene, prepare(scene, NewtonSolver()), _CONVERGED_STOP_RULE, initial_guess="previous", frames=frames
     ):
         if perf_counter() > deadline:
             return None

@@ -57,9 +57,9 @@ class RegressionTest(ConfigModel):
     exceeded."""
     size: MeshSize | None = None
     """Mesh size; the scene's default if left out."""
-    iterations: IterationLimit = 50
+    max_iterations: IterationLimit = 50
     """Iteration limit of a step."""
-    tolerance: RelativeTolerance = None
+    rtol: RelativeTolerance = None
     """Relative tolerance of a step's iterations; null performs all of them."""
     integrator: IntegratorName = "implicit-euler"
     """Time integrator."""
@@ -125,7 +125,7 @@ def run_gates_file(
 @contextmanager
 def _start_solvers(document: ConfigDocument, index: int, test: RegressionTest) -> Generator[ProgramPair]:
     """Prepare both solvers again, warm them up, and check that their answers agree."""
-    options = {key: getattr(test, key) for key in ("iterations", "tolerance", "integrator", "frames")}
+    options = {key: getattr(test, key) for key in ("max_iterations", "rtol", "integrator", "frames")}
     with limit_threads(1):
         try:
             candidate, baseline = prepare_solver_pair(

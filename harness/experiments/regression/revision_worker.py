@@ -154,7 +154,7 @@ class _RevisionSteps:
         self._run, self._num_frames, self._injected_slowdown, self._iterations = run, frames, injected_slowdown, 0
         self._scene = build_scene(run.scene, run.size, run.integrator)
         self._prepared = prepare(self._scene, load_target(SOLVERS[run.solver.name])(**run.solver.parameters))
-        self._stop = build_stop_rule(run.iterations, run.tolerance)
+        self._stop = build_stop_rule(run.max_iterations, run.rtol)
 
     def __call__(self) -> Any:
         from springbench.harness.simulation.time_loop import simulate_scene
@@ -162,7 +162,7 @@ class _RevisionSteps:
 
         self._iterations, step = 0, None
         for step in simulate_scene(
-            self._scene, self._prepared, self._stop, initial_guess=self._run.first_guess, frames=self._num_frames
+            self._scene, self._prepared, self._stop, initial_guess=self._run.initial_guess, frames=self._num_frames
         ):
             self._iterations += step.num_iterations
         assert step is not None
@@ -184,7 +184,7 @@ def _load_runs(config: str, run_options: dict[str, Any]) -> list[Any]:
 
 def _format_title(run: Any) -> str:
     """Format the description of a run, which is the same in both worktrees."""
-    given = [run.solver.name, f"{run.iterations} iterations", run.integrator, f"dt {run.scene.time_step:.4g}"]
+    given = [run.solver.name, f"{run.max_iterations} iterations", run.integrator, f"dt {run.scene.time_step:.4g}"]
     size = [f"size {run.size}"] if run.size else []
     threads = [f"{run.threads} threads"] if run.threads not in (1, "auto") else []
     return ", ".join([run.scene_name, *size, *given, *threads])

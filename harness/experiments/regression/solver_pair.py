@@ -68,7 +68,7 @@ def prepare_solver_pair(
 def _prepare_steps(scene: Path, solver_input: SolverInput, size: int | None, options: dict[str, Any]) -> SceneSteps:
     is_named = isinstance(solver_input, (str, Mapping))
     named: Any = dict(solver_input) if isinstance(solver_input, Mapping) else solver_input
-    defaults = {name: RunOptions.model_fields[name].default for name in ("iterations", "tolerance")}
+    defaults = {name: RunOptions.model_fields[name].default for name in ("max_iterations", "rtol")}
     run_options: dict[str, Any] = {"threads": 1} | defaults | options
     runs = load_config(
         scene, solvers=[named if is_named else DEFAULT_SOLVER], sizes=[size] if size else [], **run_options
@@ -79,11 +79,11 @@ def _prepare_steps(scene: Path, solver_input: SolverInput, size: int | None, opt
     (run,) = runs
     solver: Solver = load_target(SOLVERS[run.solver.name])(**run.solver.parameters) if is_named else named
     bound = build_scene(run.scene, run.size, run.integrator)
-    prepared, stop = prepare(bound, solver), build_stop_rule(run.iterations, run.tolerance)
+    prepared, stop = prepare(bound, solver), build_stop_rule(run.max_iterations, run.rtol)
 
     def positions(frames: int) -> Positions:
         p = bound.mesh.rest_positions
-        for step in simulate_scene(bound, prepared, stop, initial_guess=run.first_guess, frames=frames):
+        for step in simulate_scene(bound, prepared, stop, initial_guess=run.initial_guess, frames=frames):
             p = step.positions
         return p
 

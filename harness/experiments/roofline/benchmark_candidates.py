@@ -111,7 +111,7 @@ class SolverCandidate:
         """Time a step and the phases of an iteration."""
         prepared = self._prepared
         assert prepared is not None
-        readings = [time_phase("step", self._solve_step, self._build_columns("iteration", self.run.iterations))]
+        readings = [time_phase("step", self._solve_step, self._build_columns("iteration", self.run.max_iterations))]
         for phase, call in check_phases(prepared, self._problem).items():
             readings.append(time_phase(phase, call, self._build_columns(phase, 1)))
         return readings
@@ -123,9 +123,9 @@ class SolverCandidate:
 
     def _solve_step(self) -> None:
         assert self._prepared is not None
-        tolerance = self.run.tolerance
+        tolerance = self.run.rtol
         assert tolerance != AUTO, "the command refuses it: a step alone has no error of its own"
-        self._positions = self._prepared.solve(self._problem, StopRule(self.run.iterations, tolerance)).positions
+        self._positions = self._prepared.solve(self._problem, StopRule(self.run.max_iterations, tolerance)).positions
 
     def _build_columns(self, phase: str, num_repeats: int) -> dict[str, Any]:
         done = {"num_iterations": num_repeats}
@@ -162,7 +162,7 @@ class CppCandidate:
 
     def time_phases(self) -> list[CandidateTiming]:
         """Time a step, its local steps and its global steps."""
-        running, iterations = self._process, self.run.iterations
+        running, iterations = self._process, self.run.max_iterations
         assert running is not None
         once = running.step(iterations)
         number = _choose_num_repeats(once[0])

@@ -209,7 +209,7 @@ def _measure_rows(
 ) -> list[list[dict[str, Any]]]:
     """Measure all runs of one scene and size, and return the rows of each."""
     scene = build_scene(runs[0].scene, runs[0].size)
-    stated = build_problem(scene, build_initial_state(scene), runs[0].first_guess)
+    stated = build_problem(scene, build_initial_state(scene), runs[0].initial_guess)
     program = partial(cpp_baseline.compile_baseline, folder / "build")
     prepared: dict[str, PreparedSolver] = {}
     rest = find_converged_problem(stated) if any(read_precision(run) != "float64" for run in runs) else None

@@ -127,7 +127,7 @@ def predict_seconds(past_timings: Sequence[PastTiming], vertices: int, run: RunS
         power = max(1.0, log(last / getattr(known[-2], field)) / grown)
         return last * exp(power * log(vertices / known[-1].num_vertices))
 
-    return NUM_PREPARATIONS * at("prepare_seconds") + run.rounds * run.iterations * at("iteration_seconds")
+    return NUM_PREPARATIONS * at("prepare_seconds") + run.rounds * run.max_iterations * at("iteration_seconds")
 
 
 @contextmanager

@@ -50,9 +50,9 @@ from springbench.harness.report.plot_style import (
 )
 
 INITIAL_GUESS_LABELS: dict[str, str] = {
-    "current": "from the current positions",
+    "previous": "from the previous positions",
     "inertial": "from the inertial target",
-    "motion": "from where the motion leads",
+    "extrapolated": "from extrapolated positions",
     "assignment": "as in the assignment",
 }
 """Initial guesses in words."""

@@ -122,7 +122,7 @@ class _FixedStepSolver(ExplicitSolver):
 
         Raises:
             Unsupported: for energies other than springs, constant quadratic forms and drag on vertices; for integrators
-                other than `own` and implicit Euler; for unpinned vertices without mass; for too many substeps.
+                other than `substepping` and implicit Euler; for unpinned vertices without mass; for too many substeps.
         """
         if not self.refine >= 1:
             raise Unsupported(f"{self.solver_name}: refine came as {self.refine}; wanted 1 or more")

@@ -77,8 +77,8 @@ class _RosenbrockSolver:
         """Prepare the method for a system.
 
         Raises:
-            Unsupported: for integrators other than `own` and implicit Euler, for unpinned vertices without mass, and
-                for energies that depend on the start of a step, except drag on vertices.
+            Unsupported: for integrators other than `substepping` and implicit Euler, for unpinned vertices without
+                mass, and for energies that depend on the start of a step, except drag on vertices.
         """
         if self.refine < 1 or not 0.0 <= self.error <= 1.0:
             raise Unsupported(

@@ -63,7 +63,7 @@ INTEGRATORS: dict[str, AnyIntegrator] = {
     "esdirk-3": ESDIRK3,
     "sdirk-4": SDIRK4,
     "esdirk-4": ESDIRK4,
-    "own": SUBSTEPPING,
+    "substepping": SUBSTEPPING,
 }
 """The built-in integrators by name."""
 

@@ -90,8 +90,8 @@ class SubsteppingIntegrator(SingleStageIntegrator):
         """Return the solver's motion; raise Unsupported for a solver without a velocity."""
         if solution.velocity is None:
             raise Unsupported(
-                "the integrator `own` leaves it to the solver to integrate a step, and this one minimises what another "
-                "integrator states: take that one, or a solver such as dormand-prince-8"
+                "the integrator `substepping` leaves it to the solver to integrate a step, and this one minimises what "
+                "another integrator states: take that one, or a solver such as dormand-prince-8"
             )
         return Motion(solution.positions, solution.velocity)
 
