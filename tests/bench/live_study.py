@@ -24,18 +24,18 @@ from tests.bench.replay_study import run_background_load
 
 LIVE_STUDY_SCHEMA = run_schema.build_schema(
     (
-        run_schema.ColumnSpec("gate", pa.string(), "", "the benchmarked work"),
-        run_schema.ColumnSpec("condition", pa.string(), "", "background load: nothing, busy or bursty"),
+        run_schema.ColumnSpec("benchmark", pa.string(), "", "the benchmarked work"),
+        run_schema.ColumnSpec("background_load", pa.string(), "", "background load: nothing, busy or bursty"),
         run_schema.ColumnSpec(
             "injected_slowdown", pa.float64(), "", "extra work of the candidate, as a fraction of its iterations"
         ),
         run_schema.ColumnSpec("max_ratio", pa.float64(), "", "ratio of times that counts as slower"),
         run_schema.ColumnSpec("verdict", pa.string(), "", "pass, fail or inconclusive"),
         run_schema.ColumnSpec("ratio", pa.float64(), "", "median ratio of times over the blocks"),
-        run_schema.ColumnSpec("low", pa.float64(), "", "lower bound of its confidence sequence"),
-        run_schema.ColumnSpec("high", pa.float64(), "", "upper bound"),
+        run_schema.ColumnSpec("ratio_low", pa.float64(), "", "lower bound of its confidence sequence"),
+        run_schema.ColumnSpec("ratio_high", pa.float64(), "", "upper bound"),
         run_schema.ColumnSpec("seconds", pa.float64(), "s", "until the verdict"),
-        run_schema.ColumnSpec("load", pa.float64(), "", "load average over a minute, at the end"),
+        run_schema.ColumnSpec("load_average", pa.float64(), "", "load average over a minute, at the end"),
     )
 )
 
@@ -78,16 +78,16 @@ def run_live_study(
                 print_message(f"{number + 1} of {num_repeats}, {request.title}: {result}")
                 found.append(
                     {
-                        "gate": request.title,
-                        "condition": background_load,
+                        "benchmark": request.title,
+                        "background_load": background_load,
                         "injected_slowdown": injected_slowdown,
                         "max_ratio": options.max_ratio,
                         "verdict": result.verdict,
                         "ratio": result.interval.ratio,
-                        "low": result.interval.low,
-                        "high": result.interval.high,
+                        "ratio_low": result.interval.low,
+                        "ratio_high": result.interval.high,
                         "seconds": result.elapsed_seconds,
-                        "load": result.load_average,
+                        "load_average": result.load_average,
                     }
                 )
                 parquet_rows.write_rows(path, found, LIVE_STUDY_SCHEMA)
@@ -100,10 +100,12 @@ def summarise_live_study(path: Path) -> list[tuple[str, ...]]:
     """
     by: dict[tuple[str, str, float, float], list[dict[str, Any]]] = {}
     for row in parquet_rows.read_rows([path], LIVE_STUDY_SCHEMA).to_pylist():
-        by.setdefault((row["gate"], row["condition"], row["injected_slowdown"], row["max_ratio"]), []).append(row)
+        by.setdefault(
+            (row["benchmark"], row["background_load"], row["injected_slowdown"], row["max_ratio"]), []
+        ).append(row)
     table: list[tuple[str, ...]] = []
     for (gate, condition, slowdown, max_ratio), rows in by.items():
-        load, seconds = (median(row[name] for row in rows) for name in ("load", "seconds"))
+        load, seconds = (median(row[name] for row in rows) for name in ("load_average", "seconds"))
         verdicts = [row["verdict"] for row in rows]
         counts = [
             str(verdicts.count(verdict))

@@ -67,9 +67,9 @@ def build_requests(
 def record(
     samples: Annotated[Path, typer.Argument(help="File of the blocks (.parquet); earlier blocks in it remain.")],
     config: StudyConfig,
-    condition: BackgroundLoad = "nothing",
-    seconds: Annotated[float, typer.Option(help="For all runs together, which alternate.")] = 1800.0,
-    starts: Annotated[int, typer.Option(help="Process pairs of each run.")] = 10,
+    background_load: BackgroundLoad = "nothing",
+    duration: Annotated[float, typer.Option(help="Time of all runs together, which alternate [s].")] = 1800.0,
+    process_pairs: Annotated[int, typer.Option(help="Process pairs of each run.")] = 10,
     sizes: MeshSizes = None,
     solvers: SolverNames = None,
     injected_slowdown: InjectedSlowdown = 0.0,
@@ -80,9 +80,9 @@ def record(
         samples,
         checkout,
         requests,
-        condition,
-        duration=seconds,
-        num_process_pairs=starts,
+        background_load,
+        duration=duration,
+        num_process_pairs=process_pairs,
         injected_slowdown=injected_slowdown,
     )
     print_message(f"blocks are in {samples}")
@@ -93,7 +93,7 @@ def live(
     output: Annotated[Path, typer.Argument(help="File of the verdicts (.parquet); earlier ones in it remain.")],
     config: StudyConfig,
     repeats: Annotated[int, typer.Option(help="Tests of each run.")] = 100,
-    condition: BackgroundLoad = "nothing",
+    background_load: BackgroundLoad = "nothing",
     max_ratio: Annotated[float, typer.Option(help="Ratio of times that counts as slower.")] = 1.03,
     budget: Annotated[float, typer.Option(help="Seconds of a test.")] = 240.0,
     sizes: MeshSizes = None,
@@ -106,13 +106,23 @@ def live(
         output,
         checkout,
         requests,
-        condition,
+        background_load,
         ComparisonOptions(budget, max_ratio),
         num_repeats=repeats,
         injected_slowdown=injected_slowdown,
         print_message=print_message,
     )
-    columns = "condition", "load", "slowdown", "limit", "tests", "fail", "pass", "inconclusive", "median s"
+    columns = (
+        "background load",
+        "load average",
+        "slowdown",
+        "limit",
+        "tests",
+        "fail",
+        "pass",
+        "inconclusive",
+        "median s",
+    )
     for gate, rows in groupby(sorted(summarise_live_study(output), key=itemgetter(0)), key=itemgetter(0)):
         table = Table(*columns, title=gate)
         for _, *cells in rows:

@@ -42,14 +42,16 @@ from springbench.harness.results import parquet_rows, run_schema
 from springbench.harness.results.regression_verdict import RegressionVerdict
 
 RECORD_COLUMNS = (
-    run_schema.ColumnSpec("gate", pa.string(), "", "the benchmarked work"),
-    run_schema.ColumnSpec("condition", pa.string(), "", "background load: nothing, busy or bursty"),
-    run_schema.ColumnSpec("start", pa.int64(), "", "number of the process pair, from 0"),
+    run_schema.ColumnSpec("benchmark", pa.string(), "", "the benchmarked work"),
+    run_schema.ColumnSpec("background_load", pa.string(), "", "background load: nothing, busy or bursty"),
+    run_schema.ColumnSpec("process_pair", pa.int64(), "", "number of the process pair, from 0"),
     run_schema.ColumnSpec("order", pa.string(), "", "ABBA or BAAB"),
     *(run_schema.ColumnSpec(f"call_{k}", pa.float64(), "s", f"time of call {k} of the block") for k in range(4)),
-    run_schema.ColumnSpec("wall", pa.float64(), "s", "wall time of the block, and of rebuilding the work after it"),
-    run_schema.ColumnSpec("load", pa.float64(), "", "load average over a minute"),
-    run_schema.ColumnSpec("planted", pa.float64(), "", "extra work of A, as a fraction of its iterations"),
+    run_schema.ColumnSpec(
+        "wall_seconds", pa.float64(), "s", "wall time of the block, and of rebuilding the work after it"
+    ),
+    run_schema.ColumnSpec("load_average", pa.float64(), "", "load average over a minute"),
+    run_schema.ColumnSpec("injected_slowdown", pa.float64(), "", "extra work of A, as a fraction of its iterations"),
 )
 RECORD_SCHEMA = run_schema.build_schema(RECORD_COLUMNS)
 
@@ -111,7 +113,7 @@ def record_blocks(
         injected_slowdown: extra work of A, as a fraction of its iterations.
     """
     found = parquet_rows.read_rows([path], RECORD_SCHEMA).to_pylist() if path.exists() else []
-    first = max((row["start"] for row in found), default=-1) + 1
+    first = max((row["process_pair"] for row in found), default=-1) + 1
     sides = GitRevision("the one", checkout, injected_slowdown=injected_slowdown), GitRevision("the other", checkout)
     with run_background_load(background_load):
         for start in range(first, first + num_process_pairs):
@@ -127,10 +129,22 @@ def record_blocks(
                         at = perf_counter()
                         calls = [{"A": racers.a, "B": racers.b}[who]() for who in order]
                         renewed.rebuild_after(perf_counter() - at)
-                        row = {"gate": request.title, "condition": background_load, "start": start, "order": order}
+                        row = {
+                            "benchmark": request.title,
+                            "background_load": background_load,
+                            "process_pair": start,
+                            "order": order,
+                        }
                         row |= {f"call_{k}": call for k, call in enumerate(calls)}
                         took = perf_counter() - at
-                        found.append(row | {"wall": took, "load": os.getloadavg()[0], "planted": injected_slowdown})
+                        found.append(
+                            row
+                            | {
+                                "wall_seconds": took,
+                                "load_average": os.getloadavg()[0],
+                                "injected_slowdown": injected_slowdown,
+                            }
+                        )
                     if perf_counter() > until:
                         break
             parquet_rows.write_rows(path, found, RECORD_SCHEMA)
@@ -143,7 +157,7 @@ def run_background_load(background_load: str) -> Generator[None]:
     It is constant (busy), intermittent (bursty) or absent (nothing).
     """
     if background_load not in BACKGROUND_LOADS:
-        raise InputError(f"--condition: got {background_load}; expected one of {', '.join(BACKGROUND_LOADS)}")
+        raise InputError(f"--background-load: got {background_load}; expected one of {', '.join(BACKGROUND_LOADS)}")
     with ExitStack() as cleanup:
         for core in os.sched_getaffinity(0) if background_load != "nothing" else ():
             process = get_context("spawn").Process(
@@ -175,15 +189,15 @@ def read_recorded_blocks(paths: Sequence[Path]) -> dict[tuple[str, str], list[Re
     table = parquet_rows.read_rows(paths, RECORD_SCHEMA).to_pylist()
     by: dict[tuple[str, str, int], list[dict[str, Any]]] = {}
     for row in table:
-        by.setdefault((row["gate"], row["condition"], row["start"]), []).append(row)
+        by.setdefault((row["benchmark"], row["background_load"], row["process_pair"]), []).append(row)
     found: dict[tuple[str, str], list[RecordedBlocks]] = {}
     for (gate, condition, _), turns in by.items():
         times = np.array([[row[f"call_{k}"] for k in range(4)] for row in turns])
         abba = np.array([row["order"] == "ABBA" for row in turns])[:, None]
         outer, inner = times[:, [0, 3]], times[:, 1:3]
         a, b = np.where(abba, outer, inner), np.where(abba, inner, outer)
-        wall = float(np.mean([row["wall"] for row in turns]))
-        load = float(np.median([row["load"] for row in turns]))
+        wall = float(np.mean([row["wall_seconds"] for row in turns]))
+        load = float(np.median([row["load_average"] for row in turns]))
         start = RecordedBlocks(np.log(a.sum(axis=1) / b.sum(axis=1)), a, b, wall, load)
         found.setdefault((gate, condition), []).append(start)
     return found

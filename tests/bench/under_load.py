@@ -1,6 +1,6 @@
 """How often our own gates are wrong while other programs keep the machine busy: each is run several times.
 
-    python -m tests.bench.under_load [--times 50] [--condition busy] [--budget 10] [GATE ...]
+    python -m tests.bench.under_load [--times 50] [--background-load busy] [--budget 10] [GATE ...]
 
 A background program on each core sweeps over memory, always (`busy`) or in bursts (`bursty`); `nothing` leaves the
 load to other programs. The work of both sides is prepared again for each benchmark. None may fail: the ratios lie
@@ -44,14 +44,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("gates", nargs="*", metavar="GATE", help=f"of {', '.join(NAMED)}")
     parser.add_argument("--times", type=int, default=50)
-    parser.add_argument("--condition", default="busy")
+    parser.add_argument("--background-load", default="busy")
     parser.add_argument("--budget", type=float, default=10.0)
     asked = parser.parse_args()
     if unknown := sorted({*asked.gates} - NAMED.keys()):
         parser.error(f"{', '.join(unknown)}: no such gate; there are {', '.join(NAMED)}")
     console = Console(width=120)
     found: dict[str, list[BenchmarkResult]] = {name: [] for name in asked.gates or ASKED}
-    with limit_threads(THREADS), run_background_load(asked.condition):
+    with limit_threads(THREADS), run_background_load(asked.background_load):
         for number in range(asked.times):
             for name, results in found.items():
                 results.append(run_gate(NAMED[name], asked.budget))

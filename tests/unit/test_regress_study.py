@@ -87,13 +87,13 @@ def test_blocks_are_recorded_and_replayed(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
     samples = tmp_path / "samples.parquet"
-    given = ["record", str(samples), "cloth.yaml", "--solver", "sparse", "--seconds", "1", "--injected-slowdown", "0.1"]
+    given = ["record", str(samples), "cloth.yaml", "--solver", "sparse", "--duration", "1", "--injected-slowdown", "0.1"]
     for starts in ("2", "1"):  # what is stored already is kept
-        done = CliRunner().invoke(app, [*given, "--starts", starts])
+        done = CliRunner().invoke(app, [*given, "--process-pairs", starts])
         assert done.exit_code == 0, done.output
     recorded = parquet_rows.read_rows([samples], RECORD_SCHEMA).to_pylist()
-    assert {row["start"] for row in recorded} == {0, 1, 2}
-    assert {row["planted"] for row in recorded} == {0.1}
+    assert {row["process_pair"] for row in recorded} == {0, 1, 2}
+    assert {row["injected_slowdown"] for row in recorded} == {0.1}
     ((key, found),) = read_recorded_blocks([samples]).items()
     assert key == ("cloth, size 4, sparse, 500 iterations, implicit-euler, dt 0.03333", "nothing")
     assert sum(len(start.log_ratios) for start in found) == len(recorded)
@@ -133,8 +133,8 @@ def test_real_tests_are_counted_and_stored(tmp_path: Path, monkeypatch: pytest.M
     ("arguments", "said"),
     [
         (
-            ("record", "new.parquet", "cloth.yaml", "--condition", "windy"),
-            "--condition: got windy; expected one of nothing",
+            ("record", "new.parquet", "cloth.yaml", "--background-load", "windy"),
+            "--background-load: got windy; expected one of nothing",
         ),
         (("replay", "nowhere.parquet"), "nowhere.parquet: no such file; `record` writes one"),
     ],
