@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from springbench.solvers.cuda import device_sums
 from springbench.solvers.cuda.cuda_target import cuda
+from springbench.solvers.cuda.function_sharing import share_with_device
+from springbench.solvers.kernels import spring_hessian
 from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 
 
@@ -114,6 +116,8 @@ class HessianKernels(NamedTuple):
 def build_hessian_kernels(real: type[np.float32] | type[np.float64]) -> HessianKernels:
     """Build the kernels that compute in `real`."""
 
+    transverse_stiffness = share_with_device(spring_hessian.transverse_stiffness)
+
     @cuda.jit
     def linearise(edges, free, p, linear):
         """Write sqrt(a) n and s of each entry of the first `free` rows to linear (4, entries)."""
@@ -129,11 +133,8 @@ def build_hessian_kernels(real: type[np.float32] | type[np.float64]) -> HessianK
                     edges, e, x - p[j, 0], y - p[j, 1], z - p[j, 2]
                 )
                 k, rest = edges.entry_stiffness[e], edges.entry_rest_length[e]
-                lateral = 0.0
-                if rest == 0.0:
-                    lateral = k
-                elif rest == rest and length > 0.0:
-                    lateral = min(tension / length, k)
+                # The rest length of a dashpot is nan.
+                lateral = transverse_stiffness(k, rest, tension, length) if rest == rest else 0.0
                 root = math.sqrt(k - lateral)
                 linear[0, e], linear[1, e], linear[2, e] = real(root * n0), real(root * n1), real(root * n2)
                 linear[3, e] = real(lateral)

@@ -16,9 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from springbench.solvers.cuda import device_sums
 from springbench.solvers.cuda.cuda_target import cuda
+from springbench.solvers.cuda.function_sharing import share_with_device
+from springbench.solvers.kernels import spring_hessian
+from springbench.solvers.model.energies import element_energies
 from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 
 RealType = type[np.float32] | type[np.float64]
+
+_transverse_stiffness = share_with_device(spring_hessian.transverse_stiffness)
+_axial_hessian = share_with_device(element_energies.axial_hessian)
 
 
 def packed_length(num_nodes: int) -> int:
@@ -39,14 +45,15 @@ def write_edge_blocks(edges, p, stiff):
         length, lateral = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2), 0.0
         if rest == rest and length > ZERO_LENGTH:  # a dashpot's length at rest is nan, and its direction is its axis
             n0, n1, n2 = v0 / length, v1 / length, v2 / length
-            lateral = max(0.0, min(k * (length - rest) / length, k))
         else:
             n0, n1, n2 = edges.edge_direction[e, 0], edges.edge_direction[e, 1], edges.edge_direction[e, 2]
-        if rest == 0.0:
-            lateral = k
-        a = k - lateral
-        stiff[0, e], stiff[3, e], stiff[5, e] = a * n0 * n0 + lateral, a * n1 * n1 + lateral, a * n2 * n2 + lateral
-        stiff[1, e], stiff[2, e], stiff[4, e] = a * n0 * n1, a * n0 * n2, a * n1 * n2
+            length = 0.0
+        if rest == rest:
+            lateral = _transverse_stiffness(k, rest, k * (length - rest), length)
+        if rest > 0.0:  # edges of quadratic forms have no rest length, and may have a negative stiffness
+            lateral = max(0.0, lateral)
+        xx, xy, xz, yy, yz, zz = _axial_hessian(k, lateral, n0, n1, n2)
+        stiff[0, e], stiff[1, e], stiff[2, e], stiff[3, e], stiff[4, e], stiff[5, e] = xx, xy, xz, yy, yz, zz
         e += cuda.gridsize(1)
 
 

@@ -18,7 +18,7 @@ from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.objective_kernels import spring_direction
 from springbench.solvers.kernels.quadratic_form_kernels import add_product
 from springbench.solvers.kernels.quadratic_form_kernels import add_to_diagonal as hold_block
-from springbench.solvers.model.energies.element_energies import add_products
+from springbench.solvers.model.energies.element_energies import add_products, axial_hessian
 from springbench.solvers.model.step_problem import System
 
 
@@ -110,14 +110,13 @@ def linearise_tensions(terms, p, d, out):
 
 
 @jit_inner
-def _lateral_stiffness(terms, e, length, tension, negative_fraction):
-    """Return the transverse stiffness [N/m] of spring e, at most k; 0 for zero length and positive rest length."""
-    if terms.rest_length[e] == 0.0:
-        return terms.stiffness[e]
+def transverse_stiffness(stiffness, rest_length, tension, length):
+    """Return a spring's transverse stiffness [N/m], at most k; 0 for zero length and positive rest length."""
+    if rest_length == 0.0:
+        return stiffness
     if length <= 0.0:
         return 0.0
-    lateral = min(tension / length, terms.stiffness[e])
-    return lateral * negative_fraction if lateral < 0.0 else lateral
+    return min(tension / length, stiffness)
 
 
 @jit_inner
@@ -174,10 +173,9 @@ def assemble_hessian(terms, places, constant, p, tension, negative_fraction, val
         if i == j:
             continue
         n0, n1, n2, length = spring_direction(terms, e, p)
-        lateral = _lateral_stiffness(terms, e, length, tension[e], negative_fraction)
-        a = terms.stiffness[e] - lateral
-        xx, xy, xz = a * n0 * n0 + lateral, a * n0 * n1, a * n0 * n2
-        yy, yz, zz = a * n1 * n1 + lateral, a * n1 * n2, a * n2 * n2 + lateral
+        lateral = transverse_stiffness(terms.stiffness[e], terms.rest_length[e], tension[e], length)
+        lateral = lateral * negative_fraction if lateral < 0.0 < terms.rest_length[e] else lateral
+        xx, xy, xz, yy, yz, zz = axial_hessian(terms.stiffness[e], lateral, n0, n1, n2)
         if places.diagonal_block[i] >= 0:
             _add_block(values, places.diagonal_block[i], 1.0, xx, xy, xz, yy, yz, zz)
         if places.diagonal_block[j] >= 0:
@@ -196,7 +194,7 @@ def linearise_springs(terms, p, out):
     for e in range(len(terms.stiffness)):
         n0, n1, n2, length = spring_direction(terms, e, p)
         k = terms.stiffness[e]
-        lateral = _lateral_stiffness(terms, e, length, k * (length - terms.rest_length[e]), 1.0)
+        lateral = transverse_stiffness(k, terms.rest_length[e], k * (length - terms.rest_length[e]), length)
         root = np.sqrt(k - lateral)
         out[e, 0], out[e, 1], out[e, 2], out[e, 3] = root * n0, root * n1, root * n2, lateral
 
