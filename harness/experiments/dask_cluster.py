@@ -260,7 +260,7 @@ def execute_on_cluster(
 
     Raises:
         InputError: the input is invalid.
-        CannotWrite: no worker can write any more.
+        WriteError: no worker can write any more.
         RunFailed: the connection to the scheduler is lost.
     """
     token = folder / "rows" / f".{uuid4().hex}.partial"  # who sees it shares the folder; it goes as such files do

@@ -58,7 +58,7 @@ class ExperimentUnit(Protocol):
 
         Raises:
             InputError: the input is invalid.
-            CannotWrite: the rows cannot be written.
+            WriteError: the rows cannot be written.
         """
         ...
 
@@ -160,7 +160,7 @@ def execute_units(
 
     Raises:
         InputError: the input is invalid.
-        CannotWrite: the rows cannot be written.
+        WriteError: the rows cannot be written.
     """
     display.start_sweep([unit.cost_estimate for unit in todo], num_workers)
     runs: dict[int, RunProgress] = {}

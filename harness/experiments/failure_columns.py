@@ -30,7 +30,7 @@ def build_failure_columns(error: BaseException, solver_files: Collection[Path] =
         solver_files: source files of the solver; the reported error location is in these where possible.
 
     Raises:
-        CannotWrite: if this is the error.
+        WriteError: if this is the error.
     """
     if isinstance(error, WriteError):  # that is no outcome: a row of it would keep the run from being done again
         raise error

@@ -96,7 +96,7 @@ def execute_run(
 
     Raises:
         InputError: the input is invalid, and the run has no user code.
-        CannotWrite: the files cannot be written; there are then no rows.
+        WriteError: the files cannot be written; there are then no rows.
     """
     shared: dict[str, Any] = {"num_concurrent_runs": num_concurrent_runs, **calibrate_machine(tick)}
     threads = machine_info.choose_threads(run.threads)
@@ -450,6 +450,6 @@ def _open_recorder(
 
 
 def save_positions(path: Path, positions: np.ndarray) -> None:
-    """Store positions (frames, n, 3) [m] in a partial file and rename it. Raises CannotWrite."""
+    """Store positions (frames, n, 3) [m] in a partial file and rename it. Raises WriteError."""
     with atomic_write(path) as partial:
         np.savez_compressed(partial, positions=positions)

@@ -37,7 +37,7 @@ class PartialFile:
     """An open recording stream into a partial file in the folder of the final file.
 
     Raises:
-      CannotWrite: from any method, if the file cannot be written or is incomplete at the end.
+      WriteError: from any method, if the file cannot be written or is incomplete at the end.
     """
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:

@@ -91,7 +91,7 @@ class PerturbationGrowth:
           times: times [s]; the end if omitted.
 
         Raises:
-          Unpredictable: the perturbation has grown too large at one of the times.
+          UnpredictableMotion: the perturbation has grown too large at one of the times.
         """
         times = times or [float(self.times[-1])]
         for t, grown in zip(times, self.interpolate_growth(times), strict=True):
@@ -118,8 +118,8 @@ def estimate_growth(spec: SceneSpec, size: int, t_end: float) -> PerturbationGro
       t_end: end time [s].
 
     Raises:
-      Unpredictable: nothing moves, or the motion is not finite.
-      Unintegrable: the scene has no equation of motion.
+      UnpredictableMotion: nothing moves, or the motion is not finite.
+      NotIntegrable: the scene has no equation of motion.
     """
     samples = max(_MIN_SAMPLES, ceil(t_end / _SAMPLE_SECONDS * (1.0 - 1e-9)))
     scene, begun, advance = _build_motion(spec, size, t_end / samples)

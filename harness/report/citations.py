@@ -51,7 +51,7 @@ def write_bibtex(path: Path, references: Iterable[str | None]) -> Path:
         path: target file.
         references: references as JSON, or None.
     Raises:
-        CannotWrite: if the file cannot be written.
+        WriteError: if the file cannot be written.
     """
     with atomic_write(path) as partial:
         partial.write_text(format_bibtex(references), encoding="utf-8")

@@ -87,7 +87,7 @@ def save_page(page: Figure, path: Path, *, used_height: float = PAGE_HEIGHT) -> 
         path: target file.
         used_height: height that is drawn on [pixels from the top]; the empty part below is cropped.
     Raises:
-        CannotWrite: if the file cannot be written.
+        WriteError: if the file cannot be written.
     """
     with atomic_write(path) as partial:
         page.savefig(partial, format="png", dpi=PAGE_DPI)

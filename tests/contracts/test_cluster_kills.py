@@ -85,7 +85,7 @@ def wait_for(holds: Any) -> None:
 
 class Sweep(NamedTuple):
     config: Path
-    parquet_rows: Path
+    rows: Path
 
     @classmethod
     def made(cls, folder: Path) -> Sweep:

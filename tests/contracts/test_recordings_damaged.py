@@ -57,7 +57,7 @@ def run(code: str, path: Path) -> subprocess.CompletedProcess[str]:
 
 def test_a_full_disk_is_a_failure_and_not_a_damaged_file(tmp_path: Path):
     told = run(FULL, tmp_path / "a.rrd")
-    assert "CannotWrite" in told.stderr
+    assert "WriteError" in told.stderr
     assert "cannot be written" in told.stderr
     assert list(tmp_path.iterdir()) == []
 

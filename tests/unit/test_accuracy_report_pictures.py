@@ -209,7 +209,7 @@ def test_solvers_of_a_family_have_one_hue() -> None:
     hues: dict[str, set[int]] = {}
     for name, look in assign_solver_styles([]).items():
         hue, saturation, _ = rgb_to_hsv(to_rgb(look.color))
-        hues.setdefault(load_target(SOLVER_TABLE[name]).about.family, set()).add(
+        hues.setdefault(load_target(SOLVER_TABLE[name]).solver_info.family, set()).add(
             round(360 * hue) if saturation > 0.1 else -1
         )
     # Two hexadecimal digits round a hue by a degree or two.

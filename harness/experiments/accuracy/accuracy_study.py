@@ -83,7 +83,7 @@ def run_accuracy_study(
 
     Raises:
         InputError: the input is invalid.
-        CannotWrite: the rows cannot be written.
+        WriteError: the rows cannot be written.
     """
     home = AccuracyResults(accuracy.name, folder)
     cases = {spec.case.scene_name: spec.case for spec in reversed(accuracy.work)}
@@ -124,7 +124,7 @@ def measuring(
 
     Raises:
         InputError: the input is invalid.
-        CannotWrite: the rows cannot be written.
+        WriteError: the rows cannot be written.
     """
     home = AccuracyResults(folder.name, folder)
     require_threads({spec.measurement.threads for spec in work})

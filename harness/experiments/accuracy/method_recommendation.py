@@ -304,7 +304,7 @@ def _measured(
     say: Callable[[str], None],
     budget: float,
 ) -> Omitted:
-    """Measure the methods that may be the cheapest and have no rows. Raises InputError, CannotWrite."""
+    """Measure the methods that may be the cheapest and have no rows. Raises InputError, WriteError."""
     known: dict[str, dict[str, Any]] = {
         way.work_spec.build_file_stem(): {
             "status": "ok",

@@ -136,7 +136,7 @@ class VerifiedClaim:
 class PublishedRun:
     """Run of an archive: its rows, and the specification to repeat it."""
 
-    parquet_rows: list[ResultRow]
+    rows: list[ResultRow]
     run: RunSpec
 
     @property

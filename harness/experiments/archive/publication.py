@@ -69,7 +69,7 @@ def publish_results(
 
     Raises:
         InputError: rows are damaged, or files lie outside of the folders.
-        CannotWrite: the archive cannot be written.
+        WriteError: the archive cannot be written.
     """
     if archive.suffix.lower() != ".zip" or archive.is_dir():
         raise InputError(InputMistake("wanted the name of a file that ends in .zip", archive, key="--output"))

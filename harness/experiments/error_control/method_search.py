@@ -160,7 +160,7 @@ def compute_predictability_horizon(
         print_message: prints a remark.
 
     Raises:
-        Unpredictable: the error cannot be reached at t_end (the message states one that can), or nothing moves.
+        UnpredictableMotion: the error cannot be reached at t_end (the message states one that can), or nothing moves.
     """
     seen = estimate_growth(error_target.scene, error_target.size, error_target.t_end)
     seen.require_predictable(max_error)
@@ -378,7 +378,7 @@ class _MethodSearch:
     def _tune_setting(self, trial: Trial, reference_trial: Trial, time_limit: float) -> tuple[Trial, str]:
         """Tune the setting of a method towards the target error, and return the nearest trial.
 
-        The second result says why the trial is much more accurate. Raises TooSlow beyond a limit of CPU seconds.
+        The second result says why the trial is much more accurate. Raises TimeBudgetExceeded beyond a limit of CPU seconds.
         """
         best, above = None if trial.error_estimated > self._max_error else trial, None
         nearest, stalled = trial, 0

@@ -63,7 +63,7 @@ def compare_third_party(
         names: integrators in THIRD_PARTY_INTEGRATORS.
 
     Raises:
-        Unintegrable: the scene has no equations of motion.
+        NotIntegrable: the scene has no equations of motion.
     """
     scene = error_target.build_scene(error_target.frame_seconds, "newmark")
     fields = {compiled: OdeField(scene, compiled=compiled) for compiled in (True, False)}
@@ -141,7 +141,7 @@ class _ThirdPartyComparison:
 def _limit_cpu_time(vector_field: OdeField, deadline: float) -> Callable[[float, OdeState], OdeState]:
     """Return the vector field with a deadline on the CPU clock [s].
 
-    It raises TooSlow afterwards.
+    It raises TimeBudgetExceeded afterwards.
     """
 
     def rate(t: float, y: OdeState) -> OdeState:

@@ -219,7 +219,7 @@ class RepeatedCall:
 
     @retry_on_mismatch
     def __call__(self, num_calls: int) -> float:
-        """Return the wall seconds of a number of calls. Raises ClocksDisagree."""
+        """Return the wall seconds of a number of calls. Raises ClockMismatch."""
         watch = PhaseWatch(numba.get_num_threads())
         with watch:
             began = perf_counter()

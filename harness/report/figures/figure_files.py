@@ -35,7 +35,7 @@ def write_figure(
         title: title of the figure.
         options: options of the figure.
     Raises:
-        CannotWrite: if a file cannot be written.
+        WriteError: if a file cannot be written.
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
     about = "; ".join(

@@ -40,7 +40,7 @@ def write_json_script(path: Path, name: str, value: str) -> Path:
         name: name of the value.
         value: JSON.
     Raises:
-        CannotWrite: if the file cannot be written.
+        WriteError: if the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     value = _PROTOTYPE_KEY.sub('["__proto__"]:', value)

@@ -45,7 +45,7 @@ def update_page(
         print_message: prints a remark.
     Raises:
         InputError: if there are no rows.
-        CannotWrite: if a file cannot be written.
+        WriteError: if a file cannot be written.
     """
     found = (
         find_folders(results) if changed_folders is None else [locate_folder(path, results) for path in changed_folders]

@@ -72,7 +72,7 @@ def write_viewer(folder: Path) -> Path:
 
     Raises:
         RunFailed: if the viewer is not installed or does not answer.
-        CannotWrite: if the file cannot be written.
+        WriteError: if the file cannot be written.
     """
     how = sha256(_VIEWER_TEMPLATE.encode()).hexdigest()[:8]
     path, head = folder / VIEWER_SCRIPT, _SCRIPT_HEADER.format(version=version("rerun-sdk"), how=how)
@@ -96,7 +96,7 @@ def write_recording(recording: Path, script: Path, title: str) -> Path:
         title: heading of the recording in the page.
     Raises:
         InputError: if the recording cannot be read.
-        CannotWrite: if the file cannot be written.
+        WriteError: if the file cannot be written.
     """
     made = recording.stat().st_mtime_ns
     if not script.is_file() or script.stat().st_mtime_ns < made:
