@@ -163,7 +163,7 @@ def _list_required_files(config: Path) -> list[Path]:
             for part in (scene.mesh, *scene.effects):
                 if isinstance(part, ConfigModel):  # what is somebody's own is not opened
                     files |= {value for value in vars(part).values() if isinstance(value, Path)}
-            for _, given in scene.own.values():  # names of files come with their digests there
+            for _, given in scene.plugins.values():  # names of files come with their digests there
                 there = scene.path.parent
                 files |= {there / value[0] for value in given.values() if _is_file(value, there)}
             plugins += run.find_plugins()
