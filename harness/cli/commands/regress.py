@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 STORED_FOLDERS = (Path("results/bench"), Path(".benchmarks"))
 """Default folders of a history: those of this project, and those of pytest-benchmark."""
 
-_SCENE_OPTIONS = ("--solver", "--size", "--iterations", "--tolerance")
+_SCENE_OPTIONS = ("--solver", "--size", "--max-iterations", "--rtol")
 _TIMING_OPTIONS = ("--budget", "--max-ratio", "--clock")
 _USED_OPTIONS = {
     "a comparison of a scene or a sweep with a revision": {*_TIMING_OPTIONS, *_SCENE_OPTIONS},
@@ -62,15 +62,15 @@ def regress(
     ] = None,
     solver: Annotated[list[str] | None, typer.Option(help="For a scene: solvers; repeatable.")] = None,
     size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh sizes; repeatable.")] = None,
-    iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
-    tolerance: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of a step.")] = None,
+    max_iterations: Annotated[int | None, typer.Option(help="For a scene: iteration limit of a step.")] = None,
+    rtol: Annotated[float | None, typer.Option(help="For a scene: relative tolerance of the residual.")] = None,
 ) -> None:
     """Find performance regressions. Exit code 0: pass; 1: fail; 3: inconclusive."""
     paths = subjects or []
     kind = _choose_kind(paths, baseline, history=history)
     given = {"--budget": budget, "--max-ratio": max_ratio, "--clock": clock, "-k": gate_name}
     given |= {"--relative-to": relative_to, "--solver": solver, "--size": size}
-    given |= {"--iterations": iterations, "--tolerance": tolerance}
+    given |= {"--max-iterations": max_iterations, "--rtol": rtol}
     for option, value in given.items():
         if value not in (None, "", []) and option not in _USED_OPTIONS[kind]:
             raise InputError(f"{option}: does not apply to {kind}; leave it out")
@@ -82,7 +82,7 @@ def regress(
         verdict = _run_gates_file(paths[0], _build_options(budget, None, None).budget)
     else:
         run_options = {"solvers": solver or [], "sizes": size or []}
-        limits = {"max_iterations": iterations, "rtol": tolerance}
+        limits = {"max_iterations": max_iterations, "rtol": rtol}
         run_options |= {name: value for name, value in limits.items() if value is not None}
         options = _build_options(budget, max_ratio, clock)
         verdict = _compare_with_revision(baseline or "", paths, gate_name, options, run_options)

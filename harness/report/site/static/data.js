@@ -53,10 +53,10 @@ Object.assign(springbench, (() => {
     if (!scene || !row.has_default_parameters || row.plugins) return `${whole} --rerun`;
     const chosen = row.error_requested !== null && row.error_requested !== undefined;
     const stated = {
-      iterations: row.max_iterations, tolerance: row.residual_rtol === 0 ? "auto" : row.residual_rtol, integrator: row.integrator, "first-guess": row.initial_guess,
+      "max-iterations": row.max_iterations, rtol: row.residual_rtol === 0 ? "auto" : row.residual_rtol, integrator: row.integrator, "initial-guess": row.initial_guess,
     };
     const options = {
-      size: row.size || null, solver: row.solver, ...(chosen ? { accuracy: row.error_requested } : stated), "time-step": row.time_step && (Math.abs(Math.round(1 / row.time_step) * row.time_step - 1) < 1e-12 ? `1/${Math.round(1 / row.time_step)}` : row.time_step), threads: row.threads,
+      size: row.size || null, solver: row.solver, ...(chosen ? { "error-target": row.error_requested } : stated), "time-step": row.time_step && (Math.abs(Math.round(1 / row.time_step) * row.time_step - 1) < 1e-12 ? `1/${Math.round(1 / row.time_step)}` : row.time_step), threads: row.threads,
       frames: row.frames, rounds: row.rounds,
     };
     const told = Object.entries(options).filter(([, value]) => value !== null && value !== undefined);
