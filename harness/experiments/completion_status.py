@@ -56,7 +56,7 @@ def read_completion_statuses(
     Args:
         matches_request: for each path, a predicate on the columns of the unit's first row; whether they match the
             request.
-        columns: columns that the predicates need; `code` is added.
+        columns: columns that the predicates need; `source_fingerprint` is added.
         schema: schema of the rows.
 
     Raises:

@@ -12,7 +12,7 @@ Hence
     floor(p)  = sqrt(sum_i (FACTOR delta_i)^2 / Q_ii)          bound on the round-off of the residual
     beyond(p) = |Q^-1 (grad g less the part explained by round-off, for each vertex)|_Q / initial
 
-A step is assessed by `beyond`: it is 0 where every vertex is in equilibrium to float64 accuracy.
+A step is assessed by `stationarity_above_roundoff`: it is 0 where every vertex is in equilibrium to float64 accuracy.
 
 Where Q has more than MAX_DIRECT_NNZ entries, conjugate gradients from zero replace the factor. |x_k|_Q grows towards
 |Q^-1 g|_Q (Hestenes and Stiefel 1952), so that the result is a close lower bound. The preconditioner is multigrid,

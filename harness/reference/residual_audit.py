@@ -8,7 +8,7 @@ lengths are
 wrong.
 
 The audit runs in the instrumentation pass, which is not timed. It detects a method that does nothing and reports a zero
-residual. A method whose iterations do not end at the minimum of the step's objective (`minimises = False`, and no
+residual. A method whose iterations do not end at the minimum of the step's objective (`is_minimiser = False`, and no
 substepping) is never rejected; its stationarity is measured all the same.
 """
 
@@ -45,7 +45,7 @@ class AuditedSolver(DelegatingSolver):
         self._name = type(solver).__name__
         self._stationarity = StationarityEvaluator()
         self.found: dict[int, dict[str, Any]] = {}
-        """Column `graded` of the row of each audited frame."""
+        """Column `stationarity_audit` of the row of each audited frame."""
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
         """Return the solver's solution; raises RunFailed where its reported residual is wrong."""
@@ -66,7 +66,7 @@ class AuditedSolver(DelegatingSolver):
         yardstick = self._stationarity.compute_initial_residual(problem)
         told, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
         if np.isnan(found.residual) and found.num_iterations:
-            raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {truth:.3g} (or `minimises = False`)")
+            raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {truth:.3g} (or `is_minimiser = False`)")
         claimed = RESIDUAL_SLACK * found.residual / yardstick + round_off
         enough = RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / yardstick if yardstick else 0.0) + round_off
         if found.termination_reason != "converged":

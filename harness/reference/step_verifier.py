@@ -47,9 +47,9 @@ class StepVerifier:
     def __call__(self, step: SimulationStep) -> dict[str, Any]:
         """Compute the accuracy columns of a step's row.
 
-        Columns: `stationarity`, `attainable`, `beyond`, `minimum` and `flat` (absent for a method that does not
-        minimise), and `distance`. In a step of several stages all are evaluated, and the first three columns are those
-        of the worst.
+        They are `stationarity`, `stationarity_roundoff_bound`, `stationarity_above_roundoff`, `is_local_minimum` and
+        `is_degenerate` (absent for a method that does not minimise), and `reference_distance`. In a step of several
+        stages all are evaluated, and the first three columns are those of the worst.
         """
         row: dict[str, Any] = {}
         if self._reference is not None:

@@ -117,8 +117,8 @@ class VerifiedRun:
         case: scene, with the options in which its runs differ.
         solver: solver, with the parameters in which its runs differ.
         outcome: outcome of the run.
-        worst_error: largest `beyond` of a step, or, if `error_kind` is "distance", the largest distance from the
-            reference; None if unknown.
+        worst_error: largest `stationarity_above_roundoff` of a step, or, if `error_kind` is "distance", the largest
+            distance from the reference; None if unknown.
         error_kind: "stationarity" or "distance".
         reason: why the run is not correct.
         citation: reference of the solver as in the rows.

@@ -103,7 +103,7 @@ def _describe_unsolved(ok_runs: Sequence[RunTimes], names: Mapping[str, str]) ->
                 f"{names[run.run_id]} on {run.scene} {run.size or ''}".rstrip()
                 + " does not converge to the minimum of a step's objective: up to "
                 f"{run.max_stationarity_audit:.1e} of the residual at a "
-                "step's start is left (column `graded`); more iterations need not lower it."
+                "step's start is left (column `stationarity_audit`); more iterations need not lower it."
             )
 
 

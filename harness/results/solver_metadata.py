@@ -21,7 +21,7 @@ def list_packages(solver: str) -> tuple[str, ...]:
 
 
 def read_solver_metadata(solver: str) -> dict[str, Any]:
-    """Read the columns `family`, `reference`, `minimises` and `own_steps` of a solver.
+    """Read the columns `family`, `citation`, `is_minimiser` and `is_substepping` of a solver.
 
     Empty for an unknown name.
     """

@@ -1,4 +1,4 @@
-"""Time stepping to an error tolerance by a solver with substeps within frames (`own_steps` in its metadata).
+"""Time stepping to an error tolerance by a solver with substeps within frames (`is_substepping`).
 
 The substeps are adaptive, or have a fixed size: the largest stable one or a smaller one.
 """

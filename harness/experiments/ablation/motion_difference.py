@@ -12,7 +12,7 @@ MotionStates = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def compute_motion_difference(scene: Scene, a: MotionStates, b: MotionStates) -> dict[str, float]:
-    """Return the columns `largest`, `rms`, `energy` and `centre` for two motions.
+    """Return the columns that compare two motions.
 
     Args:
         scene: the full scene.
