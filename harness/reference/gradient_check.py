@@ -41,18 +41,6 @@ class _SamplePoint(NamedTuple):
     direction: NDArray[np.float64]
 
 
-class GradientReading(NamedTuple):
-    """Slope of an energy along a direction by its gradient, and by its value.
-
-    Attributes:
-      slope: scalar product of gradient and direction [N].
-      error: relative error of the slope; 0 within round-off, inf if it is not finite.
-    """
-
-    slope: float
-    error: float
-
-
 def measure_gradient_errors(scene: Scene, frames: int) -> dict[str, float]:
     """Measure the gradient errors of a scene's energies from user code.
 
@@ -60,11 +48,11 @@ def measure_gradient_errors(scene: Scene, frames: int) -> dict[str, float]:
 
     Args:
       scene: scene of the run.
-      frames: number of frames, of which the points are.
+      frames: number of frames; the points lie at times of these.
 
     Returns: largest relative error by class name of the energy; 0 within round-off.
     """
-    errors, min_length = dict[str, float](), find_min_length(scene)
+    errors, min_length = dict[str, float](), _find_min_length(scene)
     if all(map(_is_shipped, scene.system.energies)):
         return errors
     with np.errstate(all="ignore"):  # values that are not finite are left out
@@ -73,13 +61,13 @@ def measure_gradient_errors(scene: Scene, frames: int) -> dict[str, float]:
                 begun = energy.begin_step(point.start) if is_lagged(energy) else energy
                 start = point.start.positions, point.start.velocity_origin
                 scale = max(float(np.abs(part).max(initial=0.0)) for part in (point.x, *start))
-                reading = read_gradient(begun, point.x, point.direction, scale, min_length)
+                error = measure_gradient_error(begun, point.x, point.direction, scale, min_length)
                 name = type(energy).__name__
-                errors[name] = max(errors.get(name, 0.0), reading.error)
+                errors[name] = max(errors.get(name, 0.0), error)
     return errors
 
 
-def find_min_length(scene: Scene) -> float:
+def _find_min_length(scene: Scene) -> float:
     """Return the smallest rest length [m] of a spring, or the mesh spacing without springs."""
     lengths = scene.mesh.rest_lengths
     return float(lengths[lengths > 0.0].min(initial=scene.mesh.spacing))
@@ -107,10 +95,10 @@ def _sample_points(scene: Scene, frames: int) -> Iterator[tuple[System, _SampleP
         yield system, _SamplePoint(start, p + system.time_step * v + x, direction)
 
 
-def read_gradient(
+def measure_gradient_error(
     energy: Energy, x: Positions, direction: NDArray[np.float64], coordinate_scale: float, min_length: float
-) -> GradientReading:
-    """Compare an energy's gradient along a direction with the derivative of its value.
+) -> float:
+    """Return the relative error of an energy's slope along a direction by its gradient.
 
     Args:
       energy: energy of a step.
@@ -118,20 +106,22 @@ def read_gradient(
       direction: direction (n, 3).
       coordinate_scale: largest coordinate [m] that the energy depends on.
       min_length: smallest length [m] that it depends on.
+
+    Returns: error relative to the derivative of its value; 0 within round-off, inf if it is not finite.
     """
     gradient = np.zeros_like(x)
     energy.add_gradient(x, gradient)
     slope, size = float((gradient * direction).sum()), float(np.abs(gradient * direction).sum())
     tolerance = ROUNDOFF_MULTIPLE * EPS * (1.0 + coordinate_scale / min_length) * size
     if abs(_complex_step_derivative(energy, x, direction) - slope) <= tolerance or not np.isfinite(energy.value(x)):
-        return GradientReading(slope, 0.0)
+        return 0.0
     h = _DIFFERENCE_STEP * min_length
     derivative, bound = _difference_derivative(energy, x, direction, h, coordinate_scale)
     difference = abs(derivative - slope)
     if difference <= bound + tolerance:
-        return GradientReading(slope, 0.0)
+        return 0.0
     error = difference / max(abs(derivative), size, np.finfo(float).tiny)
-    return GradientReading(slope, error if np.isfinite(error) else float("inf"))
+    return error if np.isfinite(error) else float("inf")
 
 
 def _complex_step_derivative(energy: Any, x: Positions, direction: NDArray[np.float64]) -> float:

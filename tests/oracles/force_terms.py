@@ -61,10 +61,10 @@ def build_wind_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
             lift = n - (n @ u) * u / speed**2
             f = effect.density / 2 * area * speed * (n @ u) * (effect.drag * u / speed + effect.lift * lift)
             most = sum(rested * declared.mass[i] / around[i] for i in triangle) * speed / declared.time_step
-            asked = np.sqrt(f @ f)
-            f = f * (most / asked) if asked > most else f
+            magnitude = np.sqrt(f @ f)
+            f = f * (most / magnitude) if magnitude > most else f
             total[triangle] += f / 3
-            size += min(asked, most) * (1 + (np.abs(air).max() + np.abs(v[triangle]).max()) / speed)
+            size += min(magnitude, most) * (1 + (np.abs(air).max() + np.abs(v[triangle]).max()) / speed)
         return total, size * (1.0 + phase(p, t))
 
     return EffectTerms(evaluate_force=on_triangles if effect.per == "triangle" else on_vertices)
@@ -109,8 +109,8 @@ def _gust_field(effect: Any, declared: SceneDeclaration) -> tuple[FieldFunction,
     draws = np.random.default_rng(effect.seed)
     octaves = draws.uniform(np.log(0.25), np.log(4), waves)
     phases = draws.uniform(0, 2 * np.pi, (waves, 3))
-    ways = declared.mesh.rest_positions.max(axis=0) - declared.mesh.rest_positions.min(axis=0)
-    size = float(np.sqrt((ways**2).sum())) or 1.0
+    extents = declared.mesh.rest_positions.max(axis=0) - declared.mesh.rest_positions.min(axis=0)
+    size = float(np.sqrt((extents**2).sum())) or 1.0
     slow = mean / speed**2 if effect.per == "triangle" else mean / (speed * size)
 
     def field(x: Array, t: float) -> Array:

@@ -54,12 +54,15 @@ def build_contact_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
 
 def _build_obstacle_energy(effect: Any, one: Any, k: ExtendedArray, moment: StepMoment) -> ValueFunction:
     R, slip = obstacle_radius(one) + effect.thickness, float(effect.creep) * (moment.stage_time - moment.time)
-    begun, ended = (place_at(one.motion, moment.time + dt) for dt in (0.0, moment.time_step))
-    a, b = begun.inverse_transform(moment.p), ended.inverse_transform(moment.p + moment.time_step * moment.v)
+    start_placement, end_placement = (place_at(one.motion, moment.time + dt) for dt in (0.0, moment.time_step))
+    a, b = (
+        start_placement.inverse_transform(moment.p),
+        end_placement.inverse_transform(moment.p + moment.time_step * moment.v),
+    )
     touched, out = _locate_half_space(one, a, b, R)
-    n = out @ ended.rotation.T
-    d = (n * ended.transform(touched + R * out)).sum(axis=1)
-    carried = ended.transform(a)
+    n = out @ end_placement.rotation.T
+    d = (n * end_placement.transform(touched + R * out)).sum(axis=1)
+    carried = end_placement.transform(a)
     # The half-space is that of the step's end; where x is at an earlier time, it is interpolated from the start.
     w, started = moment.stage_fraction, (n * moment.p).sum(axis=1)
     offset, anchor = started + w * (d - started), moment.p + w * (carried - moment.p)
@@ -102,7 +105,7 @@ def _locate_half_space(one: Any, a: ExtendedArray, b: ExtendedArray, R: float) -
         falls = steep < 0
         on = left[falls]
         begin[on], far[on], slope[on], touched[on], out[on] = (x[falls] for x in (s, there, steep, at, normal))
-        end[left[~falls]] = s[~falls]  # past the nearest point of the way: it misses the obstacle
+        end[left[~falls]] = s[~falls]  # past the nearest point of the segment: it misses the obstacle
     return touched, out
 
 
@@ -129,9 +132,9 @@ def find_nearest(one: Any, x: ExtendedArray) -> tuple[ExtendedArray, ExtendedArr
         touched = np.tile(to_extended(one.center), (len(x), 1))
     elif one.kind == "capsule":
         first, last = to_extended(one.ends)
-        way = last - first
-        part = np.clip((x - first) @ way / (way @ way), 0, 1)
-        touched = first + part[:, None] * way
+        axis = last - first
+        part = np.clip((x - first) @ axis / (axis @ axis), 0, 1)
+        touched = first + part[:, None] * axis
     else:
         return _find_nearest_box(to_extended(one.low), to_extended(one.high), x)
     far = row_norms(x - touched)

@@ -73,27 +73,28 @@ class ObstaclePairs(ContactPairs):
         """Return the positions of mesh and obstacle vertices at a time [s]."""
         return np.concatenate([x, self.obstacle_positions(time)])
 
-    def find_near_pairs(self, x: Array, reach: float) -> tuple[IndexArray, IndexArray]:
+    def find_near_pairs(self, x: Array, max_distance: float) -> tuple[IndexArray, IndexArray]:
         """Find the pairs of mesh and obstacle closer than a distance [m]."""
         points = (
-            find_near_primitives(x, self.points, self._faces, reach),
-            find_near_primitives(x, self._corners, self.triangles, reach),
+            find_near_primitives(x, self.points, self._faces, max_distance),
+            find_near_primitives(x, self._corners, self.triangles, max_distance),
         )
-        return np.concatenate(points), find_near_primitives(x, self.edges, self._sides, reach)
+        return np.concatenate(points), find_near_primitives(x, self.edges, self._sides, max_distance)
 
     def rest_distance(self, rows: IndexArray, edges: bool) -> ExtendedArray:
         """Return infinite rest distances: the rest shape is not near the obstacle."""
         return to_extended(np.full(len(rows), np.inf))
 
-    def is_separated(self, p: Array, time: float, apart: float) -> bool:
+    def is_separated(self, p: Array, time: float, distance: float) -> bool:
         """Return whether no pair is closer than a distance.
 
         Args:
           p: positions of the mesh (n, 3) [m].
           time: time [s].
-          apart: distance [m].
+          distance: distance [m].
         """
-        return self.min_distance(np.concatenate([p, np.asarray(self.obstacle_positions(time), float)]), apart) >= apart
+        positions = np.concatenate([p, np.asarray(self.obstacle_positions(time), float)])
+        return self.min_distance(positions, distance) >= distance
 
 
 RandomGenerator = np.random.Generator
@@ -119,15 +120,16 @@ def sample_contact_positions(
     effect, one = all_[k % len(all_)]
     found = list[Array]()
     for _ in range(_NUM_DIRECTIONS):
-        way = rng.normal(size=3)
-        found = [move_to_obstacle(effect, one, p, spacing, time, way / np.linalg.norm(way), rng) for time in times]
+        direction = rng.normal(size=3)
+        direction /= np.linalg.norm(direction)
+        found = [move_to_obstacle(effect, one, p, spacing, time, direction, rng) for time in times]
         if all(other.is_separated(found[0], times[0], its.thickness) for its, other in all_):
             break
     return found
 
 
 def move_to_obstacle(
-    effect: Any, one: ObstaclePairs, p: Array, spacing: float, time: float, way: Array, rng: RandomGenerator
+    effect: Any, one: ObstaclePairs, p: Array, spacing: float, time: float, direction: Array, rng: RandomGenerator
 ) -> Array:
     """Translate positions to an obstacle until some pair is in range.
 
@@ -139,18 +141,19 @@ def move_to_obstacle(
       p: positions (n, 3) [m].
       spacing: mesh spacing [m].
       time: time [s].
-      way: unit vector (3,) from the obstacle.
+      direction: unit vector (3,) from the obstacle.
       rng: random generator.
     """
-    reach = effect.thickness if effect.range is None else effect.range
+    dhat = effect.thickness if effect.range is None else effect.range
     there = np.asarray(one.obstacle_positions(time), float)
     middle = 0.5 * (there.max(axis=0) + there.min(axis=0))
     at = p - p.mean(axis=0)
-    out = float(((there - middle) @ way).max() - (at @ way).min()) + effect.thickness + reach  # a plane between them
-    wanted = effect.thickness + reach * rng.uniform(0.3, 0.7)
+    # A plane separates them at first.
+    out = float(((there - middle) @ direction).max() - (at @ direction).min()) + effect.thickness + dhat
+    distance = effect.thickness + dhat * rng.uniform(0.3, 0.7)
     for _ in range(_MAX_TRIALS):
-        free = one.min_distance(np.concatenate([middle + out * way + at, there]), wanted + spacing) - wanted
-        if free < 1e-3 * reach:
+        free = one.min_distance(np.concatenate([middle + out * direction + at, there]), distance + spacing) - distance
+        if free < 1e-3 * dhat:
             break
         out -= free
-    return middle + out * way + at
+    return middle + out * direction + at

@@ -104,10 +104,10 @@ def build_rayleigh_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms
         parts += [build_bending_damping(one, b, declared) for one in declared.select_effects("bending")]
 
     def begin(moment: StepMoment) -> ValueFunction:
-        begun = [part(moment) for part in parts]
+        value_functions = [part(moment) for part in parts]
 
         def values(x: ExtendedArray) -> ExtendedArray:
-            return np.concatenate([values(x) for values in begun])
+            return np.concatenate([values(x) for values in value_functions])
 
         return values
 
@@ -117,8 +117,8 @@ def build_rayleigh_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms
 def build_pins_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build pinned vertices."""
     weight = math.inf if effect.weight == "exact" else float(effect.weight)
-    held = {i: build_pin(weight, effect.motion, declared.rest[i]) for i in select_vertices(declared, effect)}
-    return EffectTerms(pinned_vertices=held, coordinate_scale=_motion_extent(effect.motion))
+    pinned = {i: build_pin(weight, effect.motion, declared.rest[i]) for i in select_vertices(declared, effect)}
+    return EffectTerms(pinned_vertices=pinned, coordinate_scale=_motion_extent(effect.motion))
 
 
 def build_pin(weight: float, motion: Any, q: ExtendedArray) -> PinnedVertex:

@@ -53,42 +53,43 @@ def sample_points(scene: Scene, declared: SceneDeclaration, frames: int) -> Iter
       frames: number of frames.
     """
     rng, rest = np.random.default_rng(0), scene.mesh.rest_positions
-    begun = build_initial_state(scene).motion
-    touching = [(effect, one) for effect in declared.select_effects("contact") for one in effect.obstacles]
-    apart = declared.select_effects("self-contact")
-    beside = [
+    start_motion = build_initial_state(scene).motion
+    half_space_obstacles = [(effect, one) for effect in declared.select_effects("contact") for one in effect.obstacles]
+    self_contacts = declared.select_effects("self-contact")
+    surface_obstacles = [
         (effect, one)
         for effect in declared.select_effects("surface-contact")
         for one in build_obstacle_pairs(effect, declared)
     ]
     # Where there are obstacles, the displacement by forces in a step is limited
     # (`margin` of `springbench.solvers.contact.half_space.half_space_potential`).
-    limit = 0.05 * scene.mesh.bounding_box_diagonal if touching else np.inf
+    limit = 0.05 * scene.mesh.bounding_box_diagonal if half_space_obstacles else np.inf
     for k in range(NUM_POINTS):
         index = 0 if k % 5 == 0 else int(rng.integers(1, max(2, frames)))
         of = scene.scene_of_step(index)
-        dt, some = of.system.time_step, SPACING_FRACTIONS[k % len(SPACING_FRACTIONS)] * scene.mesh.spacing
-        p = (begun.positions if k // len(SPACING_FRACTIONS) % 2 == 0 else rest) + some * rng.normal(size=rest.shape)
-        if apart:
-            p = contract_to_contact(apart[0], declared, p)
-        v = begun.velocity + some / dt * rng.normal(size=rest.shape)
-        if touching:
-            effect, one = touching[k % len(touching)]
+        dt, size = of.system.time_step, SPACING_FRACTIONS[k % len(SPACING_FRACTIONS)] * scene.mesh.spacing
+        p = start_motion.positions if k // len(SPACING_FRACTIONS) % 2 == 0 else rest
+        p = p + size * rng.normal(size=rest.shape)
+        if self_contacts:
+            p = contract_to_contact(self_contacts[0], declared, p)
+        v = start_motion.velocity + size / dt * rng.normal(size=rest.shape)
+        if half_space_obstacles:
+            effect, one = half_space_obstacles[k % len(half_space_obstacles)]
             p = _move_to_obstacle(effect, one, p, scene.compute_time(index), rng)
-        if beside:  # where the obstacle is at the step's start; of four points, it takes the mesh along at two
+        if surface_obstacles:  # as they are at the step's start; at two of four points the mesh moves along with one
             times = scene.compute_time(index), scene.compute_time(index) + dt
-            p, end = sample_contact_positions(beside, k, p, scene.mesh.spacing, times, rng)
+            p, end = sample_contact_positions(surface_obstacles, k, p, scene.mesh.spacing, times, rng)
             v = v + (k // 2 % 2) * (end - p) / dt
-        before = p - dt * v + some * rng.normal(size=rest.shape), v + some / dt * rng.normal(size=rest.shape)
-        shift = some * rng.normal(size=rest.shape)
+        before = p - dt * v + size * rng.normal(size=rest.shape), v + size / dt * rng.normal(size=rest.shape)
+        shift = size * rng.normal(size=rest.shape)
         far = np.linalg.norm(shift, axis=1).max()
         shift *= min(1.0, limit / far) if far else 1.0
         yield SamplePoint(
             MotionState(
-                type(begun)(p, v),
-                type(begun)(*before) if index else None,
+                type(start_motion)(p, v),
+                type(start_motion)(*before) if index else None,
                 index,
-                random_acceleration(k, some / dt**2, rest),
+                random_acceleration(k, size / dt**2, rest),
             ),
             shift,
             rng.normal(size=rest.shape),
@@ -111,5 +112,5 @@ def _move_to_obstacle(effect: Any, one: Any, p: Array, time: float, rng: np.rand
     at = place_at(one.motion, time)
     which = int(rng.integers(len(p)))
     far, _, out = find_nearest(one, at.inverse_transform(to_extended(p[which : which + 1])))
-    wanted = obstacle_radius(one) + effect.thickness * rng.uniform()
-    return p + np.asarray((wanted - far[0]) * (out @ at.rotation.T)[0], float)
+    distance = obstacle_radius(one) + effect.thickness * rng.uniform()
+    return p + np.asarray((distance - far[0]) * (out @ at.rotation.T)[0], float)

@@ -133,6 +133,6 @@ def sum_edge_weights(edges: NDArray[np.int64], weight: Array, n: int) -> Array:
     Returns: sums (n,).
     """
     i, j = edges.T
-    apart = i != j
-    ends = np.concatenate([i[apart], j[apart]])
-    return np.asarray(np.bincount(ends, np.tile(weight[apart], 2), n), np.float64)
+    has_length = i != j
+    ends = np.concatenate([i[has_length], j[has_length]])
+    return np.asarray(np.bincount(ends, np.tile(weight[has_length], 2), n), np.float64)

@@ -56,12 +56,15 @@ def build_barriers(effect: Any, parts: Sequence[ContactPairs]) -> EffectTerms:
             for part in parts:
                 found.append(part.build_barrier_energy(t, r, k, moment.stage_time))
                 if effect.friction:
-                    begun = at = part.all_positions(moment.p, moment.time)
+                    start_positions = at = part.all_positions(moment.p, moment.time)
                     if moment.normal_force_positions is not None:
                         at = part.all_positions(moment.normal_force_positions, moment.stage_time)
-                    grips = [part.find_friction_pairs(at, begun, t, r, k, edges) for edges in (False, True)]
+                    friction_pairs = [
+                        part.find_friction_pairs(at, start_positions, t, r, k, edges) for edges in (False, True)
+                    ]
                     found += [
-                        part.build_friction_energy(effect.friction, grip, slip, moment.stage_time) for grip in grips
+                        part.build_friction_energy(effect.friction, grip, slip, moment.stage_time)
+                        for grip in friction_pairs
                     ]
             return lambda x: np.concatenate([values(x) for values in found])
 
@@ -101,20 +104,23 @@ class ContactPairs:
         """
         return x
 
-    def find_near_pairs(self, x: Array, reach: float) -> tuple[IndexArray, IndexArray]:
-        """Find point-triangle and edge-edge pairs, (k, 4) each, closer than `reach` [m]."""
-        return find_near_primitives(x, self.points, self.triangles, reach), find_near_primitives(
-            x, self.edges, self.edges, reach
+    def find_near_pairs(self, x: Array, max_distance: float) -> tuple[IndexArray, IndexArray]:
+        """Find point-triangle and edge-edge pairs, (k, 4) each, closer than `max_distance` [m]."""
+        return find_near_primitives(x, self.points, self.triangles, max_distance), find_near_primitives(
+            x, self.edges, self.edges, max_distance
         )
 
     def rest_distance(self, rows: IndexArray, edges: bool) -> ExtendedArray:
         """Return the distances of pairs at rest (k,) [m]."""
         return row_norms(_distance_vectors(rows, to_extended(self.rest_positions), edges))
 
-    def min_distance(self, x: Array, reach: float) -> float:
-        """Return the minimum distance of pairs at x (N, 3) [m], at most `reach`."""
-        least = [row_norms(_distance_vectors(rows, x, k == 1)) for k, rows in enumerate(self.find_near_pairs(x, reach))]
-        return float(np.concatenate(least).min(initial=reach))
+    def min_distance(self, x: Array, max_distance: float) -> float:
+        """Return the minimum distance of pairs at x (N, 3) [m], at most `max_distance`."""
+        least = [
+            row_norms(_distance_vectors(rows, x, k == 1))
+            for k, rows in enumerate(self.find_near_pairs(x, max_distance))
+        ]
+        return float(np.concatenate(least).min(initial=max_distance))
 
     def build_barrier_energy(self, t: float, r: float, k: Array, time: float) -> ValueFunction:
         """Build the barrier energies [J] at a time [s].
@@ -173,13 +179,13 @@ class ContactPairs:
         return lambda x: friction * friction_potential(self.all_positions(x, time), *grip, slip)
 
     def find_friction_pairs(
-        self, p: ExtendedArray, begun: ExtendedArray, t: float, r: float, k: Array, edges: bool
+        self, p: ExtendedArray, start_positions: ExtendedArray, t: float, r: float, k: Array, edges: bool
     ) -> FrictionPairs:
         """Find the friction data of pairs within range at p (N, 3) [m].
 
         Args:
           p: positions (N, 3) [m] at which normal forces are evaluated.
-          begun: positions (N, 3) [m] at the start of the step.
+          start_positions: positions (N, 3) [m] at the start of the step.
           t: minimum distance [m].
           r: barrier activation distance [m].
           k: stiffnesses (n,) [N/m].
@@ -203,7 +209,7 @@ class ContactPairs:
         at = np.where(inside, at, 1)
         force = m * stiff * scale * r * ((1 - at) ** 2 / at - 2 * (1 - at) * np.log(at))
         c = np.stack(weights, axis=1)
-        return rows, c, n, (c[:, :, None] * begun[rows]).sum(axis=1), np.where(inside, force, 0)
+        return rows, c, n, (c[:, :, None] * start_positions[rows]).sum(axis=1), np.where(inside, force, 0)
 
 
 def find_near_primitives(x: Array, one: IndexArray, two: IndexArray, radius: float) -> IndexArray:
@@ -225,9 +231,9 @@ def find_near_primitives(x: Array, one: IndexArray, two: IndexArray, radius: flo
     lists: list[list[int]] = tree.query_ball_point(middles[0], (radius + sum(radii)) * (1 + 1e-9)).tolist()
     i = np.repeat(np.arange(len(one)), [len(found) for found in lists])
     j = np.array([j for found in lists for j in sorted(found)], int)
-    apart = (one[i][:, :, None] != two[j][:, None, :]).all(axis=(1, 2))
-    apart &= (i < j) | (one is not two)
-    rows = np.concatenate([one[i[apart]], two[j[apart]]], axis=1)
+    disjoint = (one[i][:, :, None] != two[j][:, None, :]).all(axis=(1, 2))
+    disjoint &= (i < j) | (one is not two)
+    rows = np.concatenate([one[i[disjoint]], two[j[disjoint]]], axis=1)
     far = row_norms(_distance_vectors(rows, x, one.shape[1] == 2))
     return rows[far < radius]
 
@@ -330,8 +336,8 @@ def contract_to_contact(effect: Any, declared: SceneDeclaration, p: Array) -> Ar
       p: positions (n, 3) [m].
     """
     mesh, r = ContactPairs(declared), effect.thickness if effect.range is None else effect.range
-    wanted = effect.thickness + r
-    reach = max(wanted, 2.0 * declared.mesh.spacing)
-    nearest = mesh.min_distance(p, reach)
-    share = (effect.thickness + 0.5 * r) / max(wanted, nearest)
+    contact_distance = effect.thickness + r
+    max_distance = max(contact_distance, 2.0 * declared.mesh.spacing)
+    nearest = mesh.min_distance(p, max_distance)
+    share = (effect.thickness + 0.5 * r) / max(contact_distance, nearest)
     return p.mean(axis=0) + share * (p - p.mean(axis=0))

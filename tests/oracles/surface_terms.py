@@ -91,8 +91,8 @@ def _find_hinges(surface: Sequence[Triangle]) -> Iterator[tuple[int, int, int, i
 
 def _is_rectangle(x: ExtendedArray) -> bool:
     """Return whether the diagonals of x (4, 3) are equally long and bisect each other."""
-    one, two, apart = x[0] - x[1], x[2] - x[3], x[0] + x[1] - x[2] - x[3]
-    a, b, c = (np.sqrt(v @ v) for v in (one, two, apart))
+    one, two, offset = x[0] - x[1], x[2] - x[3], x[0] + x[1] - x[2] - x[3]
+    a, b, c = (np.sqrt(v @ v) for v in (one, two, offset))
     return bool(max(abs(a - b), c) <= _RECTANGLE_RTOL * a)
 
 

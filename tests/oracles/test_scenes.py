@@ -45,7 +45,7 @@ from tests.oracles.planted_errors import (
 )
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SIZES = {"pulled-curtain": 9}
+SIZES = {"pulled-curtain": 9, "touching-curtain": 9}
 """Mesh sizes of scenes whose pins require them."""
 
 
