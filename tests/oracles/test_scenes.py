@@ -55,8 +55,8 @@ def find_scenes(*folders: str) -> dict[str, Path]:
 
 
 SCENES = find_scenes("scenes")
-JUDGED = find_scenes("hard", "hard-long", "exact")
-"""Scenes of the published sweeps with `judge: true`."""
+VERIFIED = find_scenes("hard", "hard-long", "exact")
+"""Scenes of the published sweeps with `verify: true`."""
 OTHERS = find_scenes("hessians", "winners")
 CONTACT = find_scenes("growth", "hard-touch", "touch")
 
@@ -73,9 +73,9 @@ def test_both_implementations_agree_on_a_coarse_scene(name: str):
     assert run_reference_check(spec, coarse_size(spec), integrator) == "agrees"
 
 
-@pytest.mark.parametrize("name", JUDGED)
-def test_both_implementations_agree_on_a_judged_scene(name: str):
-    spec = load_scene(JUDGED[name])
+@pytest.mark.parametrize("name", VERIFIED)
+def test_both_implementations_agree_on_a_verified_scene(name: str):
+    spec = load_scene(VERIFIED[name])
     assert run_reference_check(spec, spec.default_size or 0) == "agrees"
 
 
@@ -88,14 +88,14 @@ def test_both_implementations_agree_on_a_coarse_scene_with_contact(name: str):
 
 @pytest.mark.long
 @pytest.mark.parametrize("integrator", INTEGRATOR_NAMES)
-@pytest.mark.parametrize("name", SCENES | JUDGED | OTHERS)
+@pytest.mark.parametrize("name", SCENES | VERIFIED | OTHERS)
 def test_both_implementations_agree_with_every_integrator_at_full_size(name: str, integrator: str):
-    spec = load_scene((SCENES | JUDGED | OTHERS)[name])
+    spec = load_scene((SCENES | VERIFIED | OTHERS)[name])
     assert run_reference_check(spec, spec.default_size or 0, integrator) == "agrees"
 
 
 def test_every_scene_of_the_configs_is_compared():
-    compared = {path for paths in (SCENES, JUDGED, OTHERS, CONTACT) for path in paths.values()}
+    compared = {path for paths in (SCENES, VERIFIED, OTHERS, CONTACT) for path in paths.values()}
     assert compared == set(CONFIGS.glob("*/*.yaml"))
 
 

@@ -173,11 +173,11 @@ class Magnet(ConfigModel):
 """
 
 
-def run_scene(folder: Path, more: str, *, judge: bool = True) -> list[dict[str, Any]]:
+def run_scene(folder: Path, more: str, *, verify: bool = True) -> list[dict[str, Any]]:
     """Rows of the steps of a short run with Newton's method."""
     (folder / "magnet.py").write_text(USER_CODE)
     (folder / "scene.yaml").write_text(SCENE.format(more=more))
-    options = {"rtol": 1e-6, "rounds": 1, "verify": judge, "record": False, "max_iterations": 200}
+    options = {"rtol": 1e-6, "rounds": 1, "verify": verify, "record": False, "max_iterations": 200}
     (run,) = load_config(folder / "scene.yaml", solvers=["newton"], **options).list_runs()
     files = run_pipeline.RunFiles.for_run(run, folder)
     files.rows_path.parent.mkdir(exist_ok=True)
@@ -190,7 +190,7 @@ MAGNET = ', {{kind: "./magnet.py:Magnet", slope: {slope}}}'
 
 
 @pytest.mark.parametrize(("more", "check"), [("", "release"), (MAGNET.format(slope=3.0), "gradient: Funnel")])
-def test_a_judged_run_states_how_its_energies_were_checked(tmp_path: Path, more: str, check: str):
+def test_a_verified_run_states_how_its_energies_were_checked(tmp_path: Path, more: str, check: str):
     rows = run_scene(tmp_path, more)
     assert {(row["status"], row["formula_check"]) for row in rows} == {("ok", check)}
 
@@ -204,5 +204,5 @@ def test_a_run_with_a_wrong_gradient_is_not_right(tmp_path: Path, monkeypatch: p
     assert "the derivative of its energy's value: that of Funnel by 0.012 of its size; mend" in reason
 
 
-def test_a_run_that_is_not_judged_is_not_checked(tmp_path: Path):
-    assert {(row["status"], row.get("formula_check")) for row in run_scene(tmp_path, "", judge=False)} == {("ok", None)}
+def test_a_run_that_is_not_verified_is_not_checked(tmp_path: Path):
+    assert {(row["status"], row.get("formula_check")) for row in run_scene(tmp_path, "", verify=False)} == {("ok", None)}
