@@ -205,4 +205,5 @@ def test_a_run_with_a_wrong_gradient_is_not_right(tmp_path: Path, monkeypatch: p
 
 
 def test_a_run_that_is_not_verified_is_not_checked(tmp_path: Path):
-    assert {(row["status"], row.get("formula_check")) for row in run_scene(tmp_path, "", verify=False)} == {("ok", None)}
+    rows = run_scene(tmp_path, "", verify=False)
+    assert {(row["status"], row.get("formula_check")) for row in rows} == {("ok", None)}
