@@ -6,7 +6,7 @@ All mistakes are reported at once.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -22,6 +22,7 @@ from springbench.harness.config.accuracy_config import (
     WorkSpec,
     WorkStudyConfig,
 )
+from springbench.harness.config.config_kinds import ACCURACY, read_config
 from springbench.harness.config.config_loader import (
     check_file_name,
     check_scene_parts,
@@ -33,11 +34,10 @@ from springbench.harness.config.run_options import STEP_OPTIONS
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS, load_in_sandbox
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import suggest_name
 from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, UserCodePolicy, quote_value
-from springbench.harness.schema.yaml_loader import read_yaml
 from springbench.solvers.plugins.plugin_discovery import PluginName
 
 MAX_UNITS = 20_000
@@ -71,10 +71,7 @@ def _read_metadata(accuracy: AccuracyPlan) -> dict[str, Any]:
 
 
 def _load_document(path: Path, policy: UserCodePolicy) -> AccuracyPlan:
-    document = replace(read_yaml(path), user_code=policy)
-    if not {"curves", "work"} & set(document.data):
-        problem = "is no accuracy config: it has neither `curves` nor `work`; `springbench run` does scenes and sweeps"
-        raise InputError(InputMistake(problem, path))
+    _, document = read_config(path, ACCURACY, policy=policy)
     check_file_name(document)
     fields = document.validate_data(AccuracyConfig, document.data)
     scenes, solvers = read_scenes(document), read_solvers(document)

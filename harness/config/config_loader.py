@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from springbench.harness.config.config_kinds import SCENE, SWEEP, is_assignment_file, read_config
 from springbench.harness.config.expand_grid import GridExpansion
 from springbench.harness.config.run_options import AUTO, DEFAULT_SOLVER, DEFAULT_STOP_RULE
 from springbench.harness.config.solver_parameters import read_solvers
@@ -50,7 +51,6 @@ from springbench.harness.schema.config_document import (
     is_list,
     quote_value,
 )
-from springbench.harness.schema.yaml_loader import read_yaml
 from springbench.solvers.plugins.plugin_discovery import PluginName, load_target, select_plugins
 
 ASSIGNMENT_FRAMES = 30
@@ -107,26 +107,19 @@ def load_config(
 def _load_any(
     path: Path, solvers: Sequence[str], sizes: Sequence[int], options: dict[str, Any], policy: UserCodePolicy
 ) -> SweepPlan:
-    asked = {key: value for key, value in options.items() if value is not None}
-    assignment = _is_assignment(path)
-    document = ConfigDocument(path, {}) if assignment else read_yaml(path)
-    document.user_code = policy
-    if {"curves", "work"} & set(document.data):
-        raise InputError(InputMistake("is an accuracy config; run it with `springbench accuracy`", path))
-    if "gates" in document.data:
-        raise InputError(InputMistake("is a gates file; run it with `springbench regress`, without --baseline", path))
-    if "scenes" in document.data:
-        if solvers or sizes or asked:
-            raise InputError(InputMistake("is a sweep, which says itself what to run; change the file instead", path))
+    given = {key: value for key, value in options.items() if value is not None}
+    kind, document = read_config(path, SCENE, SWEEP, policy=policy)
+    if kind == SWEEP:
+        if solvers or sizes or given:
+            raise InputError(InputMistake("is a sweep, which defines its own runs; change the file instead", path))
         return _build_sweep(document)
-    if not assignment and "mesh" not in document.data:
-        raise InputError(InputMistake("is neither a scene (it has no `mesh`) nor a sweep (it has no `scenes`)", path))
+    assignment = is_assignment_file(path)
     scene = convert_assignment_scene(path) if assignment else build_scene_from_document(document)
     if not assignment and not {*DEFAULT_STOP_RULE, "error_target"} & options.keys():
-        asked = DEFAULT_STOP_RULE | asked
+        given = DEFAULT_STOP_RULE | given
     usual = ASSIGNMENT_SOLVER if assignment else DEFAULT_SOLVER
     keys = {"scenes": [path.name], "sizes": list(sizes), "solvers": list(solvers) or [usual]}
-    alone = ConfigDocument(path, {**keys, "options": {"threads": AUTO, **asked}}, user_code=policy)
+    alone = ConfigDocument(path, {**keys, "options": {"threads": AUTO, **given}}, user_code=policy)
     return _expand_sweep(alone, {path.stem: scene})
 
 
@@ -136,7 +129,7 @@ def load_sweep(path: Path) -> SweepPlan:
     Raises:
         InputError: if that fails.
     """
-    return build_sweep_from_document(read_yaml(path))
+    return build_sweep_from_document(read_config(path, SWEEP)[1])
 
 
 def _load_sweep_checked(load: Callable[[UserCodePolicy], SweepPlan]) -> SweepPlan:
@@ -189,11 +182,8 @@ def load_scene_in_process(path: Path) -> SceneSpec:
 
 
 def _load_scene(path: Path, policy: UserCodePolicy) -> SceneSpec:
-    return (
-        convert_assignment_scene(path)
-        if _is_assignment(path)
-        else build_scene_from_document(replace(read_yaml(path), user_code=policy))
-    )
+    _, document = read_config(path, SCENE, policy=policy)
+    return convert_assignment_scene(path) if is_assignment_file(path) else build_scene_from_document(document)
 
 
 def convert_assignment_scene(path: Path) -> SceneSpec:
@@ -226,8 +216,6 @@ def convert_assignment_scene(path: Path) -> SceneSpec:
 def build_scene_from_document(document: ConfigDocument) -> SceneSpec:
     """Build the scene of a document; raise InputError for all mistakes."""
     data = document.data
-    if "scenes" in data and "mesh" not in data:
-        raise InputError(InputMistake("is a sweep; a scene is wanted here", document.path))
     check_file_name(document)
     fields = document.validate_data(SceneFile, data)
     own: dict[str, tuple[PluginName, dict[str, Any]]] = {}
@@ -399,10 +387,6 @@ def find_scene_mistakes(scene: SceneSpec, sizes: Sequence[int]) -> list[InputMis
             replace(m, file=m.file or scene.path, line=m.line or scene.key_lines.get(m.key)) for m in error.mistakes
         ]
     return []
-
-
-def _is_assignment(path: Path) -> bool:
-    return path.suffix.lower() == ".json"
 
 
 def check_file_name(document: ConfigDocument) -> None:

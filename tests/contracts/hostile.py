@@ -37,7 +37,7 @@ SCENES: dict[str, tuple[str | bytes, str, int | None]] = {
     "comments alone": ("# nothing\n", "is empty", None),
     "a list": ("- mesh\n- mass\n", "should hold a mapping", 1),
     "a word": ("mesh\n", "should hold a mapping", 1),
-    "no keys of ours": ("colour: red\n", "neither a scene", None),
+    "no keys of ours": ("colour: red\n", "expected a scene", None),
     "unfinished list": ("mesh: {kind: grid}\nframes: [1,\n", "is not YAML", 3),
     "tab as indent": ("mesh:\n\tkind: grid\n", "is not YAML", 2),
     "binary junk": (bytes(range(128, 256)), "UTF-8", 1),

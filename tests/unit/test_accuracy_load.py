@@ -128,7 +128,7 @@ def test_a_mistake_is_told_with_its_line(folder: Path, before: str, after: str, 
 
 def test_a_sweep_and_an_accuracy_config_are_not_taken_for_each_other(folder: Path) -> None:
     (folder / "sweep.yaml").write_text("scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [numba]\n")
-    with pytest.raises(InputError, match="neither `curves` nor `work`"):
+    with pytest.raises(InputError, match="expected an accuracy config"):
         load_accuracy(folder / "sweep.yaml")
     loaded(folder, CONFIG)
     with pytest.raises(InputError, match="springbench accuracy"):

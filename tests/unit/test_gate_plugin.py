@@ -182,8 +182,9 @@ def test_a_scene_is_no_gates_file_and_a_gates_file_is_no_scene(tmp_path: Path):
     path = write_gates(tmp_path, "solver: sparse, baseline: dense, max_ratio: 1")
     code, output = regress(tmp_path / "cloth.yaml")
     assert code == 2
-    assert "is no gates file, it has no `gates`; to compare a scene or a sweep with a git revision" in output
-    with pytest.raises(InputError, match="is a gates file; run it with `springbench regress`, without --baseline"):
+    assert "is a scene (with `mesh`), for `springbench run`, or `springbench regress` with --baseline" in output
+    assert "expected a gates file (with `gates`)" in output
+    with pytest.raises(InputError, match=r"is a gates file .* `springbench regress` without --baseline; expected a sc"):
         load_config(path)
 
 

@@ -29,6 +29,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from springbench.harness.atomic_files import atomic_write
+from springbench.harness.config.config_kinds import find_config_kind
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import machine_info
@@ -141,12 +142,8 @@ def _is_config(path: Path) -> bool:
         with suppress(InputError):
             return bool(read_assignment_json(path))
     with suppress(InputError):
-        return path.suffix.lower() in (".yaml", ".yml") and bool(_CONFIG_KEYS & set(read_yaml(path).data))
+        return path.suffix.lower() in (".yaml", ".yml") and find_config_kind(read_yaml(path).data) is not None
     return False
-
-
-_CONFIG_KEYS = {"scenes", "mesh", "curves", "work"}
-"""A required key of each kind of config."""
 
 
 def _list_required_files(config: Path) -> list[Path]:

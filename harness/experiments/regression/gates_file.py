@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import Field
+from springbench.harness.config.config_kinds import GATES, read_config
 from springbench.harness.config.run_options import IterationLimit, RelativeTolerance
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.machine_info import limit_threads
@@ -34,7 +35,6 @@ from springbench.harness.experiments.regression.solver_pair import prepare_solve
 from springbench.harness.scenes.scene_spec import FrameCount, IntegratorName, MeshSize
 from springbench.harness.schema.base_model import ConfigModel
 from springbench.harness.schema.config_document import ConfigDocument
-from springbench.harness.schema.yaml_loader import read_yaml
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Unsupported
 
 
@@ -99,10 +99,7 @@ def run_gates_file(
     Raises:
         InputError: for a mistake in the file, or if the answers differ.
     """
-    document = read_yaml(path)
-    if "gates" not in document.data:
-        remedy = "to compare a scene or a sweep with a git revision, add --baseline REVISION"
-        raise InputError(InputMistake(f"is no gates file, it has no `gates`; {remedy}", path))
+    _, document = read_config(path, GATES)
     gates_file = document.validate_data(GatesFile, document.data)
     if gates_file is None:
         raise document.build_error()
