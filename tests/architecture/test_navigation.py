@@ -39,8 +39,7 @@ ANSWERS = {
 def find_definitions(path: Path) -> list[str]:
     """Return the names of all functions and classes of a file."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    kinds = ast.FunctionDef | ast.ClassDef
-    return [node.name for node in ast.walk(tree) if isinstance(node, kinds)]
+    return [node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)]
 
 
 @pytest.mark.parametrize("question", ANSWERS)
