@@ -44,10 +44,9 @@ def landed(scene: str) -> tuple[StepProblem, Positions]:
     """The step at which most presses and something grips, and its minimum by Newton's method."""
     step = collect_steps(SCENES[scene](), 4, stop=StopRule(100, 1e-12))[-1]
     energy = step.problem.energies[-1]
-    assert (
-        len(energy.build_penalty_rows(step.problem.current_positions, step.solution.positions, majorise=False).vertices)
-        > 3
-    )  # pyright: ignore[reportAttributeAccessIssue]
+    before, after = step.problem.current_positions, step.solution.positions
+    rows = energy.build_penalty_rows(before, after, majorise=False)  # pyright: ignore[reportAttributeAccessIssue]
+    assert len(rows.vertices) > 3
     return step.problem, step.solution.positions
 
 
