@@ -152,7 +152,7 @@ class SolverSpec:
         )
 
     @property
-    def packages(self) -> tuple[str, ...]:
+    def plugin_packages(self) -> tuple[str, ...]:
         """Third-party distributions that the solver is an interface to."""
         return (
             tuple(self.metadata.get("packages", ())) if isinstance(self.name, PluginName) else list_packages(self.name)

@@ -61,7 +61,9 @@ def build_provenance_columns(solver: SolverSpec | None = None) -> dict[str, Any]
         "cores": here.cores,
         "memory_gib": here.memory_gib,
         "operating_system": here.operating_system,
-        "versions": json.dumps(machine_info.collect_versions(*(solver.packages if solver else ())), sort_keys=True),
+        "versions": json.dumps(
+            machine_info.collect_versions(*(solver.plugin_packages if solver else ())), sort_keys=True
+        ),
         "commit": machine_info.read_commit(),
         "source_fingerprint": machine_info.hash_sources(),
         "started_at": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -110,7 +110,7 @@ class KnownMinima:
     reason: str = ""
 
     @property
-    def lowest(self) -> MinimumCertificate:
+    def lowest_minimum(self) -> MinimumCertificate:
         """The lowest known minimum; raises UncertifiedError where there is none."""
         if not self.minima:
             raise UncertifiedError(self.reason)

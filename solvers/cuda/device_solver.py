@@ -142,7 +142,7 @@ class DeviceSolver(IterativeSolver):
         """Allocate the memory of a solve."""
 
     @abstractmethod
-    def upload_problem(self, problem: StepProblem, guess: Positions) -> DeviceStep:
+    def upload_problem(self, problem: StepProblem, initial_guess: Positions) -> DeviceStep:
         """Upload a step to the device, with an initial guess (n, 3) [m]."""
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> DeviceSolverState:

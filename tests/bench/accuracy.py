@@ -57,7 +57,7 @@ class Scored:
 def gap(spec: SceneSpec, size: int, frame: int, guess: str = "previous") -> Scored:
     """A frozen step, graded by the energy gap; that of the first guess is 1."""
     frozen = STORE.load_frames(spec, size, [frame])[frame]
-    lowest, problem = STORE.find_minima(frozen).lowest.objective, frozen.build_problem(guess)
+    lowest, problem = STORE.find_minima(frozen).lowest_minimum.objective, frozen.build_problem(guess)
     whole = problem.value(problem.initial_guess) - lowest
     return Scored(problem, lambda p: (problem.value(p) - lowest) / whole)
 

@@ -89,7 +89,7 @@ def steps(config: Path, only: str) -> Iterator[tuple[SnapshotEvaluation, list[Cu
 
 def grading(step: SnapshotEvaluation, problem: StepProblem, measure: str) -> Callable[[Positions], float]:
     """What tells the gap or the error of positions."""
-    lowest, system = step.known_minima.lowest, problem.system
+    lowest, system = step.known_minima.lowest_minimum, problem.system
     if measure == "error":
         start = compute_vertex_distances(system, problem.current_positions, lowest.positions)[0]
         return lambda p: compute_vertex_distances(system, p, lowest.positions)[0] / start

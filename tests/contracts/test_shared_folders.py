@@ -70,7 +70,8 @@ CLAIM = "from pathlib import Path; from springbench.harness.execution.folder_loc
 
 
 def claimed_elsewhere(folder: Path, unit: Path) -> subprocess.Popen[str]:
-    code = f"{CLAIM}c = UnitClaims(Path(sys.argv[1]), [u := Path(sys.argv[2])]); print(c.try_claim(u), flush=True); input()"
+    code = f"{CLAIM}c = UnitClaims(Path(sys.argv[1]), [u := Path(sys.argv[2])]); print(c.try_claim(u), flush=True)"
+    code += "; input()"
     other = subprocess.Popen([sys.executable, "-c", code, str(folder), str(unit)], stdin=-1, stdout=-1, text=True)
     assert other.stdout
     assert other.stdout.readline() == "\n"

@@ -78,7 +78,7 @@ def test_the_choice_is_that_of_a_full_search():
         measure = Measured(rows)
         omitted = search(specs(), 1e-2, inf, measure, 60.0)
         assert measure.best(1e-2) == cheapest(rows, 1e-2), seed
-        assert omitted.complete
+        assert omitted.is_complete
         assert omitted.measured == len(measure.found) == omitted.settings - sum(omitted.reasons.values())
         none += cheapest(rows, 1e-2) is None
         measured += omitted.measured
@@ -110,5 +110,5 @@ def test_a_simulation_may_take_little_more_than_the_best(best: float, limit: flo
 
 def test_after_its_budget_nothing_begins():
     omitted = search(specs(), 1e-2, inf, Measured(table(0)), -1.0)
-    assert (omitted.measured, omitted.complete) == (0, False)
+    assert (omitted.measured, omitted.is_complete) == (0, False)
     assert omitted.reasons == {OVER_BUDGET: len(specs())}

@@ -44,8 +44,8 @@ class PreparedDiagonal(IterativeSolver):
     description: str = ""
     stats: dict[str, float] = field(default_factory=dict)
 
-    def init_state(self, problem: StepProblem, guess: Positions) -> SolverState:
-        return Diagonal(self.diagonal[:, None], problem, guess.copy())
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        return Diagonal(self.diagonal[:, None], problem, initial_guess.copy())
 
 
 class Diagonal(SolverState):
@@ -195,7 +195,7 @@ class PreparedStepping(IterativeSolver):
     certain: int
     most: int = 1000
 
-    def init_state(self, problem: StepProblem, guess: Positions) -> SolverState:
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         return Stepping(self.certain, self.most)
 
 

@@ -122,7 +122,7 @@ def test_a_minimum_is_certified_by_the_oracle(problem):
 
 @problems
 def test_no_point_beside_a_minimum_is_lower(problem):
-    rng, best = np.random.default_rng(0), find_minima(problem, NewtonSolver()).lowest
+    rng, best = np.random.default_rng(0), find_minima(problem, NewtonSolver()).lowest_minimum
     for size in (1e-3, 1e-2):
         for _ in range(20):
             e = np.zeros_like(best.positions)
@@ -132,7 +132,7 @@ def test_no_point_beside_a_minimum_is_lower(problem):
 
 @problems
 def test_newtons_steps_go_on_to_round_off_from_wherever_a_solver_left_them(problem):
-    best = find_minima(problem, NewtonSolver()).lowest
+    best = find_minima(problem, NewtonSolver()).lowest_minimum
     for size in (1e-5, 1e-8):
         start = best.positions + size * np.random.default_rng(1).normal(size=best.positions.shape)
         found = certify_minimum(problem, start)
@@ -159,14 +159,14 @@ def test_a_point_that_is_no_minimum_is_never_a_reference(tmp_path):
     reference = ReferenceStore(tmp_path, Stays()).find_minima(frozen(FLAT))
     assert reference.minima == ()
     with pytest.raises(UncertifiedError, match="it is a saddle"):
-        _ = reference.lowest
+        _ = reference.lowest_minimum
     assert not list(tmp_path.iterdir())
 
 
 def test_a_lower_minimum_replaces_the_reference(tmp_path):
     problem, store = snap_through(), ReferenceStore(tmp_path)
     one = frozen(problem)
-    above = store.find_minima(one).lowest
+    above = store.find_minima(one).lowest_minimum
     assert above.positions[4, 1] > 0.1
     below = store.classify_minimum(one, lower(above.positions))
     assert below.positions[4, 1] < -0.1
@@ -174,13 +174,13 @@ def test_a_lower_minimum_replaces_the_reference(tmp_path):
     again = ReferenceStore(tmp_path).find_minima(one)
     assert [m.objective for m in again.minima] == [below.objective, above.objective]
     assert [again.find_index(m) for m in (below, above)] == [0, 1]
-    assert again.lowest.minimum_id == below.minimum_id != above.minimum_id
+    assert again.lowest_minimum.minimum_id == below.minimum_id != above.minimum_id
 
 
 def test_a_point_belongs_to_the_minimum_that_newtons_method_finds_from_it(tmp_path):
     problem, store = snap_through(), ReferenceStore(tmp_path)
     one = frozen(problem)
-    above = store.find_minima(one).lowest
+    above = store.find_minima(one).lowest_minimum
     rng, names = np.random.default_rng(0), {}
     for side, start in (("above", above.positions), ("below", lower(above.positions))):
         points = [start + 0.02 * rng.normal(size=(5, 3)) for _ in range(4)]
@@ -199,8 +199,8 @@ def test_a_point_that_leads_to_no_minimum_has_no_branch(tmp_path):
 
 def test_minima_are_found_once(tmp_path):
     one = frozen(PROBLEMS["cloth"]())
-    found = ReferenceStore(tmp_path).find_minima(one).lowest
-    again = ReferenceStore(tmp_path, Stays()).find_minima(one).lowest
+    found = ReferenceStore(tmp_path).find_minima(one).lowest_minimum
+    again = ReferenceStore(tmp_path, Stays()).find_minima(one).lowest_minimum
     np.testing.assert_array_equal(found.positions, again.positions)
     fields = ("objective", "newton_step_length", "min_eigenvalue", "eigenvalue_uncertainty", "kind", "minimum_id")
     assert [getattr(found, f) for f in fields] == [getattr(again, f) for f in fields]
@@ -209,7 +209,7 @@ def test_minima_are_found_once(tmp_path):
 
 def test_minima_are_known_by_where_they_lie():
     problem = snap_through()
-    above = find_minima(problem, NewtonSolver()).lowest
+    above = find_minima(problem, NewtonSolver()).lowest_minimum
     below = refine_minimum(problem, lower(above.positions), NewtonSolver())
     nudged = replace(above, positions=above.positions + 1e-12)
     known = KnownMinima(()).add_minimum(above).add_minimum(nudged).add_minimum(below)
@@ -243,7 +243,7 @@ def test_a_valley_of_minima_is_found_as_such_and_is_no_reference(tmp_path):
     assert np.linalg.norm(other - found.positions, axis=1).max() > 1e-3
     assert one.problem.value(other) == pytest.approx(found.objective, rel=1e-13)  # a dozen terms
     with pytest.raises(UncertifiedError, match="valley"):
-        _ = store.find_minima(one).lowest
+        _ = store.find_minima(one).lowest_minimum
     for solved in (found.positions, other):
         assert not is_minimum(one.problem, solved)
         assert compute_curvature(one.problem, solved).is_degenerate
@@ -285,16 +285,18 @@ def test_a_certificate_is_of_the_very_point_that_is_stored(name: str):
 
 def test_minima_that_were_stored_with_less_than_a_certificate_are_found_again(tmp_path):
     one = frozen(PROBLEMS["cloth"]())
-    found = ReferenceStore(tmp_path).find_minima(one).lowest
+    found = ReferenceStore(tmp_path).find_minima(one).lowest_minimum
     path = tmp_path / f"minima-{one.digest}.npz"
     arrays = dict(np.load(path))
     del arrays["eigenvalue_uncertainty"]
     np.savez(path, allow_pickle=False, **arrays)
-    assert ReferenceStore(tmp_path).find_minima(one).lowest.eigenvalue_uncertainty == found.eigenvalue_uncertainty
+    assert (
+        ReferenceStore(tmp_path).find_minima(one).lowest_minimum.eigenvalue_uncertainty == found.eigenvalue_uncertainty
+    )
     assert "eigenvalue_uncertainty" in np.load(path)
 
 
 def test_a_minimum_that_is_not_known_well_says_by_how_much():
     problem = PROBLEMS["cloth"]()
-    best = find_minima(problem, NewtonSolver()).lowest
+    best = find_minima(problem, NewtonSolver()).lowest_minimum
     assert "next step" in replace(best, kind=INACCURATE).describe_flaw

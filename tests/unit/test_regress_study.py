@@ -87,7 +87,17 @@ def test_blocks_are_recorded_and_replayed(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("springbench.harness.experiments.regression.git_worktrees.find_checkout", lambda folder: folder)
     samples = tmp_path / "samples.parquet"
-    given = ["record", str(samples), "cloth.yaml", "--solver", "sparse", "--duration", "1", "--injected-slowdown", "0.1"]
+    given = [
+        "record",
+        str(samples),
+        "cloth.yaml",
+        "--solver",
+        "sparse",
+        "--duration",
+        "1",
+        "--injected-slowdown",
+        "0.1",
+    ]
     for starts in ("2", "1"):  # what is stored already is kept
         done = CliRunner().invoke(app, [*given, "--process-pairs", starts])
         assert done.exit_code == 0, done.output

@@ -41,7 +41,8 @@ def test_a_solver_may_yield_the_same_array_every_time():
     prepared, norm = SparseLocalGlobal().prepare(problem.system), EnergyNorm(problem.system)
 
     class Reusing:
-        choice, facts, solve, phases = prepared.description, prepared.stats, prepared.solve, prepared.iteration_phases
+        description, stats = prepared.description, prepared.stats
+        solve, iteration_phases = prepared.solve, prepared.iteration_phases
         residual_at = prepared.residual_at
 
         def iterates(self, problem):

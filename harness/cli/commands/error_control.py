@@ -129,13 +129,13 @@ def _execute_error_control(
         + (f"; more exact than asked, for {answer.note}" if answer.note else "")
     )
     print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
-    scene = asked.build_scene(asked.frame_seconds, "substepping")
-    status = answer.build_status_columns(answer.compute_balances(scene))
+    motion_scene = asked.build_scene(asked.frame_seconds, "substepping")
+    status = answer.build_status_columns(answer.compute_balances(motion_scene))
     if status["status"] != "ok":
         print_message(f"{status['status']}: {status['reason']}")
     measured = _verify_error(asked, error, path.positions[-1], results, print_message) if verify else None
     label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.t_end:g}"
-    recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, scene, answer, status)
+    recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, motion_scene, answer, status)
     row = _build_row(config.stem, asked, error, answer, status) | {
         "error": measured,
         "recording_path": f"recordings/{recording.name}",

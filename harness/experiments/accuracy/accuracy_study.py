@@ -112,7 +112,7 @@ def _report_contact(cases: Mapping[str, BenchmarkCase], print_message: Callable[
 
 
 @contextmanager
-def measuring(
+def open_measurement(
     work: Sequence[WorkSpec], folder: Path, display: ProgressDisplay
 ) -> Generator[Callable[[WorkSpec], ResultRow]]:
     """Yield a function that measures one simulation in a worker and returns its row.

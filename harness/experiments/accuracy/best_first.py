@@ -35,7 +35,7 @@ OVER_BUDGET = "the budget was used up"
 
 
 @dataclass(frozen=True, slots=True)
-class Omitted:
+class SearchSummary:
     """Summary of a search.
 
     Attributes:
@@ -49,7 +49,7 @@ class Omitted:
     reasons: Mapping[str, int]
 
     @property
-    def complete(self) -> bool:
+    def is_complete(self) -> bool:
         """Whether the search ended within its budget."""
         return OVER_BUDGET not in self.reasons
 
@@ -75,18 +75,18 @@ class _Method:
     bound: float = 0.0
 
     @property
-    def left(self) -> int:
+    def num_remaining(self) -> int:
         return sum(map(len, self.grid))
 
-    def next_step(self) -> int:
+    def skip_to_next_step(self) -> int:
         """Proceed to the next time step, and return the number of omitted tolerances."""
         left = len(self.grid.pop(0))
         self.errors, self.bound = [], max(self.bound, self.loosest)
         return left
 
-    def drop(self) -> int:
+    def skip_all(self) -> int:
         """Give up the method, and return the number of omitted settings."""
-        left = self.left
+        left = self.num_remaining
         self.grid = []
         return left
 
@@ -97,7 +97,7 @@ def search(
     best: float,
     measure: Callable[[WorkSpec], Mapping[str, Any]],
     budget: float,
-) -> Omitted:
+) -> SearchSummary:
     """Measure settings until no remaining one can be the cheapest that meets an error.
 
     Args:
@@ -108,17 +108,22 @@ def search(
         budget: wall time after which no simulation starts [s].
     """
     methods = _methods(work)
-    settings, measured, reasons, end = sum(one.left for one in methods), 0, Counter[str](), monotonic() + budget
+    settings, measured, reasons, end = (
+        sum(one.num_remaining for one in methods),
+        0,
+        Counter[str](),
+        monotonic() + budget,
+    )
     heap = [(0.0, number) for number in range(len(methods))]
     heapify(heap)
     while heap:
         bound, number = heappop(heap)
         one = methods[number]
         if bound > SLOWER * best:
-            reasons[_slow(error)] += one.drop()
+            reasons[_slow(error)] += one.skip_all()
             continue
         if monotonic() > end:
-            reasons[OVER_BUDGET] += one.drop()
+            reasons[OVER_BUDGET] += one.skip_all()
             continue
         spec = one.grid[0].pop(0)
         row = measure(_limited(spec, best))
@@ -130,23 +135,23 @@ def search(
             one.loosest = cost if cost < inf else one.bound
         late = row["status"] == "time-limit" or SLOWER * best < cost < inf
         if row["status"] == "unsupported":
-            reasons["the solver does not support it"] += one.drop()
+            reasons["the solver does not support it"] += one.skip_all()
         elif late and not one.errors:
-            reasons[_slow(error)] += one.drop()
+            reasons[_slow(error)] += one.skip_all()
         elif late:
-            reasons[_slow(error)] += one.next_step()
+            reasons[_slow(error)] += one.skip_to_next_step()
         elif found <= error:
-            reasons["a larger tolerance meets the error"] += one.next_step()
+            reasons["a larger tolerance meets the error"] += one.skip_to_next_step()
         elif one.errors and abs(one.errors[-1] - found) <= UNCHANGED * (found - error) < inf:
-            reasons["a smaller tolerance does not change the error"] += one.next_step()
+            reasons["a smaller tolerance does not change the error"] += one.skip_to_next_step()
         elif not one.grid[0]:
-            one.next_step()
+            one.skip_to_next_step()
         else:
             one.errors.append(found)
             one.bound = max(one.bound, cost) if cost < inf else one.bound
-        if one.left:
+        if one.num_remaining:
             heappush(heap, (one.bound, number))
-    return Omitted(measured, settings, {reason: count for reason, count in reasons.items() if count})
+    return SearchSummary(measured, settings, {reason: count for reason, count in reasons.items() if count})
 
 
 def _slow(error: float) -> str:

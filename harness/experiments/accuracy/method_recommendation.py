@@ -32,13 +32,13 @@ from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.progress_display import ProgressDisplay
 from springbench.harness.execution.worker_process import TaskLimits
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
-from springbench.harness.experiments.accuracy.accuracy_study import measuring
+from springbench.harness.experiments.accuracy.accuracy_study import open_measurement
 from springbench.harness.experiments.accuracy.accuracy_units import (
     EXTRA_WALL_SECONDS,
     load_reference_trajectory,
     open_reference_store,
 )
-from springbench.harness.experiments.accuracy.best_first import SLOWER, Omitted, search
+from springbench.harness.experiments.accuracy.best_first import SLOWER, SearchSummary, search
 from springbench.harness.experiments.accuracy.work_precision import build_work_rows
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
@@ -210,7 +210,7 @@ def recommend_method(
     asked: AccuracyPlan = isolated(partial(_plan_study, path, scene, size, max_error, t_end, time_limit, store))
     t_end = asked.work[0].t_end
     ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
-    omitted: Omitted | None = None
+    omitted: SearchSummary | None = None
     if not any(way.error <= max_error and way.sweep != asked.name for way in ways):
         omitted = _measured(
             asked, ways, reasons, max_error, claim_folder(results / asked.name, path), display, print_message, budget
@@ -303,7 +303,7 @@ def _measured(
     display: ProgressDisplay,
     say: Callable[[str], None],
     budget: float,
-) -> Omitted:
+) -> SearchSummary:
     """Measure the methods that may be the cheapest and have no rows. Raises InputError, WriteError."""
     known: dict[str, dict[str, Any]] = {
         way.work_spec.build_file_stem(): {
@@ -318,7 +318,7 @@ def _measured(
         f"measuring up to {len(asked.work)} settings, cheap ones first, for at most {budget:g} s (--budget); a "
         f"simulation ends once it is {SLOWER:g} times as slow as the best that keeps to the error"
     )
-    with measuring(asked.work, folder, display) as measure:
+    with open_measurement(asked.work, folder, display) as measure:
 
         def look_up(spec: WorkSpec) -> dict[str, Any]:
             return known.get(spec.build_file_stem()) or failed.get(spec.compute_unit_id(here)) or measure(spec)
@@ -408,10 +408,10 @@ def _explain_no_method(
     failed_rows: list[dict[str, Any]],
     max_error: float,
     t_end: float,
-    omitted: Omitted | None,
+    omitted: SearchSummary | None,
 ) -> str:
     """Explain why no method meets the error, and suggest what to change."""
-    if omitted and not omitted.complete:
+    if omitted and not omitted.is_complete:
         return (
             f"nothing that was measured keeps to an error of {max_error:g} over {t_end:g} s, and settings remain "
             f"({omitted}): the same command with a larger --budget goes on where this one ended"

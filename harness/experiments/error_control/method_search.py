@@ -378,7 +378,8 @@ class _MethodSearch:
     def _tune_setting(self, trial: Trial, reference_trial: Trial, time_limit: float) -> tuple[Trial, str]:
         """Tune the setting of a method towards the target error, and return the nearest trial.
 
-        The second result says why the trial is much more accurate. Raises TimeBudgetExceeded beyond a limit of CPU seconds.
+        The second result says why the trial is much more accurate. Raises TimeBudgetExceeded beyond a limit of CPU
+        seconds.
         """
         best, above = None if trial.error_estimated > self._max_error else trial, None
         nearest, stalled = trial, 0

@@ -105,7 +105,7 @@ def _build_cvode_integrator(method: str) -> Callable[[InitialValueProblem], OdeS
     return end
 
 
-_SUNDIALS_REQUIREMENT: dict[str, str] = {"module": "sksundae", "pip_extra": "sundials"}
+_SUNDIALS_REQUIREMENT: dict[str, Any] = {"module": "sksundae", "pip_extra": "sundials"}
 THIRD_PARTY_INTEGRATORS = {
     "scipy-dop853": ThirdPartyIntegrator(8, _build_scipy_integrator("DOP853")),
     "scipy-dop853-numpy": ThirdPartyIntegrator(8, _build_scipy_integrator("DOP853"), uses_compiled_forces=False),

@@ -101,7 +101,7 @@ def draw_line(
     """
     hollow = np.broadcast_to(np.asarray(stale, bool), np.shape(x))
     every: dict[str, Any] = {"markevery": 0.12} if spaced_markers and np.size(x) > 3 else {}
-    more = (
+    more: dict[str, Any] = (
         {"linewidth": 1.5, "markersize": 5 * marker_scale(style)}
         | sheet_marker_style(style, is_stale=bool(hollow.all()))
         | every

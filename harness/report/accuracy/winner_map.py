@@ -39,7 +39,7 @@ class WinnerCell:
     cheapest_by_family: dict[str, WorkPoint]
 
     @property
-    def winner(self) -> str:
+    def fastest_solver(self) -> str:
         """The family of the cheapest simulation."""
         return min(
             self.cheapest_by_family,

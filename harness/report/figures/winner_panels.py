@@ -44,12 +44,12 @@ def winner_panels(folder: Path) -> list[PanelEntry]:
                         *(
                             f"{cell.error:.0e}".replace("e-0", "e-"),
                             f"{format_quantity(cell.stiffness_number)}",
-                            cell.winner,
+                            cell.fastest_solver,
                         ),
-                        colors[cell.winner],
+                        colors[cell.fastest_solver],
                         _format_lead(cell.lead_ratio) if cell.cheapest_by_family else "",
                         bool(cell.cheapest_by_family)
-                        and cell.cheapest_by_family[cell.winner].source_fingerprint != table.newest_fingerprint,
+                        and cell.cheapest_by_family[cell.fastest_solver].source_fingerprint != table.newest_fingerprint,
                     )
                     for cell in mine
                 ],

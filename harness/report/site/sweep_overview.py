@@ -47,9 +47,6 @@ class SweepOverview(NamedTuple):
     scripts: dict[str, Any]
 
 
-_SectionBuilder = Callable[[SweepFolder, Path, bool, PrintMessage], "SweepOverview"]
-
-
 class _PageSection(NamedTuple):
     """The contribution of one kind of rows to a sweep's data."""
 
@@ -59,6 +56,9 @@ class _PageSection(NamedTuple):
     failures: list[dict[str, Any]]
     row_provenance: list[dict[str, Any]]
     summary_fields: dict[str, Any]
+
+
+_SectionBuilder = Callable[[SweepFolder, Path, bool, PrintMessage], _PageSection]
 
 
 def build_overview(

@@ -32,7 +32,7 @@ def build_winner_chart(table: AccuracyData) -> dict[str, Any]:
     looks = assign_family_styles(found)
     of: dict[tuple[int, str], list[WinnerCell]] = {}
     for cell in found if len(looks) > 1 else ():
-        of.setdefault((cell.vertices, cell.winner), []).append(cell)
+        of.setdefault((cell.vertices, cell.fastest_solver), []).append(cell)
     return {
         "title": "Map of winners",
         "note": " ".join([_CHART_NOTE, *describe_self_converged(table.work_points)]),

@@ -86,8 +86,8 @@ class AggregatedJacobi:
         """
         if without_vertex_contact(system) is not system:
             raise Unsupported(
-                "a-jacobi: its matrix is computed once from Q, which does not include contact of vertices (HalfSpaceContact); "
-                "use numba, chebyshev or vbd"
+                "a-jacobi: its matrix is computed once from Q, which does not include contact of vertices "
+                "(HalfSpaceContact); use numba, chebyshev or vbd"
             )
         energies = require_projective(system, "a-jacobi")
         measure = cast("ContactFreeSolver", CompiledLocalGlobal().prepare(system))
@@ -107,7 +107,7 @@ class AggregatedSweeps:
     """Several Jacobi sweeps for Q x = b from x = 0, as one sparse matrix.
 
     Attributes:
-        num_nonzeros: number of stored entries of the matrix.
+        nonzeros: number of stored entries of the matrix.
     """
 
     def __init__(self, Q: csr_array, sweeps: int) -> None:
@@ -121,7 +121,7 @@ class AggregatedSweeps:
         if sweeps % 2:
             S = csr_array(S / (1.0 + max(0.0, largest / damped - 1.0) ** sweeps))
         self.matrix = drop_zeros(S)
-        self.num_nonzeros: int | None = int(self.matrix.nnz)
+        self.nonzeros: int | None = int(self.matrix.nnz)
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Compute S b.

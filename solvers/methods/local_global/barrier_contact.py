@@ -53,8 +53,8 @@ def prepare_with_barriers(solver: Solver, system: System) -> PreparedBarrierLoca
     """
     if without_vertex_contact(system) is not system:
         raise Unsupported(
-            "local-global: vertex contact (HalfSpaceContact) and barrier contact of pairs are not supported together; use "
-            "surface-contact"
+            "local-global: vertex contact (HalfSpaceContact) and barrier contact of pairs are not supported together; "
+            "use surface-contact"
         )
     idle: Any = solver.prepare(without_barriers(system))
     base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base

@@ -198,9 +198,9 @@ class ContactQuadraticModel(ConjugateGradientIteration):
         self._z = self._solve(self._residual)
         return float(np.vdot(self._residual, self._z))
 
-    def update_direction(self, product: float, before: float) -> float:
+    def update_direction(self, product: float, previous_product: float) -> float:
         """Update the search direction; return its curvature."""
-        scale = product / before
+        scale = product / previous_product
         self._direction, self._image = self._z + scale * self._direction, self._residual + scale * self._image
         self._product = self._image + (self._contact_matrix @ self._direction.ravel()).reshape(-1, 3)
         return float(np.vdot(self._direction, self._product))

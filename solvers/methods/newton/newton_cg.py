@@ -207,9 +207,9 @@ class _NewtonSystemCG(ConjugateGradientIteration):
             -descent,
         )
 
-    def update_direction(self, product: float, before: float) -> float:
+    def update_direction(self, product: float, previous_product: float) -> float:
         """Update the search direction p; return p'Ap."""
-        self.search_direction *= product / before
+        self.search_direction *= product / previous_product
         self.search_direction += self._preconditioned_residual
         self._product = self._hessian.matvec(self.search_direction)
         return inner_product(self.search_direction, self._product)

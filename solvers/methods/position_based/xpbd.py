@@ -14,7 +14,8 @@ instead, with one iteration per substep.
 
 Neither minimises the objective of the step. Tensions are accumulated along directions that rotate during the iteration,
 without correction terms. The fixed point is the minimiser if springs do not rotate (a straight chain), and close to it
-if they rotate little in a step. `device: cuda` computes the same iterates in `springbench.solvers.methods.position_based.device_xpbd`.
+if they rotate little in a step. `device: cuda` computes the same iterates in
+`springbench.solvers.methods.position_based.device_xpbd`.
 """
 
 from __future__ import annotations

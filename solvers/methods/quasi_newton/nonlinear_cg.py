@@ -74,8 +74,8 @@ class NonlinearCG:
         """
         if without_vertex_contact(system) is not system:
             raise Unsupported(
-                "pncg: does not support contact of single vertices (HalfSpaceContact), for which no quadratic model is valid "
-                "along a direction; use lbfgs or newton, or surface-contact"
+                "pncg: does not support contact of single vertices (HalfSpaceContact), for which no quadratic model is "
+                "valid along a direction; use lbfgs or newton, or surface-contact"
             )
         metric, objective = ResidualMetric(system), FixedObjective(system)
         at = build_preconditioner(self.preconditioner, metric, objective, "pncg")

@@ -8,9 +8,8 @@ Contact adds its exact second derivatives, since it acts on single vertices. A p
 limits, dashpots) adds those of the vertex's elements. The paper has no line search. Here a step that would raise the
 energy is replaced by that of the majorant (q_i + sum of k) I, which cannot raise it; hence no sweep raises the
 objective. Energies without such a majorant, that is, energies that are not projective, are not supported.
-`device: cuda` computes the same iterates in `springbench.solvers.methods.vertex_block.device_vbd`. Vertices are processed by colour:
-no spring,
-form or element joins two of the same colour.
+`device: cuda` computes the same iterates in `springbench.solvers.methods.vertex_block.device_vbd`. Vertices are
+processed by colour: no spring, form or element joins two of the same colour.
 
     p_{k+1} = w_{k+1} (sweep(p_k) - p_{k-1}) + p_{k-1},    w_1 = 1,  w_2 = 2/(2 - rho^2),  w_{k+1} = 4/(4 - rho^2 w_k),
 

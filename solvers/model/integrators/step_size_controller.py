@@ -62,7 +62,7 @@ def build_pi_controller(error_order: float, max_factor: float, failure_factor: f
 
 
 @register_jitable(**jit_inner_options)
-def filter_error(control, ratio, previous_ratio, step_size_ratio):
+def filter_error(control: StepSizeController, ratio: float, previous_ratio: float, step_size_ratio: float) -> float:
     """Return the unlimited change of the step size after an accepted step.
 
     Args:
@@ -81,7 +81,14 @@ def filter_error(control, ratio, previous_ratio, step_size_ratio):
 
 
 @register_jitable(**jit_inner_options)
-def choose_next_step_size(control, step_size, planned_step_size, ends_frame, ratio, previous_ratio):
+def choose_next_step_size(
+    control: StepSizeController,
+    step_size: float,
+    planned_step_size: float,
+    ends_frame: bool,
+    ratio: float,
+    previous_ratio: float,
+) -> float:
     """Return the step size [s] after an accepted step.
 
     Args:
@@ -99,7 +106,7 @@ def choose_next_step_size(control, step_size, planned_step_size, ends_frame, rat
 
 
 @register_jitable(**jit_inner_options)
-def compute_rejection_factor(control, ratio):
+def compute_rejection_factor(control: StepSizeController, ratio: float) -> float:
     """Return the change of the step size after a rejected step; its error ratio may be infinite or nan."""
     if ratio < np.inf:
         return max(control.min_factor, control.safety * ratio ** (-1.0 / control.error_order))
