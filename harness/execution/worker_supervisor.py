@@ -175,8 +175,11 @@ class _Supervisor:
         """Kill all descendants, including those started meanwhile."""
         if not has_children():
             return
-        import psutil  # for those who left something
+        # Imported only where something is left. A stop meanwhile would find a part of the module: it waits.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        import psutil
 
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
         until = time.monotonic() + _GRACE_SECONDS
         while time.monotonic() < until and has_children():
             for process in psutil.Process().children(recursive=True):
