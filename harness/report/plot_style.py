@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import cache
 from hashlib import sha256
 from typing import Any, NamedTuple
@@ -110,29 +110,28 @@ _ALL_MARKERS: tuple[Any, ...] = (
     *SPEARHEAD_MARKERS,
 )
 
-# For families in the order of the registry: four colours of Okabe and Ito's palette, and six more.
-_FAMILY_COLOURS = (
-    "#0072b2",
-    "#00a878",
-    "#e69f00",
-    "#d55e00",
-    "#9a86e0",
-    "#cc79a7",
-    "#a8326e",
-    "#858585",
-    "#8a994c",
-    "#99634c",
+_FAMILY_COLOURS: tuple[tuple[str, tuple[float, ...]], ...] = (
+    ("#0072b2", (0.0, 0.44, 0.3, 0.17, -0.26)),
+    ("#00a878", (0.0, -0.13, 0.19, -0.48, -0.28)),
+    ("#e69f00", (0.0,)),
+    ("#d55e00", (0.0, 0.3)),
+    ("#9a86e0", (0.0,)),
+    ("#cc79a7", (0.0, -0.21, -0.42)),
+    ("#b155eb", (0.0, -0.28, -0.42)),
+    ("#858585", (0.0, -0.46, 0.55, -0.15, 0.17, 0.36, -0.31)),
+    ("#8a994c", (0.0, 0.21, -0.34, -0.17)),
+    ("#8b4a1c", (0.0, 0.12, 0.3, -0.16)),
 )
-_MEMBER_STYLES: tuple[tuple[float, Any], ...] = (
-    *((0.0, "-"), (-0.27, DASHED_LINE), (0.3, (0, (14, 2))), (0.2, DASH_DOTTED_LINE), (-0.12, (0, (1, 3)))),
+"""Colours of families in the order of the registry, and by how much each member is lighter, or darker if negative.
+
+Members of two families are 25 units of CIELAB apart or more, members of one family almost 8.
+"""
+_MEMBER_LINE_STYLES: tuple[Any, ...] = (
+    *("-", DASHED_LINE, (0, (14, 2)), DASH_DOTTED_LINE, (0, (1, 3)), (0, (3, 1, 1, 1, 1, 1))),
+    (0, (12, 2, 1, 2)),
 )
-"""Lightening of a family's members (darkening where negative), and their line styles."""
-_LARGE_FAMILY_STYLES: tuple[tuple[float, Any], ...] = (
-    *((0.0, "-"), (-0.3, DOTTED_LINE), (0.3, (0, (10, 3))), (-0.48, (0, (3, 1, 1, 1, 1, 1)))),
-    *((0.15, (0, (8, 2, 2, 2, 2, 2))), (-0.16, (0, (1, 3))), (0.42, (0, (12, 2, 1, 2)))),
-)
-"""Shades and line styles for families of more than five members, and for engines; other families rarely use these."""
-_VARIANT_LINE_STYLES: tuple[Any, ...] = (*_LINE_STYLES, *(dash for _, dash in _LARGE_FAMILY_STYLES[2:]))
+"""Line styles of a family's members."""
+_VARIANT_LINE_STYLES: tuple[Any, ...] = tuple(dict.fromkeys((*_LINE_STYLES, *_MEMBER_LINE_STYLES)))
 """Line styles of variants that differ from a solver only in their settings."""
 _PLUGIN_COLOURS = (
     *("#8a8a00", "#00a0a0", "#8c564b", "#4c6ef5", "#5a9e2f", "#c9506b", "#b8860b", "#6a3d9a", "#1f8a70", "#e377c2"),
@@ -168,8 +167,8 @@ def assign_solver_styles(solvers: Iterable[str] = ()) -> dict[str, SeriesStyle]:
 def _shipped_solver_styles(names: tuple[str, ...]) -> dict[str, SeriesStyle]:
     """Return the styles of the registry's solvers.
 
-    A style has the colour of the solver's family, and a marker of its own. Solvers beyond the number of markers get no
-    style here.
+    A style has the colour of the solver's family, and a marker of its own. Solvers beyond the number of markers, or of
+    the shades of their family, get no style here.
     """
     families: dict[str, list[str]] = {}
     for name in names:
@@ -179,21 +178,10 @@ def _shipped_solver_styles(names: tuple[str, ...]) -> dict[str, SeriesStyle]:
     markers = dict(zip(names, _ALL_MARKERS, strict=False))
     return {
         name: SeriesStyle(shade_colour(color, by), markers[name], dash)
-        for color, members in zip(_FAMILY_COLOURS, families.values(), strict=False)
-        for name, (by, dash) in zip(members, _family_member_styles(members), strict=False)
+        for (color, shades), members in zip(_FAMILY_COLOURS, families.values(), strict=False)
+        for name, by, dash in zip(members, shades, _MEMBER_LINE_STYLES, strict=False)
         if name in markers
     }
-
-
-def _family_member_styles(family: Sequence[str]) -> Sequence[tuple[float, Any]]:
-    """Return the shades and line styles of a family's members.
-
-    For engines one style is skipped: their solid light brown would look like a green of others to some readers, and
-    their darkest brown like black.
-    """
-    if not set(family) & SOLVERS.keys():
-        return *_LARGE_FAMILY_STYLES[:3], *_LARGE_FAMILY_STYLES[4:]
-    return _LARGE_FAMILY_STYLES if len(family) > len(_MEMBER_STYLES) else _MEMBER_STYLES
 
 
 def shade_colour(color: str, amount: float) -> str:
@@ -246,4 +234,4 @@ def indexed_style(number: int) -> SeriesStyle:
     There are 64 styles from index 0 on, the first 8 in distinct colours.
     """
     # The marker is shifted by one with each pass through the colours.
-    return SeriesStyle(_FAMILY_COLOURS[number % 8], _ALL_MARKERS[(number + number // 8) % 8], (0, (3, 1.2)))
+    return SeriesStyle(_FAMILY_COLOURS[number % 8][0], _ALL_MARKERS[(number + number // 8) % 8], (0, (3, 1.2)))

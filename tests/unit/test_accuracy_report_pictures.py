@@ -27,7 +27,8 @@ from springbench.harness.report.plot_style import (
     STALE_NOTE,
     assign_solver_styles,
 )
-from springbench.solvers.registry import SOLVER_TABLE, load_target
+from springbench.harness.report.site.plotly_styles import plotly_style
+from springbench.solvers.registry import SOLVER_TABLE, find_solver_info, load_target
 
 from tests import synthetic_accuracy_rows as made
 
@@ -166,23 +167,40 @@ BLINDNESS = {
 }
 
 
+def lab(color: str, matrix: list[list[float]] = BLINDNESS["full sight"]) -> np.ndarray:
+    """Return CIELAB of a color as somebody sees it, but for its linear part near black."""
+    rgb = np.array(to_rgb(color))
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ np.clip(
+        np.array(matrix) @ linear, 0, 1
+    )
+    x, y, z = np.cbrt(xyz / [0.9505, 1.0, 1.089])
+    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
+
+
 @pytest.mark.parametrize("matrix", BLINDNESS.values(), ids=[*BLINDNESS])
 def test_solvers_differ_in_colour_or_line_to_the_colour_blind_too(matrix: list[list[float]]) -> None:
-    looks = assign_solver_styles([])
-
-    def seen(color: str) -> np.ndarray:
-        rgb = np.array(to_rgb(color))
-        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
-        xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ np.clip(
-            np.array(matrix) @ linear, 0, 1
-        )
-        x, y, z = np.cbrt(xyz / [0.9505, 1.0, 1.089])
-        return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])  # CIELAB, but for its linear part near black
-
-    for (a, one), (b, other) in combinations(looks.items(), 2):
-        apart = float(np.linalg.norm(seen(one.color) - seen(other.color)))
+    for (a, one), (b, other) in combinations(assign_solver_styles([]).items(), 2):
+        apart = float(np.linalg.norm(lab(one.color, matrix) - lab(other.color, matrix)))
         # 10 is five times a just noticeable difference of CIELAB.
         assert apart > 10 or one.dash != other.dash, f"{a} and {b}: {apart:.1f}"
+
+
+def test_families_are_far_apart_and_members_of_one_differ_in_lightness_line_and_marker() -> None:
+    """Also in what the page makes of the styles."""
+    looks = assign_solver_styles([])
+    family = {name: find_solver_info(load_target(SOLVER_TABLE[name]), name).family for name in looks}
+    for (a, one), (b, other) in combinations(looks.items(), 2):
+        apart = float(np.linalg.norm(lab(one.color) - lab(other.color)))
+        if family[a] != family[b]:
+            assert apart >= 25.0, f"{a} and {b}: {apart:.1f}"
+            continue
+        assert apart >= 7.5, f"{a} and {b}: {apart:.1f}"
+        assert one.dash != other.dash
+        assert one.marker != other.marker
+        shown, beside = plotly_style(one), plotly_style(other)
+        assert shown["dash"] != beside["dash"]
+        assert shown["symbol"] != beside["symbol"]
 
 
 def luminance(color: Sequence[float]) -> float:
@@ -209,7 +227,7 @@ def test_solvers_of_a_family_have_one_hue() -> None:
     hues: dict[str, set[int]] = {}
     for name, look in assign_solver_styles([]).items():
         hue, saturation, _ = rgb_to_hsv(to_rgb(look.color))
-        hues.setdefault(load_target(SOLVER_TABLE[name]).solver_info.family, set()).add(
+        hues.setdefault(find_solver_info(load_target(SOLVER_TABLE[name]), name).family, set()).add(
             round(360 * hue) if saturation > 0.1 else -1
         )
     # Two hexadecimal digits round a hue by a degree or two.

@@ -11,9 +11,6 @@ from springbench.harness.report.plot_style import (
     BOWTIE_MARKER,
     CHEVRON_MARKER,
     CORNER_MARKERS,
-    DASH_DOTTED_LINE,
-    DASHED_LINE,
-    DOTTED_LINE,
     HOURGLASS_MARKER,
     LOZENGE_MARKER,
     SPEARHEAD_MARKERS,
@@ -36,7 +33,6 @@ _PLOTLY_SYMBOLS: dict[Any, str] = {
     SPEARHEAD_MARKERS[0]: "arrow-right", SPEARHEAD_MARKERS[1]: "arrow-left", SPEARHEAD_MARKERS[2]: "arrow-down",
     SPEARHEAD_MARKERS[3]: "arrow-up",
 }  # fmt: skip
-_PLOTLY_DASHES: dict[Any, str] = {"-": "solid", DASHED_LINE: "dash", DOTTED_LINE: "dot", DASH_DOTTED_LINE: "dashdot"}
 
 LOG_AXIS = {"type": "log"}
 
@@ -46,7 +42,7 @@ def plotly_style(mark: SeriesStyle) -> dict[str, str]:
     return {
         "color": mark.color,
         "symbol": _PLOTLY_SYMBOLS[mark.marker],
-        "dash": _PLOTLY_DASHES.get(mark.dash, "longdash"),
+        "dash": "solid" if mark.dash == "-" else ",".join(f"{2 * length:g}px" for length in mark.dash[1]),
     }
 
 
