@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -120,3 +122,29 @@ def test_user_code_that_exits_after_its_trial_ends_no_command(name: str, tmp_pat
 def test_user_code_that_works_never_runs_in_the_command(name: str, tmp_path: Path, monkeypatch):
     code, said = command(tmp_path, monkeypatch, name, exits_at=1e9)
     assert code == 0, said
+
+
+STOPPED_WHILE_IMPORTING = """
+import signal, subprocess, sys
+from springbench.harness.execution.worker_supervisor import _Supervisor
+
+blocked = []
+
+
+class Watch:
+    def find_spec(self, name, path=None, target=None):
+        if name == "psutil":
+            blocked.append(signal.SIGTERM in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+
+sys.meta_path.insert(0, Watch())
+child = subprocess.Popen(["sleep", "60"])
+_Supervisor(0, 0, 0)._kill_descendants()
+print(blocked, signal.SIGTERM in signal.pthread_sigmask(signal.SIG_BLOCK, ()), child.poll() is not None)
+"""
+
+
+def test_a_stop_of_a_supervisor_waits_until_its_import_is_complete():
+    """The handler of the stop imports the same module, and would find a part of it."""
+    told = subprocess.run([sys.executable, "-c", STOPPED_WHILE_IMPORTING], capture_output=True, text=True, timeout=100)
+    assert told.stdout == "[True] False True\n", told.stderr
