@@ -85,7 +85,7 @@ def run(
         list[str] | None, typer.Option(help="For a scene: solver; repeatable. The recommended one by default.")
     ] = None,
     size: Annotated[list[int] | None, typer.Option(help="For a scene: mesh size; repeatable.")] = None,
-    error_target: ErrorOption = None,
+    max_error: ErrorOption = None,
     t_end: EndTimeOption = None,
     verify: VerifyOption = False,
     compare: CompareOption = False,
@@ -110,12 +110,12 @@ def run(
 
     _check_positions_path(positions)
     with_error = {"t_end": t_end, "verify": verify, "compare": compare}
-    if error_target is not None:
+    if max_error is not None:
         from springbench.harness.cli.commands.error_control import run_error_control
 
         is_accurate = run_error_control(
             config,
-            error_target,
+            max_error,
             results,
             _say,
             t_end=t_end,
