@@ -169,7 +169,7 @@ def test_a_run_has_exact_counts_and_each_revision_its_own_file(repository: Path)
     other.mkdir()
     (other / "cloth.yaml").write_text(CLOTH_SCENE_YAML.replace("300", "600"))
     sides = GitRevision("this", repository), GitRevision("that", other, checkout=repository, injected_slowdown=0.1)
-    run_options = {"solvers": ["sparse"], "sizes": [], "iterations": 20}
+    run_options = {"solvers": ["sparse"], "sizes": [], "max_iterations": 20}
     with start_workers(*sides) as alive:
         held = []
         for worker in alive:

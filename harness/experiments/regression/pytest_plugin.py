@@ -140,7 +140,7 @@ class PairedBenchmark:
             clock: "cpu" or "wall".
             budget: seconds; --paired-benchmark-budget by default.
             size: mesh size; the scene's default if omitted.
-            options: options of a run: iterations, tolerance, frames, integrator, time_step, first_guess.
+            options: options of a run: max_iterations, rtol, frames, integrator, time_step, initial_guess.
         Returns: the result, or None if nothing is timed.
         """
         from springbench.harness.execution.machine_info import limit_threads

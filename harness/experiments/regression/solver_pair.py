@@ -54,7 +54,7 @@ def prepare_solver_pair(
         solver: the candidate.
         baseline: solver to compare with.
         size: mesh size; the scene's default if omitted.
-        options: options of a run, such as iterations and tolerance.
+        options: options of a run, such as max_iterations and rtol.
     Raises: InputError, Unsupported, NotPositiveDefinite.
     """
     first, second = (_prepare_steps(scene, given, size, options) for given in (solver, baseline))
