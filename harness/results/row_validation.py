@@ -40,7 +40,7 @@ class ValueRange(NamedTuple):
     high: float
 
     @property
-    def expected_values(self) -> str:
+    def expected_range(self) -> str:
         """Description of the range."""
         return f"a number from {self.low:g} to {self.high:g}"
 
@@ -133,7 +133,7 @@ class InvalidValue(NamedTuple):
         came = repr(self.value[:_MAX_QUOTED_LENGTH] if isinstance(self.value, str) else self.value)
         return (
             f"came {came if len(came) <= _MAX_QUOTED_LENGTH else came[:_MAX_QUOTED_LENGTH] + '…'}; "
-            f"wanted {self.expected_values}"
+            f"wanted {self.expected}"
         )
 
 
@@ -153,7 +153,7 @@ def _find_invalid_texts(name: str, column: Any, rule: TextRule) -> Iterator[Inva
         return
     bad = [text for text in column.unique().to_pylist() if text is not None and not _is_valid_text(text, rule)]
     if bad:
-        wanted = rule.expected_values if max(map(len, bad)) <= MAX_TEXT_LENGTH else _LENGTH_RULE.expected_values
+        wanted = rule.expected if max(map(len, bad)) <= MAX_TEXT_LENGTH else _LENGTH_RULE.expected
         rows = pc.is_in(column, pa.array(bad, column.type)).to_numpy(zero_copy_only=False)
         yield from (InvalidValue(int(row), name, column[int(row)].as_py(), wanted) for row in np.flatnonzero(rows))
 
@@ -167,4 +167,4 @@ def _find_invalid_numbers(name: str, column: Any, allowed: ValueRange) -> Iterat
     known = ~column.is_null(nan_is_null=False).to_numpy()
     outside = known & ~((values >= allowed.low) & (values <= allowed.high))
     for row in np.flatnonzero(outside).tolist():
-        yield InvalidValue(row, name, column[row].as_py(), allowed.expected_values)
+        yield InvalidValue(row, name, column[row].as_py(), allowed.expected_range)
