@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import pytest
-from springbench.harness.cli.main import app
+from springbench.harness.cli.commands.ablate import ablate
+from springbench.harness.cli.main import app, run
 from springbench.harness.config import config_loader
 from springbench.harness.config.config_loader import SweepPlan, load_config
 from springbench.harness.config.run_options import RUN_OPTIONS
@@ -122,3 +125,9 @@ def test_speed_compares_steps_as_they_are_stated(folder: Path) -> None:
         (folder / "sweep.yaml").write_text(SWEEP.format("newton", options))
         done = CliRunner().invoke(app, ["roofline", str(folder / "sweep.yaml"), "--results", str(folder / "results")])
         assert done.exit_code == 2, done.output
+
+
+@pytest.mark.parametrize("command", [run, ablate])
+def test_no_option_of_runs_has_the_name_of_a_parameter_of_its_command(command: Callable[..., None]):
+    """Such an option would take the value of the parameter, which is then never given."""
+    assert not set(RUN_OPTIONS) & set(signature(command).parameters)
