@@ -250,8 +250,14 @@ def test_a_failure_outweighs_an_inconclusive_test_and_that_a_pass(verdicts: list
     [
         ("", "lacks a name that a comparison needs (No module named 'springbench.harness.config"),
         ("def load_config(path): ...", "lacks a name that a comparison needs (load_config() got an unexpected keyword"),
+        (
+            "class Run:\n    def __getattr__(self, name): raise AttributeError(name)\n"
+            "class Sweep:\n    def list_runs(self): return [Run()]\n"
+            "def load_config(path, **options): return Sweep()\n",
+            "lacks a name that a comparison needs (solver)",
+        ),
     ],
-    ids=["other modules", "other parameters"],
+    ids=["other modules", "other parameters", "other attributes"],
 )
 def test_a_revision_with_other_names_is_refused(repository: Path, package: str, message: str):
     (repository / "cloth.yaml").write_text(CLOTH_SCENE_YAML)

@@ -203,8 +203,8 @@ def _describe_error(error: Exception) -> str:
         return str(error)
     if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith("tests"):
         return "there is no tests/bench/test_gates.py, which lists the gates of a checkout"
-    place = traceback.extract_tb(error.__traceback__)[-1].filename
-    if place == __file__ and isinstance(error, AttributeError | ImportError | TypeError):
+    frames = [one for one in traceback.extract_tb(error.__traceback__) if one.name != "__getattr__"]
+    if frames[-1].filename == __file__ and isinstance(error, AttributeError | ImportError | TypeError):
         return f"it lacks a name that a comparison needs ({error}); choose a revision with the names of this checkout"
     return f"{type(error).__name__}: {error}"
 
