@@ -29,11 +29,11 @@ MESH_FIGURE_KINDS = ("run", "comparison", "scenes")
 
 FIGURE_SOURCES: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "convergence": ("block:gap", made.write_accuracy_results),
-    "times": ("net:10:current:alone", made.write_accuracy_results),
+    "times": ("net:10:previous:alone", made.write_accuracy_results),
     "work": ("bdf2", made.write_accuracy_results),
     "winners": ("", made.write_winner_results),
     "profiles": ("performance:1e-3", made.write_accuracy_results),
-    "growth": ("net:current", made.write_accuracy_results),
+    "growth": ("net:previous", made.write_accuracy_results),
     "liu2013": ("figure-2", made.write_accuracy_results),
     "timing": ("step", made.write_sweep_results),
     "hard": ("map", made.write_sweep_results),

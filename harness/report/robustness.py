@@ -169,7 +169,7 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
         if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
             runs.setdefault(row["run_id"], []).append(row)
     if not any(row["stationarity"] is not None or row["reference_distance"] is not None for row in table):
-        raise InputError(f"{folder}: holds no runs that were judged; run a sweep with `judge: true`")
+        raise InputError(f"{folder}: holds no verified runs; run a sweep with `verify: true`")
     if any(row["stationarity"] is not None and row["stationarity_above_roundoff"] is None for row in table):
         raise InputError(f"{folder}: holds runs that another version judged; run the sweep again")
     firsts = [run[0] for run in runs.values()]

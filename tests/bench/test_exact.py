@@ -56,12 +56,12 @@ def test_matrices_have_as_many_entries_as_stored(solver: str, size: int, system:
     ],
     ids=["sheet 32", "sheet 64", "sheet 128", "block", "skirt"],
 )
-def test_a_supernodal_factor_is_as_large_as_stored(scene: Scene, nonzeros: int, panel_bytes: int, flops: int):
+def test_a_supernodal_factor_is_as_large_as_stored(scene: Scene, nonzeros: int, factor_bytes: int, flops: int):
     factor = SupernodalCholesky(system_matrix(scene))
-    assert (factor.nonzeros, factor.factor_bytes, factor.flops) == (nonzeros, panel_bytes, flops)
+    assert (factor.nonzeros, factor.factor_bytes, factor.flops) == (nonzeros, factor_bytes, flops)
     # Half of the bytes for half of the precision; the work is the same.
     single = SupernodalCholesky(system_matrix(scene), precision="float32")
-    assert (single.factor_bytes, single.flops) == (panel_bytes // 2, flops)
+    assert (single.factor_bytes, single.flops) == (factor_bytes // 2, flops)
 
 
 @pytest.mark.parametrize("solver", ["dense", "sparse", "numba"])

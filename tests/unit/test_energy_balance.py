@@ -256,7 +256,7 @@ def done(folder: Path, solver: str, record: str, timing: str, integrator: str) -
 
 
 @pytest.mark.parametrize(
-    ("record", "timing"), [pytest.param("true", "exclusive", marks=pytest.mark.slow), ("false", "rough")]
+    ("record", "timing"), [pytest.param("true", "exclusive", marks=pytest.mark.slow), ("false", "none")]
 )
 def test_a_run_whose_energy_grows_says_so_in_all_rows(tmp_path: Path, record: str, timing: str):
     found, files = done(tmp_path, "newton", record, timing, "midpoint")
@@ -289,13 +289,13 @@ def test_the_reason_of_growth_is_the_step_or_its_iterations(integrator: str, sol
 
 
 def test_the_same_steps_by_implicit_euler_are_ok(tmp_path: Path):
-    found, _ = done(tmp_path, "newton", "false", "rough", "implicit-euler")
+    found, _ = done(tmp_path, "newton", "false", "none", "implicit-euler")
     assert {row["status"] for row in found} == {"ok"}
     assert all(row["energy_gain"] <= 0.0 < row["energy_available"] for row in found if row["phase"] == "step")
 
 
 def test_a_blow_up_ends_a_run_at_its_first_frame(tmp_path: Path):
-    (row,), files = done(tmp_path, "./wrong.py:Wrong", "false", "rough", "implicit-euler")
+    (row,), files = done(tmp_path, "./wrong.py:Wrong", "false", "none", "implicit-euler")
     assert (row["status"], row["phase"]) == ("diverged", "run")
     assert f"from frame {row['frame']} on the motion has " in row["reason"]
     assert 1 < row["frame"] < 20

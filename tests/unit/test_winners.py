@@ -56,7 +56,7 @@ def found(tmp_path: Path) -> dict[float, WinnerCell]:
 
 
 def test_the_cheapest_by_processor_time_within_the_error_wins(found):
-    assert [found[10.0**-k].winner for k in range(1, 6)] == [
+    assert [found[10.0**-k].fastest_solver for k in range(1, 6)] == [
         "implicit, order 1",
         "linearly implicit",
         "linearly implicit",
@@ -75,7 +75,7 @@ def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Pat
     assert points == {(10.0**-k, name) for k, name in enumerate(order, 1)}
     assert {item["panel"] for item in told["items"]} == {"81 vertices"}
     first = next(item for item in told["items"] if item["label"] == order[0])
-    assert (first["next"], first["ahead"]) == (["linearly implicit"], ["3 times as much"])
+    assert (first["runner_up_family"], first["lead_ratio"]) == (["linearly implicit"], ["3 times as much"])
     assert "numba" in first["setting"][0]
     assert not build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path / "one", ROWS[:1])))["items"], (
         "one family alone wins nothing"

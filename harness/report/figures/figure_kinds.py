@@ -108,7 +108,7 @@ FIGURE_KINDS: dict[str, FigureKind] = {
     "timing": FigureKind("Time a step", _SWEEP_ROWS, timing_panels.timing_panels, (("step",), ("prepare",))),
     "hard": FigureKind(
         "Hard cases",
-        f"{_SWEEP_ROWS} with `judge: true`",
+        f"{_SWEEP_ROWS} with `verify: true`",
         robustness_panels.robustness_panels,
         (("shares",),),
         _merge_cell_maps,

@@ -86,7 +86,7 @@ class MeshGenerator(ConfigModel):
             + bisect_right(range(self.MIN_SIZE, MAX_VERTICES + 1), self._max_vertices, key=self.count_vertices)
         )
         allowed = f"{self.MIN_SIZE} to {largest}" if largest >= self.MIN_SIZE else "none with these proportions"
-        kind = type(self).__name__.lower()
+        kind = getattr(self, "kind", type(self).__name__)
         return InputError(
             InputMistake(f"{size} {why}; allowed for {kind}: {allowed} ({self.SIZE_MEANING})", key="size")
         )
