@@ -25,7 +25,7 @@ if __name__ == "__main__":
         "scenes": ["../scenes/hanging-cloth.yaml"],
         "sizes": [8],
         "solvers": ["sparse", "lbfgs"],
-        "options": {"frames": 3, "iterations": 300, "tolerance": 1e-3, "record": False, "pictures": False, "rounds": 1},
+        "options": {"frames": 3, "max_iterations": 300, "rtol": 1e-3, "record": False, "pictures": False, "rounds": 1},
         "reports": [springbench.UserCodeName("./own_report.py:iterations")],
     }
     here = Path(globals().get("__file__", "configs/examples/own_report.py")).parent  # a notebook is no file

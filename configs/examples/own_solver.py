@@ -24,7 +24,7 @@ if __name__ == "__main__":
         "scenes": ["../scenes/hanging-cloth.yaml"],
         "sizes": [8],
         "solvers": ["sparse", springbench.UserCodeName("./own_solver.py:HeavyBall")],
-        "options": {"frames": 3, "iterations": 500, "tolerance": 1e-4, "record": False, "pictures": False, "rounds": 1},
+        "options": {"frames": 3, "max_iterations": 500, "rtol": 1e-4, "record": False, "pictures": False, "rounds": 1},
     }
     here = Path(globals().get("__file__", "configs/examples/own_solver.py")).parent  # a notebook is no file
     rows = springbench.run_config(sweep, name="heavy-ball", folder=here)

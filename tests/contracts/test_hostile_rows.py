@@ -49,7 +49,7 @@ def test_odd_rows_that_fit_are_shown(tmp_path: Path):
     assert found.code == 0
     assert ".parquet" not in found.said
     table = (tmp_path / "results" / "site" / "data" / "cases" / "runs.js").read_text()
-    assert f'"n":{2 * len(SHOWN)},' in table
+    assert f'"num_rows":{2 * len(SHOWN)},' in table
 
 
 @pytest.mark.long

@@ -121,7 +121,7 @@ from springbench.harness.simulation.stopwatch import PhaseWatch
 watch = PhaseWatch()
 with watch:
     os.kill(os.getpid(), signal.SIGSTOP)
-print(watch.build_columns("step", [watch.wall_seconds])["interrupted"], watch.preempted_seconds)
+print(watch.build_columns("step", [watch.wall_seconds])["preempted"], watch.preempted_seconds)
 """
 
 
@@ -132,8 +132,8 @@ def test_a_process_that_was_stopped_says_so() -> None:
     sleep(0.1)
     child.send_signal(signal.SIGCONT)
     said, _ = child.communicate()
-    interrupted, lost = said.split()
-    assert interrupted == "True"
+    preempted, lost = said.split()
+    assert preempted == "True"
     assert float(lost) >= 0.09  # of 0.1: CPU time is known to some milliseconds, where a host counts it
 
 

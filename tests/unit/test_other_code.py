@@ -61,9 +61,9 @@ def test_run_says_which_rows_are_of_other_code_and_the_table_marks_them(done: Pl
     told = ran(done)
     assert "2 of 2 runs are there already" in told
     assert "1 of them by other code than today's: scene 4 mine --rerun-stale does these again" in told
-    assert re.search(r" 4 mine [^a-z]+ iterations† ", told)
+    assert re.search(r" 4 mine [^a-z]+ max-iter† ", told)
     assert "† by other code than today's" in told
-    assert re.search(r" 4 sparse [^a-z]+ iterations [^†]", told)
+    assert re.search(r" 4 sparse [^a-z]+ max-iter [^†]", told)
     assert started(done) == before
 
 
