@@ -22,10 +22,11 @@ from springbench.harness.config.accuracy_config import (
     WorkSpec,
     WorkStudyConfig,
 )
-from springbench.harness.config.config_kinds import ACCURACY, read_config
 from springbench.harness.config.config_loader import (
+    ACCURACY,
     check_file_name,
     check_scene_parts,
+    read_config,
     read_plugin_metadata,
     read_scenes,
 )

@@ -1,4 +1,4 @@
-"""Loader of scenes and sweeps from their files.
+"""Reader of configs of all kinds, and loader of scenes and sweeps.
 
 All mistakes of a sweep and its scenes are reported at once.
 """
@@ -11,9 +11,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-from springbench.harness.config.config_kinds import SCENE, SWEEP, is_assignment_file, read_config
 from springbench.harness.config.expand_grid import GridExpansion
 from springbench.harness.config.run_options import AUTO, DEFAULT_SOLVER, DEFAULT_STOP_RULE
 from springbench.harness.config.solver_parameters import read_solvers
@@ -51,11 +50,70 @@ from springbench.harness.schema.config_document import (
     is_list,
     quote_value,
 )
+from springbench.harness.schema.yaml_loader import read_yaml
 from springbench.solvers.plugins.plugin_discovery import PluginName, load_target, select_plugins
 
 ASSIGNMENT_FRAMES = 30
 ASSIGNMENT_SOLVER = "numba"
 """Default number of frames and solver of an assignment's scene; iteration limits are those of `RunOptions`."""
+
+
+class ConfigKind(NamedTuple):
+    """A kind of config: its name, the keys of which it has one, and the commands that read it."""
+
+    name: str
+    keys: tuple[str, ...]
+    usage: str
+
+    @property
+    def description(self) -> str:
+        """Name and keys."""
+        return f"{self.name} (with {' or '.join(f'`{key}`' for key in self.keys)})"
+
+
+_RUN_USAGE = "`springbench run`, or `springbench regress` with --baseline REVISION"
+SCENE = ConfigKind("a scene", ("mesh",), _RUN_USAGE)
+SWEEP = ConfigKind("a sweep", ("scenes",), _RUN_USAGE)
+ACCURACY = ConfigKind("an accuracy config", ("curves", "work"), "`springbench accuracy`")
+GATES = ConfigKind("a gates file", ("gates",), "`springbench regress` without --baseline")
+CONFIG_KINDS = (ACCURACY, GATES, SWEEP, SCENE)
+"""All kinds; an accuracy config has the key of a sweep, too, so it comes first."""
+
+
+def find_config_kind(keys: Iterable[str]) -> ConfigKind | None:
+    """Find the kind of a config by its top-level keys; None if it has the key of no kind."""
+    present = set(keys)
+    return next((kind for kind in CONFIG_KINDS if present & {*kind.keys}), None)
+
+
+def is_assignment_file(path: Path) -> bool:
+    """Return whether a file is a scene of the assignment, which is JSON."""
+    return path.suffix.lower() == ".json"
+
+
+def read_config(
+    path: Path, *kinds: ConfigKind, policy: UserCodePolicy = IMPORT_USER_CODE
+) -> tuple[ConfigKind, ConfigDocument]:
+    """Read a config of one of the given kinds.
+
+    Args:
+        path: YAML file; or JSON file of an assignment, whose document is empty.
+        kinds: expected kinds.
+        policy: policy for code that the config names.
+    Returns: its kind, and its document.
+    Raises:
+        InputError: if it cannot be read, or is of another kind.
+    """
+    is_assignment = is_assignment_file(path)
+    document = ConfigDocument(path, {}) if is_assignment else read_yaml(path)
+    document.user_code = policy
+    kind = SCENE if is_assignment else find_config_kind(document.data)
+    expected = " or ".join(one.description for one in kinds)
+    if kind is None:
+        raise InputError(InputMistake(f"is no config: expected {expected}", path))
+    if kind in kinds:
+        return kind, document
+    raise InputError(InputMistake(f"is {kind.description}, for {kind.usage}; expected {expected}", path))
 
 
 class AssignmentMesh(ConfigModel):

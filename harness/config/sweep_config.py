@@ -152,7 +152,7 @@ class SolverSpec:
         )
 
     @property
-    def plugin_packages(self) -> tuple[str, ...]:
+    def third_party_packages(self) -> tuple[str, ...]:
         """Third-party distributions that the solver is an interface to."""
         return (
             tuple(self.metadata.get("packages", ())) if isinstance(self.name, PluginName) else list_packages(self.name)

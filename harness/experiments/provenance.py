@@ -27,14 +27,13 @@ def build_run_columns(run: RunSpec) -> dict[str, Any]:
 
 def build_specification_columns(run: RunSpec) -> dict[str, Any]:
     """Return the columns that state the specification of a run."""
+    plugins = run.find_plugins()
     return {
         "scene": run.scene_name,
         "size": run.size,
         "solver": run.solver.name,
         "parameters": json.dumps(dict(run.solver.parameters), sort_keys=True),
-        "plugins": json.dumps([plugin.identify_code() for plugin in run.find_plugins()])
-        if run.find_plugins()
-        else None,
+        "plugins": json.dumps([plugin.identify_code() for plugin in plugins]) if plugins else None,
         **run.solver.metadata_columns,
         **{option.column: getattr(run, name) for name, option in RUN_OPTIONS.items() if option.column},
         "residual_rtol": convert_tolerance(run.rtol),
@@ -62,7 +61,7 @@ def build_provenance_columns(solver: SolverSpec | None = None) -> dict[str, Any]
         "memory_gib": here.memory_gib,
         "operating_system": here.operating_system,
         "versions": json.dumps(
-            machine_info.collect_versions(*(solver.plugin_packages if solver else ())), sort_keys=True
+            machine_info.collect_versions(*(solver.third_party_packages if solver else ())), sort_keys=True
         ),
         "commit": machine_info.read_commit(),
         "source_fingerprint": machine_info.hash_sources(),

@@ -102,15 +102,8 @@ class SolverState(ABC):
         return _interpreted_loop(self, limits)
 
 
-def _choose_batch_size(state: SolverState, limits: LoopLimits, remaining: int) -> int:
-    """Return the number of iterations up to the next residual; all remaining ones if no residual can end the solve."""
-    if limits.residual_mode != iteration_loop.RESIDUAL_EACH:
-        return remaining
-    return min(state.iterations_until_residual(), remaining)
-
-
 _interpreted_loop = iteration_loop.build_loop(
-    lambda state, count: state.run_unchecked(count), methodcaller("residual"), _choose_batch_size
+    lambda state, count: state.run_unchecked(count), methodcaller("residual"), methodcaller("iterations_until_residual")
 )
 
 

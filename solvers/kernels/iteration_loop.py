@@ -59,7 +59,7 @@ def check_residual(residual, limits):
 
 
 def build_loop(
-    run_unchecked: Callable[..., Any], residual: Callable[..., Any], batch_size: Callable[..., Any]
+    run_unchecked: Callable[..., Any], residual: Callable[..., Any], iterations_until_residual: Callable[..., Any]
 ) -> Callable[..., Any]:
     """Build the iteration loop of a state.
 
@@ -67,8 +67,8 @@ def build_loop(
         run_unchecked: function of the state and a number of iterations that does them and returns how many succeeded;
             after the first failed one it does no more.
         residual: function of the state that returns the residual [J^(1/2)].
-        batch_size: function of the state, the limits and the number of remaining iterations that returns the number of
-            iterations up to the next residual.
+        iterations_until_residual: function of the state that returns the number of iterations up to the next residual
+            that may end the loop.
 
     Returns:
         A function (state, limits) that returns the number of iterations, the last residual (nan if none was computed)
@@ -78,7 +78,9 @@ def build_loop(
     def iterate(state: Any, limits: Any) -> Any:
         count, found, ended = 0, np.nan, REASON_ITERATIONS
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
-            requested = batch_size(state, limits, limits.max_iterations - count)
+            requested = limits.max_iterations - count
+            if limits.residual_mode == RESIDUAL_EACH:
+                requested = min(iterations_until_residual(state), requested)
             done = run_unchecked(state, requested)
             count += done
             if limits.residual_mode == RESIDUAL_EACH:
@@ -102,11 +104,14 @@ def build_compiled_loop(step_state: Callable[..., Any], residual: Callable[..., 
     """
 
     @jit_closure
-    def run_one(state, requested):
-        return 1 if step_state(state) else 0
+    def run_unchecked(state, num_iterations):
+        for count in range(num_iterations):
+            if not step_state(state):
+                return count
+        return num_iterations
 
     @jit_closure
-    def one_iteration(state, limits, remaining):
+    def iterations_until_residual(state):
         return 1
 
-    return jit_closure(build_loop(run_one, residual, one_iteration))
+    return jit_closure(build_loop(run_unchecked, residual, iterations_until_residual))

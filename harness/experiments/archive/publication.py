@@ -29,8 +29,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from springbench.harness.atomic_files import atomic_write
-from springbench.harness.config.config_kinds import find_config_kind
-from springbench.harness.config.config_loader import load_config
+from springbench.harness.config.config_loader import find_config_kind, load_config
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import machine_info
 from springbench.harness.experiments.archive.result_merge import list_sweep_folders

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import Field
-from springbench.harness.config.config_kinds import GATES, read_config
+from springbench.harness.config.config_loader import GATES, read_config
 from springbench.harness.config.run_options import IterationLimit, RelativeTolerance
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.machine_info import limit_threads
