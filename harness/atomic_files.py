@@ -49,7 +49,7 @@ def atomic_write(path: Path) -> Generator[Path]:
     except OSError as error:
         raise build_write_error(path, error) from error
     finally:
-        with suppress(OSError):  # a folder that is gone tells its own tale
+        with suppress(OSError):  # the caller reports a missing folder
             partial.unlink(missing_ok=True)
 
 

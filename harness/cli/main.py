@@ -153,7 +153,7 @@ def _preload_reports() -> None:
     """Import the modules of `_report_sweep`, which takes as long as drawing a picture."""
     from springbench.harness.execution.timing_lock import lock_timing_shared
 
-    with lock_timing_shared(lambda said: None):
+    with lock_timing_shared(lambda message: None):
         import_module("springbench.harness.report.sweep_summary")
         import_module("springbench.harness.report.site")
 
@@ -197,10 +197,10 @@ def accuracy(
     from springbench.harness.report.site import refresh_results_page
     from springbench.harness.results.folder_ownership import claim_folder
 
-    asked = load_accuracy(config)
-    folder = claim_folder(results / asked.name, config)
+    plan = load_accuracy(config)
+    folder = claim_folder(results / plan.name, config)
     files = run_accuracy_study(
-        asked,
+        plan,
         folder,
         create_display(get_error_console()),
         _say,

@@ -56,7 +56,7 @@ class ErrorReportingGroup(TyperGroup):
             for mistake in getattr(error, "mistakes", (error,)):
                 print_message(f"springbench: {mistake}")
             raise typer.Exit(error.exit_code) from error
-        except BrokenPipeError:  # whoever read the answer has read enough
+        except BrokenPipeError:  # the reader of the output closed the pipe
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(1) from None
         except OSError as error:

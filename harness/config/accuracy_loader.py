@@ -191,9 +191,9 @@ class _StudyExpansion:
         names = self._select_names("solver", study.solver, [solver.name for solver in self.solvers], at)
         return [solver for solver in self.solvers if solver.name in names]
 
-    def _select_names(self, key: str, asked: Sequence[str], known: Sequence[str], at: ConfigKey) -> list[str]:
+    def _select_names(self, key: str, requested: Sequence[str], known: Sequence[str], at: ConfigKey) -> list[str]:
         """Return the names that a study selects, or all if it selects none."""
-        for name in asked:
+        for name in requested:
             if name not in known:
                 self.document.add_mistake(f"came {quote_value(name)}; expected {suggest_name(name, known)}", (*at, key))
-        return [name for name in known if name in asked or not asked]
+        return [name for name in known if name in requested or not requested]

@@ -48,13 +48,13 @@ def _build_options(names: tuple[str, ...]) -> list[Any]:
 
     def function() -> None: ...
 
-    told = {
+    given_options = {
         name: typer.Option(help=f"For a scene: {describe_option(name)}", metavar="VALUE")
         for name in names or RUN_OPTIONS
     }
     stated = [
         Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[str | None, option])
-        for name, option in told.items()
+        for name, option in given_options.items()
     ]
     vars(function)["__signature__"] = Signature(stated)
     app = typer.Typer(add_completion=False)

@@ -73,7 +73,7 @@ class GridExpansion:
         options: Mapping[str, Sequence[Any]],
     ) -> Iterable[RunSpec]:
         scene = self.scenes[scene_name]
-        kept = {name: getattr(self.fields.options, name) for name in FixedOptions.model_fields}
+        fixed_options = {name: getattr(self.fields.options, name) for name in FixedOptions.model_fields}
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
             if chosen["error_target"] is not None:
@@ -89,7 +89,7 @@ class GridExpansion:
                 size=size,
                 solver=solver,
                 **chosen,
-                **kept,
+                **fixed_options,
             )
 
     def _select_sizes(self, scene_name: str) -> Sequence[int]:
@@ -125,12 +125,12 @@ class GridExpansion:
 
     def _apply_exclude(self, grid: Sequence[RunSpec]) -> list[RunSpec]:
         """Return the grid points that no entry of `exclude` matches."""
-        kept = list(grid)
+        remaining = list(grid)
         for i, entry in enumerate(self.fields.exclude):
             if not any(_is_match(entry, run) for run in grid):
                 self.document.add_mistake("matches no run of the grid; correct or remove it", ("exclude", i))
-            kept = [run for run in kept if not _is_match(entry, run)]
-        return kept
+            remaining = [run for run in remaining if not _is_match(entry, run)]
+        return remaining
 
     def _check_names(self) -> None:
         known = {"scene": list(self.scenes), "solver": [solver.name for solver in self.solvers]}

@@ -62,7 +62,7 @@ def _build_tagged_union(models: dict[str, type[ConfigModel]], tag: str) -> Any:
         make(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})
         for name, model in models.items()
     ]
-    own: Any = make(  # its keys are known to its code alone, which nobody runs for a schema
+    own: Any = make(  # only its code knows the keys, and a schema runs no user code
         f"Own {tag}",
         __config__=ConfigDict(extra="allow"),
         __doc__="Your own: `module:Name`, or `./file.py:Name` beside the config.",

@@ -104,8 +104,8 @@ _TYPE_HINTS, _DESCRIPTIONS = get_type_hints(RunOptions, include_extras=True), re
 
 def describe_option(name: str) -> str:
     """Describe an option in one sentence."""
-    said, null = _DESCRIPTIONS[name].removesuffix("."), RUN_OPTIONS[name].null_meaning
-    return f"{said}; {null}." if null else f"{said}."
+    description, null = _DESCRIPTIONS[name].removesuffix("."), RUN_OPTIONS[name].null_meaning
+    return f"{description}; {null}." if null else f"{description}."
 
 
 def build_list_model(*names: str, **usual: tuple[Any, ...]) -> Any:

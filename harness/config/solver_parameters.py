@@ -52,18 +52,18 @@ def _read_solver(document: ConfigDocument, entry: str | dict[str, Any], at: Conf
     named = resolve_tag(document, SOLVER_TABLE, data, "name", at)
     if named is None:
         return None
-    name, asked = named
+    name, requested = named
     own = isinstance(name, PluginName)
     if own and not document.user_code.imports_code:
-        return SolverSpec(name, asked, document.user_code.solver_metadata.get(name, {}))
-    kept = None if own or asked or not document.user_code.uses_cache else _cache_path(name)
-    if kept is not None and (known := _read_cache(kept)) is not None:
+        return SolverSpec(name, requested, document.user_code.solver_metadata.get(name, {}))
+    cache_path = None if own or requested or not document.user_code.uses_cache else _cache_path(name)
+    if cache_path is not None and (known := _read_cache(cache_path)) is not None:
         return SolverSpec(name, known)
     if own:
-        _try_plugin(document, name, asked, at)
-        return SolverSpec(name, asked)  # as `list` has them
+        _try_plugin(document, name, requested, at)
+        return SolverSpec(name, requested)  # as `list` has them
     solver = load_target(SOLVER_TABLE[name])
-    parameters = document.validate_data(build_parameter_model(name, solver), asked, at)
+    parameters = document.validate_data(build_parameter_model(name, solver), requested, at)
     if parameters is None:
         return None
     try:
@@ -71,18 +71,18 @@ def _read_solver(document: ConfigDocument, entry: str | dict[str, Any], at: Conf
     except ValueError as error:
         document.add_mistake(str(error), at)
     found: dict[str, Any] = _select_parameters(solver, parameters)
-    if kept is not None:
-        _write_cache(kept, found)
+    if cache_path is not None:
+        _write_cache(cache_path, found)
     return SolverSpec(name, found)
 
 
-def _try_plugin(document: ConfigDocument, name: PluginName, asked: dict[str, Any], at: ConfigKey) -> None:
+def _try_plugin(document: ConfigDocument, name: PluginName, requested: dict[str, Any], at: ConfigKey) -> None:
     """Try to create a user's solver, and add its mistakes to the document."""
     solver = load_plugin(document, name, "solver", at)
     if solver is None:
         return
     try:
-        parameters = document.validate_data(build_parameter_model(name, solver), asked, at)
+        parameters = document.validate_data(build_parameter_model(name, solver), requested, at)
         if parameters is not None:
             solver(**vars(parameters))
     except ValueError as error:
@@ -143,7 +143,7 @@ def _hash_solver_sources() -> str:
 def _read_cache(path: Path) -> dict[str, Any] | None:
     try:
         found: Any = json.loads(path.read_text())
-    except (OSError, ValueError):  # nothing is kept, or nothing that can be read
+    except (OSError, ValueError):  # there is no readable cache
         return None
     return found if is_mapping(found) else None
 

@@ -120,9 +120,9 @@ def _run_in_worker(piece: Callable[[ProgressCallback], Any], limits: LoadLimits,
 
     does = "loading"
 
-    def hear(said: str) -> None:
+    def hear(message: str) -> None:
         nonlocal does
-        does = said.removeprefix("\0") if said.startswith((IMPORT_NOTICE, BINDING_PREFIX)) else does
+        does = message.removeprefix("\0") if message.startswith((IMPORT_NOTICE, BINDING_PREFIX)) else does
 
     workers = IsolatedWorker()
     try:

@@ -37,8 +37,8 @@ def locate_error(error: BaseException, user_files: Collection[str]) -> str:
     frames = [(frame.filename, frame.lineno or 0) for frame in traceback.extract_tb(error.__traceback__)]
     theirs = [frame for frame in frames if not source_digest.is_known_source(frame[0])]
     blamed = [frame for frame in frames if frame[0] in user_files] or theirs or frames
-    told = [f"{Path(file).name}:{line}" for file, line in dict.fromkeys((blamed[-1], frames[-1]))]
-    return ", raised in ".join(told)
+    places = [f"{Path(file).name}:{line}" for file, line in dict.fromkeys((blamed[-1], frames[-1]))]
+    return ", raised in ".join(places)
 
 
 def parse_fault_location(dump: str) -> str:

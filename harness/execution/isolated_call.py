@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def run_isolated(
     function: Callable[[ProgressCallback], Any],
     user_code: Sequence[object],
-    print_message: Callable[[str], None] = lambda said: None,
+    print_message: Callable[[str], None] = lambda message: None,
     limits: TaskLimits | None = None,
 ) -> Any:
     """Return the result of a function, isolated if user code is involved.
@@ -36,7 +36,7 @@ def run_isolated(
     workers = IsolatedWorker()
     try:
         return workers.run_task(
-            function, lambda said: print_message(said) if is_step_event(said) else None, limits or TaskLimits()
+            function, lambda message: print_message(message) if is_step_event(message) else None, limits or TaskLimits()
         )
     except TaskFailure as lost:
         raise RunFailed(f"the process that runs {', '.join(map(str, user_code))} {lost}") from None

@@ -149,7 +149,7 @@ class IsolatedWorker:
         assert self._worker
         try:
             answer = yield from self._worker.submit_task(function, tick, limits)
-        except BaseException:  # it was lost, or somebody wants to leave
+        except BaseException:  # the worker was lost, or the command was interrupted
             if self._worker:
                 self._worker.kill_process()
             self.stop_worker()
@@ -176,8 +176,10 @@ class _WorkerProcess:
         fork = fork and sys.platform == "linux" and not FORK_BLOCKERS and not _has_numba_threads()
         context: Any = get_context("fork" if fork else "spawn")
         self._calls, calls = context.Pipe()
-        (self._ticks, ticks), (self._said, said), (self._dump, dump) = (context.Pipe(duplex=False) for _ in range(3))
-        theirs = calls, ticks, said, dump
+        (self._ticks, ticks), (self._output, output), (self._dump, dump) = (
+            context.Pipe(duplex=False) for _ in range(3)
+        )
+        theirs = calls, ticks, output, dump
         self._process = context.Process(target=supervise_worker, args=(*theirs, initialiser, os.getpid()))
         if not fork:
             resource_tracker.ensure_running()  # which unblocks Ctrl-C
@@ -198,7 +200,7 @@ class _WorkerProcess:
         self, piece: TaskFunction, tick: ProgressCallback, limits: TaskLimits
     ) -> Generator[Connection, None, TaskOutcome]:
         """Submit a task and return its result at the end; raise TaskFailure."""
-        heard, began = _TaskOutput(self._ticks, self._said, tick, limits.log_path), monotonic()
+        heard, began = _TaskOutput(self._ticks, self._output, tick, limits.log_path), monotonic()
         memory = ProcessTreeMemory(self._process.pid or 0, limits.memory_gib) if limits.memory_gib else None
         try:
             self._calls.send((piece, limits, heard.end))
@@ -271,9 +273,9 @@ class _WorkerProcess:
         """Request the worker's exit, and kill it if it does not end."""
         with suppress(OSError):
             self._calls.send(None)
-        self._wait_for_exit(_GRACE_SECONDS, partial(_read_available, self._said))
+        self._wait_for_exit(_GRACE_SECONDS, partial(_read_available, self._output))
         self.kill_process()
-        for pipe in (self._calls, self._ticks, self._said, self._dump):
+        for pipe in (self._calls, self._ticks, self._output, self._dump):
             pipe.close()
         self._process.close()
 
@@ -281,10 +283,10 @@ class _WorkerProcess:
 class _TaskOutput:
     """Progress events and output of a task while it runs."""
 
-    def __init__(self, ticks: Connection, said: Connection, tick: ProgressCallback, log: Path | None) -> None:
-        self._ticks, self._said, self._tick, self._log = ticks, said, tick, log
-        self._phase, self._steps, self._kept, self._all = "", 0, b"", bytearray()
-        self._count, self._held, self._ended = 0, bytearray(), False
+    def __init__(self, ticks: Connection, output: Connection, tick: ProgressCallback, log: Path | None) -> None:
+        self._ticks, self._output, self._tick, self._log = ticks, output, tick, log
+        self._phase, self._steps, self._tail, self._all = "", 0, b"", bytearray()
+        self._count, self._pending, self._ended = 0, bytearray(), False
         self.end = os.urandom(16)  # what the worker writes behind the last that a piece said
         self._waits_since: float | None = None
         self._waited = 0.0
@@ -307,39 +309,39 @@ class _TaskOutput:
                     self._waited, self._waits_since = self.waited_seconds, None
                 self._tick(phase)
         self._tick(POLL)
-        self._add_output(_read_available(self._said))
+        self._add_output(_read_available(self._output))
 
     def read_to_end(self, seconds: float) -> None:
         """Forward the last output of a finished task, waiting at most the given seconds."""
         until = monotonic() + seconds
         self.read_pending()
         while not self._ended and (left := until - monotonic()) > 0:
-            wait([self._said], left)
+            wait([self._output], left)
             self.read_pending()
 
-    def _add_output(self, said: bytes) -> None:
+    def _add_output(self, output: bytes) -> None:
         """Show and store output.
 
         Bytes that may be the start of the end marker are held back until the next ones arrive.
         """
-        self._held += said
-        at = self._held.find(self.end)
+        self._pending += output
+        at = self._pending.find(self.end)
         self._ended = self._ended or at >= 0
-        upto = at if at >= 0 else max(0, len(self._held) - len(self.end))
-        self._show_output(bytes(self._held[:upto]))
-        self._held = bytearray() if at >= 0 else self._held[upto:]
+        upto = at if at >= 0 else max(0, len(self._pending) - len(self.end))
+        self._show_output(bytes(self._pending[:upto]))
+        self._pending = bytearray() if at >= 0 else self._pending[upto:]
 
-    def _show_output(self, said: bytes) -> None:
-        if shown := said[: max(0, _MAX_PRINTED_BYTES - self._count)]:
+    def _show_output(self, output: bytes) -> None:
+        if shown := output[: max(0, _MAX_PRINTED_BYTES - self._count)]:
             sys.stderr.write(shown.decode(errors="replace"))
-        self._count += len(said)
-        self._all += said[: BUFFER_BYTES - len(self._all)] if self._log else b""
-        self._kept = (self._kept + said)[-_MAX_TAIL_BYTES:]
+        self._count += len(output)
+        self._all += output[: BUFFER_BYTES - len(self._all)] if self._log else b""
+        self._tail = (self._tail + output)[-_MAX_TAIL_BYTES:]
 
     def close_output(self) -> None:
         """Show the rest of the output. Write output that was too long to the log, and report that."""
-        self._show_output(bytes(self._held))
-        self._held.clear()
+        self._show_output(bytes(self._pending))
+        self._pending.clear()
         if self._count <= _MAX_PRINTED_BYTES:
             return
         where = ""
@@ -353,7 +355,7 @@ class _TaskOutput:
 
     def __str__(self) -> str:
         steps = f"after {self._steps} steps of the {self._phase}" if self._steps else "before its first step"
-        lines = [line for line in (self._kept + self._held).decode(errors="replace").splitlines() if line.strip()]
+        lines = [line for line in (self._tail + self._pending).decode(errors="replace").splitlines() if line.strip()]
         return f"{steps}; it said: {lines[-1].strip()[:300]}" if lines else steps
 
 

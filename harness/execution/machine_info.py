@@ -68,10 +68,10 @@ def compute_node_id() -> str:
 def _read_cpu_name() -> str:
     # lscpu also names ARM processors, for which the kernel reports only numbers.
     try:
-        told = subprocess.run(["lscpu"], env={**os.environ, "LC_ALL": "C"}, capture_output=True, text=True)
+        completed = subprocess.run(["lscpu"], env={**os.environ, "LC_ALL": "C"}, capture_output=True, text=True)
     except OSError:
         return platform.processor() or platform.machine()
-    fields = (line.partition(":") for line in told.stdout.splitlines())
+    fields = (line.partition(":") for line in completed.stdout.splitlines())
     names = [value.strip() for name, _, value in fields if name.strip() == "Model name"]
     return names[0] if names else platform.machine()
 
@@ -112,7 +112,7 @@ def read_commit(root: Path = _PROJECT_ROOT) -> str:
     # An explicit repository keeps git from using one that merely contains the project.
     git = ["git", "--no-optional-locks", f"--git-dir={root / '.git'}", f"--work-tree={root}"]
     try:
-        told = subprocess.run(
+        completed = subprocess.run(
             [*git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],
             cwd=root,
             capture_output=True,
@@ -120,7 +120,7 @@ def read_commit(root: Path = _PROJECT_ROOT) -> str:
         )
     except OSError:
         return "unknown"
-    return told.stdout.strip() if told.returncode == 0 else "unknown"
+    return completed.stdout.strip() if completed.returncode == 0 else "unknown"
 
 
 @cache

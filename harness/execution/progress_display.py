@@ -50,13 +50,13 @@ class ThrottledMessages:
     """Prints progress messages of work that is not a run, at most one per _MAX_SILENT_SECONDS."""
 
     def __init__(self, print_message: Callable[[str], None]) -> None:
-        self._say, self._said = print_message, monotonic()
+        self._say, self._last_print_time = print_message, monotonic()
 
     def __call__(self, words: str) -> None:
         """Print the message if the last one is old enough."""
-        if monotonic() - self._said > _MAX_SILENT_SECONDS:
+        if monotonic() - self._last_print_time > _MAX_SILENT_SECONDS:
             self._say(words)
-            self._said = monotonic()
+            self._last_print_time = monotonic()
 
 
 class RunProgress(Protocol):

@@ -55,7 +55,7 @@ def report_compilation(tick: ProgressCallback) -> Generator[None]:
 
     Kernels loaded from the cache are not reported.
     """
-    from numba.core import event  # where nothing is compiled, nobody waits for it
+    from numba.core import event  # imported only where kernels are compiled
 
     class Watch(event.Listener):
         depth = 0

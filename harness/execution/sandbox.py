@@ -191,8 +191,8 @@ def _run_call(function: Callable[..., Any], arguments: tuple[Any, ...], limits: 
     except MemoryError:
         return "error", f"reading it takes more than {limits.memory_bytes / 2**30:.1f} GiB of memory"
     except BaseException as error:  # readers raise anything on a broken file; so do panics of compiled libraries
-        said = " ".join(str(error).split())[:300]
-        return "error", said or type(error).__name__
+        message = " ".join(str(error).split())[:300]
+        return "error", message or type(error).__name__
     finally:
         for what in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):
             set_soft_limit(what, resource.RLIM_INFINITY)

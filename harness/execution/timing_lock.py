@@ -39,7 +39,7 @@ def lock_timing_exclusive(tick: ProgressCallback) -> Generator[None]:
 @contextmanager
 def lock_timing_shared(tick: ProgressCallback) -> Generator[None]:
     """Compute while no run is timed exclusively; tick reports the waiting time."""
-    with _lock_context("wanted", fcntl.LOCK_EX, tick):  # nobody who would be timed waits
+    with _lock_context("wanted", fcntl.LOCK_EX, tick):  # timed runs have priority
         used = _acquire_lock("used", fcntl.LOCK_SH, tick)
     try:
         yield

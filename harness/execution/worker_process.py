@@ -104,9 +104,9 @@ def serve_tasks(
     gc.freeze()  # what the parent had need not be looked through after each piece
     me, here = os.getpid(), os.getcwd()
     looked = monotonic()
-    with suppress(EOFError, OSError):  # a piece may have closed what this is asked through
-        while (asked := calls.recv()) is not None:
-            piece, limits, end = asked
+    with suppress(EOFError, OSError):  # the task may have closed the connection
+        while (request := calls.recv()) is not None:
+            piece, limits, end = request
             answer = _run_task(piece, limits, lambda phase: ticks.send_bytes(phase.encode()))
             if os.getpid() != me:  # a copy of this process that the piece has made
                 os._exit(0)
@@ -151,7 +151,7 @@ def _run_task(piece: TaskFunction, limits: TaskLimits, tick: ProgressCallback) -
         value: Any = piece(tick)
     except SpringbenchError as error:
         return TaskOutcome(None, error, is_clean=_is_clean_after(before) and not is_device_lost())
-    except BaseException as error:  # SystemExit and GeneratorExit too: whoever called is not to leave
+    except BaseException as error:  # also SystemExit and GeneratorExit, which must not end the worker
         why = f"raised {format_error(error)} ({locate_error(error, ())})"
         return TaskOutcome(
             None, why, is_clean=isinstance(error, Exception) and _is_clean_after(before) and not is_device_lost()

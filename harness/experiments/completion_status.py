@@ -63,7 +63,7 @@ def read_completion_statuses(
         InputError: a packed file is damaged.
     """
     from springbench.harness.results import (
-        parquet_rows,  # brings pyarrow along, for which those who only ask what there is need not wait
+        parquet_rows,  # imports pyarrow, which a listing without rows does not need
     )
 
     heads, today = (

@@ -181,14 +181,14 @@ def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callab
     answered: Any = client.run(_describe_worker, plugins, on_error="return")
     found: dict[str, Any] = answered
     problems = []
-    for worker, said in found.items():
-        if isinstance(said, OSError):
-            print_message(f"the worker {worker} was lost: {said}")
+    for worker, answer in found.items():
+        if isinstance(answer, OSError):
+            print_message(f"the worker {worker} was lost: {answer}")
             continue
-        if isinstance(said, BaseException):
-            problems.append(f"the worker {worker} cannot do runs: {type(said).__name__}: {said}")
+        if isinstance(answer, BaseException):
+            problems.append(f"the worker {worker} cannot do runs: {type(answer).__name__}: {answer}")
             continue
-        about, missing = said
+        about, missing = answer
         for field, title in _VERSION_TITLES.items():
             theirs, ours = getattr(about, field), getattr(here, field)
             if theirs != ours:
@@ -201,7 +201,7 @@ def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callab
             )
     if problems:
         raise InputError([InputMistake(problem, key="--scheduler") for problem in problems])
-    answers = [said for said in found.values() if not isinstance(said, OSError)]
+    answers = [answer for answer in found.values() if not isinstance(answer, OSError)]
     if not answers:
         raise InputError(InputMistake("all workers were lost; start others", key="--scheduler"))
     return sorted({about.machine_id for about, _ in answers})
@@ -265,7 +265,7 @@ def execute_on_cluster(
     """
     token = folder / "rows" / f".{uuid4().hex}.partial"  # who sees it shares the folder; it goes as such files do
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
-    threads, asked = dict[str, int](), 0.0
+    threads, last_query_time = dict[str, int](), 0.0
     going: dict[Future, tuple[int, RunUnit]] = {}
     fixed = (
         folder.resolve(),
@@ -280,8 +280,8 @@ def execute_on_cluster(
     try:
         token.touch()
         while left or going:
-            if not threads or monotonic() - asked > _WORKER_POLL_SECONDS:
-                threads, asked = _read_worker_threads(client), monotonic()
+            if not threads or monotonic() - last_query_time > _WORKER_POLL_SECONDS:
+                threads, last_query_time = _read_worker_threads(client), monotonic()
             workers = {name: many for name, many in threads.items() if name not in excluded}
             while left and len(going) < _QUEUED_TASKS_PER_THREAD * max(1, sum(workers.values())):
                 number, unit = left.pop()
@@ -392,12 +392,12 @@ def _execute_run(
                 (place / part).mkdir(exist_ok=True)
             here = RunUnit(unit.run, RunFiles.for_run(unit.run, place), None, unit.num_concurrent_runs)
             try:
-                told = process.run_task(partial(execute_timed, here), lambda _: None, here.task_limits)
+                outcome = process.run_task(partial(execute_timed, here), lambda _: None, here.task_limits)
             except TaskFailure as lost:
-                told = here.write_lost_rows(lost)
+                outcome = here.write_lost_rows(lost)
             made = [] if shared else [here.files.rows_path, here.files.recording_path]
             return ClusterOutcome(
-                me, told, {os.path.relpath(path, place): path.read_bytes() for path in made if path.exists()}
+                me, outcome, {os.path.relpath(path, place): path.read_bytes() for path in made if path.exists()}
             )
     except (WriteError, OSError) as error:
         return ClusterOutcome(me, worker_error=f"cannot write: {error}")

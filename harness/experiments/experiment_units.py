@@ -183,8 +183,8 @@ def execute_units(
         groups = [unit.affinity_group if isinstance(unit, SelfTimedUnit) else None for unit in todo]
         tables = [dict(table) for table in REGISTRY_TABLES]
         for number, outcome in run_tasks(num_workers, partial(update_registries, tables), groups, start):
-            told: str = todo[number].write_lost_rows(outcome) if isinstance(outcome, TaskFailure) else outcome
-            runs.pop(number).finish_run(told)
+            outcome_text: str = todo[number].write_lost_rows(outcome) if isinstance(outcome, TaskFailure) else outcome
+            runs.pop(number).finish_run(outcome_text)
     finally:
         display.finish_sweep()
 

@@ -53,21 +53,21 @@ def build_energy_growth_columns(
         growth: the energy growth and its first frame.
         by_frame: columns of the rows, by frame.
     """
-    said = f"{growth}: "
+    reason = f"{growth}: "
     step = by_frame[growth.first_frame]
     if (
         step["termination_reason"] == "max-iter"
         and step["num_iterations"] >= run.max_iterations
         and run.integrator != "substepping"
     ):
-        said += f"{run.solver.name} leaves the step unsolved; take more iterations, a tolerance, or another solver"
+        reason += f"{run.solver.name} leaves the step unsolved; take more iterations, a tolerance, or another solver"
     else:
         integrates = run.integrator == "substepping" or not is_minimiser(
             load_solver_class(run)
         )  # a method with steps of its own
         method = run.solver.name if integrates else run.integrator
-        said += f"a step of {run.scene.time_step:.3g} s is too long for {method}"
-    return {"status": "energy-growth", "reason": said}
+        reason += f"a step of {run.scene.time_step:.3g} s is too long for {method}"
+    return {"status": "energy-growth", "reason": reason}
 
 
 def _format_reason(error: BaseException, solver_files: Collection[Path]) -> str:

@@ -108,7 +108,7 @@ def execute_run(
         try:
             run = run.replace_options(scene=run.scene.load_plugins())
             found = _run_passes(run, files, tick, positions, turn)
-        except Exception as error:  # a solver may fail in any way; the sweep goes on, and the row says where it was
+        except Exception as error:  # a solver may raise any exception; the row states it, and the sweep continues
             if isinstance(error, InputError) and not run.find_plugins():
                 raise
             turn.finish_timing()
@@ -128,7 +128,7 @@ def execute_run(
         content = parquet_rows.encode_rows(result)
     parquet_rows.write_durably(
         files.rows_path, content
-    )  # who waits for the disk computes nothing, and disturbs nobody who is timed
+    )  # waiting for the disk takes no CPU time, and disturbs no timed run
     return result
 
 
@@ -147,13 +147,13 @@ def _run_passes(
     settings = _build_settings(run)
     with _hold_timing_lock(run, tick) as how:
         if run.timing == "none":
-            measured, told = prepare_untimed(scene, _build_solver(run)), None
+            measured, rows = prepare_untimed(scene, _build_solver(run)), None
         else:
-            measured, told = _measure_rows(scene, _build_solver(run), settings, tick)
+            measured, rows = _measure_rows(scene, _build_solver(run), settings, tick)
         where = device_columns(measured.prepared)
     timing_session.finish_timing()
     by_frame, stands = _run_instrumentation_pass(run, files, scene, measured, settings, tick, positions)
-    told = told or timing_rows.build_timing_rows(measured)
+    rows = rows or timing_rows.build_timing_rows(measured)
     require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.rtol, float))
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.stats.items()}
     facts |= {
@@ -161,7 +161,7 @@ def _run_passes(
         "modulus_exponent": _find_modulus_exponent(run, scene),
     }
     facts |= where | stands | how
-    return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in told]
+    return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in rows]
 
 
 def _find_modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
@@ -210,12 +210,12 @@ def _run_error_controlled(
     """Return the rows of an error-controlled run, whose integrator and step size are chosen first."""
     with _hold_timing_lock(run, tick) as how:
         found = load_target(ERROR_CONTROL_TARGET)(run, max_error, tick)
-    told, seen, last = found.rows(), found.positions, dict[str, Any]()
+    rows, seen, last = found.rows(), found.positions, dict[str, Any]()
     timing_session.finish_timing()
     if positions:
         save_positions(positions, seen[1:])
     if run.record:
-        chosen = {name: told[0][name] for name in ("status", "integrator", "error_estimated")}
+        chosen = {name: rows[0][name] for name in ("status", "integrator", "error_estimated")}
         recorder = _open_recorder(
             run, files, found.scene, chosen | {"milliseconds_per_step": found.ms_per_step}, seen[-1]
         )
@@ -232,7 +232,7 @@ def _run_error_controlled(
                 files.recording_path, recorder.info, due, {k: seen[k] for k in chosen}
             )
         }
-    return [how | row | (last if row["frame"] == run.frames else {}) for row in told]
+    return [how | row | (last if row["frame"] == run.frames else {}) for row in rows]
 
 
 @contextmanager
@@ -338,7 +338,7 @@ def _record_before_failure(run: RunSpec, files: RunFiles, failure_row: dict[str,
     """
     facts = {"status": failure_row["status"], "reason": failure_row["reason"], "failed_frame": failure_row["frame"]}
     settings = replace(_build_settings(run), frames=failure_row["frame"] - 1)
-    with ExitStack() as cleanup, suppress(Exception):  # what went wrong is told already
+    with ExitStack() as cleanup, suppress(Exception):  # the first error is already reported
         scene = build_scene(run.scene, run.size, run.integrator)
         prepared = prepare(scene, _build_solver(run))
         recorder = _open_recorder(run, files, scene, facts)
@@ -360,7 +360,7 @@ def _list_solver_files(run: RunSpec) -> frozenset[Path]:
     """Return the source files of the solver, in which an error is located first."""
     try:
         return source_digest.find_class_sources(load_solver_class(run))
-    except Exception:  # it is somebody's own, and cannot be imported; that is the error
+    except Exception:  # user code that cannot be imported is the reported error
         return frozenset()
 
 
@@ -399,7 +399,7 @@ def _compute_reference(motion: _MotionKey) -> NDArray[np.float64] | None:
         return compute_reference_positions(
             scene, load_target(SOLVERS["newton"])(), initial_guess=run.initial_guess, frames=run.frames
         )
-    except Exception:  # the row of Newton's method itself says what it was
+    except Exception:  # the row of Newton's method states the error
         return None
 
 

@@ -35,14 +35,16 @@ def collect_source_parts(run: RunSpec) -> frozenset[SourcePart]:
     named = {"mesh": run.scene.mesh, **{f"effects[{i}]": effect for i, effect in enumerate(run.scene.effects)}}
     shipped = [type(part) for place, part in named.items() if place not in run.scene.plugins]
     solver = [] if isinstance(run.solver.name, PluginName) else [run.solver.name]
-    judge = ["newton"] if run.verify else []
+    verifier = ["newton"] if run.verify else []
     guess = ["hybrid"] if run.initial_guess == "coarse-to-fine" else []
-    kept = (
+    error_control = (
         []
         if run.error_target is None
         else [Path(find_module_source(ERROR_CONTROL_TARGET.partition(":")[0]) or _RUN_MODULE)]
     )
-    return frozenset([*map(_find_solver_file, [*solver, *judge, *guess]), *kept, *shipped, *run.find_plugins()])
+    return frozenset(
+        [*map(_find_solver_file, [*solver, *verifier, *guess]), *error_control, *shipped, *run.find_plugins()]
+    )
 
 
 def compute_source_fingerprint(parts: frozenset[SourcePart]) -> str:

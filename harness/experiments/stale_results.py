@@ -42,9 +42,9 @@ def _load_runs(folder: Path) -> list[RunSpec]:
     note = folder / OWNER_FILE
     if not note.is_file():
         return []
-    said = note.read_text(errors="replace").strip()[:4096]
-    config = folder / said
-    if not said or "\0" in said or not config.is_file():
+    config_path = note.read_text(errors="replace").strip()[:4096]
+    config = folder / config_path
+    if not config_path or "\0" in config_path or not config.is_file():
         return []
     try:
         return load_config(config, imports_code=False).list_runs()

@@ -92,13 +92,13 @@ def run_sweep(
         require_threads({machine_info.choose_threads(run.threads).count for run in runs})
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    with ExitStack() as held:
-        held.enter_context(folder_locks.lock_folder_shared(folder))
+    with ExitStack() as locks:
+        locks.enter_context(folder_locks.lock_folder_shared(folder))
         away = (
-            held.enter_context(_connect_cluster(scheduler_address, runs, print_message)) if scheduler_address else None
+            locks.enter_context(_connect_cluster(scheduler_address, runs, print_message)) if scheduler_address else None
         )
         machines = away.machine_ids if away else (None,)
-        claims = held.enter_context(
+        claims = locks.enter_context(
             closing(UnitClaims(folder, [RunFiles.for_run(r, folder, m).rows_path for r in runs for m in machines]))
         )
         planned = plan_runs(runs, folder, machines)
@@ -109,7 +109,7 @@ def run_sweep(
         here = isolated and not away
         if here and len(runs) <= _MAX_RUNS_TO_PRELOAD and any(p.run.record and p.run.pictures for p in todo):
             drawing = IsolatedWorker(_preload_drawing)
-            held.callback(drawing.stop_worker)
+            locks.callback(drawing.stop_worker)
             drawing.start_worker()
         if todo and not away:
             import_module(
@@ -143,7 +143,10 @@ def run_sweep(
             return table
         try:
             drawing.run_task(
-                draw, lambda said: print_message(said) if is_step_event(said) else None, TaskLimits(), background_call
+                draw,
+                lambda message: print_message(message) if is_step_event(message) else None,
+                TaskLimits(),
+                background_call,
             )
         except TaskFailure as lost:
             raise RunFailed(

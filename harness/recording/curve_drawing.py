@@ -67,9 +67,9 @@ def draw_curves(
     radii: Any = [rr.Radius.ui_points(0.5)] * len(rules) + [rr.Radius.ui_points(1.25)] * len(strips)
     lines = rr.LineStrips2D([*rules, *strips], colors=_append_colour(len(rules), _RULE_COLOUR, colours), radii=radii)
     stream.log(f"{entity}/lines", lines, static=True)
-    beside = np.column_stack([np.full(len(ends), _WIDTH + 14.0), _spread_labels([y for _, y in ends])])
+    label_positions = np.column_stack([np.full(len(ends), _WIDTH + 14.0), _spread_labels([y for _, y in ends])])
     points = rr.Points2D(
-        np.concatenate([places, beside]) - (0.0, _MIN_LABEL_HEIGHT),
+        np.concatenate([places, label_positions]) - (0.0, _MIN_LABEL_HEIGHT),
         labels=[*words, *found],
         show_labels=True,
         colors=_append_colour(len(words), _TEXT_COLOUR, colours),

@@ -32,7 +32,7 @@ class ForceArrows:
 
     def __init__(self, stream: rr.RecordingStream, size: float) -> None:
         self._stream, self._size = stream, size
-        self._held: dict[str, list[tuple[int, PointArray, PointArray]]] = {}
+        self._pending: dict[str, list[tuple[int, PointArray, PointArray]]] = {}
         self._scale: dict[str, float] = {}  # metres a newton
 
     def add_frame(self, frame: int, p: PointArray, forces: Mapping[str, Positions], times: TimeIndex) -> None:
@@ -47,22 +47,22 @@ class ForceArrows:
         for name, force in forces.items():
             acting = np.flatnonzero(np.abs(force).max(axis=1, initial=0.0) > 0.0)
             acting = acting[:: -(-len(acting) // MAX_ARROWS) or 1]
-            held = self._held.setdefault(name, [])
-            if len(acting) or held or name in self._scale:
-                held.append((frame, p[acting], force[acting].astype(np.float32)))
-            if len(held) >= MAX_BUFFERED_FRAMES:
+            pending = self._pending.setdefault(name, [])
+            if len(acting) or pending or name in self._scale:
+                pending.append((frame, p[acting], force[acting].astype(np.float32)))
+            if len(pending) >= MAX_BUFFERED_FRAMES:
                 self._send_forces(name, times)
 
     def close(self, times: TimeIndex) -> None:
         """Write all buffered arrows."""
-        for name in [*self._held]:
+        for name in [*self._pending]:
             self._send_forces(name, times)
 
     def _send_forces(self, name: str, times: TimeIndex) -> None:
-        held = self._held.pop(name)
-        if not held:
+        pending = self._pending.pop(name)
+        if not pending:
             return
-        frames, origins, forces = zip(*held, strict=True)
+        frames, origins, forces = zip(*pending, strict=True)
         f = np.concatenate(forces)
         entity = f"/scene/forces/{name}"
         if name not in self._scale:

@@ -189,12 +189,12 @@ def open_recording_source(path: Path) -> Generator[RecordingSource]:
         came = f"begins with {start!r}" if start else "is empty"
         raise InputError(InputMistake(f"{came} and so is not a Rerun recording (.rrd)", file=path))
     require_intact(path, _try_reading)
-    with ExitStack() as kept, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of files without a footer: `complete` says so
+    with ExitStack() as stack, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # for files without a footer, which `complete` reports
         complete, end = scan_messages(path)
         readable = path
         if not complete and end < path.stat().st_size:  # the library reads nothing of a file cut within a message
-            readable = Path(kept.enter_context(tempfile.TemporaryDirectory())) / path.name
+            readable = Path(stack.enter_context(tempfile.TemporaryDirectory())) / path.name
             shutil.copyfile(path, readable)
             os.truncate(readable, end)
         try:

@@ -74,7 +74,7 @@ class RerunRecorder:
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
         self._clock: dict[int, float] = {}  # of each frame [s]
-        self._held: list[tuple[int, NDArray[np.float32], NDArray[np.uint32]]] = []
+        self._buffered: list[tuple[int, NDArray[np.float32], NDArray[np.uint32]]] = []
         self._pins: NDArray[np.float32] | None = None
         self._unseen = 1e-6 * info.mesh.bounding_box_diagonal
         self._springs_shown = False
@@ -102,7 +102,7 @@ class RerunRecorder:
         self._clock[frame.index] = frame.time
         # The iterations timeline of a run needs the scene at 0, otherwise it would show no scene at all.
         self._stream.set_time("iteration", sequence=frame.index if self._info.is_solve else 0)
-        self._held.append((frame.index, p, self._shading.compute_colours(of_vertex)))
+        self._buffered.append((frame.index, p, self._shading.compute_colours(of_vertex)))
         self._obstacles.record_time(frame.time)
         self._log_pins(p)
         self._log_springs(p, strain)
@@ -118,7 +118,11 @@ class RerunRecorder:
             frame.index, crossed | {"/residual": frame.residual, "/residual/log10": _log10(frame.residual)}
         )
         self._frames += 1
-        if len(self._held) >= FLUSH_INTERVAL or len(self._held) * len(p) >= _MAX_BUFFERED_ROWS or self._frames == 1:
+        if (
+            len(self._buffered) >= FLUSH_INTERVAL
+            or len(self._buffered) * len(p) >= _MAX_BUFFERED_ROWS
+            or self._frames == 1
+        ):
             self._box.add_positions(p)
             self._send_mesh()
             if self._frames > 1:
@@ -207,9 +211,9 @@ class RerunRecorder:
             self._stream.log("/scene/mesh", rr.Points3D.from_fields(radii=rr.Radius.ui_points(3)), static=True)
 
     def _send_mesh(self) -> None:
-        if not self._held:
+        if not self._buffered:
             return
-        frames, positions, coloured = zip(*self._held, strict=True)
+        frames, positions, coloured = zip(*self._buffered, strict=True)
         p, colours = np.concatenate(positions), np.concatenate(coloured)
         if len(self._info.mesh.triangles):
             normals = np.concatenate([self._shading.compute_normals(of_frame) for of_frame in positions])
@@ -221,7 +225,7 @@ class RerunRecorder:
             self._build_scene_times(np.array(frames)),
             columns.partition([len(positions[0])] * len(frames)),
         )
-        self._held.clear()
+        self._buffered.clear()
 
     def _log_pins(self, p: NDArray[np.float32]) -> None:
         pins = p[self._info.pinned_vertices]

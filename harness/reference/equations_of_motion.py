@@ -79,9 +79,9 @@ class OdeField:
         """Return positions [m] and velocities [m/s] of all vertices, overwritten by the next call."""
         self._p[self._free], self._v[self._free] = y.reshape(2, -1, 3)
         if self._scene.pin_motions:
-            held, h = self._system.pins.vertices, FINITE_DIFFERENCE_SECONDS
-            self._p[held] = self._scene.pin_targets_at(t)
-            self._v[held] = (self._scene.pin_targets_at(t + h) - self._scene.pin_targets_at(t - h)) / (2.0 * h)
+            pinned, h = self._system.pins.vertices, FINITE_DIFFERENCE_SECONDS
+            self._p[pinned] = self._scene.pin_targets_at(t)
+            self._v[pinned] = (self._scene.pin_targets_at(t + h) - self._scene.pin_targets_at(t - h)) / (2.0 * h)
         return self._p, self._v
 
     def __call__(self, t: float, y: OdeState) -> OdeState:
@@ -168,7 +168,7 @@ def add_springs(
 def _measure_drag(scene: Scene) -> float:
     """Return the rate of the scene's ether drag [1/s]; raises NotIntegrable for any other filter."""
     v = np.random.default_rng(0).uniform(1.0, 2.0, scene.mesh.rest_positions.shape)
-    kept = reduce(lambda v, filtered: filtered(v), scene.velocity_filters, v) / v
-    if not kept.min() > 0.0 or np.ptp(kept) > 1e-12 * kept.max():
+    remaining = reduce(lambda v, filtered: filtered(v), scene.velocity_filters, v) / v
+    if not remaining.min() > 0.0 or np.ptp(remaining) > 1e-12 * remaining.max():
         raise NotIntegrable("a filter of the velocity that does not scale all of it by one positive factor")
-    return -log(float(np.mean(kept))) / scene.system.time_step
+    return -log(float(np.mean(remaining))) / scene.system.time_step

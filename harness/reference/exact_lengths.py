@@ -83,15 +83,15 @@ class ExactLengths:
         J = _build_length_jacobian(x, n, len(p))[:, self._columns]
         downhill = -problem.gradient(p).ravel()[self._columns]
         tension = k * (length - np.clip(length, x.min_length, x.max_length))
-        held = self._active_limits(length, tension)
+        active = self._active_limits(length, tension)
         for _ in range(MAX_ACTIVE_SET_CHANGES):
-            e = np.flatnonzero(held)
-            to = np.where(held > 0, x.max_length, x.min_length)[e]
+            e = np.flatnonzero(active)
+            to = np.where(active > 0, x.max_length, x.min_length)[e]
             found = _solve_saddle_point(self._Q, J[e], COMPLIANCE / k[e], np.concatenate([downhill, to - length[e]]))
             tension = np.zeros(len(k))
             tension[e] = found[rows:]
-            before, held = held, self._active_limits(length + J @ found[:rows], tension)
-            if np.array_equal(before, held):
+            before, active = active, self._active_limits(length + J @ found[:rows], tension)
+            if np.array_equal(before, active):
                 break
         return tension
 

@@ -155,8 +155,8 @@ def build_free_hessian(problem: StepProblem, p: Positions) -> SplitHessian:
     """Assemble the objective's Hessian at p."""
     system = problem.system
     _, vertices, weight = system.penalty_pins
-    held = system.inertia_diagonal + np.bincount(vertices, weight, minlength=system.num_vertices)
-    total, columns = diagonal_matrix(np.repeat(held, 3)), [np.empty((*p.shape, 0))]
+    anchor_stiffness = system.inertia_diagonal + np.bincount(vertices, weight, minlength=system.num_vertices)
+    total, columns = diagonal_matrix(np.repeat(anchor_stiffness, 3)), [np.empty((*p.shape, 0))]
     for energy in problem.energies:
         if isinstance(energy, RankUpdateEnergy):
             total = csr_array(total + energy.sparse_hessian(p))

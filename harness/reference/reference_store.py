@@ -85,15 +85,15 @@ class ReferenceStore:
           InputError: the scene cannot be built.
           RunFailed: a step of the reference run does not converge.
         """
-        asked = _ReferenceRequest(spec, size, integrator)
-        path = self.folder / f"run-{asked.name}.npz"
+        request = _ReferenceRequest(spec, size, integrator)
+        path = self.folder / f"run-{request.name}.npz"
         violence = _read_arrays(path, ["objective_decrease"]).get("objective_decrease", np.empty(0))
         moments = select_snapshot_frames(violence, spec.frames)
-        known = self._load_known_snapshots(asked, moments.values()) if len(violence) == spec.frames else {}
+        known = self._load_known_snapshots(request, moments.values()) if len(violence) == spec.frames else {}
         if not set(moments.values()) <= set(known):
-            steps, violence = run_reference(asked.scene, self.solver, spec.frames)
+            steps, violence = run_reference(request.scene, self.solver, spec.frames)
             _write_arrays(path, {"objective_decrease": violence})
-            known, moments = self._save_steps(asked, steps), select_snapshot_frames(violence, spec.frames)
+            known, moments = self._save_steps(request, steps), select_snapshot_frames(violence, spec.frames)
         return {moment: known[frame] for moment, frame in moments.items()}
 
     def load_frames(
@@ -113,14 +113,16 @@ class ReferenceStore:
           InputError: the scene cannot be built.
           RunFailed: a step of the reference run does not converge.
         """
-        asked = _ReferenceRequest(spec, size, integrator)
-        known = self._load_known_snapshots(asked, frames)
+        request = _ReferenceRequest(spec, size, integrator)
+        known = self._load_known_snapshots(request, frames)
         if missing := set(frames) - set(known):
             there = range(min(missing) - 1, 0, -1)
-            before = next((one for frame in there for one in self._load_known_snapshots(asked, [frame]).values()), None)
+            before = next(
+                (one for frame in there for one in self._load_known_snapshots(request, [frame]).values()), None
+            )
             state = before.state if before else None
-            steps, _ = run_reference(asked.scene, self.solver, max(missing), missing, state)
-            known |= self._save_steps(asked, steps)
+            steps, _ = run_reference(request.scene, self.solver, max(missing), missing, state)
+            known |= self._save_steps(request, steps)
         return {frame: known[frame] for frame in frames}
 
     def find_minima(self, frozen: StepSnapshot) -> KnownMinima:
@@ -234,21 +236,21 @@ class ReferenceStore:
         found.require_accuracy(error)
         return found
 
-    def _load_known_snapshots(self, asked: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
+    def _load_known_snapshots(self, request: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
         """Load those of the snapshots that are on disk and match the present scene."""
-        stored = [_read_arrays(self._snapshot_path(asked, frame), SNAPSHOT_ARRAYS) for frame in frames]
-        snapshots = [restore_snapshot(arrays, asked.scene) for arrays in stored if arrays]
+        stored = [_read_arrays(self._snapshot_path(request, frame), SNAPSHOT_ARRAYS) for frame in frames]
+        snapshots = [restore_snapshot(arrays, request.scene) for arrays in stored if arrays]
         return {snapshot.frame: snapshot for snapshot in snapshots if snapshot}
 
-    def _snapshot_path(self, asked: _ReferenceRequest, frame: int) -> Path:
-        return self.folder / f"snapshot-{asked.name}-{frame}.npz"
+    def _snapshot_path(self, request: _ReferenceRequest, frame: int) -> Path:
+        return self.folder / f"snapshot-{request.name}-{frame}.npz"
 
-    def _save_steps(self, asked: _ReferenceRequest, steps: dict[int, SimulationStep]) -> dict[int, StepSnapshot]:
-        kept: dict[int, StepSnapshot] = {}
+    def _save_steps(self, request: _ReferenceRequest, steps: dict[int, SimulationStep]) -> dict[int, StepSnapshot]:
+        snapshots: dict[int, StepSnapshot] = {}
         for frame, step in steps.items():
-            kept[frame], arrays = save_snapshot(step, asked.name)
-            _write_arrays(self._snapshot_path(asked, frame), arrays)
-        return kept
+            snapshots[frame], arrays = save_snapshot(step, request.name)
+            _write_arrays(self._snapshot_path(request, frame), arrays)
+        return snapshots
 
     def _save_minima(self, frozen: StepSnapshot, known: KnownMinima) -> None:
         arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in _CERTIFICATE_FIELDS}

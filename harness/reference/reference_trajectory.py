@@ -82,14 +82,14 @@ ProgressFunction = Callable[[int, float], None]
 class _ReportingField:
     """A field that reports progress; a restart at time 0 is the second integration."""
 
-    def __init__(self, field: OdeField, told: ProgressFunction) -> None:
-        self._field, self._told, self._motion, self._until = field, told, 1, 0.0
+    def __init__(self, field: OdeField, report_progress: ProgressFunction) -> None:
+        self._field, self._report_progress, self._motion, self._until = field, report_progress, 1, 0.0
 
     def __call__(self, t: float, y: OdeState) -> OdeState:
         if t == 0.0 < self._until:
             self._motion, self._until = self._motion + 1, 0.0
         self._until = max(self._until, t)
-        self._told(self._motion, t)
+        self._report_progress(self._motion, t)
         return self._field(t, y)
 
 

@@ -64,9 +64,9 @@ class AuditedSolver(DelegatingSolver):
         if not self._claims:
             return {"stationarity_audit": reached}
         yardstick = self._stationarity.compute_initial_residual(problem)
-        told, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
+        message, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
         if np.isnan(found.residual) and found.num_iterations:
-            raise RunFailed(f"{told}; wanted |Q^-1 grad g|_Q, which is {truth:.3g} (or `is_minimiser = False`)")
+            raise RunFailed(f"{message}; wanted |Q^-1 grad g|_Q, which is {truth:.3g} (or `is_minimiser = False`)")
         claimed = RESIDUAL_SLACK * found.residual / yardstick + round_off
         enough = RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / yardstick if yardstick else 0.0) + round_off
         if found.termination_reason != "converged":
@@ -75,10 +75,10 @@ class AuditedSolver(DelegatingSolver):
             before = [self._stationarity(problem, p).stationarity for p in self._find_previous_iterate(problem, found)]
             least = min(reached, *before, np.inf)
             if claimed < least:
-                raise RunFailed(f"{told}, where |Q^-1 grad g|_Q is {truth:.3g}")
+                raise RunFailed(f"{message}, where |Q^-1 grad g|_Q is {truth:.3g}")
             if enough < least:
                 raise RunFailed(
-                    f"{told} and says that it reached the tolerance, where {least:.3g} of the start's is left"
+                    f"{message} and says that it reached the tolerance, where {least:.3g} of the start's is left"
                 )
         return {"stationarity_audit": reached}
 

@@ -152,7 +152,7 @@ def _sample_motion(scene: Scene, times: Sequence[float], until: float) -> _Sampl
     wanted = [round(t / h) for t in times]
     if any(abs(k * h - t) > 1e-9 * times[-1] for k, t in zip(wanted, times, strict=True)):
         raise NotConverged("the times are no whole numbers of steps")
-    kept: dict[int, tuple[Positions, Positions]] = {}
+    samples: dict[int, tuple[Positions, Positions]] = {}
     run = simulate_scene(
         scene, prepare(scene, NewtonSolver()), _SOLVED_STOP_RULE, initial_guess="previous", frames=wanted[-1]
     )
@@ -160,10 +160,10 @@ def _sample_motion(scene: Scene, times: Sequence[float], until: float) -> _Sampl
         if not np.isfinite(step.positions).all():
             raise NotConverged(f"the motion is not finite from {step.index * h:.3g} s on")
         if step.index in wanted:
-            kept[step.index] = step.positions.copy(), step.state.motion.velocity.copy()
+            samples[step.index] = step.positions.copy(), step.state.motion.velocity.copy()
         if thread_time() > until and step.index < wanted[-1]:
             return None
-    p, v = (np.array([kept[k][i] for k in wanted]) for i in (0, 1))
+    p, v = (np.array([samples[k][i] for k in wanted]) for i in (0, 1))
     return _SampledMotion(scene.system.free_vertices, build_initial_state(scene).motion.positions, p, v)
 
 

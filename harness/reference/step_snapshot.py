@@ -105,7 +105,7 @@ def run_reference(
     Raises:
       RunFailed: a step does not converge.
     """
-    kept: dict[int, SimulationStep] = {}
+    stored: dict[int, SimulationStep] = {}
     violence, keep = np.full(num_steps, np.nan), set(frames)
     run = simulate_scene(
         scene,
@@ -122,9 +122,9 @@ def run_reference(
         violence[step.index - 1] = stated.value(stated.current_positions) - stated.value(step.solution.positions)
         if not frames:
             keep = set(select_snapshot_frames(violence[: step.index], num_steps).values())
-        kept[step.index] = step
-        kept = {frame: one for frame, one in kept.items() if frame in keep}
-    return kept, violence
+        stored[step.index] = step
+        stored = {frame: one for frame, one in stored.items() if frame in keep}
+    return stored, violence
 
 
 def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dict[str, int]:
@@ -202,8 +202,8 @@ def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
         and is_equal_to_roundoff(problem.gradient(problem.current_positions), arrays["gradient"])
     )
     after = Motion(arrays["end_positions"], arrays["end_velocity"])
-    told = str(arrays["digest"]), arrays.get("end_acceleration")
-    return StepSnapshot(int(arrays["frame"]), problem, after, *told) if same else None
+    digest = str(arrays["digest"]), arrays.get("end_acceleration")
+    return StepSnapshot(int(arrays["frame"]), problem, after, *digest) if same else None
 
 
 def is_equal_to_roundoff(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:

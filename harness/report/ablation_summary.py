@@ -173,10 +173,10 @@ def _format_overhead(row: ResultRow) -> str:
 
 def summarise_ablation(rows: Sequence[ResultRow]) -> list[str]:
     """Return sentences on all effects, on suggested effects, and on errors that are unknown."""
-    said = [f"{row['name']}: {describe_effect(row, rows)}" for row in select_kind(rows, "ablated")]
-    said += [f"not listed: {row['name']}: {row['reason']}" for row in select_kind(rows, "suggestion")]
+    sentences = [f"{row['name']}: {describe_effect(row, rows)}" for row in select_kind(rows, "ablated")]
+    sentences += [f"not listed: {row['name']}: {row['reason']}" for row in select_kind(rows, "suggestion")]
     unknown = [row for row in select_kind(rows, "error") if row["status"] != "ok"]
-    return said + [f"error of the {row['name']}: unknown ({row['reason']})" for row in unknown]
+    return sentences + [f"error of the {row['name']}: unknown ({row['reason']})" for row in unknown]
 
 
 def _format_count(number: int | None, sign: str) -> str:

@@ -164,17 +164,17 @@ def summarise_runs(all_runs: Sequence[DeviceRun], config: str) -> list[str]:
         all_runs: runs of the sweep.
         config: path of the sweep's config; "" if it no longer exists.
     """
-    asked = [run for run in all_runs if run.device_requested]
-    if not asked:
+    requested = [run for run in all_runs if run.device_requested]
+    if not requested:
         return []
-    if not any(run.status == "ok" for run in asked):
+    if not any(run.status == "ok" for run in requested):
         return [
             "No run on a device ended well, so nothing is said of what one saves "
-            f"({_most_common_reason(asked)}). Where there is a "
+            f"({_most_common_reason(requested)}). Where there is a "
             f"device, `.venv/bin/springbench run {config or 'CONFIG'}` fills this in."
         ]
-    said = [_describe_panel(panel, compared) for panel, compared in pair_fastest_runs(all_runs).items()]
-    return [*said, *_without_time(asked)]
+    sentences = [_describe_panel(panel, compared) for panel, compared in pair_fastest_runs(all_runs).items()]
+    return [*sentences, *_without_time(requested)]
 
 
 def _most_common_reason(runs: Sequence[DeviceRun]) -> str:
@@ -191,11 +191,11 @@ def _describe_panel(panel: ScenePanel, device_pairs: Sequence[DevicePair]) -> st
         return f"{begun}: at no size did both sides get there ({got} alone), so nothing is compared."
     first, last = find_break_even(device_pairs), both[-1]
     if first:
-        told = f"a device pays from {format_count(first.vertices)} vertices on, {_describe_speedup(first)}"
-        told += f", and {_describe_speedup(last)} at {format_count(last.vertices)}" if last is not first else ""
-        told += "" if first is not both[0] else ", the smallest that was measured"
+        sentence = f"a device pays from {format_count(first.vertices)} vertices on, {_describe_speedup(first)}"
+        sentence += f", and {_describe_speedup(last)} at {format_count(last.vertices)}" if last is not first else ""
+        sentence += "" if first is not both[0] else ", the smallest that was measured"
     else:
-        told = (
+        sentence = (
             f"a device does not pay up to {format_count(last.vertices)} vertices, where "
             f"both got there: {_describe_speedup(last)}"
         )
@@ -204,7 +204,7 @@ def _describe_panel(panel: ScenePanel, device_pairs: Sequence[DevicePair]) -> st
         for p in device_pairs
         if p.speedup is None
     ]
-    return f"{begun}: {told}" + (f"; one side alone got there at {', '.join(alone)}" if alone else "") + "."
+    return f"{begun}: {sentence}" + (f"; one side alone got there at {', '.join(alone)}" if alone else "") + "."
 
 
 def _describe_speedup(pair: DevicePair) -> str:
@@ -218,8 +218,8 @@ def _describe_speedup(pair: DevicePair) -> str:
     return f"{pair.device_run.solver} there {how} {pair.cpu_run.solver} on the processor"
 
 
-def _without_time(asked: Sequence[DeviceRun]) -> Iterator[str]:
+def _without_time(requested: Sequence[DeviceRun]) -> Iterator[str]:
     """Describe the runs on a device that have no time."""
-    failed = [run for run in asked if run.status != "ok"]
+    failed = [run for run in requested if run.status != "ok"]
     if failed:
-        yield f"{len(failed)} of {len(asked)} runs on a device have no time: {_most_common_reason(failed)}."
+        yield f"{len(failed)} of {len(requested)} runs on a device have no time: {_most_common_reason(failed)}."

@@ -62,8 +62,8 @@ def draw_device_speedups(results: Path) -> Iterator[tuple[Path | None, list[str]
                 parquet_rows.read_rows(row_store.list_units(folder), on_invalid=lambda mistake: None)
             )
         except InputError:
-            continue  # the page tells of damaged rows
-        if said := summarise_runs(found, find_config(folder.parent)):
+            continue  # the page reports damaged rows
+        if sentences := summarise_runs(found, find_config(folder.parent)):
             picture = folder.parent / "pictures" / "devices.png"
             compared = pair_fastest_runs(found)
             picture.unlink(missing_ok=True)  # rows that are gone may have drawn it
@@ -71,7 +71,7 @@ def draw_device_speedups(results: Path) -> Iterator[tuple[Path | None, list[str]
                 picture.parent.mkdir(exist_ok=True)
                 devices = sorted({run.device for run in found if run.device})
                 draw_pairs(compared, picture, folder.parent.resolve().name, devices)
-            yield picture if compared else None, said
+            yield picture if compared else None, sentences
 
 
 def draw_pairs(

@@ -105,8 +105,8 @@ def draw_gallery_sheet(tiles: Sequence[SceneTile], path: Path, facts: Sequence[s
                 *_wrap_effects(_format_title(tile), width),
             ):
                 page.text(left / PAGE_WIDTH, 1 - (top + _TILE_HEIGHT + below) / height, words, size=size, color=color)
-        said = "   ·   ".join((*facts, *describe_machine_and_commit([tile.replay.properties for tile in tiles])))
-        page.text(_SHEET_MARGIN / PAGE_WIDTH, _SHEET_MARGIN / height, said, size=10.0, color=MUTED_COLOUR)
+        footer = "   ·   ".join((*facts, *describe_machine_and_commit([tile.replay.properties for tile in tiles])))
+        page.text(_SHEET_MARGIN / PAGE_WIDTH, _SHEET_MARGIN / height, footer, size=10.0, color=MUTED_COLOUR)
         save_page(page, path)
 
 

@@ -49,9 +49,11 @@ def machine_footer(table: pa.Table) -> list[str]:
         f"select machine_id, node_id, {able} from rows_of where machine_id is not null group by all", table
     )
     known = assign_machine_names((machine, node) for machine, node, *_ in found)
-    told = sorted(f"machine {known[machine, node]}: {_describe_machine(*about)}" for machine, node, *about in found)
-    more = [f"and {len(told) - _MAX_LISTED} more machines"] if len(told) > _MAX_LISTED else []
-    return [*told[:_MAX_LISTED], *more, COMPARISON_NOTE]
+    machine_lines = sorted(
+        f"machine {known[machine, node]}: {_describe_machine(*about)}" for machine, node, *about in found
+    )
+    more = [f"and {len(machine_lines) - _MAX_LISTED} more machines"] if len(machine_lines) > _MAX_LISTED else []
+    return [*machine_lines[:_MAX_LISTED], *more, COMPARISON_NOTE]
 
 
 def _describe_machine(

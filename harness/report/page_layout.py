@@ -123,8 +123,8 @@ def draw_strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, 
     bar.imshow(np.linspace(0, 1, 512)[None], cmap=STRAIN_MAP, aspect="auto", interpolation="bilinear")
     bar.set_axis_off()
     for place, word, end, align in ((0.0, "compressed", ends[0], "left"), (1.0, "stretched", ends[1], "right")):
-        told = f"{word}, to {format_percent(end)}" if end else f"{word}: none"
-        draw_text(page, left + place * width, top - 8, told, size=9.5, ha=align)
+        caption = f"{word}, to {format_percent(end)}" if end else f"{word}: none"
+        draw_text(page, left + place * width, top - 8, caption, size=9.5, ha=align)
     draw_text(page, left + width / 2, top - 8, "at rest", size=9.5, ha="center")
     for place, beyond, tip in ((0.0, ends[0] < -limit, -14), (1.0, ends[1] > limit, 14)):
         if beyond:

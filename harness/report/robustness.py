@@ -63,7 +63,7 @@ OTHER_MINIMUM = RunOutcome(
     "another minimum", "#8fcbad", "a certified minimum in every step, and another motion than the reference, or none"
 )
 DEGENERATE_MINIMUM = RunOutcome(
-    "in a valley", "#c9c27a", "stationary, where some curvature cannot be told from zero: minima that are a continuum"
+    "in a valley", "#c9c27a", "stationary, with a curvature that is zero up to round-off: a continuum of minima"
 )
 SADDLE_POINT = RunOutcome("no minimum", "#b9a3d6", "stationary, but where the objective falls some way: a saddle")
 NOT_CONVERGED = RunOutcome("not converged", "#f2c45f", "finite, and not yet stationary, or not close to the reference")
@@ -218,8 +218,8 @@ def classify_run(run: Sequence[dict[str, Any]]) -> tuple[RunOutcome, float | Non
     ]
     if missed:
         claimed = sum(row["termination_reason"] in _CONVERGED_REASONS for row in missed)
-        said = f", {claimed} of which said they had met it" if claimed else ""
-        why = f"{len(missed)} of {len(run)} steps missed the tolerance{said}"
+        claims = f", {claimed} of which said they had met it" if claimed else ""
+        why = f"{len(missed)} of {len(run)} steps missed the tolerance{claims}"
         return (SILENTLY_WRONG if claimed else NOT_CONVERGED), worst, "stationarity", why
     none = [row for row in run if not row["is_local_minimum"]]
     if none:

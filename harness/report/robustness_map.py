@@ -83,10 +83,10 @@ def draw_robustness_map(cells: Sequence[VerifiedRun], path: Path, title: str, st
     used = [outcome for outcome in RUN_OUTCOMES if any(cell.outcome == outcome for cell in cells)]
     ends = [_CELL_WIDTH * (x + 0.45) + _ROTATED_LETTER_WIDTH * len(solver) for x, solver in enumerate(solvers)]
     width = max(_CASE_LABEL_WIDTH + max([_CELL_WIDTH * len(solvers) + 0.3, *ends]), _MIN_WIDTH)
-    told = ", ".join(describe_machine_and_commit([{"cpu": cell.cpu, "commit": cell.commit} for cell in cells]))
+    provenance = ", ".join(describe_machine_and_commit([{"cpu": cell.cpu, "commit": cell.commit} for cell in cells]))
     head, foot = (
         _wrap_words(title, width, _TITLE_SIZE),
-        [*_wrap_words(MAP_NOTE, width, _NOTE_SIZE), *_wrap_words(told, width, _NOTE_SIZE)],
+        [*_wrap_words(MAP_NOTE, width, _NOTE_SIZE), *_wrap_words(provenance, width, _NOTE_SIZE)],
     )
     if any(cell.run_id in stale_ids for cell in cells):
         foot += _wrap_words("Hollow marks: runs that other code than today's did.", width, _NOTE_SIZE)

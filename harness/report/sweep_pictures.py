@@ -108,7 +108,7 @@ def _draw_run_pictures(
     """Draw the pictures of runs in parallel processes, and report why a process was lost."""
     done, remarks = 0, ThrottledMessages(print_message)
 
-    def tick(said: str) -> None:
+    def tick(message: str) -> None:
         remarks(f"{done} of {len(pending_jobs)} pictures are drawn")
 
     tasks = [PoolTask(partial(_draw_job, p), tick, TaskLimits()) for p in pending_jobs]

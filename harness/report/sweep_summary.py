@@ -33,8 +33,8 @@ def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Pa
         folder: folder of this sweep's results.
     """
     found, page = read_run_times(table), results / "index.html"
-    told = summarise_sweep(found)
-    lines = ["what was learned:", *(f"  {line}" for line in told)] if told else []
+    sentences = summarise_sweep(found)
+    lines = ["what was learned:", *(f"  {line}" for line in sentences)] if sentences else []
     lines += ["what to do next:", *suggest_commands(found, config, results, folder / "recordings")]
     return [*lines, f"everything on one page: {page.resolve().as_uri()}"] if page.is_file() else lines
 
@@ -42,13 +42,13 @@ def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Pa
 def summarise_sweep(timed_runs: Sequence[RunTimes]) -> list[str]:
     """Summarise the fastest solvers, the termination reasons and the strains of runs, in lines."""
     fine, names = [run for run in timed_runs if run.status == "ok"], label_runs(timed_runs)
-    told = [
+    sentences = [
         *_describe_fastest(fine, names),
         *_describe_iteration_limits(fine),
         *_describe_unsolved(fine, names),
         *_describe_strain_growth(fine, names),
     ]
-    return [line for sentence in told for line in wrap(sentence, TABLE_WIDTH - 2, subsequent_indent="  ")]
+    return [line for sentence in sentences for line in wrap(sentence, TABLE_WIDTH - 2, subsequent_indent="  ")]
 
 
 def suggest_commands(timed_runs: Sequence[RunTimes], config: Path, results: Path, recordings: Path) -> list[str]:
@@ -62,14 +62,14 @@ def suggest_commands(timed_runs: Sequence[RunTimes], config: Path, results: Path
         results: folder of the results of all sweeps.
         recordings: folder of this sweep's recordings.
     """
-    told: list[tuple[str, Path | str, str]] = []
+    suggestions: list[tuple[str, Path | str, str]] = []
     if best := _choose_recording(timed_runs, recordings):
-        told.append(("springbench view", best, "replay a run of the largest mesh"))
+        suggestions.append(("springbench view", best, "replay a run of the largest mesh"))
     scenes = {run.scene: None for run in timed_runs}
     if scene := next(filter(None, (_find_scene_file(config, name) for name in scenes)), None):
-        told.append(("springbench recommend --error 1e-2", scene, "the cheapest way to an error of 1 %"))
-    told.append(("springbench report", results, "bring the page up to date, with recordings that it replays"))
-    return [line for words, path, why in told for line in (f"  # {why}", f"  {words} {shlex.quote(str(path))}")]
+        suggestions.append(("springbench recommend --error 1e-2", scene, "the cheapest way to an error of 1 %"))
+    suggestions.append(("springbench report", results, "bring the page up to date, with recordings that it replays"))
+    return [line for words, path, why in suggestions for line in (f"  # {why}", f"  {words} {shlex.quote(str(path))}")]
 
 
 def _describe_fastest(timed_runs: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:

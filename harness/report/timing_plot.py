@@ -49,7 +49,7 @@ from springbench.harness.report.timing_table import RunTimes, label_runs, read_r
 
 _PANELS_LEFT, _PANELS_TOP, _PANELS_RIGHT, _PANELS_BOTTOM = 40, 118, PAGE_WIDTH - 40, PAGE_HEIGHT - 30
 _PANEL_COLUMNS = 4  # scenes side by side
-_MAX_NOTES = 4  # failures told in words at the foot; all are marked in the panels
+_MAX_NOTES = 4  # failures described in the footer; the panels mark all
 _LABEL_LETTERS = 34  # of a direct label
 _VARIANT_LINE_STYLES = (DASHED_LINE, DOTTED_LINE, DASH_DOTTED_LINE)  # the further variants of one solver
 
@@ -216,11 +216,11 @@ def _format_axes(
 def _select_spaced_sizes(ax: Axes, sizes: Sequence[int]) -> list[int]:
     """Select the sizes whose tick labels do not overlap; the largest is always included."""
     at = {size: ax.transData.transform((size, 1.0))[0] for size in sizes}
-    kept = [sizes[-1]]
+    selected = [sizes[-1]]
     for size in reversed(sizes[:-1]):
-        if at[kept[-1]] - at[size] > 8.0 * len(format_count(kept[-1])):
-            kept.append(size)
-    return kept
+        if at[selected[-1]] - at[size] > 8.0 * len(format_count(selected[-1])):
+            selected.append(size)
+    return selected
 
 
 def _draw_step_times(

@@ -27,12 +27,12 @@ def read_owner(folder: Path) -> Path | None:
     All symbolic links of the path are resolved.
     """
     note = folder / OWNER_FILE
-    with suppress(OSError, ValueError):  # what a folder from elsewhere says may be no path at all
+    with suppress(OSError, ValueError):  # the file of a copied folder may hold no path
         if note.is_file():
             with note.open("rb") as file:
-                said = os.fsdecode(file.read(_MAX_PATH_BYTES).strip())
-            if said and (folder / said).is_file():
-                return (folder / said).resolve()
+                owner = os.fsdecode(file.read(_MAX_PATH_BYTES).strip())
+            if owner and (folder / owner).is_file():
+                return (folder / owner).resolve()
     return None
 
 

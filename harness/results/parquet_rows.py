@@ -336,13 +336,13 @@ def _read_within_limits(content: BinaryIO) -> pa.Table:
         OSError: if it exceeds the maximum number of rows or bytes.
     """
     with pq.ParquetFile(content) as file:
-        told, fields = file.metadata, list[Any](file.schema_arrow)
+        metadata, fields = file.metadata, list[Any](file.schema_arrow)
     names = [field.name for field in fields]
     if len(set(names)) < len(names) or row_store.FILE_COLUMN in names:
         raise OSError("its columns have the names of others")
-    if told.num_rows > MAX_ROWS:
-        raise OSError(f"it claims {told.num_rows:,} rows, and at most {MAX_ROWS:,} are read")
-    size = sum(told.row_group(k).total_byte_size for k in range(told.num_row_groups))
+    if metadata.num_rows > MAX_ROWS:
+        raise OSError(f"it claims {metadata.num_rows:,} rows, and at most {MAX_ROWS:,} are read")
+    size = sum(metadata.row_group(k).total_byte_size for k in range(metadata.num_row_groups))
     if size > _MAX_FILE_BYTES:
         raise OSError(f"it claims {size:,} bytes, and at most {_MAX_FILE_BYTES:,} are read")
     texts = [field.name for field in fields if pa.types.is_string(field.type)]

@@ -28,10 +28,10 @@ def read_solver_metadata(solver: str) -> dict[str, Any]:
     if solver not in SOLVER_TABLE:
         return {}
     method = load_target(SOLVER_TABLE[solver])
-    told = find_solver_info(method, solver)
+    info = find_solver_info(method, solver)
     return {
-        "family": told.family,
-        "citation": json.dumps(asdict(told.citation), ensure_ascii=False) if told.citation else None,
+        "family": info.family,
+        "citation": json.dumps(asdict(info.citation), ensure_ascii=False) if info.citation else None,
         "is_minimiser": is_minimiser(method),
-        "is_substepping": told.is_substepping,
+        "is_substepping": info.is_substepping,
     }

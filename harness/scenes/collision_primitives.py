@@ -59,8 +59,8 @@ def compute_barrier_stiffness(
     if stiffness is not None:
         return np.full(len(mass), stiffness)
     projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
-    held = System(mass, time_step, pins=DirichletPins(np.arange(len(mass)), np.full(len(mass), np.inf)))
-    return _STIFFNESS_FRACTION * np.asarray(assemble_system_matrix(held, projective).diagonal(), np.float64)
+    system = System(mass, time_step, pins=DirichletPins(np.arange(len(mass)), np.full(len(mass), np.inf)))
+    return _STIFFNESS_FRACTION * np.asarray(assemble_system_matrix(system, projective).diagonal(), np.float64)
 
 
 class PinTargets(Protocol):

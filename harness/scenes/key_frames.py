@@ -129,7 +129,7 @@ def _interpolate_linear(times: NDArray[np.float64], values: NDArray[np.float64],
 
 
 def _interpolate_smooth(times: NDArray[np.float64], values: NDArray[np.float64], t: float) -> NDArray[np.float64]:
-    from scipy.interpolate import PchipInterpolator  # a third of a second to import, for those who ask for it
+    from scipy.interpolate import PchipInterpolator  # takes a third of a second to import
 
     return np.asarray(PchipInterpolator(times, values)(t))
 

@@ -53,7 +53,7 @@ def load_plugin(document: ConfigDocument, plugin: PluginName, part_kind: str, ke
             "cannot be loaded: "
             f"{f'{plugin.module_name} has no {error.name}' if missing else _describe_error(error, plugin)}"
         )
-    except Exception as error:  # it is somebody's code, and may fail in any way
+    except Exception as error:  # user code may raise any exception
         problem = f"cannot be loaded: {_describe_error(error, plugin)}"
     else:
         if not problem:
@@ -74,7 +74,7 @@ def build_plugin_part(
         return None
     try:
         return document.validate_data(model, document.resolve_paths(model, parameters, key), key)
-    except Exception as error:  # a validator may be somebody's too
+    except Exception as error:  # a validator may be user code, too
         document.add_mistake(f"{plugin} cannot be made of these parameters: {_describe_error(error, plugin)}", key)
         return None
 
@@ -346,8 +346,8 @@ def check_plugin_mesh(plugin: PluginName, mesh: Any) -> Mesh:
 
 
 def _list_arrays(mesh: Mesh, mass: NDArray[np.float64]) -> list[NDArray[Any]]:
-    held = [mesh.rest_positions, mesh.springs, mesh.triangles, mesh.mass_fractions, mass]
-    return [*held, *mesh.spring_families.values(), *mesh.parts.values(), *mesh.attributes.values()]
+    arrays = [mesh.rest_positions, mesh.springs, mesh.triangles, mesh.mass_fractions, mass]
+    return [*arrays, *mesh.spring_families.values(), *mesh.parts.values(), *mesh.attributes.values()]
 
 
 def _describe_value(value: Any) -> str:

@@ -163,9 +163,9 @@ class SceneSpec(SceneFields):
 
     def keep_effects(self, effect_indices: Sequence[int]) -> dict[str, Any]:
         """Return the fields `effects` and `plugins` of the scene restricted to effects with these indices."""
-        plugins = {place: told for place, told in self.plugins.items() if place == "mesh"}
+        plugins = {place: plugin for place, plugin in self.plugins.items() if place == "mesh"}
         places = {f"effects[{i}]": f"effects[{k}]" for k, i in enumerate(effect_indices)}
-        plugins |= {places[place]: told for place, told in self.plugins.items() if place in places}
+        plugins |= {places[place]: plugin for place, plugin in self.plugins.items() if place in places}
         return {"effects": tuple(self.effects[i] for i in effect_indices), "plugins": plugins}
 
     def find_plugins(self) -> list[PluginName]:
@@ -199,12 +199,12 @@ class SceneSpec(SceneFields):
         """SHA-256 of everything that determines a run; mesh files count by content, not by name."""
         content = self.model_dump(mode="json", include={"mass", "time_step", "velocity", "camera", "mesh", "effects"})
         content["mesh"] = self.mesh_digest or content["mesh"]
-        for place, (plugin, given) in self.plugins.items():  # which need not be imported to be told apart
-            told = [plugin.identify_code(), dict(given)]
+        for place, (plugin, given) in self.plugins.items():  # identified without an import
+            identity = [plugin.identify_code(), dict(given)]
             if place == "mesh":
-                content["mesh"] = told
+                content["mesh"] = identity
             else:
-                content["effects"][int(place[len("effects[") : -1])] = told
+                content["effects"][int(place[len("effects[") : -1])] = identity
         if self.start:
             content["start"] = self.start.model_dump(mode="json")
         if self.mass_per_area is not None:

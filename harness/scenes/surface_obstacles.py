@@ -53,7 +53,7 @@ class TriangleSurface(ConfigModel):
     @field_validator("triangles")
     @classmethod
     def _check_triangle_indices(cls, triangles: tuple[tuple[int, int, int], ...], info: ValidationInfo) -> Any:
-        n = len(info.data.get("points", ())) or np.inf  # refused points are told of by themselves
+        n = len(info.data.get("points", ())) or np.inf  # invalid points are reported separately
         for k, corners in enumerate(triangles):
             if not all(0 <= i < n for i in corners) or len(set(corners)) < 3:
                 raise ValueError(f"number {k} is {corners}; wanted three different points from 0 to {n - 1}")
@@ -141,17 +141,17 @@ class MeshObstacle(ConfigModel):
     @model_serializer(mode="wrap")
     def _dump_contents(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Dump the contents of files: they define the obstacle, and a recording must contain them."""
-        told: dict[str, Any] = dump(self)
+        contents: dict[str, Any] = dump(self)
         if self.frames is None:
-            told.pop("frames", None)  # which whoever leaves out what is None has done already
+            contents.pop("frames", None)  # absent if None values were excluded
         else:
             moved = self.scale * self.frames.frame_positions + np.array(self.offset)
-            told["frames"]["positions"] = moved.tolist()
+            contents["frames"]["positions"] = moved.tolist()
         if isinstance(self.mesh, FileMesh) or self.frames:
             points, triangles = self.build_surface()
-            told |= {"scale": 1.0, "offset": (0.0, 0.0, 0.0)}
-            told["mesh"] = {"kind": "triangles", "points": points.tolist(), "triangles": triangles.tolist()}
-        return told
+            contents |= {"scale": 1.0, "offset": (0.0, 0.0, 0.0)}
+            contents["mesh"] = {"kind": "triangles", "points": points.tolist(), "triangles": triangles.tolist()}
+        return contents
 
     def build_surface(self) -> SurfaceMesh:
         """Build its points and triangles; raise InputError on failure."""

@@ -85,8 +85,8 @@ class VertexSelection(ConfigModel):
     @model_serializer(mode="wrap")
     def _dump_used_selectors(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Dump without unused optional selectors: run identities depend on this dump, older ones lack them."""
-        told: dict[str, Any] = dump(self)
-        return {key: value for key, value in told.items() if value or key not in _OPTIONAL_SELECTORS}
+        contents: dict[str, Any] = dump(self)
+        return {key: value for key, value in contents.items() if value or key not in _OPTIONAL_SELECTORS}
 
     @property
     def has_selectors(self) -> bool:

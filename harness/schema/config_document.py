@@ -23,7 +23,7 @@ _EXPECTED_PREFIX = "; should be "
 M = TypeVar("M", bound=BaseModel)
 
 
-def _ignore_message(said: str) -> None:
+def _ignore_message(message: str) -> None:
     pass
 
 
@@ -90,10 +90,10 @@ class ConfigDocument:
                     continue  # the list is short because its items were refused, which is reported
                 key = _locate_error(detail, data)
                 problems.setdefault(key, []).append(_describe_problem(detail, model, key))
-            for key, said in problems.items():
-                came = said[0].partition(_EXPECTED_PREFIX)[0] + _EXPECTED_PREFIX  # members of a union all say what came
-                others = [problem.removeprefix(came) for problem in said[1:]]
-                self.add_mistake(" or ".join([said[0], *others]), at + key)
+            for key, messages in problems.items():
+                came = messages[0].partition(_EXPECTED_PREFIX)[0] + _EXPECTED_PREFIX  # all members of a union quote it
+                others = [problem.removeprefix(came) for problem in messages[1:]]
+                self.add_mistake(" or ".join([messages[0], *others]), at + key)
             return None
 
     def resolve_paths(self, model: type[BaseModel], data: dict[str, Any], at: ConfigKey) -> dict[str, Any]:
@@ -175,7 +175,7 @@ def _has_key(data: Any, step: str | int) -> bool:
 
 def _describe_problem(detail: ErrorDetails, model: type[BaseModel], key: ConfigKey) -> str:
     """Describe the given value and the expected one."""
-    kind, said = detail["type"], detail["msg"]
+    kind, message = detail["type"], detail["msg"]
     if kind == "missing":
         return "is missing" if isinstance(detail["loc"][-1], str) else "has too few items"
     if kind == "extra_forbidden":
@@ -183,7 +183,7 @@ def _describe_problem(detail: ErrorDetails, model: type[BaseModel], key: ConfigK
         allowed = owner[0].model_fields if owner else ()
         return "unknown key; " + (f"expected {suggest_name(key[-1], allowed)}" if allowed else "remove it")
     if kind == "value_error":
-        return said.removeprefix("Value error, ")
+        return message.removeprefix("Value error, ")
     if kind.startswith("union_tag"):
         kinds = [one.model_fields["kind"].default for one in _models_at(model, detail["loc"])]
         came = detail.get("ctx", {}).get("tag")
@@ -192,7 +192,7 @@ def _describe_problem(detail: ErrorDetails, model: type[BaseModel], key: ConfigK
         return (
             f"came {quote_value(detail['input'])}{_EXPECTED_PREFIX}a mapping with a `kind`, {suggest_name('', kinds)}"
         )
-    wanted = said.removeprefix("Input should be ").replace("a valid array", "a list")
+    wanted = message.removeprefix("Input should be ").replace("a valid array", "a list")
     return f"came {quote_value(detail['input'])}{_EXPECTED_PREFIX}{wanted}"
 
 

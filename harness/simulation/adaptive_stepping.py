@@ -142,7 +142,7 @@ class _StepSizeLevels:
 
     def __init__(self, bound: Callable[[float], Scene], solver: Solver, horizon: float) -> None:
         self._bound, self._solver, self._horizon = bound, solver, horizon
-        self._kept = OrderedDict[int, tuple[Scene, PreparedSolver]]()
+        self._cached = OrderedDict[int, tuple[Scene, PreparedSolver]]()
         self.made = 0
 
     def compute_step_size(self, level: int) -> float:
@@ -150,17 +150,17 @@ class _StepSizeLevels:
         return self._horizon * 0.5**level
 
     def prepare_level(self, level: int) -> tuple[Scene, PreparedSolver]:
-        if level not in self._kept:
+        if level not in self._cached:
             scene = self._bound(self.compute_step_size(level))
-            self._kept[level] = scene, prepare(scene, self._solver)
+            self._cached[level] = scene, prepare(scene, self._solver)
             self.made += 1
-        self._kept.move_to_end(level)
+        self._cached.move_to_end(level)
         while (
-            len(self._kept) > 2
-            and sum(_estimate_factor_bytes(prepared) for _, prepared in self._kept.values()) > MAX_FACTOR_BYTES
+            len(self._cached) > 2
+            and sum(_estimate_factor_bytes(prepared) for _, prepared in self._cached.values()) > MAX_FACTOR_BYTES
         ):
-            self._kept.popitem(last=False)
-        return self._kept[level]
+            self._cached.popitem(last=False)
+        return self._cached[level]
 
 
 def _estimate_factor_bytes(prepared: PreparedSolver) -> float:
@@ -199,11 +199,11 @@ class AdaptiveImplicitStepper(Stepper):
 class _AdaptiveIntegration:
     """One motion with steps of the levels."""
 
-    def __init__(self, asked: AdaptiveImplicitStepper, tolerance: float, limit: float) -> None:
-        self._asked, self._tolerance, self._limit, self._cpu = asked, tolerance, limit, thread_time()
-        self._ladder = _StepSizeLevels(asked.build_scene, asked.solver, asked.t_end)
-        self._span = asked.t_end / asked.frames
-        self._level = ceil(log2(max(1.0, asked.t_end / self._span)))
+    def __init__(self, stepper: AdaptiveImplicitStepper, tolerance: float, limit: float) -> None:
+        self._stepper, self._tolerance, self._limit, self._cpu = stepper, tolerance, limit, thread_time()
+        self._ladder = _StepSizeLevels(stepper.build_scene, stepper.solver, stepper.t_end)
+        self._span = stepper.t_end / stepper.frames
+        self._level = ceil(log2(max(1.0, stepper.t_end / self._span)))
         scene, _ = self._ladder.prepare_level(self._level)
         method = scene.integrator
         if not isinstance(method, RungeKutta) or not method.embedded_order:
@@ -267,7 +267,7 @@ class _AdaptiveIntegration:
             self._level -= 1
 
     def _tick_time(self, ticks: int) -> float:
-        return self._asked.t_end * (ticks / (1 << _MAX_LEVEL))
+        return self._stepper.t_end * (ticks / (1 << _MAX_LEVEL))
 
     def _build_stop_rule(self, h: float) -> StopRule:
         """Build the stop rule from the share of the error estimate that residuals may cause.
@@ -292,7 +292,7 @@ class _AdaptiveIntegration:
     def _add_frames(self, after: Motion, time: float, h: float) -> None:
         """Add the frames that end within a step."""
         until, reached = self._tick_time(self._ticks), perf_counter() - self._began
-        while len(self._seen) <= self._asked.frames and (len(self._seen) * self._span) <= until * (1.0 + 1e-12):
+        while len(self._seen) <= self._stepper.frames and (len(self._seen) * self._span) <= until * (1.0 + 1e-12):
             part = min(1.0, (len(self._seen) * self._span - time) / h)
             self._seen.append(interpolate_hermite(self._now, after, h, part))
             self._reached.append(reached)

@@ -43,11 +43,11 @@ class ReplayingDeviceSolver(DelegatingSolver):
 
     def __init__(self, prepared: PreparedSolver, counts: Sequence[int]) -> None:
         super().__init__(prepared)
-        self._left, self._told = iter(counts), dict[str, float]()
+        self._left, self._timings = iter(counts), dict[str, float]()
 
     def collect_timings(self) -> dict[str, float | None]:
         """Return the timing columns since the last call: times [s] by events on the device."""
-        found, self._told = self._told, {}
+        found, self._timings = self._timings, {}
         return {**found}
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
@@ -57,7 +57,7 @@ class ReplayingDeviceSolver(DelegatingSolver):
         )
         found, marks = one.replay_iterations(problem, next(self._left))
         for name, value in compute_event_seconds(marks).items():
-            self._told[name] = self._told.get(name, 0.0) + value
+            self._timings[name] = self._timings.get(name, 0.0) + value
         return found
 
 

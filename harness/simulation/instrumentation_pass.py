@@ -73,22 +73,22 @@ def observe_run(
 
     def look(step: SimulationStep, residual: float, balance: EnergyGain) -> None:
         terms = step.problem.evaluate_terms(step.solution.positions)
-        found[step.index] = told = build_solution_columns(scene, step, terms, residual) | (
+        found[step.index] = columns = build_solution_columns(scene, step, terms, residual) | (
             verify_step(step) if verify_step else {}
         )
-        told |= balance.columns
+        columns |= balance.columns
         if positions_out is not None:
             positions_out[step.index - 1] = step.positions
         if sample_frame:
             sample_frame(step.index, step.positions)
         if recorder:
-            drawn = terms, residual, step.num_iterations, collect_forces(step), told["num_intersections"]
+            drawn = terms, residual, step.num_iterations, collect_forces(step), columns["num_intersections"]
             recorder.record_frame(RecordedFrame(step.index, scene.compute_time(step.index), step.positions, *drawn))
 
-    with ThreadPoolExecutor(1) as beside:
+    with ThreadPoolExecutor(1) as executor:
         looked: Future[None] | None = None
         if recorder:
-            looked = beside.submit(
+            looked = executor.submit(
                 recorder.record_frame,
                 RecordedFrame(0, 0.0, build_initial_state(scene).motion.positions, {}, float("nan"), 0),
             )
@@ -99,7 +99,7 @@ def observe_run(
             balance = energy.add_step(step)
             if balance.is_above(BLOW_UP_FACTOR):
                 raise StepError(step.index) from DivergenceError(f"from frame {step.index} on the motion has {balance}")
-            looked = beside.submit(look, step, compute_returned_residual(prepared, step), balance)
+            looked = executor.submit(look, step, compute_returned_residual(prepared, step), balance)
             if recorder and step.index in convergence_frames:
                 norm = EnergyNorm(step.problem.system)
                 # A further round of friction starts where the previous one ended; only the first one is drawn.

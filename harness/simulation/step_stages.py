@@ -54,7 +54,7 @@ class StageSequence:
         method = scene.integrator
         assert isinstance(method, StagedIntegrator)
         self.scene, self.time, pins = scene, time, scene.system.pins
-        self._exact, self._held = pins.exact_mask, pins.vertices[pins.exact_mask]
+        self._exact, self._pinned = pins.exact_mask, pins.vertices[pins.exact_mask]
         self.now = self._apply_pins(now, time)
         if acceleration is None and method.needs_start_acceleration:
             acceleration = self._compute_acceleration()
@@ -100,15 +100,15 @@ class StageSequence:
         """
         scene, system = self.scene, self.scene.system
         until = self.time + stage.stage_fraction * system.time_step
-        held, moving = scene.pin_targets_at(until), scene.pin_velocities_at(until)
-        stage.velocity_origin[self._held] = held[self._exact] - moving[self._exact] / system.velocity_rate
+        pin_targets, moving = scene.pin_targets_at(until), scene.pin_velocities_at(until)
+        stage.velocity_origin[self._pinned] = pin_targets[self._exact] - moving[self._exact] / system.velocity_rate
         if expected is None:
             expected = stage.inertial_target.copy()
             if stage.predicted_acceleration is not None:
                 expected += (system.time_step**2 / system.inertia_factor) * stage.predicted_acceleration
-            expected[system.pins.vertices] = held
+            expected[system.pins.vertices] = pin_targets
         current = self.now.positions.copy()
-        current[system.pins.vertices] = held
+        current[system.pins.vertices] = pin_targets
         begun = StepStart(
             *(self.now.positions, self.now.velocity, self.time, stage.velocity_origin, system.velocity_rate, until),
             lag_override=expected,
@@ -118,12 +118,12 @@ class StageSequence:
         force = reduce(
             lambda total, effect: total + effect(expected, v, until), scene.varying_forces, scene.constant_force
         )
-        return StepProblem(system, stage.inertial_target, force, held, current, current, begun)
+        return StepProblem(system, stage.inertial_target, force, pin_targets, current, current, begun)
 
     def _finish_stage(self, step_problem: StepProblem, solution: Solution) -> StageSolution:
         system, x = self.scene.system, solution.positions
         acceleration = (system.inertia_factor / system.time_step**2) * (x - step_problem.inertial_target)
-        acceleration[self._held] = 0.0
+        acceleration[self._pinned] = 0.0
         return StageSolution(x, step_problem.step_start.velocity_at(x), acceleration)
 
     def _finish_step(self, end: StepEnd) -> StepEnd:
@@ -131,11 +131,11 @@ class StageSequence:
         return end._replace(motion=self._apply_pins(end.motion, self.time + self.scene.system.time_step))
 
     def _apply_pins(self, motion: Motion, time: float) -> Motion:
-        if not len(self._held):
+        if not len(self._pinned):
             return motion
         p, v = (part.copy() for part in motion)
-        p[self._held] = self.scene.pin_targets_at(time)[self._exact]
-        v[self._held] = self.scene.pin_velocities_at(time)[self._exact]
+        p[self._pinned] = self.scene.pin_targets_at(time)[self._exact]
+        v[self._pinned] = self.scene.pin_velocities_at(time)[self._exact]
         return Motion(p, v)
 
     def _compute_acceleration(self) -> Positions:
@@ -146,8 +146,8 @@ class StageSequence:
         force = reduce(
             lambda total, effect: total + effect(p, v, self.time), self.scene.varying_forces, self.scene.constant_force
         )
-        held = self.scene.pin_targets_at(self.time)
-        pull = StepProblem(system, p, force, held, p, p, begun).gradient(p)
+        pin_targets = self.scene.pin_targets_at(self.time)
+        pull = StepProblem(system, p, force, pin_targets, p, p, begun).gradient(p)
         mass = system.mass[:, None]
         return np.divide(pull, -mass, out=np.zeros_like(p), where=mass > 0.0)
 

@@ -96,20 +96,20 @@ class PhaseWatch:
 
     def build_columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
         """Build the check columns of the rows with given times; raises ClockMismatch."""
-        told = sum(seconds)
+        total = sum(seconds)
         if (
             not -self.max_difference
-            <= self.wall_seconds - told
+            <= self.wall_seconds - total
             <= self.max_difference + PREEMPTED_FACTOR * self.preempted_seconds
         ):  # so that NaN fails too
             raise ClockMismatch(
-                f"the times of {what} add up to {told:.6g} s, where another clock saw {self.wall_seconds:.6g} s go by, "
+                f"the times of {what} add up to {total:.6g} s, where another clock measured {self.wall_seconds:.6g} s, "
                 f"{self.preempted_seconds:.3g} s of them without computing: one "
                 "of the two does not measure what it says"
             )
         return {
             "wall_seconds_check": self.wall_seconds,
-            "wall_seconds_sum": told,
+            "wall_seconds_sum": total,
             "cpu_seconds": self.process_seconds,
             "preempted": self.preempted_seconds > max(CLOCK_RTOL * self.wall_seconds, CLOCK_ATOL_SECONDS),
         }

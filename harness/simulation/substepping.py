@@ -110,8 +110,8 @@ class AdaptiveSubstepper(Stepper):
         scene, ready, pieces = self._prepare_pieces(setting)
         state, began = build_initial_state(scene), perf_counter()
         reached = list[float]()
-        seen, h, told = [state.motion], None, np.zeros((self.frames * pieces, 3))
-        for k in range(len(told)):
+        seen, h, step_stats = [state.motion], None, np.zeros((self.frames * pieces, 3))
+        for k in range(len(step_stats)):
             stated = build_problem(scene, state, "previous")
             try:
                 p, v, each = ready.step(stated, h)
@@ -119,16 +119,16 @@ class AdaptiveSubstepper(Stepper):
                 raise StepSizeUnderflow(
                     f"frame {k // pieces + 1}, after {scene.compute_time(k):.6g} s: {error}"
                 ) from error
-            told[k] = each[:3]
-            h, state = float(told[k, 2]), MotionState(Motion(p, v), None, k + 1)
+            step_stats[k] = each[:3]
+            h, state = float(step_stats[k, 2]), MotionState(Motion(p, v), None, k + 1)
             if (k + 1) % pieces == 0:
                 seen.append(state.motion)
                 reached.append(perf_counter() - began)
             if thread_time() - cpu > cpu_limit:
                 raise TimeBudgetExceeded
-        accepted, rejected = (int(count) for count in told[:, :2].sum(axis=0))
+        accepted, rejected = (int(count) for count in step_stats[:, :2].sum(axis=0))
         evaluations = (accepted + rejected) * ready.num_evaluations
-        mean = scene.system.time_step * len(told) / accepted
+        mean = scene.system.time_step * len(step_stats) / accepted
         counts = accepted, rejected, (accepted + rejected) * ready.num_factorisations, evaluations
         return Trajectory(
             *stack_motions(seen), *counts, (mean, mean), reached[-1], share_frame_seconds(reached), thread_time() - cpu

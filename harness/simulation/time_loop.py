@@ -140,13 +140,13 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
         a = method.extrapolation_fraction
         p, v = (x + a * (x - y) for x, y in zip(now, before, strict=True)) if a and state.previous_motion else now
         force = reduce(lambda total, effect: total + effect(p, v, time + a * dt), scene.varying_forces, force)
-    held = scene.pin_targets_at(time + dt)
+    pin_targets = scene.pin_targets_at(time + dt)
     if method.stage_fraction < 1.0:
-        held = now.positions[system.pins.vertices] + method.stage_fraction * (
-            held - now.positions[system.pins.vertices]
+        pin_targets = now.positions[system.pins.vertices] + method.stage_fraction * (
+            pin_targets - now.positions[system.pins.vertices]
         )
-    current = _place_pins(system, now.positions, held)
-    stated = StepProblem(system, target, force, held, current, current, begun)
+    current = _place_pins(system, now.positions, pin_targets)
+    stated = StepProblem(system, target, force, pin_targets, current, current, begun)
     guessed = (
         _guess_coarse_to_fine(scene, state, stated)
         if initial_guess == COARSE_TO_FINE

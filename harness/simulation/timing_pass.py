@@ -165,8 +165,8 @@ def measure_run(
         clock, found = Stopwatch(watch("step", round)), list[TimingSample]()
         replayed = remote.again() if remote else None
         for step in iterate_steps(scene, replayed or prepared, settings, clock):
-            told = replayed.collect_timings() if replayed else {}
-            found.append(TimingSample("step", step.index, round, clock.seconds, device_columns=told))
+            device_timings = replayed.collect_timings() if replayed else {}
+            found.append(TimingSample("step", step.index, round, clock.seconds, device_columns=device_timings))
             final = step.positions
             tick("timed pass")
         state = remote.usual.device_state() if remote else {}

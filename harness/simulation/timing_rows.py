@@ -22,7 +22,7 @@ def build_timing_rows(measured: RunMeasurement) -> list[dict[str, Any]]:
         groups[timing.phase, measured.get_round(timing)].append(timing)
     adds_up, found = _check_phase_sums(measured.timings), list[dict[str, Any]]()
     for (phase, _), timings in groups.items():
-        told: list[dict[str, Any]] = [
+        rows: list[dict[str, Any]] = [
             {
                 "phase": phase,
                 "frame": t.frame,
@@ -34,8 +34,8 @@ def build_timing_rows(measured: RunMeasurement) -> list[dict[str, Any]]:
             for t in timings
         ]
         watch = measured.watches[phase, measured.get_round(timings[0])]
-        seen = watch.build_columns(phase, (row["seconds"] * t.num_calls for row, t in zip(told, timings, strict=True)))
-        found += [row | seen for row in told]
+        seen = watch.build_columns(phase, (row["seconds"] * t.num_calls for row, t in zip(rows, timings, strict=True)))
+        found += [row | seen for row in rows]
     return found
 
 

@@ -99,8 +99,8 @@ def _push_out(problem: StepProblem, energies: Sequence[BarrierEnergy], p: Positi
         places = np.full((len(blocks.vertices), k * k), -1)
         places[:, :: k + 1] = blocks.vertices
         blocks.add_blocks(places, curvature)
-    held = np.maximum(system.inertia_diagonal, 1e-9 * float(curvature.max(initial=0.0)) or 1.0)
-    curvature += held[:, None, None] * np.eye(3)
+    diagonal = np.maximum(system.inertia_diagonal, 1e-9 * float(curvature.max(initial=0.0)) or 1.0)
+    curvature += diagonal[:, None, None] * np.eye(3)
     way = np.asarray(-0.5 * np.linalg.solve(curvature, gradient[:, :, None])[:, :, 0], np.float64)
     way[system.pins.vertices[system.pins.exact_mask]] = 0.0
     return p + max_step_size(energies, p, way) * way

@@ -105,18 +105,18 @@ _NVML_QUERIES: dict[str, Callable[[Any, Any], float]] = {
 def read_device_state() -> dict[str, float | None]:
     """Return the current clocks, power and temperature; None if unavailable, as in the simulator."""
     found: dict[str, float | None] = dict.fromkeys(_NVML_QUERIES)
-    with _open_nvml() as nvml, suppress(Exception):  # the library, its driver or the right to ask may be missing
+    with _open_nvml() as nvml, suppress(Exception):  # the library, its driver or the permission may be missing
         handle = _nvml_handle(nvml, import_module("numba.cuda").get_current_device())
         for name, ask in _NVML_QUERIES.items():
-            with suppress(Exception):  # not every device tells everything
+            with suppress(Exception):  # not every device reports all values
                 found[name] = float(ask(nvml, handle))
     return found
 
 
 def _driver_version() -> dict[str, str]:
     with _open_nvml() as nvml, suppress(Exception):
-        told = nvml.nvmlSystemGetDriverVersion()
-        return {"device_driver": told.decode() if isinstance(told, bytes) else str(told)}
+        driver_version = nvml.nvmlSystemGetDriverVersion()
+        return {"device_driver": driver_version.decode() if isinstance(driver_version, bytes) else str(driver_version)}
     return {}
 
 

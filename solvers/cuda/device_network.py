@@ -48,9 +48,9 @@ class EdgeEntries(NamedTuple):
     @classmethod
     def from_ends(cls, ends: IndexArray, rows: int) -> EdgeEntries:
         """Build the entries of edges between rows (m, 2), for the first `rows` rows, without self-loops."""
-        kept = np.flatnonzero(ends[:, 0] != ends[:, 1])
-        here, there = ends[kept].T.ravel(), ends[kept, ::-1].T.ravel()
-        edge = np.concatenate([kept, ~kept])
+        proper = np.flatnonzero(ends[:, 0] != ends[:, 1])
+        here, there = ends[proper].T.ravel(), ends[proper, ::-1].T.ravel()
+        edge = np.concatenate([proper, ~proper])
         order = np.argsort(here, kind="stable")
         order = order[: np.searchsorted(here[order], rows)]
         here, there, edge = here[order], there[order], edge[order]

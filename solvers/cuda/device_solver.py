@@ -80,7 +80,7 @@ class DeviceSolverState(SolverState):
         return out
 
     @property
-    def positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] a copy, when asked for
+    def positions(self) -> Positions:  # pyright: ignore[reportIncompatibleVariableOverride] copied on access
         """A copy of the current positions (n, 3) [m], with the velocity; reused until the next iteration."""
         if self._positions_copy is None:
             with cuda_device.guard_device_errors():

@@ -190,16 +190,16 @@ def build_spring_kernels(real: Any) -> SpringKernels:
                 out[i, c] = x[i, c] + float64(u[i, c])
 
     @cuda.jit
-    def linearise(own, start, neighbour, kind, weights, spring, direction, arrows, nobody, far, given, x, force):
+    def linearise(own, start, neighbour, kind, weights, spring, direction, arrows, padding_row, far, given, x, force):
         """Write the spring vectors of the reference and the negative gradient there, in float64 (3, lanes) [N]."""
         t = cuda.grid(1)
-        if t >= len(own) or own[t] == nobody:
+        if t >= len(own) or own[t] == padding_row:
             return
         i, b, lane = own[t], t // LANES, t % LANES
-        held, x0, x1, x2 = given.anchor_stiffness[i], x[i, 0], x[i, 1], x[i, 2]
-        f0 = held * (given.anchor_positions[i, 0] - x0) + given.external_force[i, 0]
-        f1 = held * (given.anchor_positions[i, 1] - x1) + given.external_force[i, 1]
-        f2 = held * (given.anchor_positions[i, 2] - x2) + given.external_force[i, 2]
+        anchor_stiffness, x0, x1, x2 = given.anchor_stiffness[i], x[i, 0], x[i, 1], x[i, 2]
+        f0 = anchor_stiffness * (given.anchor_positions[i, 0] - x0) + given.external_force[i, 0]
+        f1 = anchor_stiffness * (given.anchor_positions[i, 1] - x1) + given.external_force[i, 1]
+        f2 = anchor_stiffness * (given.anchor_positions[i, 2] - x2) + given.external_force[i, 2]
         for entry in range(start[b], start[b + 1]):
             e = LANES * entry + lane
             j = neighbour[e]

@@ -88,7 +88,7 @@ def build_schwarz_kernels(real: RealType, patch: int) -> SchwarzKernels:
     def invert(level, stiff, nodes, inverses):
         """Write the inverses of a level's subdomains, packed by rows; blocks of threads loop over subdomains."""
         a = cuda.shared.array(half, np.float64)
-        column = cuda.shared.array(rows, np.float64)  # by its line the simulator tells it from another
+        column = cuda.shared.array(rows, np.float64)  # the simulator identifies shared arrays by their line
         b = cuda.blockIdx.x
         while b < inverses.shape[0]:
             begin = patch * b

@@ -191,10 +191,10 @@ class ExternalEngine(ABC):
             Unsupported: for features that the engine does not support, and if it is not installed.
         """
         network = EngineNetwork.from_system(system, self.solver_name, supports_damping=self.supports_damping)
-        stepping, told = self.build_stepper(network, self.engine_package.import_library(self.solver_name))
+        stepping, description = self.build_stepper(network, self.engine_package.import_library(self.solver_name))
         soft = int((~system.pins.exact_mask).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
-        return PreparedEngine(system, stepping, f"{self.engine_package.name_and_version}, {told}{taken}")
+        return PreparedEngine(system, stepping, f"{self.engine_package.name_and_version}, {description}{taken}")
 
     @abstractmethod
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[EngineStepper, str]:

@@ -163,7 +163,7 @@ def build_mjcf(network: EngineNetwork, integrator: str, problem: StepProblem | N
         if problem is None
         else problem.step_start.positions[net.pinned_vertices]
     )
-    held = "".join(
+    weld_elements = "".join(
         f'<body mocap="true" pos="{_format_numbers(x)}"><site name="{i}"/></body>\n'
         for i, x in zip(net.pinned_vertices.tolist(), at, strict=True)
     )
@@ -178,7 +178,7 @@ def build_mjcf(network: EngineNetwork, integrator: str, problem: StepProblem | N
         key = f'<keyframe><key qpos="{_format_numbers(p)}" qvel="{_format_numbers(v)}"/></keyframe>\n'
     return (
         f'<mujoco>\n<option {option}><flag autoreset="disable" constraint="disable" contact="disable"/></option>\n'
-        f"<worldbody>\n{moving}{held}</worldbody>\n<tendon>\n{tendons}</tendon>\n{key}</mujoco>\n"
+        f"<worldbody>\n{moving}{weld_elements}</worldbody>\n<tendon>\n{tendons}</tendon>\n{key}</mujoco>\n"
     )
 
 

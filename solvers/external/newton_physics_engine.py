@@ -89,9 +89,9 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
 
     def prepare(self, system: System) -> PreparedEngine:
         """Prepare the engine for a system; raise Unsupported for unsupported features."""
-        with suppress(ImportError):  # which is told where Newton is asked for
+        with suppress(ImportError):  # reported where Newton is prepared
             warp = import_module("warp")
-            warp.config.log_level = warp.LOG_ERROR  # it tells of devices and of each module that it compiles
+            warp.config.log_level = warp.LOG_ERROR  # otherwise it logs devices and each compiled module
         return super().prepare(system)
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_NewtonPhysicsStepper, str]:
@@ -110,16 +110,16 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
         ):
             builder.add_spring(i, j, k, 0.0, control=0.0)
         builder.spring_rest_length = network.spring_dashpots.rest_length.tolist()
-        told = "explicit"
+        description = "explicit"
         if self.method != "semi-implicit":
-            told = f"{self.iterations} iterations a substep"
+            description = f"{self.iterations} iterations a substep"
         if self.method == "vbd":
-            told += f", {self._set_colouring(builder, network)} colours"
+            description += f", {self._set_colouring(builder, network)} colours"
         model = builder.finalize(device=self.device)
         solver, explicit = self._build_solver(library.solvers, model), self.method == "semi-implicit"
         made = _NewtonPhysicsStepper(warp, model, solver, network, explicit=explicit)
         where = f"the device {model.device.name}" if self.device == "cuda" else "the CPU, on one thread"
-        return made, f"{self.method}, {told}, in float32 on {where}"
+        return made, f"{self.method}, {description}, in float32 on {where}"
 
     def _set_colouring(self, builder: Any, network: EngineNetwork) -> int:
         """Set the colours; return their number."""

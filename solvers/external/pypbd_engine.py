@@ -168,7 +168,7 @@ class _PyPbdStepper:
                     particles.setPosition(i, x)
                 self._run_substeps(h, 1)
         p = self._read_positions()
-        v = (1.0 / h) * (p - before)  # as it has them itself, to the last bit; to ask for them takes a call a vertex
+        v = (1.0 / h) * (p - before)  # bitwise as pyPBD stores them; reading them takes a call per vertex
         v[net.pinned_vertices] = 0.0
         self._velocity = v.copy()
         p[net.pinned_vertices], v[net.pinned_vertices] = end, (end - begin) / net.time_step

@@ -87,12 +87,12 @@ class KernelCache(_NUMBA_CACHE):
         key = (sig, target_context.codegen().magic_tuple(), self._fixed_key)
         path = self._entry_path(key)
         try:
-            there, kept = pickle.loads(path.read_bytes())
+            there, compiled = pickle.loads(path.read_bytes())
         except Exception:  # nothing is there, or what is there cannot be read: it is compiled and written anew
             return None
         with suppress(OSError):
             os.utime(path.parent)
-        return rebuild_result(target_context, kept) if there == key else None
+        return rebuild_result(target_context, compiled) if there == key else None
 
     def save_overload(self, sig: Any, data: CompileResult) -> None:
         """Store the code compiled for a signature, if it is cacheable and the disk has space."""

@@ -34,6 +34,6 @@ jit_inner_options: Any = {**_bare_options, **_linked_options}
 jit_kernel: Any = cached_njit(**_bare_options, no_cfunc_wrapper=True)
 jit_inner: Any = cached_njit(**jit_inner_options)
 jit_inner_allocating: Any = cached_njit(**_linked_options)  # an inner one that makes arrays
-jit_closure: Any = njit(**jit_inner_options)  # has no name on disk; kept within what calls it
+jit_closure: Any = njit(**jit_inner_options)  # not cached by itself, but within its caller
 jit_inlined_closure: Any = njit(**jit_inner_options, forceinline=True)  # for what takes more arrays than it has work
 jit_inner_parallel: Any = cached_njit(**_bare_options, **_no_wrapper_options, parallel=True)

@@ -74,10 +74,10 @@ _FIRST_STAMPS: dict[str, FileStamp] = {
 
 def digest_sources(sources: Iterable[str | Path]) -> str:
     """Return the SHA-256 digest, in hexadecimal digits, of all sources that these depend on."""
-    told = hashlib.sha256()
+    digest = hashlib.sha256()
     for name, path in _sorted_dependencies(frozenset(os.path.abspath(source) for source in sources)):
-        told.update(f"{name}\0".encode() + _content_digest(path))
-    return told.hexdigest()
+        digest.update(f"{name}\0".encode() + _content_digest(path))
+    return digest.hexdigest()
 
 
 @cache
@@ -100,10 +100,10 @@ def find_dependencies(source: str) -> frozenset[str]:
 
 def digest_package(package: str) -> str:
     """Return the SHA-256 digest, in hexadecimal digits, of all sources of a package in PACKAGE_NAMES."""
-    start, told = f"{PROJECT_ROOT / package}{os.sep}", hashlib.sha256()
+    start, digest = f"{PROJECT_ROOT / package}{os.sep}", hashlib.sha256()
     for path in sorted(path for path in _FIRST_STAMPS if path.startswith(start)):
-        told.update(f"{_portable_name(path)}\0".encode() + _content_digest(path))
-    return told.hexdigest()
+        digest.update(f"{_portable_name(path)}\0".encode() + _content_digest(path))
+    return digest.hexdigest()
 
 
 @cache
@@ -145,12 +145,12 @@ def _content_digest(path: str) -> bytes:
     """Return the digest of a source; it is unique to this process if the file has changed since the first read."""
     try:
         first = _FIRST_STAMPS.get(path) or _FIRST_STAMPS.setdefault(path, _stamp_file(path))
-        held = _file_digest(path)
+        file_digest = _file_digest(path)
         if _stamp_file(path) == first:
-            return held
+            return file_digest
     except OSError:  # it was removed
-        held = b""
-    return hashlib.sha256(_PROCESS_SALT + held).digest()
+        file_digest = b""
+    return hashlib.sha256(_PROCESS_SALT + file_digest).digest()
 
 
 @cache

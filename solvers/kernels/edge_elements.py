@@ -53,14 +53,14 @@ class EdgeElements(NamedTuple):
         rows: int,
     ) -> EdgeElements:
         """Build edges between vertices (m, 2) in rows `row` (n,)."""
-        kept = np.flatnonzero(ends[:, 0] != ends[:, 1])
-        here, there = row[ends[kept]].T.ravel(), row[ends[kept, ::-1]].T.ravel()
+        proper = np.flatnonzero(ends[:, 0] != ends[:, 1])
+        here, there = row[ends[proper]].T.ravel(), row[ends[proper, ::-1]].T.ravel()
         order = np.argsort(here, kind="stable")
         return cls(
             row[ends].astype(np.int64),
             np.concatenate([[0], np.cumsum(np.bincount(here, minlength=rows))]),
             there[order],
-            np.concatenate([kept, ~kept])[order],
+            np.concatenate([proper, ~proper])[order],
             stiffness,
             low,
             high,

@@ -30,11 +30,11 @@ class QuadraticForm(NamedTuple):
     def from_matrix(cls, L: csr_array) -> QuadraticForm:
         """Build the form of a symmetric matrix [N/m], (n, n)."""
         above = coo_array(triu(L, 1))
-        held, size = L.sum(axis=1), abs(L).sum(axis=1)
+        row_sums, size = L.sum(axis=1), abs(L).sum(axis=1)
         return cls(
             np.column_stack(above.coords).astype(np.int64),
             -np.asarray(above.data, np.float64),
-            np.where(abs(held) <= _ROW_SUM_ROUNDOFF * size, 0.0, held),
+            np.where(abs(row_sums) <= _ROW_SUM_ROUNDOFF * size, 0.0, row_sums),
         )
 
     @classmethod

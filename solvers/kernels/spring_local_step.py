@@ -27,8 +27,8 @@ SORT_WINDOW = 128
 class SpringPackets(NamedTuple):
     """Springs by their ends, in b packets of eight vertices.
 
-    A packet has as many entries as its vertex of largest degree, at least two. Padding lanes are vertex `nobody`, and
-    padding springs have zero stiffness and end at row `far`.
+    A packet has as many entries as its vertex of largest degree, at least two. Padding lanes are vertex
+    `padding_row`, and padding springs have zero stiffness and end at row `far`.
 
     Attributes:
         row_offset: offset of each lane's vertex (8 b,), four times its row.
@@ -50,7 +50,7 @@ class SpringPackets(NamedTuple):
 
     @classmethod
     def from_springs(
-        cls, springs: Springs, row: NDArray[np.int64], part: NDArray[np.int64], parts: int, nobody: int, far: int
+        cls, springs: Springs, row: NDArray[np.int64], part: NDArray[np.int64], parts: int, padding_row: int, far: int
     ) -> tuple[SpringPackets, NDArray[np.int64]]:
         """Build the packets of springs, and the first packet of each part of the rows (parts + 1,).
 
@@ -61,7 +61,7 @@ class SpringPackets(NamedTuple):
             row: row of each vertex (n,).
             part: part of each vertex (n,), ascending with its row; -1 for a vertex that does not move.
             parts: number of parts.
-            nobody: row of padding lanes.
+            padding_row: row of padding lanes.
             far: row of the ends of padding springs.
         """
         keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
@@ -75,7 +75,7 @@ class SpringPackets(NamedTuple):
         first = np.concatenate([[0], np.cumsum(-(-count // LANES))])
         place = np.full(len(row), -1)
         place[vertices] = LANES * first[part[vertices]] + rank
-        own = np.full(LANES * first[-1], nobody, np.int32)
+        own = np.full(LANES * first[-1], padding_row, np.int32)
         own[place[vertices]] = row[vertices]
 
         at = np.zeros(len(own), np.int64)
@@ -150,9 +150,9 @@ def deduplicate_packets(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32
     _, first, kind = np.unique(rows.view(np.uint64) @ mixing, return_index=True, return_inverse=True)
     if not np.array_equal(rows[first[kind]], rows):  # two kinds were mixed to one number
         first = kind = np.arange(len(rows))
-    kept = allocate_aligned(rows[first].size)
-    kept[:] = rows[first].ravel()
-    return (rows.shape[1] * kind).astype(np.int32), kept
+    unique_weights = allocate_aligned(rows[first].size)
+    unique_weights[:] = rows[first].ravel()
+    return (rows.shape[1] * kind).astype(np.int32), unique_weights
 
 
 @jit_inner

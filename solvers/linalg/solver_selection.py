@@ -204,15 +204,17 @@ def estimate_supernodal_cost(s: SymbolicFactor, precision: Precision = "float64"
     squares, entered = count_stored_entries(s)
     half = 2 if precision == "float16" else 4
     panels = 8 * (squares + entered)
-    kept = panels if precision == "float64" else 4 * squares + half * entered
+    factor_bytes = panels if precision == "float64" else 4 * squares + half * entered
     fronts, flops = _count_factorisation_work(s.parent, s.first_slot, s.row_start, s.postorder)
     memory = (
         panels
         + max(8 * fronts, _ROUNDED_COPY_MEMORY[precision] * panels)
         + _SYMBOLIC_BYTES_PER_VERTEX * len(s.slot_of_vertex)
     )
-    words = f"its factor has {s.nonzeros:,} entries, {format_bytes(kept)} in {precision}, after {flops:.1e} flops"
-    return CostEstimate(memory, 2 * kept + _BYTES_PER_FLOP * flops / _AMORTISED_SOLVES, words)
+    words = (
+        f"its factor has {s.nonzeros:,} entries, {format_bytes(factor_bytes)} in {precision}, after {flops:.1e} flops"
+    )
+    return CostEstimate(memory, 2 * factor_bytes + _BYTES_PER_FLOP * flops / _AMORTISED_SOLVES, words)
 
 
 def _estimate_inverse_cost(n: int) -> CostEstimate:

@@ -118,5 +118,5 @@ def max_step_size(energies: Iterable[Energy], p: Positions, direction: Positions
 
 def without_barriers(system: System) -> System:
     """Return the system without barrier energies; the system itself if it has none."""
-    kept = tuple(energy for energy in system.energies if not is_barrier_energy(energy))
-    return system if len(kept) == len(system.energies) else replace(system, energies=kept)
+    remaining = tuple(energy for energy in system.energies if not is_barrier_energy(energy))
+    return system if len(remaining) == len(system.energies) else replace(system, energies=remaining)

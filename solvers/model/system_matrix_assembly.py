@@ -123,9 +123,9 @@ def assemble_system_matrix(system: System, energies: Iterable[ProjectiveEnergy])
     """
     n = system.num_vertices
     _, vertices, weight = system.penalty_pins
-    held = system.inertia_diagonal + np.bincount(vertices, weight, minlength=n)
+    diagonal = system.inertia_diagonal + np.bincount(vertices, weight, minlength=n)
     Q = drop_zeros(
-        reduce(lambda total, share: total + share, stiffness_shares(system, energies), diagonal_matrix(held))
+        reduce(lambda total, share: total + share, stiffness_shares(system, energies), diagonal_matrix(diagonal))
     )
     require_determined_positions(system, Q)
     return Q

@@ -32,10 +32,10 @@ def _dot_products_code(*pairs: tuple[int, int]) -> Callable[..., Any]:
         whole = builder.and_(count, I64(-_NUM_ACCUMULATORS * LANES))
 
         def read(array: Any, place: Any, lanes: int) -> Any:
-            kept = array.type.pointee
-            narrow, wide = (ir.VectorType(kept, lanes), PACKET_TYPE) if lanes > 1 else (kept, F64)
+            element_type = array.type.pointee
+            narrow, wide = (ir.VectorType(element_type, lanes), PACKET_TYPE) if lanes > 1 else (element_type, F64)
             term = v.load(builder.gep(array, [place]), narrow)
-            return term if kept == F64 else builder.fpext(term, wide)
+            return term if element_type == F64 else builder.fpext(term, wide)
 
         def add(place: Any, lanes: int, sums: list[Any]) -> None:
             terms = [read(array, place, lanes) for array in arrays]

@@ -147,8 +147,8 @@ def _panel_product_code(
         panel, index = builder.gep(panel, [offset]), builder.gep(index, [at])
         x, y = (builder.gep(rows, [builder.mul(first, I64(4))]) for rows, first in ((x, x_row), (y, y_row)))
         columns = [t.load_lanes(builder.gep(x, [I64(4 * j)])) for j in range(4 * m)]
-        held = [t.join_vectors(columns[j : j + t.lanes_per_vector]) for j in range(0, 4 * m, t.lanes_per_vector)]
-        factors = [[t.repeat_entry(vector, c) for c in range(numbers)] for vector in held]
+        vectors = [t.join_vectors(columns[j : j + t.lanes_per_vector]) for j in range(0, 4 * m, t.lanes_per_vector)]
+        factors = [[t.repeat_entry(vector, c) for c in range(numbers)] for vector in vectors]
         with cgutils.for_range(builder, builder.lshr(count, I64(2))) as loop:
             first = builder.mul(loop.index, I64(4))
             tile = builder.gep(panel, [builder.mul(loop.index, I64(t.entries_per_tile))])

@@ -52,8 +52,8 @@ def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any
         *total, energy = [builder.load(accumulator) for accumulator in sums]
         short = v.has_short_spring(shortest)
         with builder.if_then(builder.not_(short), likely=True):
-            *constants, held = v.load_right_hand_side(right, number)
-            away = [v.subtract_product(a, held, b) for a, b in zip(constants, centre, strict=True)]
+            *constants, anchor_stiffness = v.load_right_hand_side(right, number)
+            away = [v.subtract_product(a, anchor_stiffness, b) for a, b in zip(constants, centre, strict=True)]
             half = v.load(builder.gep(shares.inverse_anchor, [builder.mul(number, I64(LANES))]), PACKET_TYPE)
             builder.store(v.multiply_add(half, v.squared_norm(away), energy), sums[3])
             total = [builder.fadd(a, b) for a, b in zip(total, away, strict=True)]

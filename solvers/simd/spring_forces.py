@@ -36,10 +36,10 @@ def _spring_force_code(subtract_position: bool) -> Callable[..., Any]:
             v.prefetch_ahead(springs, places, right, out)
             sums, short = _sum_spring_forces(v, springs, x, centre, subtract_position)
             with builder.if_then(builder.not_(short), likely=True):
-                *constants, held = v.load_right_hand_side(right, number)
+                *constants, anchor_stiffness = v.load_right_hand_side(right, number)
                 total = [builder.fadd(a, b) for a, b in zip(sums, constants, strict=True)]
                 if subtract_position:
-                    total = [v.subtract_product(a, held, b) for a, b in zip(total, centre, strict=True)]
+                    total = [v.subtract_product(a, anchor_stiffness, b) for a, b in zip(total, centre, strict=True)]
                 places = v.load_row_offsets(springs.row_offset, number)  # again: they would not stay in registers
                 for place, row in zip(places, v.transpose_to_rows(total, out.type.pointee), strict=True):
                     v.add_row(builder.gep(out, [place]), row)
@@ -96,9 +96,9 @@ def _spring_norm_code(typingctx: Any, bundles: Any, number: Any, x: Any, measure
             v.add_products(values[:1], values[1:], [total])
 
         v.pipeline_entries(springs.first_entry, springs.end_entry, read, add)
-        held = v.load(builder.gep(measure, [builder.mul(number, I64(LANES))]), PACKET_TYPE)
+        diagonal = v.load(builder.gep(measure, [builder.mul(number, I64(LANES))]), PACKET_TYPE)
         return v.sum_lanes(
-            v.multiply_add(v.squared_norm(centre), held, builder.fmul(constant_packet(0.5), builder.load(total)))
+            v.multiply_add(v.squared_norm(centre), diagonal, builder.fmul(constant_packet(0.5), builder.load(total)))
         )
 
     return types.float64(bundles, number, x, measure), generate

@@ -73,8 +73,8 @@ def _build_vertex_model(
         tiny = builder.fcmp_ordered("<=", squared, constant_packet(MIN_SQUARED_LENGTH))
         builder.store(builder.or_(builder.load(short), tiny), short)
         root = v.inverse_sqrt(v.clamp_squared_length(squared))
-        kept = _scratch_pointers(builder, springs, near, entry)
-        for value, pointer in zip([*arrow, builder.fmul(squared, root)], kept, strict=True):
+        scratch = _scratch_pointers(builder, springs, near, entry)
+        for value, pointer in zip([*arrow, builder.fmul(squared, root)], scratch, strict=True):
             v.store(value, pointer)
         pull, k = v.load_packets(springs.weights, springs.weight_offset, entry)
         inward = builder.fmul(pull, root)
@@ -178,8 +178,8 @@ def _model_step_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: A
         v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
         _, _, load, weight = _load_vertices(v, springs, number, x, right)
         at = [builder.gep(sums, [I64(LANES * k)]) for k in range(9)]
-        told = [v.load(pointer, PACKET_TYPE) for pointer in at]
-        d, definite = _solve_newton_system(v, told[3:], [builder.fsub(_ZERO, component) for component in told[:3]])
+        loaded = [v.load(pointer, PACKET_TYPE) for pointer in at]
+        d, definite = _solve_newton_system(v, loaded[3:], [builder.fsub(_ZERO, component) for component in loaded[:3]])
         rise = builder.select(
             definite, _energy_change(v, springs, near, load, weight, d), constant_packet(float("inf"))
         )

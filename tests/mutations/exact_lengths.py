@@ -20,7 +20,13 @@ EXACT_LENGTHS = (
         "return np.ones(len(trial), np.int64)",
         (_TESTS,),
     ),
-    Mutation("multipliers-halved", _MULTIPLIERS, "tension[held] = found", "tension[held] = 0.5 * found", (_TESTS,)),
+    Mutation(
+        "multipliers-halved",
+        _MULTIPLIERS,
+        "tension[active_indices] = found",
+        "tension[active_indices] = 0.5 * found",
+        (_TESTS,),
+    ),
     Mutation(
         "multipliers-of-lengths-unmended",
         _MULTIPLIERS,

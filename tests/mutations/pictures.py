@@ -15,8 +15,8 @@ PICTURES = (
     Mutation(
         "odd-frames-late",
         "harness/recording/rerun_recorder.py",
-        "self._held.append((frame.index, p,",
-        "self._held.append((frame.index, self._held[-1][1] if self._held and frame.index % 2 else p,",
+        "self._buffered.append((frame.index, p,",
+        "self._buffered.append((frame.index, self._buffered[-1][1] if self._buffered and frame.index % 2 else p,",
         (_RECORDINGS,),
         ("sparse", "other positions"),
     ),

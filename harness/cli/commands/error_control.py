@@ -115,12 +115,12 @@ def _execute_error_control(
     rerun: bool,
     print_message: PrintMessage,
 ) -> bool:
-    asked = ErrorTarget.from_scene(scene, size, t_end, print_message)
+    error_target = ErrorTarget.from_scene(scene, size, t_end, print_message)
     folder = claim_folder(results / config.stem, config)
     with machine_info.limit_threads(1):
-        seen = compute_predictability_horizon(asked, error, print_message)
-        before = read_stored_trials(folder / "accuracy", asked)
-        answer = _search_method(asked, error, seen, [] if rerun else before, print_message)
+        seen = compute_predictability_horizon(error_target, error, print_message)
+        before = read_stored_trials(folder / "accuracy", error_target)
+        answer = _search_method(error_target, error, seen, [] if rerun else before, print_message)
     path, best = answer.best_trial.trajectory, answer.best_trial
     print_message(f"asked {error:g}, estimated {best.error_estimated:.1g}, {path.cpu_seconds:.3g} s of processor time")
     factors = f", {path.num_factorisations} factorisations" if path.num_factorisations else ""
@@ -129,19 +129,24 @@ def _execute_error_control(
         + (f"; more exact than asked, for {answer.note}" if answer.note else "")
     )
     print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
-    motion_scene = asked.build_scene(asked.frame_seconds, "substepping")
+    motion_scene = error_target.build_scene(error_target.frame_seconds, "substepping")
     status = answer.build_status_columns(answer.compute_balances(motion_scene))
     if status["status"] != "ok":
         print_message(f"{status['status']}: {status['reason']}")
-    measured = _verify_error(asked, error, path.positions[-1], results, print_message) if verify else None
-    label = f"{config.stem}-{asked.size}-asked-{error:g}-{asked.t_end:g}"
-    recording = _record_motion(folder / "recordings" / f"{label}.rrd", config.stem, asked, motion_scene, answer, status)
-    row = _build_row(config.stem, asked, error, answer, status) | {
+    measured = _verify_error(error_target, error, path.positions[-1], results, print_message) if verify else None
+    label = f"{config.stem}-{error_target.size}-asked-{error:g}-{error_target.t_end:g}"
+    recording = _record_motion(
+        folder / "recordings" / f"{label}.rrd", config.stem, error_target, motion_scene, answer, status
+    )
+    row = _build_row(config.stem, error_target, error, answer, status) | {
         "error": measured,
         "recording_path": f"recordings/{recording.name}",
     }
     (folder / "accuracy").mkdir(exist_ok=True)
-    found = [row, *(_build_third_party_rows(row, asked, error, answer, print_message) if compare_third_party else ())]
+    found = [
+        row,
+        *(_build_third_party_rows(row, error_target, error, answer, print_message) if compare_third_party else ()),
+    ]
     shared = {name: row[name] for name in (*_SHARED_COLUMNS, "problem_digest")} | build_provenance_columns()
     found += [shared | way for way in build_trial_rows(answer, before, error)]
     parquet_rows.write_rows(
@@ -253,10 +258,10 @@ def _build_third_party_rows(
     """Build the rows of third-party integrators, and print their relative times."""
     shared = {name: row[name] for name in _SHARED_COLUMNS} | build_provenance_columns()
     found = list[dict[str, Any]]()
-    print_message("beside it, on the same machine in the same process, to the same error:")
+    print_message("third-party integrators, in the same process, to the same error:")
     for peer in peers_of(error_target, error, search_result):
-        told = f"{peer.cpu_time_ratio:.3g} times the processor time, an error of {peer.error_estimated:.1g}"
-        print_message(f"  {peer.name}: {peer.reason or told}")
+        comparison = f"{peer.cpu_time_ratio:.3g} times the processor time, an error of {peer.error_estimated:.1g}"
+        print_message(f"  {peer.name}: {peer.reason or comparison}")
         became = {"status": "failed", "reason": peer.reason} if peer.reason else {"status": "ok"}
         times = (
             {}

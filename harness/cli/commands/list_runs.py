@@ -131,9 +131,9 @@ def _read_summary(target: Any) -> str:
         return ""
     tree = ast.parse(Path(spec.origin).read_text(encoding="utf-8"))
     classes = (node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
-    said = next((ast.get_docstring(node) or "" for node in classes), "")
+    docstring = next((ast.get_docstring(node) or "" for node in classes), "")
     # A class docstring that starts with its parameters leaves the description to the module docstring.
-    return _extract_first_sentence(ast.get_docstring(tree) or "" if said[:1].islower() else said)
+    return _extract_first_sentence(ast.get_docstring(tree) or "" if docstring[:1].islower() else docstring)
 
 
 def _extract_first_sentence(text: str) -> str:

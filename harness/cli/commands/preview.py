@@ -48,7 +48,7 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     from springbench.harness.scenes.vertex_selectors import find_selections
     from springbench.harness.simulation.time_loop import build_initial_state
 
-    scene, told = run.scene.load_plugins(), list[str]()
+    scene, lines = run.scene.load_plugins(), list[str]()
     made = build_scene(scene, run.size)
     mesh, choices = made.mesh, list[SelectedVertices]()
     for k, effect in enumerate(scene.effects):
@@ -60,9 +60,9 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     notes = _list_selectors(mesh)
     for one in choices:
         some = ", ".join(map(str, one.vertices[:8].tolist())) + (", ..." if len(one.vertices) > 8 else "")
-        told.append(f"{one.name}: {len(one.vertices)} vertices ({one.description}): {some}")
+        lines.append(f"{one.name}: {len(one.vertices)} vertices ({one.description}): {some}")
     for kind, words in notes:
-        told.append(f"{kind}: {words}")
+        lines.append(f"{kind}: {words}")
     origin = compute_local_origin(mesh.rest_positions)
     replay = RecordingReplay(
         title=f"{run.scene_name}, size {run.size}" if run.size else run.scene_name,
@@ -95,7 +95,7 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     draw_scene_preview(
         replay, choices, facts, notes, path, camera=(camera.azimuth, camera.elevation) if camera else None
     )
-    return [*told, f"the picture is {path}"]
+    return [*lines, f"the picture is {path}"]
 
 
 def _list_selectors(mesh: Any) -> list[tuple[str, str]]:

@@ -133,15 +133,15 @@ def _measure_ablation(run: RunSpec, with_pairs: bool, tick: ProgressCallback) ->
         )
         whole = found[0]
         assert whole.scene is not None
-        told = [_build_full_row(whole), *(_build_variant_row(whole, turn) for turn in found[1:])]
-        told += _measure_reference_errors(run, whole, settings, tick)
+        rows = [_build_full_row(whole), *(_build_variant_row(whole, turn) for turn in found[1:])]
+        rows += _measure_reference_errors(run, whole, settings, tick)
         kinds = {effect.kind for effect in run.scene.effects}
         motion_seen = build_evidence(whole.scene, kinds, whole.positions, whole.velocities)
-        told += [
+        rows += [
             {"kind": "suggestion", "name": s.effect_kind, "reason": s.evidence}
             for s in suggest_effects(motion_seen, kinds)
         ]
-    return _add_shared_columns(run, whole.scene, told)
+    return _add_shared_columns(run, whole.scene, rows)
 
 
 def _build_full_row(full: VariantRun) -> ResultRow:
@@ -203,9 +203,9 @@ def _measure_reference_errors(
             )
             found.append(row | {"status": "ok"} | compute_motion_difference(full.scene, coarser, finer))
         except Exception as error:  # the better solver may fail in any way: then the error is not known
-            told = build_failure_columns(error)
+            columns = build_failure_columns(error)
             found += [
-                {"kind": "error", "name": n, "status": "failed", "reason": told["reason"]}
+                {"kind": "error", "name": n, "status": "failed", "reason": columns["reason"]}
                 for n in _REFERENCE_KINDS[every - 1 :]
             ]
             break
@@ -213,7 +213,7 @@ def _measure_reference_errors(
     return found
 
 
-def _add_shared_columns(run: RunSpec, scene: Scene, told: list[ResultRow]) -> list[ResultRow]:
+def _add_shared_columns(run: RunSpec, scene: Scene, rows: list[ResultRow]) -> list[ResultRow]:
     """Add the columns that all rows share."""
     shared = build_specification_columns(run) | {
         "vertices": len(scene.mesh.rest_positions),
@@ -222,4 +222,4 @@ def _add_shared_columns(run: RunSpec, scene: Scene, told: list[ResultRow]) -> li
         "rounds": run.rounds,
         "bounding_box_diagonal": scene.mesh.bounding_box_diagonal / compute_mean_rest_length(scene),
     }
-    return [shared | build_provenance_columns() | row for row in told]
+    return [shared | build_provenance_columns() | row for row in rows]

@@ -63,8 +63,8 @@ def suggest_effects(evidence: ObservedMotion, effect_kinds: Collection[str]) -> 
         for kind in EFFECT_CLASSES
         if kind not in effect_kinds and hasattr(_load_effect_class(kind), "find_evidence")
     ]
-    told = (EffectSuggestion(kind, _load_effect_class(kind).find_evidence(evidence)) for kind in absent)
-    return [suggestion for suggestion in told if suggestion.evidence]
+    suggestions = (EffectSuggestion(kind, _load_effect_class(kind).find_evidence(evidence)) for kind in absent)
+    return [suggestion for suggestion in suggestions if suggestion.evidence]
 
 
 def _load_effect_class(kind: str) -> Any:

@@ -69,8 +69,8 @@ class EffectUnit(ABC):
         except InputError:
             raise
         except Exception as error:  # a solver may fail in any way
-            told = build_failure_columns(error)
-            found = self.build_failure_rows(told["status"], told["reason"])
+            columns = build_failure_columns(error)
+            found = self.build_failure_rows(columns["status"], columns["reason"])
         return self._write_rows(found)
 
     def write_lost_rows(self, task_loss: TaskFailure) -> str:

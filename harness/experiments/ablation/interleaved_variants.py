@@ -134,7 +134,7 @@ def _store_motion(variant_run: VariantRun, settings: SteppingSettings) -> None:
     if variant_run.failure_reason:
         return
     try:
-        kept = [
+        frames = [
             (step.state.motion.positions, step.state.motion.velocity) for step in _iterate_steps(variant_run, settings)
         ]
     except StepError as error:
@@ -142,7 +142,7 @@ def _store_motion(variant_run: VariantRun, settings: SteppingSettings) -> None:
             raise
         variant_run.failure_reason = f"{error}: {error.__cause__}"
         return
-    variant_run.positions, variant_run.velocities = (np.array(part) for part in zip(*kept, strict=True))
+    variant_run.positions, variant_run.velocities = (np.array(part) for part in zip(*frames, strict=True))
 
 
 def _iterate_steps(variant_run: VariantRun, settings: SteppingSettings) -> Iterator[SimulationStep]:
@@ -163,5 +163,5 @@ def simulate_motion(
         stride: number of steps per frame of the result.
     """
     run = replace(settings, frames=settings.frames * stride)
-    kept = [s.state.motion for s in iterate_steps(scene, prepare(scene, solver), run) if s.index % stride == 0]
-    return np.array([now.positions for now in kept]), np.array([now.velocity for now in kept])
+    motions = [s.state.motion for s in iterate_steps(scene, prepare(scene, solver), run) if s.index % stride == 0]
+    return np.array([now.positions for now in motions]), np.array([now.velocity for now in motions])

@@ -118,8 +118,8 @@ def select_effects(scene: SceneSpec, *kinds: str) -> SceneSpec:
     """Return the scene with these effects and the baseline effects only; ALL_EFFECTS selects all."""
     if ALL_EFFECTS in kinds:
         return scene
-    kept = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _is_baseline_effect(e)]
-    return scene.model_copy(update=scene.keep_effects(kept))
+    selected = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _is_baseline_effect(e)]
+    return scene.model_copy(update=scene.keep_effects(selected))
 
 
 def _is_baseline_effect(effect: SceneEffect) -> bool:

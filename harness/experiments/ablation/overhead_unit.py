@@ -48,14 +48,14 @@ class OverheadUnit(EffectUnit):
         """Measure the overhead of each effect and return the rows."""
         run = self.run
         solver: Solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters)
-        stop, told = build_stop_rule(run.max_iterations, run.rtol), list[ResultRow]()
+        stop, rows = build_stop_rule(run.max_iterations, run.rtol), list[ResultRow]()
         plain = build_scene(select_effects(run.scene), run.size)
         counts = {"vertices": len(plain.mesh.rest_positions), "springs": len(plain.all_springs.edges)}
         with machine_info.limit_threads(machine_info.choose_threads(run.threads).count):
             for found in measure_overheads(run.scene, run.size, solver, stop, frames=run.frames, max_rounds=run.rounds):
-                told.append(counts | _build_row(found))
+                rows.append(counts | _build_row(found))
                 tick(found.effect_kind)
-        return self._add_shared_columns(told)
+        return self._add_shared_columns(rows)
 
     def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
         """Build the rows of a unit without a result: no effect has an overhead."""
@@ -63,13 +63,13 @@ class OverheadUnit(EffectUnit):
             [{"name": effect, "status": status, "reason": reason} for effect in list_measured_effects(self.run.scene)]
         )
 
-    def _add_shared_columns(self, told: list[ResultRow]) -> list[ResultRow]:
+    def _add_shared_columns(self, rows: list[ResultRow]) -> list[ResultRow]:
         shared = (
             build_specification_columns(self.run)
             | build_provenance_columns()
             | {"kind": "overhead", "frames": self.run.frames}
         )
-        return [shared | row for row in told]
+        return [shared | row for row in rows]
 
 
 def _build_row(overhead: EffectOverhead) -> ResultRow:

@@ -42,5 +42,5 @@ def name_effects(scene: SceneSpec) -> list[str]:
 
 def _omit_effects(scene: SceneSpec, omitted: tuple[int, ...]) -> SceneSpec:
     values = {key: getattr(scene, key) for key in SceneSpec.model_fields}
-    kept = [i for i in range(len(scene.effects)) if i not in omitted]
-    return SceneSpec.model_construct(None, **values | scene.keep_effects(kept))
+    remaining = [i for i in range(len(scene.effects)) if i not in omitted]
+    return SceneSpec.model_construct(None, **values | scene.keep_effects(remaining))

@@ -26,6 +26,6 @@ _STATUS_OF_ERROR: dict[type[Exception], str] = {
 
 def build_accuracy_failure_columns(error: Exception) -> dict[str, Any]:
     """Return the status and the reason of a measurement that ended with an error."""
-    told = build_failure_columns(error)
-    reason = str(error) if type(error) in _STATUS_OF_ERROR else told["reason"]
-    return {"status": _STATUS_OF_ERROR.get(type(error), told["status"]), "reason": reason}
+    columns = build_failure_columns(error)
+    reason = str(error) if type(error) in _STATUS_OF_ERROR else columns["reason"]
+    return {"status": _STATUS_OF_ERROR.get(type(error), columns["status"]), "reason": reason}

@@ -218,6 +218,6 @@ def _plan_units(units: Sequence[CurveUnit | WorkPrecisionUnit], results: Accurac
         of_step = not isinstance(unit, CurveUnit) or row["problem_digest"] == unit.snapshot_row["problem_digest"]
         return of_step and row["unit_id"] == unit.spec.compute_unit_id(here)
 
-    asked = {results.rows_path(unit.spec.build_file_stem()): partial(as_asked, unit) for unit in units}
-    found = read_completion_statuses(asked, ("unit_id", "problem_digest"), ACCURACY_SCHEMA)
+    planned = {results.rows_path(unit.spec.build_file_stem()): partial(as_asked, unit) for unit in units}
+    found = read_completion_statuses(planned, ("unit_id", "problem_digest"), ACCURACY_SCHEMA)
     return [_PlannedUnit(unit, found[results.rows_path(unit.spec.build_file_stem())]) for unit in units]

@@ -98,7 +98,7 @@ class SnapshotUnit:
 
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Find the snapshots, write their rows and return the outcome as text."""
-        told: list[str] = []
+        messages: list[str] = []
         known: set[str] = set()
         for spec in self.curve_specs:
             path = self.results.rows_path(spec.build_problem_stem())
@@ -109,14 +109,14 @@ class SnapshotUnit:
                 raise
             except Exception as error:  # no solver can be graded here; the other steps go on
                 found = [_build_missing_snapshot_row(spec, ended(error))]
-                told.append(f"{spec.snapshot}: {found[0]['status']}: {found[0]['reason']}")
+                messages.append(f"{spec.snapshot}: {found[0]['status']}: {found[0]['reason']}")
             else:
                 if step.step_snapshot.digest in known:
                     continue
                 known.add(step.step_snapshot.digest)
             _write_snapshot_rows(path, self.results, found)
             tick(str(spec.snapshot))
-        return "; ".join(told) or "ok"
+        return "; ".join(messages) or "ok"
 
     def write_lost_rows(self, task_loss: TaskFailure) -> str:
         """Write a row for each snapshot of a lost unit, and return a message."""

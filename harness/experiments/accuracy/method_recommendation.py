@@ -75,12 +75,12 @@ def build_candidate_grid() -> list[dict[str, Any]]:
     solvers with their own integrator are included.
     """
     made = {name: load_target(target) for name, target in SOLVERS.items()}
-    told = {name: find_solver_info(solver, name) for name, solver in made.items()}
-    own = [name for name, of in told.items() if of.is_substepping and of.supports_error_control]
-    first = {name: made[name] for name, of in told.items() if of.is_family_default}
+    infos = {name: find_solver_info(solver, name) for name, solver in made.items()}
+    own = [name for name, of in infos.items() if of.is_substepping and of.supports_error_control]
+    first = {name: made[name] for name, of in infos.items() if of.is_family_default}
     implicit = [name for name, solver in first.items() if is_minimiser(solver)]
     fixed = [
-        name for name, solver in first.items() if not is_minimiser(solver) or told[name].family == LOCAL_GLOBAL_FAMILY
+        name for name, solver in first.items() if not is_minimiser(solver) or infos[name].family == LOCAL_GLOBAL_FAMILY
     ]
     return [
         {"solver": implicit, "rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
@@ -125,8 +125,8 @@ class MeasuredMethod:
         steps = round(u.t_end / u.case.scene.time_step)
         given: dict[str, Any] = {"size": u.case.size or None, "solver": u.solver.name, "integrator": u.case.integrator}
         given |= {"time-step": repr(u.case.scene.time_step), "frames": steps, **u.options}
-        said = ((name.replace("_", "-"), value) for name, value in given.items() if value is not None)
-        options = (part for name, value in said for part in (f"--{name}", str(value)))
+        named_values = ((name.replace("_", "-"), value) for name, value in given.items() if value is not None)
+        options = (part for name, value in named_values for part in (f"--{name}", str(value)))
         return shlex.join(["springbench", "run", str(scene), *options])
 
 
@@ -207,13 +207,13 @@ def recommend_method(
         limits=TaskLimits(EXTRA_WALL_SECONDS),
     )
     store = open_reference_store(results)
-    asked: AccuracyPlan = isolated(partial(_plan_study, path, scene, size, max_error, t_end, time_limit, store))
-    t_end = asked.work[0].t_end
+    study: AccuracyPlan = isolated(partial(_plan_study, path, scene, size, max_error, t_end, time_limit, store))
+    t_end = study.work[0].t_end
     ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
     omitted: SearchSummary | None = None
-    if not any(way.error <= max_error and way.sweep != asked.name for way in ways):
+    if not any(way.error <= max_error and way.sweep != study.name for way in ways):
         omitted = _measured(
-            asked, ways, reasons, max_error, claim_folder(results / asked.name, path), display, print_message, budget
+            study, ways, reasons, max_error, claim_folder(results / study.name, path), display, print_message, budget
         )
         print_message(f"{path.stem} {size or ''}: {omitted}")
         ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
@@ -295,7 +295,7 @@ def _compute_reference(
 
 
 def _measured(
-    asked: AccuracyPlan,
+    study: AccuracyPlan,
     ways: list[MeasuredMethod],
     without: list[dict[str, Any]],
     error: float,
@@ -315,16 +315,16 @@ def _measured(
     }
     failed, here = {row["unit_id"]: row for row in without}, machine_info.describe_machine().machine_id
     say(
-        f"measuring up to {len(asked.work)} settings, cheap ones first, for at most {budget:g} s (--budget); a "
+        f"measuring up to {len(study.work)} settings, cheap ones first, for at most {budget:g} s (--budget); a "
         f"simulation ends once it is {SLOWER:g} times as slow as the best that keeps to the error"
     )
-    with open_measurement(asked.work, folder, display) as measure:
+    with open_measurement(study.work, folder, display) as measure:
 
         def look_up(spec: WorkSpec) -> dict[str, Any]:
             return known.get(spec.build_file_stem()) or failed.get(spec.compute_unit_id(here)) or measure(spec)
 
         best = min((way.seconds_per_simulated_second for way in ways if way.error <= error), default=math.inf)
-        return search(asked.work, error, best, look_up, budget)
+        return search(study.work, error, best, look_up, budget)
 
 
 def _build_study(path: Path, scene: SceneSpec, size: int, t_end: float, time_limit: float) -> AccuracyPlan:

@@ -77,7 +77,7 @@ def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: C
     row["preempted"] = False
     p, *_ = _simulate_timed(
         spec, scene, prepared, min(NUM_WARMUP_STEPS, frames), time_limit=inf
-    )  # compiling counts against nobody
+    )  # compilation is not timed
     for _ in range(spec.measurement.rounds):
         p, iterations, watched = _simulate_timed(spec, scene, prepared, frames)
         seconds.append(watched["wall_seconds_sum"])

@@ -472,9 +472,9 @@ def _find_differences(
 
 
 def _format_differences(differences: Mapping[str, tuple[ResultRow, Any, Any]]) -> str:
-    told = [f"{name} is {was!r:.60}, here {now!r:.60}" for name, (_, was, now) in list(differences.items())[:5]]
-    more = f", and {len(differences) - len(told)} more columns" if len(differences) > len(told) else ""
-    return "; ".join(told) + more
+    descriptions = [f"{name} is {was!r:.60}, here {now!r:.60}" for name, (_, was, now) in list(differences.items())[:5]]
+    more = f", and {len(differences) - len(descriptions)} more columns" if len(differences) > len(descriptions) else ""
+    return "; ".join(descriptions) + more
 
 
 def _build_failed_claim(
@@ -521,7 +521,7 @@ def _compute_preempted_share(result_rows: Sequence[ResultRow]) -> float:
 
 def _describe_environment_change(old: ResultRow, new: ResultRow) -> str:
     """Describe the differences of machine, libraries, source code and threads."""
-    differ = [f"{told}" for name, told in _ENVIRONMENT_COLUMNS.items() if old[name] != new[name]]
+    differ = [f"{description}" for name, description in _ENVIRONMENT_COLUMNS.items() if old[name] != new[name]]
     return f"other {' and '.join(differ)}" if differ else ""
 
 

@@ -79,24 +79,24 @@ def _compact_folder(folder: Path, max_modified_time: float, print_message: Calla
         print_message(f"{folder}: nothing to pack; {len(row_store.list_packed_units(folder))} units are packed")
         return 0
     stays = sorted(row_store.list_packed_units(folder) - {unit.stem for unit in whole})
-    asked = sorted([*whole, *(folder / f"{name}.parquet" for name in stays)])
-    schema = unify_schemas(asked)
+    file_paths = sorted([*whole, *(folder / f"{name}.parquet" for name in stays)])
+    schema = unify_schemas(file_paths)
     if row_store.FILE_COLUMN in schema.names:
         raise InputError(
             InputMistake(f"rows have a column {row_store.FILE_COLUMN!r} of their own; they cannot be packed", packed)
         )
     with atomic_write(packed) as partial:
         with partial.open("wb") as into, pq.ParquetWriter(into, schema.append(_FILE_FIELD)) as writer:
-            for batch in _iterate_batches(asked):
+            for batch in _iterate_batches(file_paths):
                 table = parquet_rows.read_rows(batch, schema, with_unit_names=True)
                 writer.write_table(table, row_group_size=len(table))
         with partial.open("rb") as written:
             os.fsync(written.fileno())
-            _check_compacted_rows(written, asked, schema)
+            _check_compacted_rows(written, file_paths, schema)
     _sync_folder(packed.parent)
     for unit in whole:
         unit.unlink()
-    print_message(f"{folder}: {len(whole)} units packed into {packed.name}, which holds {len(asked)}")
+    print_message(f"{folder}: {len(whole)} units packed into {packed.name}, which holds {len(file_paths)}")
     return len(whole)
 
 

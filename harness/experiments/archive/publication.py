@@ -91,7 +91,7 @@ def publish_results(
             content[f"results/{name}/{CLAIM}"] = os.fsencode(f"{way}\n")
         else:
             gone = f"what it names as its config, {config}, is none" if config else "its config is not there any more"
-            print_message(f"{folder}: {gone}, so nobody can do its runs again")
+            print_message(f"{folder}: {gone}, so its runs cannot be repeated")
     odd = "its name is no UTF-8, or breaks a line; rename it"
     refused += [InputMistake(odd, Path(name)) for name in content if _INVALID_NAME_CHARACTERS.search(name)]
     if refused:
@@ -157,7 +157,7 @@ def _list_required_files(config: Path) -> list[Path]:
             if scene.path.suffix.lower() == ".json":
                 files.add(scene.path.parent / read_assignment_json(scene.path).obj)
             for part in (scene.mesh, *scene.effects):
-                if isinstance(part, ConfigModel):  # what is somebody's own is not opened
+                if isinstance(part, ConfigModel):  # the configuration of user code is not inspected
                     files |= {value for value in vars(part).values() if isinstance(value, Path)}
             for _, given in scene.plugins.values():  # names of files come with their digests there
                 there = scene.path.parent
@@ -176,11 +176,11 @@ def _is_local_plugin(plugin: PluginName) -> bool:
 
 
 def _describe_environment() -> bytes:
-    told = asdict(machine_info.describe_machine()) | {
+    environment = asdict(machine_info.describe_machine()) | {
         "versions": machine_info.collect_versions(),
         "commit": machine_info.read_commit(),
     }
-    return (json.dumps(told, indent=2, sort_keys=True, default=str) + "\n").encode()
+    return (json.dumps(environment, indent=2, sort_keys=True, default=str) + "\n").encode()
 
 
 def _list_requirements() -> bytes:

@@ -133,16 +133,20 @@ def _merge_table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
         newest = sorted(
             tables, key=lambda pair: _read_start_time(heads[pair[0]]), reverse=True
         )  # the first where they tie
-        kept = list[pa.Table]()
+        merged = list[pa.Table]()
         named = list[tuple[Path, pa.Table, Path]]()
         for unit, table in newest:
-            if any(parquet_rows.is_bitwise_equal(table, other) for other in kept):
+            if any(parquet_rows.is_bitwise_equal(table, other) for other in merged):
                 known += 1
                 continue
             named.append(
-                (unit, table, home / (f"{name}~{compute_content_digest(table)}.parquet" if kept else f"{name}.parquet"))
+                (
+                    unit,
+                    table,
+                    home / (f"{name}~{compute_content_digest(table)}.parquet" if merged else f"{name}.parquet"),
+                )
             )
-            kept.append(table)
+            merged.append(table)
         for unit, table, target in reversed(named):  # what gives its name to a newer one is there under another first
             if not row_store.has_rows(target) or not parquet_rows.is_bitwise_equal(
                 parquet_rows.read_rows_by_file([target], _EMPTY_SCHEMA), table
@@ -225,7 +229,7 @@ def _find_conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str], list
 
 def _query_conflicts(units: Sequence[Path], table: pa.Table | None = None) -> tuple[list[str], list[str], list[str]]:
     """Query the conflicts; DuckDB reads the units unless `table` has their rows. Raises SchemaMismatch."""
-    asked = ", ".join(f'"{name}"' for name in PAIRING_COLUMNS)
+    pairing_columns = ", ".join(f'"{name}"' for name in PAIRING_COLUMNS)
     with row_union.open_connection() as connection:
         if table is None:
             whole = row_union.build_union(connection, "files", units, run_schema.RUN_SCHEMA, "default")
@@ -235,12 +239,13 @@ def _query_conflicts(units: Sequence[Path], table: pa.Table | None = None) -> tu
 
         def differing(key: str) -> list[str]:
             each = (
-                f"SELECT {key}, {asked}, frame FROM rows "
+                f"SELECT {key}, {pairing_columns}, frame FROM rows "
                 "WHERE phase = 'step' AND positions_digest IS NOT NULL GROUP BY ALL"
             )
             found = connection.execute(
-                f"SELECT scene, size, solver, parameters, first FROM (SELECT {key}, {asked}, min(frame) AS first "
-                f"FROM ({each} HAVING count(DISTINCT positions_digest) > 1) GROUP BY ALL) ORDER BY ALL"
+                "SELECT scene, size, solver, parameters, first FROM "
+                f"(SELECT {key}, {pairing_columns}, min(frame) AS first FROM "
+                f"({each} HAVING count(DISTINCT positions_digest) > 1) GROUP BY ALL) ORDER BY ALL"
             ).fetchall()
             return [
                 f"{scene}{f' {size}' if size else ''} {solver}{'' if given == '{}' else f' {given}'}: from step {first}"

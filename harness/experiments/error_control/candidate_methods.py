@@ -72,8 +72,8 @@ class ErrorTarget:
         frames = max(1, round(t_end / scene.time_step))
         if mistakes := find_scene_mistakes(scene, [size]):
             raise InputError(mistakes)
-        asked = cls(scene, size, t_end, frames)
-        system = asked.build_scene(asked.frame_seconds, "implicit-euler").system
+        target = cls(scene, size, t_end, frames)
+        system = target.build_scene(target.frame_seconds, "implicit-euler").system
         if without_vertex_contact(system) is not system:
             if print_message:
                 print_message(
@@ -82,9 +82,9 @@ class ErrorTarget:
                 )
             raise RunFailed(
                 f"{_CONTACT_MESSAGE}; "
-                f"{estimate_by_step_doubling(asked.build_scene, t_end, frames, time_budget=_STEP_DOUBLING_SECONDS)}"
+                f"{estimate_by_step_doubling(target.build_scene, t_end, frames, time_budget=_STEP_DOUBLING_SECONDS)}"
             )
-        return asked
+        return target
 
     def build_scene(self, time_step: float, integrator: str) -> Scene:
         """Build the scene with a time step [s] and an integrator by name."""
@@ -124,7 +124,7 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
     """
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order}
     best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].needs_start_acceleration))
-    told = {name: find_solver_info(load_target(target), name) for name, target in SOLVERS.items()}
+    infos = {name: find_solver_info(load_target(target), name) for name, target in SOLVERS.items()}
     single = {
         name: one.order
         for name, one in INTEGRATORS.items()
@@ -133,7 +133,7 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
     even = max((name for name in single if name != "substepping"), key=single.__getitem__)
     tried = {
         name: ("substepping",) if one.is_substepping else (best, even)
-        for name, one in told.items()
+        for name, one in infos.items()
         if one.supports_error_control
     }
     found = [(integrator, SolverSpec(name, {})) for name, several in tried.items() for integrator in several]

@@ -113,13 +113,13 @@ def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> 
         Unsupported: the solver does not support error control. Errors of the solver are raised unchanged.
     """
     pairs = list_methods_of_solver(run.solver)
-    asked = ErrorTarget.from_scene(run.scene, run.size, run.frames * run.scene.time_step)
-    said = list[str]()
+    error_target = ErrorTarget.from_scene(run.scene, run.size, run.frames * run.scene.time_step)
+    messages = list[str]()
     tick("choosing steps")
     answer = search_cheapest_method(
-        asked,
+        error_target,
         error,
-        compute_predictability_horizon(asked, error, said.append),
+        compute_predictability_horizon(error_target, error, messages.append),
         lambda line: tick("choosing steps"),
         pairs,
     )
@@ -130,4 +130,6 @@ def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> 
             raise RunFailed("a round ended at other positions than the one before")
         for _ in range(run.frames):
             tick("timed pass")
-    return ErrorControlledRun(asked.build_scene(asked.frame_seconds, "substepping"), answer, error, tuple(rounds), said)
+    return ErrorControlledRun(
+        error_target.build_scene(error_target.frame_seconds, "substepping"), answer, error, tuple(rounds), messages
+    )

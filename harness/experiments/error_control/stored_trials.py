@@ -63,7 +63,9 @@ def select_promising_methods(
     Returns: the nearest error, and integrators with solvers; none where no stored error is similar.
     """
     nearest = min(
-        (row["error_requested"] for row in stored_trials), key=lambda asked: abs(log(asked / error)), default=0.0
+        (row["error_requested"] for row in stored_trials),
+        key=lambda requested: abs(log(requested / error)),
+        default=0.0,
     )
     if not error / _MAX_ERROR_RATIO <= nearest <= error * _MAX_ERROR_RATIO:
         return nearest, []
@@ -100,9 +102,9 @@ def build_trial_rows(search_result: SearchResult, stored_trials: Iterable[Result
         for one, promised in search_result.trials
     ]
     again = {(row["integrator"], row["solver"]) for row in made}
-    kept = [
+    trial_rows = [
         row
         for row in stored_trials
         if row["error_requested"] == error and (row["integrator"], row["solver"]) not in again
     ]
-    return [*made, *kept]
+    return [*made, *trial_rows]

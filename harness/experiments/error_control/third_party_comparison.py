@@ -70,8 +70,8 @@ def compare_third_party(
     fields[True].evaluate_fingerprint()  # compiles
     began = thread_time()
     search_result.best_trial.rerun_trial()
-    beside = _ThirdPartyComparison(error_target, error, search_result, scene, fields, thread_time() - began)
-    yield from map(beside.measure_integrator, names)
+    comparison = _ThirdPartyComparison(error_target, error, search_result, scene, fields, thread_time() - began)
+    yield from map(comparison.measure_integrator, names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ class _ThirdPartyComparison:
         order, tolerance = THIRD_PARTY_INTEGRATORS[name].order, 0.2 * self.search_result.step_atol
         if missing := THIRD_PARTY_INTEGRATORS[name].missing_reason:
             return ThirdPartyResult(name, inf, inf, inf, missing)
-        found = ThirdPartyResult(name, inf, inf, inf, "its error does not come down to the one asked")
+        found = ThirdPartyResult(name, inf, inf, inf, "its error does not reach the target")
         for _ in range(_MAX_TOLERANCES):
             one = self._integrate_at_tolerance(name, tolerance)
             if one.reason:

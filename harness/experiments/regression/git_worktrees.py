@@ -135,9 +135,9 @@ def _run_git(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         raise InputError(f"--baseline: git cannot be run ({error}); install it") from error
 
 
-def _last_line(said: str) -> str:
+def _last_line(output: str) -> str:
     """Return the last line of a program's output."""
-    return next((line.strip() for line in reversed(said.splitlines()) if line.strip()), "no reason given")
+    return next((line.strip() for line in reversed(output.splitlines()) if line.strip()), "no reason given")
 
 
 @contextmanager

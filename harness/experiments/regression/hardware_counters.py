@@ -47,10 +47,10 @@ def count_events(work: Callable[[], object], event: tuple[int, int] = INSTRUCTIO
 
 def explain_unavailable(event: tuple[int, int] = INSTRUCTIONS) -> str:
     """Explain why an event cannot be counted here; empty if it can."""
-    handle, said = _open_counter(event)
+    handle, message = _open_counter(event)
     if handle is not None:
         os.close(handle)
-    return said
+    return message
 
 
 def _open_counter(event: tuple[int, int]) -> tuple[int | None, str]:

@@ -74,7 +74,7 @@ def build_timer(work: WorkFunction, num_calls: int, clock: ClockName) -> TimedCa
 
 
 def build_program_pair(candidate: WorkFunction, baseline: WorkFunction, clock: ClockName) -> ProgramPair:
-    """Build timers of two warm functions, of so many calls that a clock resolves them.
+    """Build timers of two warm functions, of enough calls for the resolution of the clock.
 
     Args:
         candidate: function to test.

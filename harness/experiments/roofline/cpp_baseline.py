@@ -79,7 +79,7 @@ class CppBaseline:
         try:
             self._process.stdin.write(f"{iterations}\n")
             self._process.stdin.flush()
-        except OSError:  # it has ended; its exit code says why
+        except OSError:  # the program has ended; its exit code states the reason
             pass
         return self._read_answer()
 

@@ -76,8 +76,10 @@ def measure_round_robin(
                 past_timings.get(format_candidate_name(candidate.run), ()), counts["vertices"], candidate.run
             )
             if wanted > budget:
-                said = f"would take {wanted:.0f} s by its smaller sizes; the budget of each candidate is {budget:.0f} s"
-                rows[candidate].append({"phase": "run", "status": "skipped", "reason": said})
+                reason = (
+                    f"would take {wanted:.0f} s by its smaller sizes; the budget of each candidate is {budget:.0f} s"
+                )
+                rows[candidate].append({"phase": "run", "status": "skipped", "reason": reason})
             else:
                 alive.append(candidate)
         for round in range(NUM_PREPARATIONS):

@@ -183,10 +183,10 @@ def _describe_profiles(table: AccuracyData) -> Iterator[str]:
             wins = {label: int(np.sum(values <= 1.0)) for label, values in found.items()}
             count = len(next(iter(found.values())))
             first = sorted(wins, key=lambda label: -wins[label])[:3]
-            told = ", ".join(
+            description = ", ".join(
                 f"{label} on {wins[label]} ({_format_factor(found[label])})" for label in first if wins[label]
             )
-            yield f"To {format_gap(target)}, of {count} problems: fastest is {told}."
+            yield f"To {format_gap(target)}, of {count} problems: fastest is {description}."
 
 
 def _format_factor(values: FloatArray) -> str:

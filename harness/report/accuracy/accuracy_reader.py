@@ -222,8 +222,10 @@ def _build_row_labeller(rows: Sequence[_ResultRow]) -> _RowLabeller:
             values[row["solver"], key].add(str(own.get(key)))
 
     def label(row: _ResultRow) -> str:
-        told = [f"{key} {value}" for key, value in settings(row).items() if len(values[row["solver"], key]) > 1]
-        return ", ".join([row["solver"], *told])
+        differing_settings = [
+            f"{key} {value}" for key, value in settings(row).items() if len(values[row["solver"], key]) > 1
+        ]
+        return ", ".join([row["solver"], *differing_settings])
 
     return label
 

@@ -85,7 +85,7 @@ def compare_engines(works: Iterable[WorkPoint], errors: Sequence[float] = ERROR_
         by_program = pareto_fronts(here)
         for error in errors:
             within = {name: [work for work in best if work.error <= error] for name, best in by_program.items()}
-            found.append(EngineComparison(mesh, error, {name: kept[0] for name, kept in within.items() if kept}))
+            found.append(EngineComparison(mesh, error, {name: front[0] for name, front in within.items() if front}))
     return found
 
 
@@ -116,12 +116,12 @@ def format_markdown_table(works: Sequence[WorkPoint]) -> Iterator[str]:
         if one.fastest_by_program:
             cells = (_format_cell(one, name, refused[one.mesh]) for name in names)
             ours = one.fastest_by_program.get(OWN_PROGRAM)
-            told = (
+            notes = (
                 f"{ours.setting_label}: {format_duration(ours.seconds_per_simulated_second)}"
                 if ours
                 else "does not get there"
             )
-            yield f"| {one.mesh} | {format_gap(one.error)} | {' | '.join(cells)} | {told} |"
+            yield f"| {one.mesh} | {format_gap(one.error)} | {' | '.join(cells)} | {notes} |"
 
 
 def describe_best_settings(works: Iterable[WorkPoint]) -> Iterator[str]:

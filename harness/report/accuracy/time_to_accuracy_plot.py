@@ -89,17 +89,17 @@ def distinct_columns(
         return np.array([median_time(curves, target, steps) for curves in groups for target in GAP_TARGETS])
 
     # From many steps to few: set-up contributes least where it is amortised over most steps.
-    kept, last, alike = [None], found(None), list[int]()
+    distinct, last, alike = [None], found(None), list[int]()
     for steps in sorted(AMORTISATION_STEPS, reverse=True):
         times = found(steps)
         both = np.isfinite(times) & np.isfinite(last) & (last > 0.0)
         if (times[both] > _SIMILAR_RATIO * last[both]).any():
-            kept, last = [*kept, steps], times
+            distinct, last = [*distinct, steps], times
         else:
             alike.append(steps)
     listed = ", ".join(format_count(steps) for steps in sorted(alike))
     same = f"Not shown, as no time doubles: set-up over {listed} step{'s' if alike != [1] else ''}" if alike else ""
-    return {steps: _COLUMN_TITLES[steps] for steps in kept}, same
+    return {steps: _COLUMN_TITLES[steps] for steps in distinct}, same
 
 
 def median_time(curves: Sequence[ConvergenceCurve], target: float, steps: int | None = None) -> float:

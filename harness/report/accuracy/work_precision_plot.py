@@ -75,11 +75,11 @@ def find_default_setting(works: Iterable[WorkPoint]) -> WorkPoint | None:
 
 def pareto_front(works: Iterable[WorkPoint]) -> list[WorkPoint]:
     """Return the Pareto front in time and error, the cheapest first."""
-    kept: list[WorkPoint] = []
+    front: list[WorkPoint] = []
     for work in sorted((w for w in works if _is_complete(w)), key=lambda w: (w.seconds_per_simulated_second, w.error)):
-        if not kept or work.error < kept[-1].error:
-            kept.append(work)
-    return kept
+        if not front or work.error < front[-1].error:
+            front.append(work)
+    return front
 
 
 def describe_cheapest_settings(works: Sequence[WorkPoint]) -> list[str]:

@@ -192,8 +192,8 @@ def _build_cell(row: ResultRow) -> MapCell:
         return MapCell(*at, row["status"], _describe_missing_overhead(row["status"]), "–", _is_stale(row))
     price = row["overhead_ratio"]
     class_ = next((words, color) for most, words, color in _OVERHEAD_CLASSES if price <= most)
-    told = _INDISTINGUISHABLE if row["overhead_ratio_low"] <= 1.0 <= row["overhead_ratio_high"] else class_
-    return MapCell(*at, *told, f"{price:.2f}" if price < 9.995 else f"{price:.0f}", _is_stale(row))
+    label = _INDISTINGUISHABLE if row["overhead_ratio_low"] <= 1.0 <= row["overhead_ratio_high"] else class_
+    return MapCell(*at, *label, f"{price:.2f}" if price < 9.995 else f"{price:.0f}", _is_stale(row))
 
 
 def _describe_missing_overhead(status: str) -> str:

@@ -186,9 +186,9 @@ def work_precision_panels(folder: Path) -> list[PanelEntry]:
         for integrator in dict.fromkeys(w.integrator for w in here):
             mine = [w for w in here if w.integrator == integrator]
             tolerances = sorted({w.residual_rtol for w in mine if w.residual_rtol is not None}, reverse=True)
-            said = ["Joined points differ in the time step alone."]
+            notes = ["Joined points differ in the time step alone."]
             if len(tolerances) > 1:
-                said.append(
+                notes.append(
                     "Larger marks: tighter tolerances, "
                     f"{', '.join(format_power(t) if t else 'auto' for t in tolerances)}."
                 )
@@ -204,7 +204,7 @@ def work_precision_panels(folder: Path) -> list[PanelEntry]:
                     AxisScale("error of the positions, relative to the way from the start", "log", "percent"),
                     [_build_front_series(here), *_build_time_step_series(mine, marked, tolerances)],
                     notes=[
-                        *(*said, "Grey: the least error that a budget buys, by any integrator."),
+                        *(*notes, "Grey: the least error that a budget buys, by any integrator."),
                         *(*describe_self_converged(mine), *_describe_stale(mine)),
                     ],
                     machine_words=", ".join(table.machine_words),

@@ -92,9 +92,9 @@ class _EndLabels:
         wanted = [ax.transAxes.inverted().transform(ax.transData.transform(end))[1] * points for end in self._ends]
         order = np.argsort(wanted)
         at = spread_positions([wanted[k] for k in order], self._gap, points)
-        beside = self._label_position()
+        label_position = self._label_position()
         for k, height in zip(order, at, strict=True):
-            self._names[k].set_position((beside, height / points))
+            self._names[k].set_position((label_position, height / points))
 
 
 def spread_positions(targets: Sequence[float], gap: float, top: float) -> list[float]:

@@ -90,11 +90,11 @@ def _mesh_rows(panel: MeshPicture) -> list[CsvRow]:
 def build_script(figure: Figure, panels: Sequence[FigurePanel], name: str, options: FigureOptions) -> str:
     """Build a script that needs only Matplotlib and the CSV file next to it."""
     kind = type(panels[0])
-    said = {"name": name, "width": options.width_mm, "size": options.font_size, "small": options.small_font_size}
+    settings = {"name": name, "width": options.width_mm, "size": options.font_size, "small": options.small_font_size}
     inches = tuple(round(float(side), 3) for side in figure.get_size_inches())
     places = [spec for ax in figure.axes[: len(panels)] if (spec := ax.get_subplotspec())]
     columns = max(spec.get_topmost_subplotspec().colspan.stop for spec in places)
-    shared: dict[str, Any] = said | {"inches": inches, "columns": columns, "rows": -(-len(panels) // columns)}
+    shared: dict[str, Any] = settings | {"inches": inches, "columns": columns, "rows": -(-len(panels) // columns)}
     head = script_templates.SCRIPT_HEADER.format(**shared)
     if kind is CurvePlot:
         plots = [panel for panel in panels if isinstance(panel, CurvePlot)]

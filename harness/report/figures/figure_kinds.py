@@ -181,5 +181,5 @@ def _plugin_entries(name: str, report: Any, folder: Path) -> list[PanelEntry]:
         return entries_from_panels(panels)
     except (SpringbenchError, OSError):
         raise
-    except Exception as error:  # it is somebody's own
+    except Exception as error:  # user code may raise any exception
         raise RunFailed(f"the report {name} failed: {type(error).__name__}: {error}") from error

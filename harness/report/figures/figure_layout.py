@@ -221,11 +221,11 @@ def _draw_strips(
     The argument `height` is the height of the panels [inches].
     """
     room = options.width_mm / MILLIMETRES_PER_INCH * 72.0 - 2.0 * _STRIP_PADDING
-    said = list(dict.fromkeys(note for panel in panels for note in panel.notes))
+    notes = list(dict.fromkeys(note for panel in panels for note in panel.notes))
     machines = list(dict.fromkeys(panel.machine_words for panel in panels if panel.machine_words))
     foot = [
         line
-        for words in said + (machines if options.has_title else [])
+        for words in notes + (machines if options.has_title else [])
         for line in wrap_words(words, room, options.small_font_size)
     ]
     head = wrap_words(title, room / 1.08, options.font_size) if options.has_title else []
@@ -317,7 +317,7 @@ def _adjust_final_labels(axes: Sequence[Axes], panels: Sequence[FigurePanel], op
     These are tick labels, values in cells, and labels at curve ends.
     """
     figure: Any = axes[0].figure
-    warnings.simplefilter("ignore", UserWarning)  # where frames have no room the faults are told
+    warnings.simplefilter("ignore", UserWarning)  # missing room is reported as a fault
     figure.draw_without_rendering()
     for ax, panel in zip(axes, panels, strict=True):
         if isinstance(panel, CurvePlot):

@@ -108,9 +108,9 @@ def _find_recorded_runs(folder: Path) -> list[_RecordedRun]:
     table = read_sweep_rows(folder)
     found = read_run_times(table)
     names, looks = label_runs(found), assign_solver_styles(run.solver for run in found)
-    told = {row["run_id"]: row for row in table.select(["run_id", *PROVENANCE_COLUMNS]).to_pylist()}
+    provenance = {row["run_id"]: row for row in table.select(["run_id", *PROVENANCE_COLUMNS]).to_pylist()}
     there = [
-        _RecordedRun(one, names[one.run_id], path, looks[one.solver], describe_provenance([told[one.run_id]]))
+        _RecordedRun(one, names[one.run_id], path, looks[one.solver], describe_provenance([provenance[one.run_id]]))
         for one in sorted(found, key=lambda run: -(run.vertices or 0))
         for path in [*(folder / "recordings").glob(f"*-{one.run_id}.rrd")][:1]
     ]

@@ -35,13 +35,15 @@ def robustness_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]
     """
     table = read_sweep_rows(folder)
     cells, other = read_verified_runs(folder), find_stale(table)
-    told = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
-    panels: list[FigurePanel] = [_build_share_plot(cells, other, told)]
+    provenance = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
+    panels: list[FigurePanel] = [_build_share_plot(cells, other, provenance)]
     for family in dict.fromkeys(cell.case.partition("-")[0] for cell in cells):
         mine = [cell for cell in cells if cell.case.partition("-")[0] == family]
         drawn = [_build_cell(cell, is_stale=cell.run_id in other) for cell in mine]
         outcomes = [(outcome.label, outcome.color) for outcome in RUN_OUTCOMES]
-        panels.append(CellMap(("map",), (family,), "", family, drawn, outcomes, describe_stale_cells(drawn), told))
+        panels.append(
+            CellMap(("map",), (family,), "", family, drawn, outcomes, describe_stale_cells(drawn), provenance)
+        )
     return entries_from_panels(panels)
 
 

@@ -50,7 +50,7 @@ def timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
     found, other = read_run_times(table), find_stale(table)
     names = label_runs(found)
     marked = assign_label_styles((names[run.run_id], run.solver) for run in found)
-    told = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
+    provenance = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     plots: list[CurvePlot] = []
     for scene in dict.fromkeys(run.scene for run in found):
         here = [run for run in found if run.scene == scene]
@@ -66,7 +66,7 @@ def timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
                     CurvePlot(
                         *((scene,), (key,), _subject_with_size(scene, timed), title, *scales, series),
                         notes=[*(_SPREAD_NOTES[len(fields)]), *hollow, *notes],
-                        machine_words=told,
+                        machine_words=provenance,
                     )
                 )
     return entries_from_panels(plots)
@@ -123,7 +123,7 @@ def speed_panels(folder: Path) -> list[PanelEntry]:
             InputMistake("holds no speed report; wanted the rows of `springbench roofline CONFIG`", folder)
         )
     found = [one for one in speed_figures.compute_speed_figures(table) if one.status == "ok"]
-    told = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
+    provenance = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     marked = assign_label_styles((one.label, one.solver) for one in found)
     plots: list[CurvePlot] = []
     for scene in dict.fromkeys(one.scene for one in found):
@@ -137,7 +137,9 @@ def speed_panels(folder: Path) -> list[PanelEntry]:
                 title = picture.title.replace("Milliseconds ", "")
                 hollow = [STALE_NOTE] if any(one.is_stale for one, _ in points) else []
                 plots.append(
-                    CurvePlot((scene,), (picture.stem,), scene, title, x, y, series, notes=hollow, machine_words=told)
+                    CurvePlot(
+                        (scene,), (picture.stem,), scene, title, x, y, series, notes=hollow, machine_words=provenance
+                    )
                 )
     return entries_from_panels(plots)
 

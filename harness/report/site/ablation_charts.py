@@ -26,7 +26,7 @@ def build_ablation_charts(rows: Sequence[ResultRow]) -> tuple[dict[str, dict[str
     """
     made = {"ablation": _build_effect_chart(rows), "prices": _build_overhead_chart(rows)}
     by_whole = [_select_unit_rows(whole, rows) for whole in select_kind(rows, "full-scene") if whole["status"] == "ok"]
-    words = [f"{some[0]['scene']}: {said}" for some in by_whole for said in summarise_ablation(some)]
+    words = [f"{some[0]['scene']}: {sentence}" for some in by_whole for sentence in summarise_ablation(some)]
     return {name: chart | {"command": _CHART_COMMANDS[name]} for name, chart in made.items() if chart["items"]}, words
 
 

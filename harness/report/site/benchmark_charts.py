@@ -75,12 +75,12 @@ def collect_benchmark_provenance(stored: Sequence[StoredBenchmarks]) -> list[Cha
         cpu, cores, usable = one.machine_key
         commit = one.commit_info.id + ("-dirty" if one.commit_info.dirty else "")
         dates.setdefault((commit, cpu, usable or cores or 0), []).append(one.datetime)
-    told: list[ChartItem] = [
+    items: list[ChartItem] = [
         {"machine_id": None, "cpu": cpu, "cores": cores, "memory_gib": None, "operating_system": None, "commit": commit}
         | {"source_fingerprints": [], "first_started_at": min(when), "last_started_at": max(when), "count": len(when)}
         for (commit, cpu, cores), when in dates.items()
     ]
-    return sorted(told, key=lambda one: str(one["last_started_at"]), reverse=True)
+    return sorted(items, key=lambda one: str(one["last_started_at"]), reverse=True)
 
 
 def _build_chart(name: str, gate_histories: Sequence[BenchmarkHistory]) -> ChartItem:
@@ -131,8 +131,8 @@ def _build_items(gate: BenchmarkHistory, panel: str) -> Iterable[ChartItem]:
         some = [(at, level, ratio) for at, (level, ratio) in changes.items() if (ratio > 1) == slower]
         if some:
             commits, levels = [names[at] for at, *_ in some], round_numbers(scale * level for _, level, _ in some)
-            told = {"commit": commits, "value": levels, "change": [_format_change(ratio) for *_, ratio in some]}
-            yield same | {"label": label, "large": True} | told | _item_provenance(gate, commits)
+            columns = {"commit": commits, "value": levels, "change": [_format_change(ratio) for *_, ratio in some]}
+            yield same | {"label": label, "large": True} | columns | _item_provenance(gate, commits)
 
 
 def _item_provenance(gate: BenchmarkHistory, commits: Sequence[str | None]) -> ChartItem:

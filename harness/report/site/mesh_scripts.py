@@ -121,8 +121,12 @@ def _write_snapshot_solves(
             continue
         distance = data_scripts.round_number(float(best.max_vertex_error[-1] * best.problem.mean_rest_length))
         reference = store_relative(last.absolute_positions(-1), replay.origin)
-        told = {"reference_label": best.label, "distance": distance, "positions": _encode_array(reference, np.float32)}
-        value = _select_iterates(replay, reference) | {"reference": told}
+        document = {
+            "reference_label": best.label,
+            "distance": distance,
+            "positions": _encode_array(reference, np.float32),
+        }
+        value = _select_iterates(replay, reference) | {"reference": document}
         data_scripts.write_script(targets[name], f"{folder.slug}/solves/{targets[name].stem}", value)
     return {name: f"solves/{target.stem}" for name, target in targets.items() if target.exists()}
 
@@ -132,11 +136,13 @@ def _select_iterates(replay: RecordingReplay, reference: NDArray[np.float32]) ->
 
     Distances are from the reference.
     """
-    kept = np.unique(np.linspace(0, len(replay.frames) - 1, min(MAX_ITERATES, len(replay.frames))).round().astype(int))
-    farthest = float(np.linalg.norm(replay.positions[kept] - reference, axis=2).max()) or 1.0
+    selected = np.unique(
+        np.linspace(0, len(replay.frames) - 1, min(MAX_ITERATES, len(replay.frames))).round().astype(int)
+    )
+    farthest = float(np.linalg.norm(replay.positions[selected] - reference, axis=2).max()) or 1.0
     return _mesh_topology(replay) | {
-        "iterations": replay.frames[kept].tolist(),
-        "positions": _encode_array(replay.positions[kept], np.float32),
+        "iterations": replay.frames[selected].tolist(),
+        "positions": _encode_array(replay.positions[selected], np.float32),
         "max_distance": data_scripts.round_number(farthest),
         "min_distance": data_scripts.round_number(_MIN_DISTANCE_RATIO * farthest),
     }

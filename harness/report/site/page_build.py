@@ -118,17 +118,17 @@ def _sweep_state(folder: SweepFolder, code: str, with_recordings: bool) -> str:
 
     It changes with new data, or if this program would present them differently.
     """
-    told: list[Any] = [code, with_recordings]
+    state: list[Any] = [code, with_recordings]
     for kind in ROW_FOLDERS:
         home = folder.path / kind
         own = [(home / f"{unit}.parquet").stat().st_mtime_ns for unit in row_store.list_unit_files(home)]
         packed = row_store.packed_path(home)
-        told += [len(own), max(own, default=0), packed.stat().st_mtime_ns if packed.exists() else 0]
+        state += [len(own), max(own, default=0), packed.stat().st_mtime_ns if packed.exists() else 0]
     of_gates = [path.stat().st_mtime_ns for path in find_benchmark_files(folder.path)]
-    told += [len(of_gates), max(of_gates, default=0)]
+    state += [len(of_gates), max(of_gates, default=0)]
     for part in ("pictures", "recordings", "report"):
-        told.append(sum(1 for _ in (folder.path / part).glob("*")))
-    return sha256(repr(told).encode()).hexdigest()[:16]
+        state.append(sum(1 for _ in (folder.path / part).glob("*")))
+    return sha256(repr(state).encode()).hexdigest()[:16]
 
 
 def _command_path(results: Path) -> str:
@@ -147,14 +147,14 @@ def _write_index(results: Path, data: Path) -> None:
     """
     there = {folder.slug: folder for folder in find_folders(results)}
     known = {slug: _read_summary(data / slug) for slug in there}
-    told = sorted(
+    entries = sorted(
         (summary for summary in known.values() if summary), key=lambda s: s["last_started_at"] or "", reverse=True
     )
     value = {
         "title": results.resolve().name,
         "results_path": _command_path(results),
         "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        "sweeps": [{key: part for key, part in summary.items() if key != "fingerprint"} for summary in told],
+        "sweeps": [{key: part for key, part in summary.items() if key != "fingerprint"} for summary in entries],
         "unwritten_sweeps": [there[slug].name for slug, summary in known.items() if not summary],
     }
     data_scripts.write_script(data / "index.js", "index", value)

@@ -41,9 +41,9 @@ def find_config(folder: Path) -> str:
     It is "" if the config is unknown or deleted.
     """
     note = folder / CLAIM
-    said = note.read_text(errors="replace").strip() if note.is_file() else ""
-    path = folder / said
-    if not said or "\0" in said or not path.is_file():
+    config_path = note.read_text(errors="replace").strip() if note.is_file() else ""
+    path = folder / config_path
+    if not config_path or "\0" in config_path or not path.is_file():
         return ""
     there = path.resolve()
     for above in (Path.cwd(), *there.parents):  # as it is called from the folder that holds `configs/`

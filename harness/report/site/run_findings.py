@@ -14,12 +14,12 @@ RunRecord = dict[str, Any]
 def describe_runs(run_records: Sequence[RunRecord]) -> list[dict[str, Any]]:
     """Describe runs in sentences, each with the ids of its runs (`equal_accuracy`)."""
     names = {run["run_id"]: run["label"] for run in run_records}
-    told = [
+    sentences = [
         {"text": words, "runs": runs}
         for compared in equal_accuracy.compare_runs(map(_to_run_times, run_records))
         for words, runs in equal_accuracy.describe_comparison(compared, names)
     ]
-    return told + list(_describe_unconverged(run_records))
+    return sentences + list(_describe_unconverged(run_records))
 
 
 def _to_run_times(run: RunRecord) -> RunTimes:

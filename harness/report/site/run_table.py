@@ -81,12 +81,12 @@ def build_run_table(folder: SweepFolder, table: pa.Table) -> list[RunRecord]:
     names, more = label_runs(timed), _query_run_details(table)
     found: list[RunRecord] = []
     for run in timed:
-        told: RunRecord = {**run._asdict(), **more[run.run_id], "label": names[run.run_id]}
-        told["global"] = told.pop("global_")
-        told["has_default_parameters"] = int(_has_default_parameters(run.solver, run.parameters_json))
-        told["options"] = names[run.run_id].removeprefix(run.solver).removeprefix(", ")
-        told |= {part[:-1]: int(told["unit"] in files) for part, files in there.items()}
-        found.append(told)
+        record: RunRecord = {**run._asdict(), **more[run.run_id], "label": names[run.run_id]}
+        record["global"] = record.pop("global_")
+        record["has_default_parameters"] = int(_has_default_parameters(run.solver, run.parameters_json))
+        record["options"] = names[run.run_id].removeprefix(run.solver).removeprefix(", ")
+        record |= {part[:-1]: int(record["unit"] in files) for part, files in there.items()}
+        found.append(record)
     found.sort(key=lambda run: (run["scene"], run["size"] or 0, run["label"]))
     for run, how in zip(found, _classify_staleness(found), strict=True):
         run["staleness"] = how

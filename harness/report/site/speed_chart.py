@@ -66,9 +66,9 @@ def _build_item(scene: str, label: str, some: list[SpeedFigures], newest_fingerp
     columns["speedup"] = [round_number(f.speedup and f.speedup.estimate) for f in some]
     ends = {f"speedup_{end}": [round_number(getattr(f.speedup, end, None)) for f in some] for end in ("low", "high")}
     threads = f"{some[0].threads} thread{'s' if some[0].threads > 1 else ''}"
-    told = {"label": label, "description": f"{scene}, {threads}", "scene": scene, "panel": scene, "parameters": "{}"}
+    item = {"label": label, "description": f"{scene}, {threads}", "scene": scene, "panel": scene, "parameters": "{}"}
     return (
-        told
+        item
         | columns
         | ends
         | {

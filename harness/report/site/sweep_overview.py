@@ -80,8 +80,10 @@ def build_overview(
     }
     there = [kind for kind in kinds if kind != "gates" and row_store.list_units(folder.path / kind)]
     there += ["gates"] if find_benchmark_files(folder.path) else []
-    told = [_build_section(kind, kinds[kind], folder, data_folder, with_recordings, print_message) for kind in there]
-    made = [one for each in told for one in each.row_provenance]
+    sections = [
+        _build_section(kind, kinds[kind], folder, data_folder, with_recordings, print_message) for kind in there
+    ]
+    made = [one for each in sections for one in each.row_provenance]
     summary: dict[str, Any] = {
         "slug": folder.slug,
         "name": folder.name,
@@ -92,14 +94,14 @@ def build_overview(
         "provenance": made,
         "first_started_at": min((one["first_started_at"] or "" for one in made), default=""),
         "last_started_at": max((one["last_started_at"] or "" for one in made), default=""),
-        "plots": [{"id": name, "title": title} for each in told for name, title in each.plots],
-        "findings": [said for each in told for said in each.findings],
-        "failures": [cause for each in told for cause in each.failures],
+        "plots": [{"id": name, "title": title} for each in sections for name, title in each.plots],
+        "findings": [finding for each in sections for finding in each.findings],
+        "failures": [cause for each in sections for cause in each.failures],
         "pictures": _select_pictures(folder),
     }
-    for each in told:
+    for each in sections:
         summary |= each.summary_fields
-    return SweepOverview(summary, {name: value for each in told for name, value in each.scripts.items()})
+    return SweepOverview(summary, {name: value for each in sections for name, value in each.scripts.items()})
 
 
 def _build_section(
@@ -132,8 +134,8 @@ def _build_run_section(
         {"text": words} for words in of_devices(table, row_provenance.find_config(folder.path))
     ] + describe_runs(found)
     if speed_chart.has_machine_limits(table):
-        scripts["speed"], said = speed_chart.build_speed_chart(table)
-        findings = [{"text": words} for words in said]
+        scripts["speed"], speed_findings = speed_chart.build_speed_chart(table)
+        findings = [{"text": words} for words in speed_findings]
     outcomes: dict[str, Any] = {}
     if robustness_chart.has_verification(table):
         scripts["hard"] = robustness_chart.build_robustness_chart(folder)
@@ -173,8 +175,8 @@ def _mark_recordings(
         from springbench.harness.report.site.mesh_scripts import write_last_frames, write_recordings
 
         there["meshes"] = write_last_frames(folder, data_folder, list(recorded), print_message)
-        kept = {f"recordings/{unit}.rrd": words for unit, words in recorded.items()}
-        there["recordings"] = {Path(name).stem for name in write_recordings(folder, data_folder, kept)}
+        marks = {f"recordings/{unit}.rrd": words for unit, words in recorded.items()}
+        there["recordings"] = {Path(name).stem for name in write_recordings(folder, data_folder, marks)}
     for run in run_records:
         run |= {name: int(run["unit"] in there[part]) for name, part in (("mesh", "meshes"), ("replay", "recordings"))}
 
@@ -218,21 +220,21 @@ def _build_accuracy_section(
         from springbench.harness.report.site.mesh_scripts import write_recordings, write_solves
 
         facts["solves"] = write_solves(folder, data_folder, without_short_curves(table), print_message)
-        kept = {
+        scripts_by_name = {
             c.recording_path: f"{c.label}, {c.problem.problem_label}"
             for c in table.curves
             if c.recording_path in facts["solves"]
         }
-        facts["replays"] = write_recordings(folder, data_folder, kept)
+        facts["replays"] = write_recordings(folder, data_folder, scripts_by_name)
     chapters = summarise_findings(table)
-    told = [{"text": w, "chapter": name} for name, some in chapters.items() if name != "Methods" for w in some]
+    findings = [{"text": w, "chapter": name} for name, some in chapters.items() if name != "Methods" for w in some]
     failed = [FailedRun(row["where"], row["solver"], row["status"], row["reason"]) for row in list_failures(table)]
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     facts |= {"curves": len(table.curves), "work_points": len(table.work_points)}
     return _PageSection(
         scripts,
         plots,
-        told,
+        findings,
         group_failures(failed),
         row_provenance.collect_provenance(_read_rows(folder, "accuracy"), "unit_id"),
         facts,
@@ -245,11 +247,11 @@ def _build_ablation_section(
     table = _read_rows(folder, "ablation", print_message)
     scripts, words = ablation_charts.build_ablation_charts(table.to_pylist())
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
-    said = [{"text": f"{one}.", "chapter": "Effects"} for one in words]
+    findings = [{"text": f"{one}.", "chapter": "Effects"} for one in words]
     return _PageSection(
         dict(scripts),
         plots,
-        said,
+        findings,
         [],
         row_provenance.collect_provenance(table, row_store.FILE_COLUMN),
         {"ablations": len(words)},

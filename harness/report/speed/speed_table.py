@@ -71,9 +71,9 @@ def _build_scene_labels(candidates: Sequence[SpeedFigures]) -> Callable[[SpeedFi
 
 
 def _format_label(f: SpeedFigures) -> str:
-    said = [f"{f.iterations} of {STEP_ITERATIONS}"] if f.iterations != STEP_ITERATIONS else []
-    said += ["by other code"] if f.is_stale else []
-    return f"{f.label} ({', '.join(said)})" if said else f.label
+    notes = [f"{f.iterations} of {STEP_ITERATIONS}"] if f.iterations != STEP_ITERATIONS else []
+    notes += ["by other code"] if f.is_stale else []
+    return f"{f.label} ({', '.join(notes)})" if notes else f.label
 
 
 def _format_cells(f: SpeedFigures) -> list[str]:
@@ -111,18 +111,18 @@ def describe_speed(candidates: Sequence[SpeedFigures]) -> list[str]:
     Failed and omitted candidates are listed with their reasons.
     """
     where = _build_scene_labels(candidates)
-    told: dict[str, list[str]] = defaultdict(list)
+    sizes_by_sentence: dict[str, list[str]] = defaultdict(list)
     for f in sorted(candidates, key=lambda f: f.status == "ok"):
         if f.status != "ok":
-            told[f"{f.label}: {f.status}: {f.reason}"].append(where(f))
+            sizes_by_sentence[f"{f.label}: {f.status}: {f.reason}"].append(where(f))
         elif f.solver_description and "auto" in f.label.split():
-            told[f"{f.label} chose {f.solver_description}"].append(where(f))
-    said = [f"{words} (at {', '.join(sizes)})" for words, sizes in told.items()]
+            sizes_by_sentence[f"{f.label} chose {f.solver_description}"].append(where(f))
+    sentences = [f"{words} (at {', '.join(sizes)})" for words, sizes in sizes_by_sentence.items()]
     entries = fit_exponents(candidates, "factor_entries")
     for (scene, label), exponent in fit_exponents(candidates).items():
         factor = f", its factor has n^{entries[scene, label]:.2f} entries" if (scene, label) in entries else ""
-        said.append(f"{label}: from 10,000 vertices of {scene} on a solve costs n^{exponent:.2f}{factor}")
-    return said
+        sentences.append(f"{label}: from 10,000 vertices of {scene} on a solve costs n^{exponent:.2f}{factor}")
+    return sentences
 
 
 def fit_exponents(

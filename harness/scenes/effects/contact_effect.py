@@ -83,8 +83,8 @@ class ContactEffect(ConfigModel):
         def derived(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
             projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
             everything = np.arange(len(mass))
-            held = System(mass, time_step, pins=DirichletPins(everything, np.full(len(mass), np.inf)))
-            resists = np.asarray(assemble_system_matrix(held, projective).diagonal(), np.float64)
+            pinned_system = System(mass, time_step, pins=DirichletPins(everything, np.full(len(mass), np.inf)))
+            resists = np.asarray(assemble_system_matrix(pinned_system, projective).diagonal(), np.float64)
             stiffness = _STIFFNESS_SAFETY * max(1.0, self.speed * time_step / self.max_penetration) * resists
             rubs = self.creep, _MARGIN_FRACTION * mesh.bounding_box_diagonal, time_step, self.friction_rounds
             return (Energy(obstacles, self.thickness, self.friction, stiffness, *rubs),)

@@ -128,8 +128,8 @@ def _triangle_wind(wind: WindEffect, mesh: Mesh, mass: NDArray[np.float64], dt: 
         normal = np.sign(wide)[:, None] * np.divide(area, size, out=np.zeros_like(area), where=size > 0.0)
         across = normal - np.einsum("ij,ij->i", normal, ahead)[:, None] * ahead
         f = 0.5 * wind.density * (np.abs(wide) * speed)[:, None] * (wind.drag * ahead + wind.lift * across)
-        most, asked = limit * speed, np.linalg.norm(f, axis=1)
-        f *= np.divide(most, asked, out=np.ones_like(asked), where=asked > most)[:, None]
+        most, wanted_force = limit * speed, np.linalg.norm(f, axis=1)
+        f *= np.divide(most, wanted_force, out=np.ones_like(wanted_force), where=wanted_force > most)[:, None]
         out = np.zeros_like(p)
         for corner in triangles.T:
             np.add.at(out, corner, f / 3.0)

@@ -33,7 +33,7 @@ def find_boundary_loops(mesh: Mesh) -> list[BoundaryLoop]:
     """Find the boundary loops of a mesh at rest, longest first; ties by the lowest vertex."""
     if not len(mesh.triangles):
         return []
-    from scipy.sparse import coo_array  # for those who ask
+    from scipy.sparse import coo_array  # imported only when loops are needed
     from scipy.sparse.csgraph import connected_components
 
     n = len(mesh.rest_positions)

@@ -98,10 +98,14 @@ def _read_by_suffix(path: Path) -> MeshFileContent:
     if missing and (what := missing(content, raw)):
         raise ValueError(f"{what}; the file was cut before its end, so write it once more")
     blocks = [(block.type, np.array(block.data, np.int64)) for block in raw.cells if len(block.data)]
-    kept = [(kind, data) for kind, data in blocks if kind != "vertex"]
+    cell_blocks = [(kind, data) for kind, data in blocks if kind != "vertex"]
     points = np.array(raw.points, np.float64)
     found = MeshFileContent(
-        points, kept, _collect_groups(raw), _split_columns(raw.point_data, len(points)), _number_faces(kept)
+        points,
+        cell_blocks,
+        _collect_groups(raw),
+        _split_columns(raw.point_data, len(points)),
+        _number_faces(cell_blocks),
     )
     return _drop_unused_points(found) if suffix == ".msh" else found
 
@@ -142,13 +146,13 @@ def _restrict_file_access(path: Path) -> Generator[None]:
 
 def _read_with_meshio(path: Path) -> _MeshioMesh:
     """Read a file with meshio; raise ValueError with the reason if meshio prints it and exits."""
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        with warnings.catch_warnings(), redirect_stdout(said):
+        with warnings.catch_warnings(), redirect_stdout(output):
             warnings.simplefilter("ignore")
             return cast(_MeshioMesh, meshio.read(path))
     except SystemExit:
-        reason = "; ".join(filter(None, map(str.strip, said.getvalue().splitlines())))
+        reason = "; ".join(filter(None, map(str.strip, output.getvalue().splitlines())))
         raise ValueError(reason or f"it does not hold what a {path.suffix} file begins with") from None
 
 

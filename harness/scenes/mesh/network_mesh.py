@@ -34,7 +34,7 @@ class NetworkMesh(ConfigModel):
     @field_validator("springs", "shear", "bend")
     @classmethod
     def _check_pairs(cls, pairs: VertexPairs, info: ValidationInfo) -> VertexPairs:
-        n = len(info.data.get("positions", ())) or np.inf  # refused positions are told of by themselves
+        n = len(info.data.get("positions", ())) or np.inf  # invalid positions are reported separately
         for k, (i, j) in enumerate(pairs):
             if i == j:
                 raise ValueError(f"spring {k} joins the vertex {i} to itself; remove it or name another vertex")

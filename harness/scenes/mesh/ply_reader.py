@@ -167,7 +167,7 @@ class _TextBody:
 
     def __init__(self, body: bytes) -> None:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # which says that something is no number
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy warns of text that is no number
             try:
                 self._values = np.fromstring(body, np.float64, sep=" ") if body.strip() else np.empty(0)
             except (DeprecationWarning, ValueError):

@@ -197,11 +197,11 @@ def _triangulate_faces(cells: MeshCells, path: Path) -> tuple[IndexArray, PointA
         new[cover.corners][cover.rows] = False
     if repeats:
         _warn_repeated_faces(cells, path, sorted(repeats))
-    kept = {k: surfaces[k].select_rows(new[k]) for k in faces}
-    triangles = np.concatenate([NO_TRIANGLES, *(made.triangles.reshape(-1, 3) for made in kept.values())])
+    selected = {k: surfaces[k].select_rows(new[k]) for k in faces}
+    triangles = np.concatenate([NO_TRIANGLES, *(made.triangles.reshape(-1, 3) for made in selected.values())])
     if set(faces) <= {3}:
         return triangles, None
-    areas = [compute_vertex_areas(cells.points, faces[k][new[k]], kept[k]) for k in faces]
+    areas = [compute_vertex_areas(cells.points, faces[k][new[k]], selected[k]) for k in faces]
     return triangles, np.sum(areas, axis=0)
 
 

@@ -223,7 +223,9 @@ def traverse_trees(one, other, begin, end, query, is_same_tree, stack, out):
                 while left != 0:
                     f = first + lowest_set_bit(left)
                     left &= left - 1
-                    if count < len(out):  # what shares a vertex is written over: nobody could foretell a branch here
+                    if count < len(
+                        out
+                    ):  # pairs with a common vertex are overwritten, as a branch here would be mispredicted
                         out[count, 0], out[count, 1] = first_of_eight + k, f
                     count += not has_common_vertex(one.primitives, first_of_eight + k, other.primitives, f)
     return count

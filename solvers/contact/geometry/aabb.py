@@ -123,8 +123,8 @@ def merge_aabbs(boxes, num_boxes):
 @jit_kernel
 def max_inflation(query):
     """Return the distance [m] beyond which no limit can be violated."""
-    beside = query.relative_min_distance * query.max_displacement if query.relative_min_distance > 0.0 else 0.0
-    return max(query.inflation_radius, (query.min_distance + beside) / (1.0 - query.relative_min_distance))
+    relative_offset = query.relative_min_distance * query.max_displacement if query.relative_min_distance > 0.0 else 0.0
+    return max(query.inflation_radius, (query.min_distance + relative_offset) / (1.0 - query.relative_min_distance))
 
 
 @jit_inner

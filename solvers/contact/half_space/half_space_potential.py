@@ -275,10 +275,10 @@ class HalfSpaceContact:
         rows, n = self.build_penalty_rows(p, p, majorise=False), len(p)
         blocks = np.zeros((n, 3, 3))
         np.add.at(blocks, rows.vertices, _outer_products(rows.stiffness, rows.direction))
-        held = np.zeros(n, bool)
-        held[rows.vertices] = True
-        columns = np.flatnonzero(held)
-        indptr = np.concatenate([[0], np.cumsum(held)])
+        in_contact = np.zeros(n, bool)
+        in_contact[rows.vertices] = True
+        columns = np.flatnonzero(in_contact)
+        indptr = np.concatenate([[0], np.cumsum(in_contact)])
         return scipy.sparse.csr_array(scipy.sparse.bsr_array((blocks[columns], columns, indptr), shape=(3 * n, 3 * n)))
 
     def build_penalty_rows(self, p: Positions, trial: Positions, *, majorise: bool) -> PenaltyRows:

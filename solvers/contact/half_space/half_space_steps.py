@@ -93,10 +93,10 @@ def half_space_energy(s, p):
 
 
 @jit_inner
-def _spring_gradient_and_block(bundles, b, lane, p, x, held, load):
+def _spring_gradient_and_block(bundles, b, lane, p, x, anchor_stiffness, load):
     """Return the gradient and the block's upper triangle of a vertex's springs, inertia and pins."""
     g0, g1, g2 = -load[0], -load[1], -load[2]
-    a00, a01, a02, a11, a12, a22 = held, 0.0, 0.0, held, 0.0, held
+    a00, a01, a02, a11, a12, a22 = anchor_stiffness, 0.0, 0.0, anchor_stiffness, 0.0, anchor_stiffness
     for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
         e, w = LANES * entry + lane, bundles.weight_offset[entry] + lane
         j, k, pull = bundles.neighbour_offset[e], bundles.weights[w + LANES], bundles.weights[w]
@@ -179,11 +179,11 @@ def solve_block(block, g):
 
 
 @jit_inner
-def _energy_change(bundles, b, lane, p, x, d, held, load):
+def _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load):
     """Return the change of a vertex's energy [J] of springs, inertia and pins by a step d, without cancellation."""
     total = 0.0
     for c in range(3):
-        total += d[c] * (0.5 * held * d[c] - load[c])
+        total += d[c] * (0.5 * anchor_stiffness * d[c] - load[c])
     for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
         j, w = bundles.neighbour_offset[LANES * entry + lane], bundles.weight_offset[entry] + lane
         stiffness, before, after, change = bundles.weights[w + LANES], 0.0, 0.0, 0.0
@@ -259,13 +259,13 @@ def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
 
     @jit_closure
     def rise(d, where):
-        bundles, beside, b, lane, i, p, x, held, load = where
-        return _energy_change(bundles, b, lane, p, x, d, held, load) + energy_change(beside, i, p, d)
+        bundles, elements, b, lane, i, p, x, anchor_stiffness, load = where
+        return _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load) + energy_change(elements, i, p, d)
 
     lowering = build_block_step(rise)
 
     @jit_closure
-    def move(bundles, s, beside, b, unknowns, p, right, majorant):
+    def move(bundles, s, elements, b, unknowns, p, right, majorant):
         for lane in range(LANES):
             i = bundles.row_offset[LANES * b + lane] // 4
             if i >= unknowns:
@@ -275,8 +275,8 @@ def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
             x = p[4 * i], p[4 * i + 1], p[4 * i + 2]
             load = right[at] - h * x[0], right[at + LANES] - h * x[1], right[at + 2 * LANES] - h * x[2]
             gradient, block = _spring_gradient_and_block(bundles, b, lane, p, x, h, load)
-            gradient, block = add_gradient_block(beside, i, p, gradient, block)
-            majorant_block, where = (most, 0.0, 0.0, most, 0.0, most), (bundles, beside, b, lane, i, p, x, h, load)
+            gradient, block = add_gradient_block(elements, i, p, gradient, block)
+            majorant_block, where = (most, 0.0, 0.0, most, 0.0, most), (bundles, elements, b, lane, i, p, x, h, load)
             d = lowering(s, i, x, majorant_block, EXACT_BLOCK, gradient, block, where)
             p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
 

@@ -58,7 +58,7 @@ def is_vertex_contact(energy: Energy) -> TypeGuard[VertexContactEnergy]:
 
 @cache
 def _is_vertex_contact_type(kind: type) -> bool:
-    return issubclass(kind, VertexContactEnergy)  # takes 30 us each time, and is asked each step
+    return issubclass(kind, VertexContactEnergy)  # takes 30 us, and is called in each step
 
 
 def begin_active_contacts(problem: StepProblem) -> list[VertexContactEnergy]:
@@ -69,5 +69,5 @@ def begin_active_contacts(problem: StepProblem) -> list[VertexContactEnergy]:
 
 def without_vertex_contact(system: System) -> System:
     """Return the system without vertex contact; the same object if it has none."""
-    kept = tuple(energy for energy in system.energies if not is_vertex_contact(energy))
-    return system if len(kept) == len(system.energies) else replace(system, energies=kept)
+    remaining = tuple(energy for energy in system.energies if not is_vertex_contact(energy))
+    return system if len(remaining) == len(system.energies) else replace(system, energies=remaining)

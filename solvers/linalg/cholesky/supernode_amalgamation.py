@@ -56,15 +56,15 @@ def amalgamate_supernodes(parent, count):
     tree, of_column, width, rows = _find_fundamental_supernodes(parent, count)
     into = _merge_children(tree, width, rows)
     name = np.full(len(tree), -1, np.int32)
-    kept = 0
+    num_supernodes = 0
     for s in range(len(tree)):
         if into[s] == s:
-            name[s] = kept
-            kept += 1
+            name[s] = num_supernodes
+            num_supernodes += 1
     for s in range(len(tree) - 1, -1, -1):  # a node's name is that of the one it went into
         name[s] = name[into[s]]
-    merged = np.full(kept, -1, np.int32)
-    cost = np.empty(kept)
+    merged = np.full(num_supernodes, -1, np.int32)
+    cost = np.empty(num_supernodes)
     for s in range(len(tree)):
         if into[s] == s:
             cost[name[s]] = _solve_cost(width[s], rows[s])

@@ -101,9 +101,9 @@ def _build_prolongator(
     order = inside[np.argsort(owner[inside], kind="stable")]
     size = np.bincount(owner[inside], minlength=count)
     first = np.cumsum(size) - size
-    kept = np.minimum(size, B.shape[1])
-    column = np.cumsum(kept) - kept
-    total = int(kept.sum())
+    num_columns = np.minimum(size, B.shape[1])
+    column = np.cumsum(num_columns) - num_columns
+    total = int(num_columns.sum())
     coarse, parts = np.zeros((total, B.shape[1])), []
     for s in np.unique(size):  # aggregates of one size at a time
         which = np.flatnonzero(size == s)
@@ -118,7 +118,7 @@ def _build_prolongator(
     return (
         csr_array(coo_array((entries, (row, col)), shape=(len(nodes), total))),
         coarse,
-        np.repeat(np.arange(count), kept),
+        np.repeat(np.arange(count), num_columns),
     )
 
 

@@ -22,7 +22,7 @@ def run_admm_local_step(edges, stiffness, low, high, rest_direction, weight, p, 
         u: scaled dual variables (m, 3) [m].
         out: output (n, 3) [N].
     """
-    share, kept = 1.0 / (1.0 + weight), weight * (weight - 1.0) / (1.0 + weight)
+    share, multiplier_share = 1.0 / (1.0 + weight), weight * (weight - 1.0) / (1.0 + weight)
     for i in range(len(p)):
         for c in range(3):
             out[i, c] = constant[i, c]
@@ -37,7 +37,11 @@ def run_admm_local_step(edges, stiffness, low, high, rest_direction, weight, p, 
         d0, d1, d2 = t * d0, t * d1, t * d2
         u[e, 0], u[e, 1], u[e, 2] = share * (v0 - d0), share * (v1 - d1), share * (v2 - d2)
         f0, f1, f2 = 2.0 * weight * share * d0, 2.0 * weight * share * d1, 2.0 * weight * share * d2
-        f0, f1, f2 = k * (f0 + kept * v0), k * (f1 + kept * v1), k * (f2 + kept * v2)
+        f0, f1, f2 = (
+            k * (f0 + multiplier_share * v0),
+            k * (f1 + multiplier_share * v1),
+            k * (f2 + multiplier_share * v2),
+        )
         out[i, 0] += f0
         out[i, 1] += f1
         out[i, 2] += f2

@@ -61,9 +61,9 @@ def compile_cpp(
     if not made.exists():
         folder.mkdir(parents=True, exist_ok=True)
         partial = made.with_suffix(f".{os.getpid()}.partial")
-        told = subprocess.run([*command, "-o", str(partial)], capture_output=True, text=True)
-        if told.returncode:
-            first = next((line for line in told.stderr.splitlines() if "error" in line), "no message")
+        completed = subprocess.run([*command, "-o", str(partial)], capture_output=True, text=True)
+        if completed.returncode:
+            first = next((line for line in completed.stderr.splitlines() if "error" in line), "no message")
             raise Unsupported(f"{source.name} does not compile: {first.strip()}; it needs {requirements}")
         os.replace(partial, made)
     return made

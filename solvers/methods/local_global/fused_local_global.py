@@ -98,7 +98,7 @@ def _max_direct_coordinate(base: PreparedLocalGlobal, springs: Springs) -> float
 
 
 def _build_plan(
-    order: EliminationSchedule, first: IndexArray, held: FloatArray, measure: FloatArray, loose: FloatArray
+    order: EliminationSchedule, first: IndexArray, anchor_stiffness: FloatArray, measure: FloatArray, loose: FloatArray
 ) -> local_global_iteration.IterationPlan:
     """Build the plan over a factor's spans, with the first packet of each (groups + 1,)."""
     spans = np.ascontiguousarray(
@@ -111,7 +111,7 @@ def _build_plan(
         order.group_blocks,
         order.visit_schedule,
         order.visit_starts,
-        held,
+        anchor_stiffness,
         measure,
         loose,
         order.row_shift,
@@ -125,8 +125,8 @@ def _build_vertex_rows(
     s, pins = base.system, base.system.pins
     coupling = csr_array((0, 0)).tocoo() if corrects else base.pin_coupling.tocoo()
     ends = s.free_vertices[coupling.coords[0]], np.flatnonzero(pins.exact_mask)[coupling.coords[1]]
-    held = np.array(pins.weight), np.array(pins.vertices), np.array(coupling.data, np.float64)
-    return step_setup.VertexRows(row, right, s.inertia_diagonal, *held, *ends)
+    pin_arrays = np.array(pins.weight), np.array(pins.vertices), np.array(coupling.data, np.float64)
+    return step_setup.VertexRows(row, right, s.inertia_diagonal, *pin_arrays, *ends)
 
 
 class StepScratch(NamedTuple):
@@ -174,7 +174,7 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         """Build the iterations over a factor in blocks; use_corrections selects corrections in any case."""
         s, pins = base.system, base.system.pins
         exact = pins.vertices[pins.exact_mask]
-        nobody = order.num_rows + len(exact)
+        padding_row = order.num_rows + len(exact)
         row = np.empty(s.num_vertices, np.int64)
         slot = order.row_of_unknown[: len(s.free_vertices)]  # those behind are padding
         row[s.free_vertices] = slot
@@ -182,27 +182,27 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         part = np.full(s.num_vertices, -1)
         part[s.free_vertices] = np.searchsorted(order.block_spans[:, 0], slot, side="right") - 1
         corrects |= order.inverse_blocks.dtype != np.float64
-        where = row, part, len(order.block_spans), nobody, nobody + 1
+        where = row, part, len(order.block_spans), padding_row, padding_row + 1
         form, first = kernels.SpringPackets.from_springs(parts.system_pairs, *where)
         # A solve for positions has the forms in Q; one for corrections also needs their gradient.
         local = parts.springs_and_forms if corrects else parts.springs
         bundles = form if local is parts.system_pairs else kernels.SpringPackets.from_springs(local, *where)[0]
         inertia = s.inertia_diagonal
-        held, measure, loose = np.zeros((3, nobody + 2 + order.row_shift))
-        held[row] = measure[row] = inertia + parts.vertex_weight
+        anchor_stiffness, measure, loose = np.zeros((3, padding_row + 2 + order.row_shift))
+        anchor_stiffness[row] = measure[row] = inertia + parts.vertex_weight
         _, soft, weight = s.penalty_pins
-        held[row[soft]] += weight
+        anchor_stiffness[row[soft]] += weight
         measure[row[s.free_vertices]] -= 0.5 * base.pin_coupling.sum(axis=1)
         loose[row[s.unpinned_mask]] = 1.0
         return cls(
             base,
             parts,
-            _build_plan(order, first, held, form.gather_lanes(measure), loose),
+            _build_plan(order, first, anchor_stiffness, form.gather_lanes(measure), loose),
             bundles,
-            parts.build_edges(row, len(held)),
+            parts.build_edges(row, len(anchor_stiffness)),
             form,
-            _build_vertex_rows(base, row, bundles.right_hand_side_offset(len(held))[row], corrects),
-            nobody + 1,
+            _build_vertex_rows(base, row, bundles.right_hand_side_offset(len(anchor_stiffness))[row], corrects),
+            padding_row + 1,
             corrects,
             np.inf if corrects else _max_direct_coordinate(base, parts.springs),
         )

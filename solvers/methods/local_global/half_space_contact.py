@@ -144,8 +144,8 @@ class ContactCorrections:
     def _concatenate_rows(self, parts: list[PenaltyRows]) -> PenaltyRows:
         """Return all rows of free vertices with positive stiffness."""
         vertices, direction, weight, gap = (np.concatenate(field) for field in zip(*parts, strict=True))
-        kept = self._free[vertices] & (weight > 0.0)
-        return PenaltyRows(vertices[kept], direction[kept], weight[kept], gap[kept])
+        active = self._free[vertices] & (weight > 0.0)
+        return PenaltyRows(vertices[active], direction[active], weight[active], gap[active])
 
     def _solve_woodbury(self, rows: PenaltyRows, gradient: Positions, contact_free_correction: Positions) -> Positions:
         vertices, place = np.unique(rows.vertices, return_inverse=True)

@@ -84,8 +84,10 @@ def prepare_newton_cg(
     order = order_into_subdomains(metric.free_block)
     network = DeviceNetwork.from_system("newton-cg", system, order)
     size = np.dtype(real).itemsize
-    held = network.anchor_stiffness[: network.num_free] + MIN_DIAGONAL_FRACTION * metric.free_diagonal[order]
-    of = build_levels(network, held)
+    anchor_stiffness = (
+        network.anchor_stiffness[: network.num_free] + MIN_DIAGONAL_FRACTION * metric.free_diagonal[order]
+    )
+    of = build_levels(network, anchor_stiffness)
     vectors = network.num_free * (3.0 * (12 * 8 + 8 * size) + 8.0 * 8)
     solve = vectors + compute_schwarz_bytes(of, size) + 4.0 * size * len(network.edge_entries.neighbour_rows)
     cuda_device.require_memory("newton-cg", network.device_bytes + solve)
@@ -205,8 +207,8 @@ class _NewtonCGState(DeviceSolverState):
         ):
             return False
         before, self._residual_product = self._residual_product, self._linearise_at_point()
-        following, held = 0.9 * self._residual_product / before, 0.9 * self._eta**2
-        self._eta = min(self._max_eta, max(self._min_eta, following, held if held > 0.1 else 0.0))
+        following, safeguard = 0.9 * self._residual_product / before, 0.9 * self._eta**2
+        self._eta = min(self._max_eta, max(self._min_eta, following, safeguard if safeguard > 0.1 else 0.0))
         return True
 
     def _linearise_at_point(self) -> float:

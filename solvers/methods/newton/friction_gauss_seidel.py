@@ -175,13 +175,13 @@ def sweep_friction(planes, smoothing_length, matrix, p, gradient, sweeps):
             weight = friction_stiffness(grip[e], np.sqrt(u0 * u0 + u1 * u1 + u2 * u2), smoothing_length)
             v0, v1, v2 = u0 - (g0 - weight * u0) / q, u1 - (g1 - weight * u1) / q, u2 - (g2 - weight * u2) / q
             length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-            kept = friction_proximal_factor(grip[e], q, length, smoothing_length)
-            d0, d1, d2 = kept * v0 - u0, kept * v1 - u1, kept * v2 - u2
-            after = friction_stiffness(grip[e], kept * length, smoothing_length)
+            factor = friction_proximal_factor(grip[e], q, length, smoothing_length)
+            d0, d1, d2 = factor * v0 - u0, factor * v1 - u1, factor * v2 - u2
+            after = friction_stiffness(grip[e], factor * length, smoothing_length)
             p[i, 0], p[i, 1], p[i, 2] = p[i, 0] + d0, p[i, 1] + d1, p[i, 2] + d2
-            gradient[i, 0] += after * kept * v0 - weight * u0
-            gradient[i, 1] += after * kept * v1 - weight * u1
-            gradient[i, 2] += after * kept * v2 - weight * u2
+            gradient[i, 0] += after * factor * v0 - weight * u0
+            gradient[i, 1] += after * factor * v1 - weight * u1
+            gradient[i, 2] += after * factor * v2 - weight * u2
             for k in range(starts[f], starts[f + 1]):
                 j, w = columns[k], entries[k]
                 gradient[j, 0] += w * d0

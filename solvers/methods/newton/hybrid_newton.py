@@ -177,9 +177,9 @@ class HybridIteration:
                 run = None
                 if predicting is None:
                     predicting = PredictedTensionNewton(self, step, start)
-                    following, fall, beside = predicting.compute_first_step(point)
-                    gain = np.inf if beside else gain
-                    fall = 0.0 if beside else fall
+                    following, fall, curvature = predicting.compute_first_step(point)
+                    gain = np.inf if curvature else gain
+                    fall = 0.0 if curvature else fall
                 else:
                     following, fall, ended = predicting.compute_next_step(point)
                 newton_gain = fall / self._newton_step_cost

@@ -85,7 +85,7 @@ class NewtonCG(PrecisionOptions):
             Unsupported: if Q does not fit in memory, and for block preconditioners with energies without elements.
         """
         if self.device == "cuda":
-            from springbench.solvers.cuda.cuda_device import require_device  # for those who ask for it
+            from springbench.solvers.cuda.cuda_device import require_device  # imported only for a device
 
             require_device("newton-cg")
             from springbench.solvers.methods.newton.device_newton_cg import prepare_newton_cg

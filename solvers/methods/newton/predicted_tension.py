@@ -70,14 +70,14 @@ class PredictedTensionNewton:
         self._slope = -inner_product(at.gradient, descent)
         following = backtracking_line_search(step, at, -descent) or at
         self._can_reduce_shift = objective_decrease(step, at, following) > -_MODEL_DECREASE_FRACTION * self._slope
-        beside = probe_negative_curvature(step, following, hessian, self._method.system_diagonal)
-        following = beside or following
+        curvature = probe_negative_curvature(step, following, hessian, self._method.system_diagonal)
+        following = curvature or following
         if self._can_reduce_shift:
             self._first_point, self._predicted_tensions = (
                 None,
                 step.linearise_tensions(following.positions, np.zeros_like(descent)),
             )
-        return following, objective_decrease(step, at, following), beside is not None
+        return following, objective_decrease(step, at, following), curvature is not None
 
     def compute_next_step(self, point: DescentPoint) -> tuple[DescentPoint, float, bool]:
         """Return a lower point or the same one, the decrease [J], and whether to continue with the exact Hessian."""
@@ -93,15 +93,15 @@ class PredictedTensionNewton:
         if not -slope > self._method.metric.energy_roundoff(at.positions):
             return point, 0.0, True
         predicted = step.linearise_tensions(at.positions, direction)
-        length, following, kept = self._line_search(at, direction, slope)
+        length, following, is_sufficient = self._line_search(at, direction, slope)
         if following is None:
             return point, 0.0, True
-        self._can_reduce_shift = kept or self._shift == np.inf
+        self._can_reduce_shift = is_sufficient or self._shift == np.inf
         self._predicted_tensions += length * (predicted - self._predicted_tensions)
         gain = objective_decrease(step, point, following)
         if gain == 0.0:
             return point, 0.0, at is point
-        return following, gain, self._shift == 0.0 and kept and slope >= _QUADRATIC_SLOPE_RATIO * before
+        return following, gain, self._shift == 0.0 and is_sufficient and slope >= _QUADRATIC_SLOPE_RATIO * before
 
     def _solve_regularised(self, hessian: Hessian, b: Positions) -> Positions | None:
         """Solve with the regularised Hessian.

@@ -59,9 +59,9 @@ def prepare_xpbd(
             DeviceConstraints.from_constraints(stream, coloured_constraints, real_dtype),
             VertexData.from_system(stream, system),
         )
-        told = f"{description}; kernels in {np.dtype(real_dtype)}, from a reference in float64"
+        words = f"{description}; kernels in {np.dtype(real_dtype)}, from a reference in float64"
         made = PreparedDeviceXpbdSmallSteps if small_steps else PreparedDeviceXpbd
-        return made(system, stream, *there, colour_starts, real_dtype, cuda_device.describe_device(), told)
+        return made(system, stream, *there, colour_starts, real_dtype, cuda_device.describe_device(), words)
 
 
 class DeviceConstraints(NamedTuple):

@@ -39,14 +39,14 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
         """Write the positions without springs, y/q, to x; set u to 0."""
         i = cuda.grid(1)
         while i < x.shape[0]:
-            held, w, q = places.anchor_stiffness[i], places.pin_weight[i], places.pin_indices[i]
+            anchor_stiffness, w, q = places.anchor_stiffness[i], places.pin_weight[i], places.pin_indices[i]
             for c in range(3):
                 away = force[i, c]
                 if q >= 0 and not math.isinf(w):
                     away += w * (pins[q, c] - target[i, c])
-                x[i, c] = pins[q, c] if math.isinf(w) else target[i, c] + away / held
+                x[i, c] = pins[q, c] if math.isinf(w) else target[i, c] + away / anchor_stiffness
                 u[i, c] = zero
-            compliance[i] = real(1.0 / held)
+            compliance[i] = real(1.0 / anchor_stiffness)
             i += cuda.gridsize(1)
 
     @cuda.jit

@@ -98,16 +98,18 @@ class MultigridXpbd:
         Raises:
             Unsupported: for energies other than springs, and for unpinned vertices without mass.
         """
-        springs, held = require_only_springs(system, "mgpbd"), vertex_terms.compute_anchor_stiffness(system)
-        vertex_terms.require_mass(system, held, "mgpbd")
+        springs, anchor_stiffness = require_only_springs(system, "mgpbd"), vertex_terms.compute_anchor_stiffness(system)
+        vertex_terms.require_mass(system, anchor_stiffness, "mgpbd")
         keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])  # self-loops stretch nothing
         incidence, root = (
-            signed_incidence_matrix_sparse(springs.edges[keep], len(held)),
+            signed_incidence_matrix_sparse(springs.edges[keep], len(anchor_stiffness)),
             np.sqrt(springs.stiffness[keep]),
         )
         half = csr_array(diagonal_matrix(root) @ incidence)
         one = csr_array(eye_array(len(keep)))
-        coupling = drop_zeros(one + csr_array(half @ diagonal_matrix(1.0 / held)) @ csr_array(half.T))  # rows in order
+        coupling = drop_zeros(
+            one + csr_array(half @ diagonal_matrix(1.0 / anchor_stiffness)) @ csr_array(half.T)
+        )  # rows in order
         return PreparedMultigridXpbd(
             self,
             system,
@@ -116,7 +118,7 @@ class MultigridXpbd:
             root,
             springs.rest_length[keep],
             springs.rest_direction[keep],
-            1.0 / held,
+            1.0 / anchor_stiffness,
             f"{self.components or 'no'} components of the near-kernel, conjugate gradients with multigrid",
             {"nnz_system": float(coupling.nnz)},
         )

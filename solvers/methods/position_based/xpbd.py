@@ -57,11 +57,11 @@ class Xpbd(PrecisionOptions):
         Raises:
             Unsupported: for energies other than springs, and for unpinned vertices without mass.
         """
-        held = vertex_terms.compute_anchor_stiffness(system)
+        anchor_stiffness = vertex_terms.compute_anchor_stiffness(system)
         if self.device == "cuda":
-            return _prepare_on_device(self, system, held, "xpbd", small_steps=False)
-        constraints, _, choice = _colour_constraints(system, held, "xpbd")
-        return PreparedXpbd(system, constraints, *_compute_compliance(constraints, held), choice)
+            return _prepare_on_device(self, system, anchor_stiffness, "xpbd", small_steps=False)
+        constraints, _, choice = _colour_constraints(system, anchor_stiffness, "xpbd")
+        return PreparedXpbd(system, constraints, *_compute_compliance(constraints, anchor_stiffness), choice)
 
 
 @dataclass(frozen=True)
@@ -94,10 +94,10 @@ class XpbdSmallSteps(PrecisionOptions):
             Unsupported: as for `Xpbd`, and for integrators other than implicit Euler.
         """
         vertex_terms.require_implicit_euler(system, "xpbd-small-steps")
-        held = vertex_terms.compute_anchor_stiffness(system)
+        anchor_stiffness = vertex_terms.compute_anchor_stiffness(system)
         if self.device == "cuda":
-            return _prepare_on_device(self, system, held, "xpbd-small-steps", small_steps=True)
-        constraints, _, choice = _colour_constraints(system, held, "xpbd-small-steps")
+            return _prepare_on_device(self, system, anchor_stiffness, "xpbd-small-steps", small_steps=True)
+        constraints, _, choice = _colour_constraints(system, anchor_stiffness, "xpbd-small-steps")
         return PreparedXpbdSmallSteps(system, constraints, choice)
 
 
@@ -187,7 +187,7 @@ def _prepare_on_device(
     method: PrecisionOptions, system: System, anchor_stiffness: NDArray[np.float64], solver: str, *, small_steps: bool
 ) -> PreparedSolver:
     """Prepare the method on a CUDA device (`springbench.solvers.methods.position_based.device_xpbd`)."""
-    from springbench.solvers.cuda.cuda_device import require_device  # for those who ask for it
+    from springbench.solvers.cuda.cuda_device import require_device  # imported only for a device
 
     require_device(solver)
     from springbench.solvers.methods.position_based.device_xpbd import prepare_xpbd

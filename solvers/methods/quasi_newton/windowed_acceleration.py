@@ -59,7 +59,7 @@ def prepare_accelerated(
     Args:
         system: the system.
         scheme: coefficients of the acceleration.
-        linear_solver: solver of Q x = b.
+        linear: solver of Q x = b.
         precision: floating-point type of its stored entries.
 
     Raises:

@@ -91,7 +91,7 @@ def apply_pins(forces, fraction, p):
 
 
 @jit_inner
-def kick_and_drift(inverse, kept, gained, first, second, h, p, v, force):
+def kick_and_drift(inverse, velocity_factor, gained, first, second, h, p, v, force):
     """Apply one kick to v, a second one unless it is negative, and a drift of p for h [s].
 
     The force [N] is cleared.
@@ -99,15 +99,15 @@ def kick_and_drift(inverse, kept, gained, first, second, h, p, v, force):
     for i in range(len(p)):
         a = force[i] * inverse[i]
         force[i] = 0.0
-        w = kept[first, i] * v[i] + gained[first, i] * a
+        w = velocity_factor[first, i] * v[i] + gained[first, i] * a
         if second >= 0:
-            w = kept[second, i] * w + gained[second, i] * a
+            w = velocity_factor[second, i] * w + gained[second, i] * a
         v[i] = w
         p[i] += h * w
 
 
 @jit_kernel
-def run_splitting(forces, drifts, kept, gained, count, h, p, v, force):
+def run_splitting(forces, drifts, velocity_factor, gained, count, h, p, v, force):
     """Run `count` steps of size h: drift 0, kick 0, drift 1, ..., the last drift.
 
     If a step neither starts nor ends with a drift, its last kick and the first kick of the next step share one force.
@@ -116,14 +116,15 @@ def run_splitting(forces, drifts, kept, gained, count, h, p, v, force):
     Args:
         forces: forces of the frame.
         drifts: fractions of h (k + 1,).
-        kept, gained: decay of a velocity by a kick, and its gain per acceleration [s] (k, rows), exact for drag.
+        velocity_factor, gained: decay of a velocity by a kick, and its gain per acceleration [s] (k, rows), exact for
+            drag.
         count: number of steps.
         h: step size [s].
         p: positions [m].
         v: velocities [m/s].
         force: scratch, initially zero.
     """
-    last = len(kept) - 1
+    last = len(velocity_factor) - 1
     joined = drifts[0] == 0.0 and drifts[-1] == 0.0
     for step in range(count):
         gone = drifts[0]
@@ -135,7 +136,7 @@ def run_splitting(forces, drifts, kept, gained, count, h, p, v, force):
             both = joined and k == last and step < count - 1
             after = drifts[1] if both else drifts[k + 1]
             add_forces(forces, p, force)
-            kick_and_drift(forces.inverse_mass, kept, gained, k, 0 if both else -1, after * h, p, v, force)
+            kick_and_drift(forces.inverse_mass, velocity_factor, gained, k, 0 if both else -1, after * h, p, v, force)
             gone = 1 + after if both else gone + after
             if after != 0.0:
                 apply_pins(forces, (step + gone) / count, p)

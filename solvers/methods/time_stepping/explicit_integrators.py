@@ -95,14 +95,14 @@ class ExplicitSolver:
             )
         soft = int((~system.pins.exact_mask).sum())
         exact = f"; {soft} pins by penalty taken as exact" if soft else ""
-        told = (
+        description = (
             f"steps by an error of {error:.3g}"
             if error
             else f"{needed:.0f} substeps of {system.time_step / needed:.2g} s"
         )
         lengths = parts.springs.rest_length
         tolerance = error * (float(lengths.mean()) if len(lengths) else 1.0)
-        choice = f"{told}, for vibrations of at most {omega:.3g} rad/s{exact}"
+        choice = f"{description}, for vibrations of at most {omega:.3g} rad/s{exact}"
         taken = SubstepChoice(int(needed), tolerance, rate, choice)
         return PreparedExplicit(method, taken, system, parts)
 
@@ -294,22 +294,22 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
             end,
         )
         count = self.substep_choice.num_substeps
-        told = np.array([count, 0.0, frame / count, frame])
+        step_stats = np.array([count, 0.0, frame / count, frame])
         if isinstance(self.method, SplittingMethod):
             self._compose(forces, self.method, p, v)
         else:
-            self._integrate(forces, self.method, p, v, h, told)
+            self._integrate(forces, self.method, p, v, h, step_stats)
         velocity = v.reshape(-1, 4)[: s.num_vertices, :3].copy()
         velocity[pins] = (end - begin) / frame
-        return p.reshape(-1, 4)[: s.num_vertices, :3].copy(), velocity, told
+        return p.reshape(-1, 4)[: s.num_vertices, :3].copy(), velocity, step_stats
 
     def _compose(
         self, forces: FrameForces, method: SplittingMethod, p: NDArray[np.float64], v: NDArray[np.float64]
     ) -> None:
         count = self.substep_choice.num_substeps
         h = self.system.time_step / count
-        kept, gained = integrate_drag(method.kicks, h, forces.drag_rate)
-        run_splitting(forces, method.drifts, kept, gained, count, h, p, v, np.zeros_like(v))
+        velocity_factor, gained = integrate_drag(method.kicks, h, forces.drag_rate)
+        run_splitting(forces, method.drifts, velocity_factor, gained, count, h, p, v, np.zeros_like(v))
 
     def _integrate(
         self,

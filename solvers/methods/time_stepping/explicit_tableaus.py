@@ -186,7 +186,7 @@ TSITOURAS_5 = ExplicitTableau(
 @cache
 def build_dormand_prince_8() -> ExplicitTableau:
     """Return the method of order 8."""
-    from scipy.integrate import DOP853  # for those who ask for it
+    from scipy.integrate import DOP853  # imported only for this tableau
 
     a = np.zeros((13, 13))
     a[:12, :12], a[12, :12] = DOP853.A, DOP853.B

@@ -88,7 +88,7 @@ class _RosenbrockSolver:
             )
         vertex_terms.require_implicit_euler(system, self.solver_name)
         vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), self.solver_name)
-        drag, kept = np.zeros(system.num_vertices), list[Any]()
+        drag, remaining_energies = np.zeros(system.num_vertices), list[Any]()
         for energy in system.energies:
             if (c := drag_of_vertices(energy)) is not None:
                 drag += c
@@ -99,12 +99,14 @@ class _RosenbrockSolver:
                     f"alone and drag on vertices; the scene has {type(energy).__name__} as well"
                 )
             else:
-                kept.append(energy)
-        objective = FixedObjective(replace(system, energies=tuple(kept), inertia_factor=0.0))
+                remaining_energies.append(energy)
+        objective = FixedObjective(replace(system, energies=tuple(remaining_energies), inertia_factor=0.0))
         lengths, factor = objective.springs.rest_length, objective.hessian_matrix.factor
         tolerance = self.error * (float(lengths.mean()) if len(lengths) else 1.0)
-        told = f"steps by an error of {self.error:.3g}" if self.error else f"{self.refine} steps a frame"
-        choice = f"{told}, a factor of the Hessian with {factor.nonzeros:,} entries{objective.interpreted_energies}"
+        step_rule = f"steps by an error of {self.error:.3g}" if self.error else f"{self.refine} steps a frame"
+        choice = (
+            f"{step_rule}, a factor of the Hessian with {factor.nonzeros:,} entries{objective.interpreted_energies}"
+        )
         facts = {"nnz_hessian_factor": float(factor.nonzeros)}
         return PreparedRosenbrock(system, self.coefficients, objective, drag, self.refine, tolerance, choice, facts)
 
@@ -320,7 +322,7 @@ class _FrameIntegration:
             p: positions (n, 3) [m].
             v: velocities (n, 3) [m/s].
             h: step size [s].
-            exact: whether the exact Hessian is required.
+            require_exact: whether the exact Hessian is required.
 
         Returns:
             The motion after the step, None if the matrix has no factor.

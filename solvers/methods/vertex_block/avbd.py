@@ -222,8 +222,8 @@ class AugmentedSweepState(SweepState):
         made, method, edges = prepared.vertex_block_descent, prepared.parameters, prepared.augmented_edges
         super().__init__(made, replace(problem, system=made.system), guess)
         self._augmented_solver, self._problem = prepared, problem
-        kept = problem.step_start.warm_start
-        begun = np.zeros((len(prepared.min_stiffness), 2)) if kept is None else method.decay * kept
+        warm_start = problem.step_start.warm_start
+        begun = np.zeros((len(prepared.min_stiffness), 2)) if warm_start is None else method.decay * warm_start
         past = method.stabilisation * np.where(
             prepared.exact_mask, length_errors(edges, problem.step_start.positions), 0.0
         )

@@ -95,10 +95,10 @@ def build_augmented_iteration(sweeps: Any) -> Any:
     """Build the iteration over a kernel of sweeps, `vbd_sweeps.run_iterations` or one for elements."""
 
     @jit_kernel
-    def iterate(blocks, spaces, beside, right, work, p, iterations, hard, duals):
+    def iterate(blocks, spaces, elements, right, work, p, iterations, hard, duals):
         """Run n sweeps from p, which is overwritten, each with a dual step; edge parameters must be current."""
         for _ in range(iterations):
-            sweeps(blocks, spaces, beside, right, 0.0, work, p, 1)
+            sweeps(blocks, spaces, elements, right, 0.0, work, p, 1)
             _update_duals(hard, duals, p)
             write_edge_parameters(blocks, hard, duals, p)
 

@@ -44,10 +44,12 @@ class VertexBlocks(NamedTuple):
         return len(self.first_packet) - 1
 
     @classmethod
-    def from_system(cls, system: System, parts: SpringForm, beside: VertexElements) -> VertexBlocks:
+    def from_system(cls, system: System, parts: SpringForm, vertex_elements: VertexElements) -> VertexBlocks:
         """Build the rows of a system from the decomposition of its energies."""
         n = system.num_vertices
-        coloured = colouring.colour_vertices(np.concatenate([parts.springs_and_forms.edges, beside.vertex_pairs()]), n)
+        coloured = colouring.colour_vertices(
+            np.concatenate([parts.springs_and_forms.edges, vertex_elements.vertex_pairs()]), n
+        )
         colour = np.empty(n, np.int64)
         colour[coloured.item_order] = np.repeat(np.arange(coloured.num_colours), np.diff(coloured.colour_starts))
         pinned = system.pins.vertices[system.pins.exact_mask]
@@ -58,11 +60,11 @@ class VertexBlocks(NamedTuple):
         bundles, first = SpringPackets.from_springs(
             parts.springs_and_forms, row, colour, coloured.num_colours, n, n + 1
         )
-        held, majorant = np.zeros(n + 2), np.ones(n + 2)
-        held[: len(order)] = majorant[: len(order)] = (
+        anchor_stiffness, majorant = np.zeros(n + 2), np.ones(n + 2)
+        anchor_stiffness[: len(order)] = majorant[: len(order)] = (
             vertex_terms.compute_anchor_stiffness(system) + parts.vertex_weight
         )[order]
-        majorant[: len(order)] += beside.stiffness_diagonal()[order]
+        majorant[: len(order)] += vertex_elements.stiffness_diagonal()[order]
         ends = np.repeat(bundles.row_offset.reshape(-1, LANES), np.diff(bundles.packet_start), axis=0)
         np.add.at(majorant, ends.ravel() // 4, bundles.entry_weights()[1])
-        return cls(row, len(order), bundles, first, held, majorant)
+        return cls(row, len(order), bundles, first, anchor_stiffness, majorant)

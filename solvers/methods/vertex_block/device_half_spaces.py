@@ -190,7 +190,7 @@ def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
     @cuda.jit
     def push(
         begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
-        nobody, far, held, majorant, force, u, before, x, spaces,
+        padding_row, far, anchor_stiffness, majorant, force, u, before, x, spaces,
     ):  # fmt: skip
         """Recompute the steps of a colour's vertices with half-spaces, from their positions before the sweep.
 
@@ -198,18 +198,33 @@ def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
         documents the other arguments.
         """
         t = begin + cuda.grid(1)
-        if t >= end or own[t] == nobody or not spaces.has_half_space[own[t]]:
+        if t >= end or own[t] == padding_row or not spaces.has_half_space[own[t]]:
             return
         i, b = own[t], t // device_vbd_kernels.LANES
         first, last = start[b], start[b + 1]
         u0, u1, u2 = before[i, 0], before[i, 1], before[i, 2]
         f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless = gathered(
-            t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, held, force, u
+            t,
+            first,
+            last,
+            u0,
+            u1,
+            u2,
+            neighbour,
+            kind,
+            weights,
+            spring,
+            direction,
+            arrows,
+            far,
+            anchor_stiffness,
+            force,
+            u,
         )
         at = x[i, 0] + u0, x[i, 1] + u1, x[i, 2] + u2
         gradient = -float64(f0), -float64(f1), -float64(f2)
         block = float64(b00), float64(b01), float64(b02), float64(b11), float64(b12), float64(b22)
-        lane = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, held, u
+        lane = t, first, last, (u0, u1, u2), (f0, f1, f2), neighbour, kind, weights, arrows, far, anchor_stiffness, u
         # A spring of zero length has no Hessian: the step of the majorant separates its ends.
         level = SPRING_MAJORANT if lengthless else EXACT_BLOCK
         most = float64(majorant[t])
@@ -217,15 +232,15 @@ def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
         u[i, 0], u[i, 1], u[i, 2] = real(u0 + d[0]), real(u1 + d[1]), real(u2 + d[2])
 
     @cuda.jit
-    def press(spaces, x, u, asked, control, first, out):
+    def press(spaces, x, u, sequence_number, control, first, out):
         """Write the change of the half-space energy from the reference to u [J], one number per block.
 
         The numbers are stored in `out` from `first` on; see `sum_objective` in
         `springbench.solvers.methods.vertex_block.device_vbd_kernels`.
         """
-        if asked == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
+        if sequence_number == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
             return
-        if asked == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
+        if sequence_number == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
             return
         total, i = 0.0, cuda.grid(1)
         while i < spaces.has_half_space.shape[0]:

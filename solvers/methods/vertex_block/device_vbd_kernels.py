@@ -53,14 +53,15 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
 
     @cuda.jit(device=True)
     def gathered(
-        t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, held, force, u,
+        t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, anchor_stiffness,
+        force, u,
     ):  # fmt: skip
         """Return the force [N] on a lane's vertex at displacement u0, u1, u2, and its block [N/m].
 
         The block is stored as its upper triangle. Also return whether a spring has zero length;
         such a spring does not contribute to the block.
         """
-        lane, h = t % LANES, held[t]
+        lane, h = t % LANES, anchor_stiffness[t]
         f0, f1, f2 = force[0, t] - h * u0, force[1, t] - h * u1, force[2, t] - h * u2
         b00, b01, b02, b11, b12, b22 = h, zero, zero, h, zero, h
         lengthless = False
@@ -90,7 +91,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
 
     @cuda.jit(device=True)
     def risen(
-        t, first, last, u0, u1, u2, x0, x1, x2, f0, f1, f2, neighbour, kind, weights, arrows, far, held, u,
+        t, first, last, u0, u1, u2, x0, x1, x2, f0, f1, f2, neighbour, kind, weights, arrows, far, anchor_stiffness, u,
     ):  # fmt: skip
         """Return the energy change [J] of a step x0, x1, x2 of a lane's vertex, from where the force is f0, f1, f2.
 
@@ -98,7 +99,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         """
         lane = t % LANES
         moved = x0 * x0 + x1 * x1 + x2 * x2
-        rise = half * held[t] * moved - (f0 * x0 + f1 * x1 + f2 * x2)
+        rise = half * anchor_stiffness[t] * moved - (f0 * x0 + f1 * x1 + f2 * x2)
         for entry in range(first, last):
             e = LANES * entry + lane
             j = neighbour[e]
@@ -122,35 +123,50 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
 
         `lane` has the lane's index, its displacement and force, and the arrays.
         """
-        t, first, last, at, pull, neighbour, kind, weights, arrows, far, held, u = lane
+        t, first, last, at, pull, neighbour, kind, weights, arrows, far, anchor_stiffness, u = lane
         return float64(
             risen(
                 t, first, last, at[0], at[1], at[2], real(d[0]), real(d[1]), real(d[2]), pull[0], pull[1], pull[2],
-                neighbour, kind, weights, arrows, far, held, u,
+                neighbour, kind, weights, arrows, far, anchor_stiffness, u,
             )
         )  # fmt: skip
 
     @cuda.jit
     def sweep(
         begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
-        nobody, far, held, majorant, force, u, before,
+        padding_row, far, anchor_stiffness, majorant, force, u, before,
     ):  # fmt: skip
         """Move the vertices of a colour, lanes `begin` to `end`, each to a lower energy.
 
         Args:
-            held, majorant: (lanes,) [N/m], anchor stiffness and majorant.
+            anchor_stiffness, majorant: (lanes,) [N/m], anchor stiffness and majorant.
             force: (3, lanes) [N], negative gradient at the reference.
             before: receives the displacements before the sweep.
         """
         t = begin + cuda.grid(1)
-        if t >= end or own[t] == nobody:
+        if t >= end or own[t] == padding_row:
             return
         i, b = own[t], t // LANES
         first, last = start[b], start[b + 1]
         u0, u1, u2 = u[i, 0], u[i, 1], u[i, 2]
         before[i, 0], before[i, 1], before[i, 2] = u0, u1, u2
         f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless = gathered(
-            t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, held, force, u
+            t,
+            first,
+            last,
+            u0,
+            u1,
+            u2,
+            neighbour,
+            kind,
+            weights,
+            spring,
+            direction,
+            arrows,
+            far,
+            anchor_stiffness,
+            force,
+            u,
         )
         scale = one / majorant[t]
         s0, s1, s2 = scale * f0, scale * f1, scale * f2
@@ -167,7 +183,25 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             x1 = y1 / second - l3 * x2
             x0 = f0 / b00 - l1 * x1 - l2 * x2
             rise = risen(
-                t, first, last, u0, u1, u2, x0, x1, x2, f0, f1, f2, neighbour, kind, weights, arrows, far, held, u
+                t,
+                first,
+                last,
+                u0,
+                u1,
+                u2,
+                x0,
+                x1,
+                x2,
+                f0,
+                f1,
+                f2,
+                neighbour,
+                kind,
+                weights,
+                arrows,
+                far,
+                anchor_stiffness,
+                u,
             )
             if rise <= zero:
                 s0, s1, s2 = x0, x1, x2
@@ -185,7 +219,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
     @cuda.jit
     def level(
         own, start, neighbour, kind, weights, spring, direction, arrows,
-        nobody, far, free, held, force, u, asked, control, sums,
+        padding_row, far, free, anchor_stiffness, force, u, num_requested, control, sums,
     ):  # fmt: skip
         """Write the objective at the reference plus u, minus that at the reference, to `sums` [J], one per block.
 
@@ -193,19 +227,19 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
 
         Args:
             free: number of rows, from the first one, that may move.
-            asked: index in `control`; the kernel runs if that entry is positive (ASKED), or above one (WEIGHT).
+            num_requested: index in `control`; the kernel runs if that entry is positive (ASKED), or above one (WEIGHT).
         """
-        kept = cuda.shared.array(THREADS, float64)
+        shared_sums = cuda.shared.array(THREADS, float64)
         t, inside = cuda.grid(1), cuda.threadIdx.x
-        if asked == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
+        if num_requested == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
             return
-        if asked == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
+        if num_requested == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
             return
         total = float64(0.0)
-        if t < len(own) and own[t] != nobody:
+        if t < len(own) and own[t] != padding_row:
             i, b, lane = own[t], t // LANES, t % LANES
             u0, u1, u2 = float64(u[i, 0]), float64(u[i, 1]), float64(u[i, 2])
-            energy = 0.5 * held[t] * (u0 * u0 + u1 * u1 + u2 * u2)
+            energy = 0.5 * anchor_stiffness[t] * (u0 * u0 + u1 * u1 + u2 * u2)
             energy -= force[0, t] * u0 + force[1, t] * u1 + force[2, t] * u2
             for entry in range(start[b], start[b + 1]):
                 e = LANES * entry + lane
@@ -228,16 +262,16 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
                 share = 0.5 if j < free else 1.0  # the other end adds the other half, if it is anybody's
                 energy += share * (0.5 * k * moved - pull * turned)
             total = energy
-        kept[inside] = total
+        shared_sums[inside] = total
         cuda.syncthreads()
         span = THREADS // 2
         while span > 0:
             if inside < span:
-                kept[inside] += kept[inside + span]
+                shared_sums[inside] += shared_sums[inside + span]
             cuda.syncthreads()
             span //= 2
         if inside == 0:
-            sums[cuda.blockIdx.x] = kept[0]
+            sums[cuda.blockIdx.x] = shared_sums[0]
 
     @cuda.jit
     def decide(radius, at_before, at_new, control):
@@ -247,7 +281,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             radius: rho.
             at_before, at_new: sums of the objective, if requested.
         """
-        kept = cuda.shared.array((2, THREADS), float64)
+        shared_sums = cuda.shared.array((2, THREADS), float64)
         inside = cuda.threadIdx.x
         before, new = float64(0.0), float64(0.0)
         w = control[EXTRAPOLATION]
@@ -257,22 +291,22 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             if control[IS_REQUESTED] > 0.0:
                 for k in range(inside, len(at_before), THREADS):
                     before += at_before[k]
-        kept[0, inside], kept[1, inside] = before, new
+        shared_sums[0, inside], shared_sums[1, inside] = before, new
         cuda.syncthreads()
         span = THREADS // 2
         while span > 0:
             if inside < span:
-                kept[0, inside] += kept[0, inside + span]
-                kept[1, inside] += kept[1, inside + span]
+                shared_sums[0, inside] += shared_sums[0, inside + span]
+                shared_sums[1, inside] += shared_sums[1, inside + span]
             cuda.syncthreads()
             span //= 2
         if inside == 0:
             omega, known, taken = w, control[OBJECTIVE], 0.0
             if w > 1.0:
                 if control[IS_REQUESTED] > 0.0:
-                    known = kept[0, 0]
-                if kept[1, 0] <= known:
-                    known, taken = kept[1, 0], 1.0
+                    known = shared_sums[0, 0]
+                if shared_sums[1, 0] <= known:
+                    known, taken = shared_sums[1, 0], 1.0
                 else:
                     omega, known = 0.0, math.nan
             following = 1.0

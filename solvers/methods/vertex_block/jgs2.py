@@ -121,18 +121,18 @@ def assemble_rest_hessian(system: System, springs: Springs, lateral: float) -> c
     Args:
         system: the system; its other projective energies contribute as in Q.
         springs: all springs of the system.
-        lateral_stiffness_ratio: lateral stiffness of a spring at rest, relative to its stiffness.
+        lateral: lateral stiffness of a spring at rest, relative to its stiffness.
 
     Returns:
         H0 [N/m] over the coordinates of the free vertices, (3f, 3f).
     """
     others = [e for e in system.energies if isinstance(e, ProjectiveEnergy) and not isinstance(e, Springs)]
-    held = vertex_terms.compute_anchor_stiffness(system)
-    held[np.isinf(held)] = 0.0
+    anchor_stiffness = vertex_terms.compute_anchor_stiffness(system)
+    anchor_stiffness[np.isinf(anchor_stiffness)] = 0.0
     shares = reduce(
         lambda total, share: total + share,
         system_matrix_assembly.stiffness_shares(system, others),
-        system_matrix_assembly.diagonal_matrix(held),
+        system_matrix_assembly.diagonal_matrix(anchor_stiffness),
     )
     whole = csr_array(kron(shares, eye_array(3))) + springs.rest_hessian(lateral, system.num_vertices)
     free = (3 * system.free_vertices[:, None] + np.arange(3)).ravel()
@@ -147,7 +147,7 @@ def compute_responses(H: csr_array, graph: csr_array, rings: int) -> VertexPatch
     Args:
         H: Hessian of the rest shape (3f, 3f).
         graph: adjacency of the free vertices (f, f), with a full diagonal.
-        neighbour_rings: rings of springs in a patch.
+        rings: rings of springs in a patch.
 
     Raises:
         Unsupported: if the responses do not fit in memory.
@@ -222,9 +222,9 @@ class _VertexRotations:
 
     def __init__(self, system: System, springs: Springs) -> None:
         i, j = springs.edges.T
-        said = (springs.rest_length > 0.0) & (i != j)
-        self._edges, self._rest_directions = springs.edges[said], springs.rest_direction[said]
-        k = springs.stiffness[said]
+        oriented = (springs.rest_length > 0.0) & (i != j)
+        self._edges, self._rest_directions = springs.edges[oriented], springs.rest_direction[oriented]
+        k = springs.stiffness[oriented]
         weight = k / k.max(initial=np.finfo(np.float64).tiny)
         count, rows = len(k), self._edges.T.ravel()
         shares = csr_array(

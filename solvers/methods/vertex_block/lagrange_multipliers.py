@@ -58,11 +58,13 @@ class LagrangeMultipliers:
         tension = k * (length - np.clip(length, x.min_length, x.max_length))
         active = self._active_set(length, tension)
         for _ in range(_MAX_ACTIVE_SET_CHANGES):
-            (held,) = np.nonzero(active)
-            bound = np.where(active > 0, x.max_length, x.min_length)[held]
-            step, found = self._solve_kkt(J[held], k[held], downhill, bound - length[held])
+            (active_indices,) = np.nonzero(active)
+            bound = np.where(active > 0, x.max_length, x.min_length)[active_indices]
+            step, found = self._solve_kkt(
+                J[active_indices], k[active_indices], downhill, bound - length[active_indices]
+            )
             tension = np.zeros(len(k))
-            tension[held] = found
+            tension[active_indices] = found
             before, active = active, self._active_set(length + J @ step, tension)
             if np.array_equal(before, active):
                 break

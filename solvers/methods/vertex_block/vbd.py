@@ -92,21 +92,21 @@ class VertexBlockDescent(PrecisionOptions):
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         if self.device == "cuda":
-            from springbench.solvers.cuda.cuda_device import require_device  # for those who ask for it
+            from springbench.solvers.cuda.cuda_device import require_device  # imported only for a device
 
             require_device("vbd")
         bare, n = without_barriers(without_vertex_contact(system)), system.num_vertices
-        parts, beside = decompose_energies(bare), VertexElements.from_system(system)
-        unknown = {*parts.unsupported_energies} - {type(energy).__name__ for energy in beside.energies}
+        parts, vertex_elements = decompose_energies(bare), VertexElements.from_system(system)
+        unknown = {*parts.unsupported_energies} - {type(energy).__name__ for energy in vertex_elements.energies}
         if unknown:
             raise Unsupported(
                 f"vbd: {', '.join(sorted(unknown))} states no elements of a projective energy, and so neither whose "
                 "neighbours its vertices are nor a bound of the second derivatives; a vertex's step needs both, the "
                 "neighbours for the colouring and the bound for the fallback step that cannot raise the energy"
             )
-        made = VertexBlocks.from_system(system, parts, beside)
+        made = VertexBlocks.from_system(system, parts, vertex_elements)
         if self.device == "cuda":
-            from springbench.solvers.methods.vertex_block.device_vbd import prepare_vbd  # for those who ask for it
+            from springbench.solvers.methods.vertex_block.device_vbd import prepare_vbd  # imported only for a device
 
             return prepare_vbd(system, parts, made, self.spectral_radius, self.real_dtype)
         gauge = cast("ContactFreeSolver", CompiledLocalGlobal().prepare(system))
@@ -116,7 +116,7 @@ class VertexBlockDescent(PrecisionOptions):
         return PreparedVertexBlockDescent(
             system,
             parts,
-            beside.with_rows(made.row_of_vertex, n + 2),
+            vertex_elements.with_rows(made.row_of_vertex, n + 2),
             self.spectral_radius,
             kernels.ColourPackets(
                 made.spring_packets, shares, made.num_free, made.spring_packets.gather_lanes(made.majorant)
@@ -165,7 +165,7 @@ class PreparedVertexBlockDescent(IterativeSolver):
         if not any(map(is_barrier_energy, self.system.energies)):
             return sweeps
         from springbench.solvers.methods.vertex_block.vbd_barrier_contact import (
-            BarrierVbdState,  # for those who need it
+            BarrierVbdState,  # imported only with vertex contact
         )
         from springbench.solvers.objective.step_objective import StepObjective
 
@@ -197,7 +197,9 @@ class PreparedVertexBlockDescent(IterativeSolver):
 
     def build_half_spaces(self, contacts: list[VertexContactEnergy]) -> HalfSpaces:
         """Build the half-spaces of the contacts."""
-        from springbench.solvers.contact.half_space.packed_half_spaces import pack_half_spaces  # for those who need it
+        from springbench.solvers.contact.half_space.packed_half_spaces import (
+            pack_half_spaces,
+        )  # imported only with vertex contact
 
         return pack_half_spaces(
             contacts, self.row_of_vertex, self.colour_packets.spring_packets, self.colour_packets.num_free

@@ -29,7 +29,7 @@ def build_element_iteration(*kinds: ElementKind) -> Any:
     move = build_vertex_move(felt, risen)
 
     @jit_closure
-    def without_length(blocks, beside, right, b, p, work):
+    def without_length(blocks, elements, right, b, p, work):
         """Step with the majorant's block, because a spring of zero length has no Hessian."""
         write_degenerate_descent(blocks.spring_packets, b, p, right, work.descent_scratch)
         for lane in range(LANES):
@@ -37,21 +37,21 @@ def build_element_iteration(*kinds: ElementKind) -> Any:
             if i // 4 >= blocks.num_free:
                 continue
             none = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-            gradient, _ = felt(beside, i // 4, p, *none)
+            gradient, _ = felt(elements, i // 4, p, *none)
             for c in range(3):
                 p[i + c] += (work.descent_scratch[i + c] - gradient[c]) / blocks.majorant[LANES * b + lane]
 
     @jit_closure
-    def sweep(blocks, spaces, beside, right, p, work):
+    def sweep(blocks, spaces, elements, right, p, work):
         """Move every vertex once to a lower energy."""
         bundles, sums = blocks.spring_packets, work.packet_sums
         for b in range(len(bundles.packet_start) - 1):
             if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
                 if spaces.has_half_space[b]:
-                    move(bundles, spaces, beside, b, blocks.num_free, p, right, blocks.majorant)
+                    move(bundles, spaces, elements, b, blocks.num_free, p, right, blocks.majorant)
                     continue
             if vbd_vertex_model(bundles, b, p, right, work.spring_scratch, sums):
-                without_length(blocks, beside, right, b, p, work)
+                without_length(blocks, elements, right, b, p, work)
                 continue
             for lane in range(LANES):
                 i = bundles.row_offset[LANES * b + lane] // 4
@@ -61,7 +61,7 @@ def build_element_iteration(*kinds: ElementKind) -> Any:
                         sums[3 * LANES + lane], sums[4 * LANES + lane], sums[5 * LANES + lane],
                         sums[6 * LANES + lane], sums[7 * LANES + lane], sums[8 * LANES + lane],
                     )  # fmt: skip
-                    gradient, block = felt(beside, i, p, force, block)
+                    gradient, block = felt(elements, i, p, force, block)
                     for c in range(3):
                         sums[LANES * c + lane] = -gradient[c]
                     for k in range(6):
@@ -77,16 +77,16 @@ def build_element_iteration(*kinds: ElementKind) -> Any:
                     sums[LANES * (_STEP_SLOT + 2) + lane],
                 )
                 rise, most = sums[LANES * _CHANGE_SLOT + lane], blocks.majorant[LANES * b + lane]
-                if not (rise < _INFINITE and rise + risen(beside, i, p, d) <= 0.0):
+                if not (rise < _INFINITE and rise + risen(elements, i, p, d) <= 0.0):
                     d = sums[lane] / most, sums[LANES + lane] / most, sums[2 * LANES + lane] / most
                 p[4 * i], p[4 * i + 1], p[4 * i + 2] = p[4 * i] + d[0], p[4 * i + 1] + d[1], p[4 * i + 2] + d[2]
 
     @jit_closure
-    def level(blocks, spaces, beside, p, right, out):
+    def level(blocks, spaces, elements, p, right, out):
         return (
             objective(blocks.spring_packets, blocks.objective_weights, p, right, out)
             + half_space_energy(spaces, p)
-            + total(beside, p)
+            + total(elements, p)
         )
 
     return build_iteration(sweep, level)

@@ -55,12 +55,12 @@ class SweepScratch(NamedTuple):
 
 
 @jit_inner
-def _no_contribution(beside, i, p, gradient, block):
+def _no_contribution(elements, i, p, gradient, block):
     return gradient, block
 
 
 @jit_inner
-def _no_energy_change(beside, i, p, d):
+def _no_energy_change(elements, i, p, d):
     return 0.0
 
 
@@ -68,13 +68,13 @@ _move_vertices = build_vertex_move(_no_contribution, _no_energy_change)
 
 
 @jit_inner
-def _sweep_vertices(blocks, spaces, beside, right, p, work):
+def _sweep_vertices(blocks, spaces, elements, right, p, work):
     """Move every vertex once to a lower energy."""
     own = blocks.spring_packets.row_offset
     for b in range(len(blocks.spring_packets.packet_start) - 1):
         if spaces is not None:  # noqa: SIM102 Numba leaves a branch out for None alone
             if spaces.has_half_space[b]:
-                _move_vertices(blocks.spring_packets, spaces, beside, b, blocks.num_free, p, right, blocks.majorant)
+                _move_vertices(blocks.spring_packets, spaces, elements, b, blocks.num_free, p, right, blocks.majorant)
                 continue
         short = vbd_newton_step(blocks.spring_packets, b, p, right, blocks.majorant, work.spring_scratch)
         if short:
@@ -102,7 +102,7 @@ def _copy_positions(p, out):
 
 
 @jit_inner
-def _evaluate_objective(blocks, spaces, beside, p, right, out):
+def _evaluate_objective(blocks, spaces, elements, p, right, out):
     return objective(blocks.spring_packets, blocks.objective_weights, p, right, out) + half_space_energy(spaces, p)
 
 
@@ -110,7 +110,7 @@ def build_iteration(sweep: Any, level: Any) -> Any:
     """Build the iteration from a sweep and the objective."""
 
     @jit_kernel
-    def iterate(blocks, spaces, beside, right, radius, work, p, iterations):
+    def iterate(blocks, spaces, elements, right, radius, work, p, iterations):
         """Run n sweeps over all vertices from p, which is overwritten with the result.
 
         An extrapolation that increases the objective above that before the sweep is rejected and restarts.
@@ -118,7 +118,7 @@ def build_iteration(sweep: Any, level: Any) -> Any:
         Args:
             blocks: packets of the vertices.
             spaces: half-spaces of the vertices, or None.
-            beside: other element energies, or None.
+            elements: other element energies, or None.
             right: see `SpringPackets.build_right_hand_side`.
             radius: spectral radius of Chebyshev's extrapolation, 0 for none.
             work: scratch memory.
@@ -135,16 +135,16 @@ def build_iteration(sweep: Any, level: Any) -> Any:
                 else 1.0
             )
             if w > 1.0 and np.isnan(known[0]):
-                known[0] = level(blocks, spaces, beside, p, right, work.descent_scratch)
+                known[0] = level(blocks, spaces, elements, p, right, work.descent_scratch)
             _copy_positions(p, work.previous_positions)
-            sweep(blocks, spaces, beside, right, p, work)
+            sweep(blocks, spaces, elements, right, p, work)
             if radius == 0.0:
                 continue
             omega[0] = w
             if w > 1.0:
                 for k in range(4 * blocks.num_free):
                     older[k] += w * (p[k] - older[k])
-                new = level(blocks, spaces, beside, older, right, work.descent_scratch)
+                new = level(blocks, spaces, elements, older, right, work.descent_scratch)
                 if new <= known[0]:
                     _copy_positions(older, p)
                     known[0] = new

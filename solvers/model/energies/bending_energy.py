@@ -69,8 +69,8 @@ def _triangulations(rest: Positions, triangles: IndexArray) -> Iterator[IndexArr
         cut = np.sort(np.concatenate([np.stack(corners, axis=1) for corners in ((a, b, c), (a, b, d))]), axis=1)
         n = len(rest)
         names, given = ((t[:, 0] * n + t[:, 1]) * n + t[:, 2] for t in (cut, np.sort(triangles, axis=1)))
-        kept = triangles[~np.isin(given, names)]
-        yield np.concatenate([kept, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1)])
+        remaining = triangles[~np.isin(given, names)]
+        yield np.concatenate([remaining, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1)])
 
 
 def _flap_stencils(rest: Positions, flap: IndexArray) -> tuple[scipy.sparse.csr_array, NDArray[np.float64]]:
