@@ -171,13 +171,13 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "the list of a sweep in a file": (["list", "sweep.yaml", "--results", "good.yaml"], 0, "missing"),
 }
 
-SPHERE = "{kind: sphere, center: [0, -1, 0], radius: 0.5, motion: {keys: [%s]}}"
+SPHERE = "{kind: sphere, center: [0, -1, 0], radius: 0.5, motion: {key_frames: [%s]}}"
 BALL = "{kind: sphere, center: [0.5, -2, 0.5], radius: 0.1}"
-MOVES = "motion: {keys: [{time: 0}, {time: 1, offset: [0, 6, 0]}]}"
+MOVES = "motion: {key_frames: [{time: 0}, {time: 1, offset: [0, 6, 0]}]}"
 RISING = f"{{kind: sphere, center: [0.5, -3, 0.5], radius: 0.1, {MOVES}}}"
 CONTACT = "[{kind: springs, stretch: 100}, {kind: contact, obstacles: [%s]}]"
 KEYS = ", ".join(f"{{time: {i}}}" for i in range(10_001))
-PINNED = "{kind: pins, at: [corners], motion: {keys: [{time: 0}, {time: 1, offset: [0, -4, 0]}]}}"
+PINNED = "{kind: pins, parts: [corners], motion: {key_frames: [{time: 0}, {time: 1, offset: [0, -4, 0]}]}}"
 PRESS = "{kind: plane, point: [0, -1, 0]}, {kind: plane, point: [0, 1, 0], normal: [0, -1, 0], motion: {keys: %s}}"
 
 SCENES: dict[str, tuple[str, str]] = {
@@ -203,28 +203,28 @@ SCENES: dict[str, tuple[str, str]] = {
         "pins hold vertex",
     ),
     "a ball that goes through pins": (
-        scene(effects=f"[{{kind: pins, at: [corners]}}, {{kind: contact, obstacles: [{RISING}]}}]"),
+        scene(effects=f"[{{kind: pins, parts: [corners]}}, {{kind: contact, obstacles: [{RISING}]}}]"),
         "pins hold vertex",
     ),
-    "a part in Unicode": (scene(effects="[{kind: pins, at: ['tоp']}]"), "at"),
+    "a part in Unicode": (scene(effects="[{kind: pins, parts: ['tоp']}]"), "at"),
     "an index of 1e18": (scene(effects="[{kind: pins, indices: [1000000000000000000]}]"), "indices"),
-    "every 1e18th": (scene(effects="[{kind: pins, every: 0}]"), "every"),
+    "every 1e18th": (scene(effects="[{kind: pins, stride: 0}]"), "every"),
     "a stiffness of 1e400": (scene(effects="[{kind: springs, stretch: 1e400}]"), "stretch"),
     "gas in a sheet": (scene(effects="[{kind: gas, pressure: 1}]"), "gas"),
     "a thickness of 1e9": (
-        scene(effects="[{kind: springs, stretch: 1}, {kind: contact, obstacles: [{kind: plane}], thickness: 1e9}]"),
+        scene(effects="[{kind: springs, stretch: 1}, {kind: contact, obstacles: [{kind: plane}], min_distance: 1e9}]"),
         "thickness",
     ),
-    "a spin of NaN": (scene(start="{kind: rest, spin: [0, .nan, 0]}"), "spin"),
+    "a spin of NaN": (scene(start="{kind: rest, angular_velocity: [0, .nan, 0]}"), "spin"),
     "a start of another kind": (scene(start="{kind: exploded}"), "start"),
     "a merge of what is not there": (scene(start="{kind: merged, vertices: [0, 99]}"), "start.vertices"),
 }
 
 SOLVERS: dict[str, tuple[str, str]] = {
-    "pairs of -3": (sweep(solvers="[{name: lbfgs, pairs: -3}]"), "pairs"),
-    "pairs of 0": (sweep(solvers="[{name: anderson, pairs: 0}]"), "pairs"),
-    "pairs of 1e9": (sweep(solvers="[{name: lbfgs, pairs: 1000000000}]"), "pairs"),
-    "pairs of a fraction": (sweep(solvers="[{name: lbfgs, pairs: 2.5}]"), "pairs"),
+    "pairs of -3": (sweep(solvers="[{name: lbfgs, history_size: -3}]"), "pairs"),
+    "pairs of 0": (sweep(solvers="[{name: anderson, history_size: 0}]"), "pairs"),
+    "pairs of 1e9": (sweep(solvers="[{name: lbfgs, history_size: 1000000000}]"), "pairs"),
+    "pairs of a fraction": (sweep(solvers="[{name: lbfgs, history_size: 2.5}]"), "pairs"),
     "a radius of 1": (sweep(solvers="[{name: vbd, spectral_radius: 1}]"), "spectral_radius"),
     "a precision of words": (sweep(solvers="[{name: numba, precision: best}]"), "precision"),
 }

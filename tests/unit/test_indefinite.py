@@ -28,7 +28,7 @@ from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem
 from tests.self_contact_scenes import build_touching_sheets
 
-OTHERS = [name for name in get_args(IndefiniteStrategy) if name != "graded"]
+OTHERS = [name for name in get_args(IndefiniteStrategy) if name != "shift-schedule"]
 others = pytest.mark.parametrize("rule", OTHERS)
 
 FILTERS = {"clamp": lambda x: np.maximum(x, 0.0), "absolute": np.abs}

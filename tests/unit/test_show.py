@@ -21,8 +21,8 @@ frames: 2
 default_size: 5
 effects:
   - {kind: springs, stretch: 100}
-  - {kind: pins, at: [top_corners]}
-  - {kind: sewing, first: {at: [left]}, second: {at: [right], every: 2}, stiffness: 10}
+  - {kind: pins, parts: [top_corners]}
+  - {kind: sewing, first_row: {parts: [left]}, second_row: {parts: [right], stride: 2}, stiffness: 10}
 """
 
 
