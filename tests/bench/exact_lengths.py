@@ -81,7 +81,7 @@ def swinging() -> Table:
     )  # stretch by the bob at rest
     of = [
         ("avbd", exact, Avbd()),
-        ("avbd, ramp: 100000, stabilisation: 0.95", exact, STEEP),
+        ("avbd, stiffness_ramp: 100000, error_stabilisation: 0.95", exact, STEEP),
         ("xpbd", firm, Xpbd()),
         ("xpbd-small-steps", firm, XpbdSmallSteps()),
         ("vbd, spectral_radius: 0, stretches .001", stiff, Vbd(spectral_radius=0.0)),
@@ -96,7 +96,8 @@ def swinging() -> Table:
 def ratios() -> Table:
     """The second table."""
     chain = build_test_scene(
-        ChainMesh(), SpringsEffect(stretch=1e4, scaling_rule="fixed"), GravityEffect(), ENDS, EtherDragEffect(decay_rate=2.0),
+        ChainMesh(), SpringsEffect(stretch=1e4, scaling_rule="fixed"), GravityEffect(), ENDS,
+        EtherDragEffect(decay_rate=2.0),
         size=12, mass=11.0, time_step=FRAME,
     )  # fmt: skip
     (found,) = chain.system.energies

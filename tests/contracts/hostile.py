@@ -113,7 +113,7 @@ SCENES: dict[str, tuple[str | bytes, str, int | None]] = {
     "more vertices than memory": (scene(mesh="{kind: block}", default_size="5000"), "vertices", None),
     "negative stiffness": (scene(effects="[{kind: springs, stretch: -1}]"), "effects[0].stretch", 6),
     "stiffness as a boolean": (scene(effects="[{kind: springs, stretch: yes}]"), "effects[0].stretch", 6),
-    "unknown rule": (scene(effects="[{kind: springs, stretch: 1, scaling_rule: magic}]"), "effects[0].rule", 6),
+    "unknown rule": (scene(effects="[{kind: springs, stretch: 1, scaling_rule: magic}]"), "effects[0].scaling_rule", 6),
     "pins at no part": (scene(effects="[{kind: pins, parts: [cornrs]}]"), "effects[0]", 6),
     "pins that pin nothing": (scene(effects="[{kind: pins}]"), "effects[0]", 6),
     "pins beyond the mesh": (scene(effects="[{kind: pins, indices: [16]}]"), "effects[0]", 6),

@@ -13,7 +13,9 @@ SCENES = {
     "falls": "[{kind: gravity}]",
     "springs-without-stiffness": "[{kind: springs, stretch: 0}, {kind: gravity}]",
     "pins-alone": "[{kind: pins, parts: [corners]}]",
-    "all-pinned-exactly": "[{kind: springs, stretch: 10}, {kind: pins, parts: [boundary], indices: [4], weight: exact}]",
+    "all-pinned-exactly": (
+        "[{kind: springs, stretch: 10}, {kind: pins, parts: [boundary], indices: [4], weight: exact}]"
+    ),
     "nothing": "[]",
 }
 

@@ -69,7 +69,12 @@ SMOOTH: dict[str, Case] = {
 }
 STILL = (0.0, 0.0, 0.0)
 PLANE = {"kind": "plane", "point": [0, -0.05, 0]}
-SURFACE = {"obstacles": [{"kind": "plane", "point": [0, -0.1, 0]}], "thickness": 0.01, "range": 0.2, "stiffness": 5.0}
+SURFACE = {
+    "obstacles": [{"kind": "plane", "point": [0, -0.1, 0]}],
+    "min_distance": 0.01,
+    "dhat": 0.2,
+    "barrier_stiffness": 5.0,
+}
 SELF = {"kind": "self-contact", "min_distance": 0.05, "dhat": 0.2, "barrier_stiffness": 1.0}
 SEWN = {
     "kind": "sewing",

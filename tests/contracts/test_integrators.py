@@ -80,11 +80,14 @@ PROBLEMS: dict[str, tuple[tuple[SceneEffect, ...], tuple, tuple[float, float, fl
     "swinging": ((SOFT, GravityEffect(), HELD), (), (0.5, 1.0, 2.0)),
     "under a force of time, place and speed": ((SOFT, HELD), (gusts,), (1.0, 0.0, 0.5)),
     "slowed by ether drag": ((SOFT, GravityEffect(), EtherDragEffect(decay_rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
-    "slowed by quadratic drag": ((SOFT, AirDragEffect(drag_law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by quadratic drag": (
+        (SOFT, AirDragEffect(drag_law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)
+    ),
     "slowed by air": ((SOFT, GravityEffect(), AirDragEffect(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by dashpots": ((SOFT, GravityEffect(), DashpotsEffect(stretch=0.4), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by Rayleigh's damping": (
-        (SOFT, GravityEffect(), RayleighEffect(mass_coefficient=0.5, stiffness_coefficient=0.02), HELD), (), (1.0, 0.0, 2.0)
+        (SOFT, GravityEffect(), RayleighEffect(mass_coefficient=0.5, stiffness_coefficient=0.02), HELD),
+        (), (1.0, 0.0, 2.0),
     ),
     "swung by its pin": ((SOFT, GravityEffect(), SWUNG), (), (0.5, 1.0, 0.0)),
 }  # fmt: skip

@@ -142,8 +142,8 @@ _TABLE = (
     (
         "ether-decay",
         "harness/scenes/effects/ether_drag_effect.py",
-        "exp(-self.rate * time_step)",
-        "1.0 - self.rate * time_step",
+        "exp(-self.decay_rate * time_step)",
+        "1.0 - self.decay_rate * time_step",
         _STEPS,
     ),
     (

@@ -16,9 +16,9 @@ from springbench.solvers.model.step_problem import StopRule, Unsupported
 from tests.scene_builders import CLOTH_SCENE_YAML
 
 
-def made(folder, mesh="{kind: grid}", pins="at: [top_corners]", size=21, integrator="implicit-euler"):
+def made(folder, mesh="{kind: grid}", pins="parts: [top_corners]", size=21, integrator="implicit-euler"):
     path = folder / "cloth.yaml"
-    text = CLOTH_SCENE_YAML.replace("{kind: grid}", mesh).replace("at: [top_corners]", pins).replace("300", "3000")
+    text = CLOTH_SCENE_YAML.replace("{kind: grid}", mesh).replace("parts: [top_corners]", pins).replace("300", "3000")
     path.write_text(text, encoding="utf-8")
     (run,) = load_config(path, solvers=["lbfgs"], sizes=[size]).list_runs()
     return build_scene(run.scene, size, integrator)

@@ -174,7 +174,7 @@ def test_conflicts_are_refused_with_both_names(case):
         {"obstacles": [{"kind": "capsule", "end_points": ((0, 0, 0), (0, 0, 0)), "radius": 1}]},
         {"obstacles": [{"kind": "box", "low": (0, 0, 0), "high": (1, 0, 1)}]},
         {"obstacles": [{"kind": "sphere", "radius": -1}]},
-        {"obstacles": [{"kind": "plane"}], "thickness": 0.01, "tolerance": 0.01},
+        {"obstacles": [{"kind": "plane"}], "min_distance": 0.01, "penetration_tolerance": 0.01},
         {"obstacles": [{"kind": "plane"}], "friction": -0.1},
     ],
     ids=str,

@@ -184,7 +184,7 @@ def test_wind_of_nothing_leaves_nothing(wind):
     [
         ({"acts_on": "triangle", "force": (1, 0, 0)}, "force"),
         ({"velocity": (1, 0, 0)}, "velocity"),
-        ({"lift_coefficient": 1.0}, "lift"),
+        ({"lift_coefficient": 1.0}, "lift_coefficient"),
         ({"seed": 1}, "seed"),
         ({"field": "assignment", "force": (1, 0, 0)}, "force"),
     ],

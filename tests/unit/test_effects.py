@@ -130,7 +130,7 @@ def test_the_assignments_wind_and_force_make_its_external_force():
 
 
 def test_the_assignments_wind_per_share_is_the_mean_over_the_mass():
-    each, shared = (force_of(WindEffect(field="assignment", acts_on=per)) for per in ("vertex", "share"))
+    each, shared = (force_of(WindEffect(field="assignment", acts_on=per)) for per in ("vertex", "mass"))
     np.testing.assert_allclose(shared, MESH.mass_fractions[:, None] * each, rtol=1e-15)
 
 
@@ -216,7 +216,15 @@ def test_a_holeless_sheet_and_unknown_numbers_are_refused():
 
 
 def test_selectors_that_are_not_used_are_not_written_down():
-    assert set(PinsEffect(parts=("top",)).model_dump()) == {"at", "indices", "box", "every", "kind", "weight", "motion"}
+    assert set(PinsEffect(parts=("top",)).model_dump()) == {
+        "parts",
+        "indices",
+        "box",
+        "stride",
+        "kind",
+        "weight",
+        "motion",
+    }
 
 
 REFUSED = {

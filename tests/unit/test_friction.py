@@ -53,7 +53,7 @@ TAKE = ("sparse", "numba", "anderson", "chebyshev", "lbfgs", "vbd", "avbd", "hyb
 
 def pebble(friction: float, dt: float = 1 / 60, integrator: str = "implicit-euler", **more: Any) -> Scene:
     """A vertex of 1 kg at rest on a slope, just not pressed."""
-    ground = {"obstacles": [{"kind": "plane", "point": (0.0, -THICKNESS, 0.0)}], "thickness": THICKNESS}
+    ground = {"obstacles": [{"kind": "plane", "point": (0.0, -THICKNESS, 0.0)}], "min_distance": THICKNESS}
     rough = ContactEffect.model_validate(ground | {"friction": friction} | more)
     return with_integrator(
         build_test_scene(NetworkMesh(positions=((0.0, 0.0, 0.0),)), DOWN, rough, size=0, time_step=dt), integrator
@@ -155,7 +155,7 @@ def test_a_slide_converges_with_order_1_by_implicit_euler():
 
 @pytest.mark.parametrize("dt", [1 / 60, 1 / 960])
 def test_what_sticks_creeps_at_a_speed_whatever_the_step(dt):
-    """A vertex at y times `creep` is pulled back by y times the limit of friction."""
+    """A vertex at y times `eps_v` is pulled back by y times the limit of friction."""
     last = steps(pebble(STICKS, dt, eps_v=2e-4), 16)[-1]
     assert last.state.motion.velocity[0, 0] == pytest.approx(SLOPE / STICKS * 2e-4, rel=1e-3)
 

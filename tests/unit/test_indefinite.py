@@ -193,7 +193,10 @@ def test_all_rules_leave_a_saddle(rule):
 @others
 def test_energies_without_elements_are_refused_by_name(rule):
     made = EFFECT_SCENES["gas"]()
-    with pytest.raises(Unsupported, match=f"newton, indefinite: {rule}: .*none of Gas; take indefinite: graded"):
+    with pytest.raises(
+        Unsupported,
+        match=f"newton, indefinite_strategy: {rule}: .*none of Gas; take indefinite_strategy: shift-schedule",
+    ):
         NewtonSolver(rule).prepare(made.system)
 
 

@@ -152,8 +152,8 @@ def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
 def test_a_crushed_sheet_in_long_steps_stays_finite(name):
     """Its springs are compressed to a half, so the exact Hessian of a frame has no factor."""
     integrator = "implicit-euler" if name == "baraff-witkin" else "substepping"
-    scene = made(SpringsEffect(stretch=1e4), PinsEffect(parts=("top_corners",), weight="exact"), mesh=GridMesh(), size=6,
-                 integrator=integrator, time_step=1 / 30)  # fmt: skip
+    scene = made(SpringsEffect(stretch=1e4), PinsEffect(parts=("top_corners",), weight="exact"), mesh=GridMesh(),
+                 size=6, integrator=integrator, time_step=1 / 30)  # fmt: skip
     state = build_initial_state(scene)
     crushed = type(state)(Motion(0.5 * scene.mesh.rest_positions, np.zeros_like(scene.mesh.rest_positions)), None, 0)
     ready = prepare(scene, load_target(SOLVERS[name])())

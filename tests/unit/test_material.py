@@ -220,10 +220,10 @@ def test_the_rule_of_liu_2013_gives_the_stiffness_of_their_figure(size, k):
 @pytest.mark.parametrize(
     ("changes", "key"),
     [
-        ({"scaling_rule": "continum"}, "rule"),
-        ({"scaling_rule": "liu2013"}, "reference"),
-        ({"scaling_rule": "liu2013", "reference_size": 1}, "reference"),
-        ({"scaling_rule": "fixed", "reference_size": 10}, "reference"),
+        ({"scaling_rule": "continum"}, "scaling_rule"),
+        ({"scaling_rule": "liu2013"}, "reference_size"),
+        ({"scaling_rule": "liu2013", "reference_size": 1}, "reference_size"),
+        ({"scaling_rule": "fixed", "reference_size": 10}, "reference_size"),
         ({"stretch": -1.0}, "stretch"),
         ({"shear": float("nan")}, "shear"),
         ({"bend": float("inf")}, "bend"),

@@ -189,7 +189,9 @@ def test_what_it_cannot_do_is_said_before_any_work(change, told):
         MultigridXpbd().prepare(change(build_random_problem(0).system))
 
 
-@pytest.mark.parametrize(("settings", "told"), [({"components": -1}, "components"), ({"setup": 0}, "setup")])
+@pytest.mark.parametrize(
+    ("settings", "told"), [({"near_null_vectors": -1}, "near_null_vectors"), ({"setup_interval": 0}, "setup_interval")]
+)
 def test_settings_that_mean_nothing_are_refused(settings, told):
     with pytest.raises(ValueError, match=f"{told}: should be at least"):
         MultigridXpbd(**settings)

@@ -33,7 +33,7 @@ from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem, build_test_scene
 from tests.unit.test_surface_contact import BALL, contact, count_intersections, draped
 
-OTHERS: list[PreconditionerName] = [name for name in get_args(PreconditionerName) if name != "factor"]
+OTHERS: list[PreconditionerName] = [name for name in get_args(PreconditionerName) if name != "cholesky"]
 others = pytest.mark.parametrize("name", OTHERS)
 METHODS = {"newton-cg": NewtonCG, "pncg": NonlinearCG}
 

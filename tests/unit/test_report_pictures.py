@@ -278,7 +278,7 @@ def test_obstacles_far_from_zero_are_drawn_as_near_it() -> None:
         capsule = {"kind": "capsule", "end_points": [at(0, -1.5, 0), at(1, -1.5, 0)], "radius": 0.1}
         box = {"kind": "box", "low": at(0, -2, 0), "high": at(0.5, -1.75, 0.25)}
         plane = {"kind": "plane", "point": at(0, 0, -1), "normal": [0, 0, 1]}
-        return json.dumps([sphere, capsule, box | {"motion": turns | {"about": at(0, 0, 0)}}, plane])
+        return json.dumps([sphere, capsule, box | {"motion": turns | {"pivot": at(0, 0, 0)}}, plane])
 
     images = []
     with OffscreenRenderer(80, 80) as studio:

@@ -45,14 +45,14 @@ def test_a_start_is_where_its_kind_says(keys, wanted):
 
 
 def test_random_starts_fill_their_cube_and_follow_their_seed():
-    p = positions(kind="random", side=0.5)
+    p = positions(kind="random", side_length=0.5)
     assert np.abs(p - MEAN).max() <= 0.25
-    np.testing.assert_array_equal(p, positions(kind="random", side=0.5))
-    assert np.abs(p - positions(kind="random", side=0.5, seed=1)).max() > 0.01
+    np.testing.assert_array_equal(p, positions(kind="random", side_length=0.5))
+    assert np.abs(p - positions(kind="random", side_length=0.5, seed=1)).max() > 0.01
 
 
 def test_perturbed_starts_lie_about_as_far_off_as_they_say():
-    away = positions(kind="perturbed", deviation=1e-3, seed=2) - REST
+    away = positions(kind="perturbed", standard_deviation=1e-3, seed=2) - REST
     assert 2e-4 < away.std() < 5e-3  # twelve normal numbers of deviation 1e-3
 
 

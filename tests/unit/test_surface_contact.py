@@ -158,7 +158,7 @@ def deforming(path: Path, rate: float) -> MeshObstacle:
     ball = BalloonMesh(radius=0.3).build_mesh(4).rest_positions
     stored = [ball * (1 / s, s, 1 / s) + (0.0, 0.4 * (s - 1), 0.0) for s in 1 + 0.08 * np.arange(7)]
     np.savez(path / "ball.npz", positions=np.array(stored))
-    frames = {"positions": str(path / "ball.npz"), "rate": rate}
+    frames = {"positions": str(path / "ball.npz"), "frame_rate": rate}
     return MeshObstacle.model_validate(
         BALL.model_dump() | {"mesh": {"kind": "balloon", "radius": 0.3}, "frames": frames}
     )

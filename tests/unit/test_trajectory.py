@@ -66,11 +66,14 @@ ALONG = {  # the place of the second vertex of two along x, each of 1 kg, less 1
     "spring": ((SPRING, HELD), FAST, lambda t: damped(t, 0.0)),
     "spring and ether drag": ((SPRING, HELD, EtherDragEffect(decay_rate=C)), FAST, lambda t: damped(t, C)),
     "spring and air drag": ((SPRING, HELD, AirDragEffect(coefficient=2.0 * C)), FAST, lambda t: damped(t, C)),
-    "spring and dashpot": ((SPRING, HELD, DashpotsEffect(scaling_rule="fixed", stretch=C)), FAST, lambda t: damped(t, C)),
+    "spring and dashpot": (
+        (SPRING, HELD, DashpotsEffect(scaling_rule="fixed", stretch=C)), FAST, lambda t: damped(t, C)
+    ),
     "ether drag": ((EtherDragEffect(decay_rate=C),), FAST, lambda t: SPEED / C * (1.0 - np.exp(-C * t))),
     "spring whose pin moves": ((SPRING, DRAGGED), (0.0, 0.0, 0.0), lambda t: SPEED * t - damped(t, 0.0)),
     "dashpot whose pin moves": (
-        (SPRING, DashpotsEffect(scaling_rule="fixed", stretch=C), DRAGGED), (0.0, 0.0, 0.0), lambda t: SPEED * t - damped(t, C)
+        (SPRING, DashpotsEffect(scaling_rule="fixed", stretch=C), DRAGGED),
+        (0.0, 0.0, 0.0), lambda t: SPEED * t - damped(t, C),
     ),
 }  # fmt: skip
 

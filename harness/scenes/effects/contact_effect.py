@@ -46,7 +46,7 @@ class ContactEffect(ConfigModel):
     friction: NonNegativeFloat = 0.0
     """Coulomb's friction coefficient mu, both static and kinetic."""
     penetration_tolerance: PositiveFloat | None = None
-    """Penetration [m] into `min_distance` that is allowed at the end of a step; by default a tenth of `min_distance`."""
+    """Penetration [m] into `min_distance` that is allowed at the end of a step; by default a tenth of it."""
     max_speed: PositiveFloat = 10.0
     """Largest speed [m/s] at which the penetration tolerance is met."""
     eps_v: PositiveFloat = 1e-5
@@ -75,8 +75,8 @@ class ContactEffect(ConfigModel):
         lengths = mesh.rest_lengths
         if len(lengths) and not self.min_distance < lengths.min():
             raise InputError(
-                f"contact: came a min_distance of {self.min_distance:g} m, which is not below the shortest of the springs "
-                f"at rest, {lengths.min():.3g} m; take a smaller one, or a coarser mesh"
+                f"contact: came a min_distance of {self.min_distance:g} m, which is not below the shortest of the "
+                f"springs at rest, {lengths.min():.3g} m; take a smaller one, or a coarser mesh"
             )
         obstacles = tuple(one.build_obstacle() for one in self.obstacles)
 
@@ -125,6 +125,6 @@ class ContactEffect(ConfigModel):
             vertex = f"{vertices[worst]}{mesh.format_file_numbers(int(vertices[worst]))}"
             raise InputError(
                 f"contact: {who.format(vertex)} {distance[worst]:.3g} m from the surface of obstacles[{k}] "
-                f"({self.obstacles[k].kind}), which is nearer than the min_distance of {self.min_distance:g} m; move one of "
-                "them" + (" (negative distances are inside)" if distance[worst] < 0.0 else "")
+                f"({self.obstacles[k].kind}), which is nearer than the min_distance of {self.min_distance:g} m; move "
+                "one of them" + (" (negative distances are inside)" if distance[worst] < 0.0 else "")
             )

@@ -10,7 +10,8 @@ of the air in one step, f dt <= m |u|; otherwise light cloth is unstable in a st
 
     constant    uniform in space and time
     gusts       the constant one, and waves that it advects (after Kraichnan 1970): each component varies by the
-                fraction `turbulence_intensity` of the mean's magnitude (root mean square), at 16 frequencies around `frequency`
+                fraction `turbulence_intensity` of the mean's magnitude (root mean square), at 16 frequencies
+                around `frequency`
     assignment  that of the University of Toronto assignment, with t the simulated time [s], b the diagonal of
                 the rest bounding box and phi = x / b + t at the current x:
 
@@ -114,7 +115,7 @@ def _vertex_wind(wind: WindEffect, mesh: Mesh, weight: NDArray[np.float64]) -> t
 def _triangle_wind(wind: WindEffect, mesh: Mesh, mass: NDArray[np.float64], dt: float) -> tuple[ForceFunction, ...]:
     triangles, field = mesh.triangles, _FIELD_BUILDERS[wind.field](wind, mesh)
     if not len(triangles):
-        raise InputError("wind: per: triangle needs triangles, and this mesh has none; let it act per share")
+        raise InputError("wind: acts_on: triangle needs triangles, and this mesh has none; take acts_on: mass")
     if not wind.air_density or not (wind.drag_coefficient or wind.lift_coefficient):
         return ()
     limit = _lump_triangle_masses(mesh, mass) / dt

@@ -47,7 +47,7 @@ class Admm:
     """ADMM for springs, strain limits and constant quadratic forms.
 
     Args:
-        weight: W, relative to the stiffness of each edge.
+        penalty_weight: W, relative to the stiffness of each edge.
     """
 
     is_minimiser: ClassVar[bool] = True
@@ -67,7 +67,7 @@ class Admm:
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
         if not 0.0 < self.penalty_weight < np.inf:
-            raise ValueError(f"weight: should be positive and finite, not {self.penalty_weight}")
+            raise ValueError(f"penalty_weight: should be positive and finite, not {self.penalty_weight}")
 
     def prepare(self, system: System) -> PreparedAdmm:
         """Prepare the method for a system.

@@ -4,11 +4,10 @@
 
 The Hessian of compressed springs may be indefinite. It remains exact wherever it has a Cholesky factor, which preserves
 quadratic convergence. Where it has none, an increasing part of the springs' negative lateral stiffness is removed, and
-finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite_strategy`, see
-`springbench.solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005)
-converges linearly. Where the
-slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a saddle. From a stationary
-point whose exact Hessian has no factor, the method escapes
+finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite_strategy`,
+see `springbench.solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005) converges
+linearly. Where the slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a
+saddle. From a stationary point whose exact Hessian has no factor, the method escapes
 (`springbench.solvers.methods.newton.negative_curvature`).
 
 With active contacts, an iteration converges friction and may consist of several steps
@@ -88,8 +87,8 @@ class NewtonSolver:
         }
         if whole and self.indefinite_strategy != "shift-schedule":
             raise Unsupported(
-                f"newton, indefinite_strategy: {self.indefinite_strategy}: changes second derivatives element by element, and there are "
-                f"none of {', '.join(sorted(whole))}; take indefinite_strategy: shift-schedule"
+                f"newton, indefinite_strategy: {self.indefinite_strategy}: changes second derivatives element by "
+                f"element, and there are none of {', '.join(sorted(whole))}; take indefinite_strategy: shift-schedule"
             )
         factor = objective.hessian_matrix.factor
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
