@@ -97,7 +97,9 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_NewtonPhysicsStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
         if not self.iterations_per_substep >= 1:
-            raise Unsupported(f"newton-physics: iterations came as {self.iterations_per_substep}; wanted 1 or more")
+            raise Unsupported(
+                f"newton-physics: iterations_per_substep came as {self.iterations_per_substep}; wanted 1 or more"
+            )
         warp = import_module("warp")
         if self.device == "cuda" and not warp.is_cuda_available():
             raise Unsupported("newton-physics: device: cuda: Warp finds no CUDA device, or no driver for it")

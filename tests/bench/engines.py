@@ -32,7 +32,7 @@ from springbench.solvers.registry import SOLVER_TABLE, load_target
 
 SCENES = [Path(__file__).parents[2] / "configs" / "scenes" / f"{name}.yaml" for name in ("curtain", "stiff-cloth-sway")]
 ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (
-    *(("mujoco", {"integrator": one}) for one in ("implicitfast", "implicit", "Euler", "RK4")),
+    *(("mujoco", {"mujoco_integrator": one}) for one in ("implicitfast", "implicit", "Euler", "RK4")),
     *(("pypbd", {"iterations_per_substep": one}) for one in (1, 4, 16)),
     ("newton-physics", {"newton_solver": "vbd", "iterations_per_substep": 10}),
     ("newton-physics", {"newton_solver": "vbd", "iterations_per_substep": 10, "colouring_source": "newton"}),

@@ -4,10 +4,10 @@
 
 A chain of 17 vertices that hangs straight, its first step: every second spring of 1,000 N/m is so many times as
 stiff, or the last vertex of a chain of 100,000 N/m is so many times as heavy. Primal methods change positions vertex
-by vertex: `vbd`, Gauss and Seidel's way, with and without its acceleration, and Jacobi's (`jgs2`, `neighbour_rings: 0`). Dual
-ones change the tensions of springs: `xpbd`, Gauss and Seidel's way. A cell is how many iterations it takes until
-every vertex is within a thousandth of the step's way of where it ends; a dash: not within 100,000. The line stays
-straight, so what XPBD tends to is the minimum.
+by vertex: `vbd`, Gauss and Seidel's way, with and without its acceleration, and Jacobi's (`jgs2`, `neighbour_rings:
+0`). Dual ones change the tensions of springs: `xpbd`, Gauss and Seidel's way. A cell is how many iterations it takes
+until every vertex is within a thousandth of the step's way of where it ends; a dash: not within 100,000. The line
+stays straight, so what XPBD tends to is the minimum.
 """
 
 from __future__ import annotations

@@ -156,8 +156,8 @@ _TABLE = (
     (
         "wind-density",
         "harness/scenes/effects/wind_effect.py",
-        "f = 0.5 * wind.density",
-        "f = wind.density",
+        "            0.5\n            * wind.air_density",
+        "            1.0\n            * wind.air_density",
         f"{_U}/test_effect_wind.py",
     ),
 )

@@ -146,7 +146,7 @@ def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, dampi
     wind = replace(
         stated, external_force=stated.external_force + np.random.default_rng(0).normal(size=stated.external_force.shape)
     )
-    prepared = ready("mujoco", scene.system, integrator=integrator)
+    prepared = ready("mujoco", scene.system, mujoco_integrator=integrator)
     for one in stated, wind:
         found = prepared.solve(one, StopRule(20))
         p, v = semi_implicit(scene, one, 20, damping)

@@ -150,7 +150,7 @@ class _AdaptiveStepSolver(ExplicitSolver):
         """
         if not 1e-14 <= self.error_tolerance <= 1.0:
             raise Unsupported(
-                f"{self.solver_name}: error came as {self.error_tolerance}; wanted a number from 1e-14 to 1"
+                f"{self.solver_name}: error_tolerance came as {self.error_tolerance}; wanted a number from 1e-14 to 1"
             )
         return self._prepare_explicit(system, 1, self.error_tolerance)
 
