@@ -130,6 +130,6 @@ def test_all_mistakes_of_a_sweep_and_its_scenes_come_at_once_in_the_order_of_the
     lines = refusal(folder, configs / "worse.yaml")
     keys = [line.split(": ")[2] for line in lines]
     assert keys == [
-        *("mass", "frames", "effects[0].at[0]"),
+        *("mass", "frames", "effects[0].parts[0]"),
         *("scenes[1]", "sizes[0]", "solvers[0].name", "solvers[1].name", "z"),
     ]

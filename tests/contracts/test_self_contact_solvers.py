@@ -170,7 +170,7 @@ def test_two_free_sheets_that_collide_keep_their_momentum():
 STARTS = {
     "through itself": (ScaledStart(factors=(1.0, 0.0, 1.0)), "passes through itself"),
     "collapsed": (CollapsedStart(), "passes through itself"),
-    "too near": (ScaledStart(factors=(1.0, 0.02, 1.0)), "pairs start nearer than the thickness.*vertex|edges"),
+    "too near": (ScaledStart(factors=(1.0, 0.02, 1.0)), "pairs start nearer than the min_distance.*vertex|edges"),
 }
 
 

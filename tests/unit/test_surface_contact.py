@@ -213,7 +213,7 @@ def test_what_is_squeezed_between_obstacles_is_said():
         (SphereObstacle(center=(0.0, 0.0, 0.0), radius=0.3), "passes through obstacles, .* edge .* of the obstacles"),
         (
             PlaneObstacle(point=(0.0, -0.005, 0.0)),
-            "nearer than the thickness of 0.01 m: .* of the obstacles 0.005 m apart",
+            "nearer than the min_distance of 0.01 m: .* of the obstacles 0.005 m apart",
         ),
     ],
 )
