@@ -33,13 +33,13 @@ BALL_OBSTACLE = SphereObstacle(center=(0.0, -0.36, 0.0), radius=0.3)
 
 def simulate_fall(thickness: float, stiffness: float) -> Positions:
     """Where the sheet is after 0.7 s, (n, 3) [m]."""
-    own = SelfContactEffect(thickness=thickness, stiffness=stiffness)
-    ball = SurfaceContactEffect(thickness=thickness, stiffness=stiffness, obstacles=(BALL_OBSTACLE,))
+    own = SelfContactEffect(min_distance=thickness, barrier_stiffness=stiffness)
+    ball = SurfaceContactEffect(min_distance=thickness, barrier_stiffness=stiffness, obstacles=(BALL_OBSTACLE,))
     effects = (
         SpringsEffect(stretch=100.0, shear=20.0),
         GravityEffect(),
-        EtherDragEffect(rate=5.0),
-        PinsEffect(at=("corners",)),
+        EtherDragEffect(decay_rate=5.0),
+        PinsEffect(parts=("corners",)),
         own,
         ball,
     )

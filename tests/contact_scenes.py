@@ -19,11 +19,11 @@ from springbench.solvers.model.step_problem import Positions, Solver, StopRule
 from tests.scene_builders import build_test_scene
 
 CONTACT_THICKNESS, TIME_STEP = 0.01, 1 / 30
-TILTING_MOTION = {"keys": [{"time": 0, "turn": 20}], "axis": (0, 0, 1)}
+TILTING_MOTION = {"key_frames": [{"time": 0, "angle": 20}], "axis": (0, 0, 1)}
 OBSTACLE_SPECS: dict[str, dict[str, Any]] = {
     "plane": {"kind": "plane", "point": (0, -0.25, 0), "normal": (0.2, 1, 0.1)},
     "sphere": {"kind": "sphere", "center": (0.05, -0.6, 0), "radius": 0.3},
-    "capsule": {"kind": "capsule", "ends": ((-0.7, -0.5, 0.1), (0.6, -0.4, 0)), "radius": 0.1},
+    "capsule": {"kind": "capsule", "end_points": ((-0.7, -0.5, 0.1), (0.6, -0.4, 0)), "radius": 0.1},
     "plate": {"kind": "box", "low": (-0.8, -0.305, -0.8), "high": (0.8, -0.295, 0.8)},  # as thin as the cloth is thick
     "tilted box": {"kind": "box", "low": (-0.4, -0.7, -0.5), "high": (0.3, -0.35, 0.4), "motion": TILTING_MOTION},
 }
@@ -33,7 +33,7 @@ DESCENT_STOP = StopRule(40, 1e-9)
 
 
 def build_contact(*obstacles: dict[str, Any], friction: float = 0.0, **more: Any) -> ContactEffect:
-    given = {"obstacles": obstacles, "thickness": CONTACT_THICKNESS, "friction": friction}
+    given = {"obstacles": obstacles, "min_distance": CONTACT_THICKNESS, "friction": friction}
     return ContactEffect.model_validate(given | more)
 
 

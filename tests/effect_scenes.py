@@ -29,14 +29,14 @@ from springbench.solvers.model.step_problem import Positions, Solver, StepProble
 
 from tests.scene_builders import build_test_scene
 
-KEYED_MOTION = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.1, 0.2, 0.0), turn=90.0)))
+KEYED_MOTION = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.1, 0.2, 0.0), angle=90.0)))
 
 BENDING_EFFECT = BendingEffect(stiffness=0.5)
-STRAIN_LIMIT_EFFECT = StrainLimitsEffect(longest=1.02, shortest=0.98, stiffness=500.0)
+STRAIN_LIMIT_EFFECT = StrainLimitsEffect(max_stretch=1.02, min_stretch=0.98, stiffness=500.0)
 DASHPOT_EFFECT = DashpotsEffect(stretch=2.0)
-RAYLEIGH_EFFECT = RayleighEffect(mass=0.5, stiffness=0.02)
+RAYLEIGH_EFFECT = RayleighEffect(mass_coefficient=0.5, stiffness_coefficient=0.02)
 AIR_DRAG_EFFECT = AirDragEffect(coefficient=2.0)
-ATTACHMENT_EFFECT = AttachmentsEffect(at=("bottom",), stiffness=50.0, motion=KEYED_MOTION)
+ATTACHMENT_EFFECT = AttachmentsEffect(parts=("bottom",), stiffness=50.0, motion=KEYED_MOTION)
 GAS_EFFECT = GasEffect(pressure=200.0)
 FLOOR_CONTACT = ContactEffect.model_validate(
     {"obstacles": [{"kind": "plane", "point": (0, -0.02, 0)}], "friction": 0.3}
@@ -45,7 +45,7 @@ FLOOR_CONTACT = ContactEffect.model_validate(
 
 
 def build_effect_cloth(*effects: SceneEffect) -> Scene:
-    pins = PinsEffect(at=("top_corners",), motion=KEYED_MOTION)
+    pins = PinsEffect(parts=("top_corners",), motion=KEYED_MOTION)
     return build_test_scene(
         GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), pins, *effects, size=6
     )
@@ -53,7 +53,7 @@ def build_effect_cloth(*effects: SceneEffect) -> Scene:
 
 def build_balloon(*effects: SceneEffect) -> Scene:
     return build_test_scene(
-        BalloonMesh(), SpringsEffect(stretch=100.0), GravityEffect(), PinsEffect(at=("pole_top",)), *effects, size=2
+        BalloonMesh(), SpringsEffect(stretch=100.0), GravityEffect(), PinsEffect(parts=("pole_top",)), *effects, size=2
     )
 
 

@@ -55,7 +55,7 @@ mass: 1
 time_step: 0.03
 frames: 3
 default_size: 4
-effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, parts: [top_corners]}]
 """
 SWEEP_TEMPLATE = "scenes: [scene.yaml]\nsolvers: [mine, sparse]\noptions: {%s}\n"
 SWEEP_OPTIONS = "rounds: 1, max_iterations: 5, record: false, pictures: false"

@@ -44,7 +44,7 @@ mass: 0.3
 time_step: 1/30
 frames: 2
 default_size: 4
-effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, parts: [top_corners]}]
 """
 """A scene's file: a small cloth held at two corners, for two steps."""
 
@@ -72,7 +72,7 @@ def build_test_scene(
 
 def build_cloth(size: int, weight: float | str = 1e10, stretch: float = 300.0) -> Scene:
     """A level cloth that falls, held at two corners."""
-    pins = PinsEffect.model_validate({"at": ["top_corners"], "weight": weight})
+    pins = PinsEffect.model_validate({"parts": ["top_corners"], "weight": weight})
     return build_test_scene(
         GridMesh(), SpringsEffect(stretch=stretch, shear=stretch / 5), GravityEffect(), pins, size=size
     )
@@ -104,7 +104,7 @@ SCENE_BUILDERS: dict[str, Callable[[float | str], Scene]] = {
 
 
 def _build_pins(part: str, weight: float | str) -> PinsEffect:
-    return PinsEffect.model_validate({"at": [part], "weight": weight})
+    return PinsEffect.model_validate({"parts": [part], "weight": weight})
 
 
 def build_first_problem(scene: Scene, initial_guess: str = "previous") -> StepProblem:

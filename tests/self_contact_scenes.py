@@ -40,7 +40,7 @@ def build_touching_sheets(
     seed: int = 0, *, size: int = 5, noise: float = 0.004
 ) -> tuple[SelfContact, Positions, NDArray[np.int64]]:
     """The contact of two sheets, positions where they touch, nearly parallel edges among them, and the triangles."""
-    mesh, rng = StackMesh(apart=0.2).build_mesh(size), np.random.default_rng(seed)
+    mesh, rng = StackMesh(layer_spacing=0.2).build_mesh(size), np.random.default_rng(seed)
     n = len(mesh.rest_positions) // 2
     surface = CollisionMesh.from_rest_shape(
         mesh.rest_positions,

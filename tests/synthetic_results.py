@@ -207,7 +207,7 @@ def write_speed_results(folder: Path) -> Path:
         limits = [row | {"working_set_bytes": row.get("working_set_bytes") or 0.0} for row in limits]
         write_result_rows(folder / "rows" / f"machine-{size}.parquet", limits)
         for place, (solver, linear) in enumerate((("sparse", None), ("numba", "auto"), ("numba", "supernodal"))):
-            parameters = json.dumps({"linear": linear} if linear else {})
+            parameters = json.dumps({"linear_solver": linear} if linear else {})
             one = known | {"run_id": f"{solver}{linear}{size}", "solver": solver, "parameters": parameters}
             one |= (
                 {"started_at": "2025"} if linear == "supernodal" else {"started_at": "2026", "source_fingerprint": None}

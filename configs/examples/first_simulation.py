@@ -8,7 +8,7 @@ scene = springbench.make_scene(
     time_step="1/30",
     frames=30,
     default_size=12,
-    effects=[{"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}, {"kind": "pins", "at": ["top_corners"]}],
+    effects=[{"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}, {"kind": "pins", "parts": ["top_corners"]}],
 )
 
 if __name__ == "__main__":

@@ -34,6 +34,6 @@ class Wheel(MeshGenerator):
 
 if __name__ == "__main__":
     springs = {"kind": "springs", "stretch": 500.0, "shear": 500.0}
-    effects = [springs, {"kind": "gravity"}, {"kind": "pins", "at": ["hub"]}]
+    effects = [springs, {"kind": "gravity"}, {"kind": "pins", "parts": ["hub"]}]
     scene = springbench.make_scene(mesh=Wheel(radius=0.5), effects=effects, mass=1.0, time_step=0.02, frames=20)
     print(f"the rim sinks to {springbench.Simulation(scene, size=12).run_steps(20)[:, :, 1].min():.3f} m")

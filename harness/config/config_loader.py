@@ -256,7 +256,7 @@ def convert_assignment_scene(path: Path) -> SceneSpec:
     assignment = read_assignment_scene(path)
     k, pins, mesh = assignment.stiffness, assignment.pinned_vertices.tolist(), AssignmentMesh(path=path)
     effects: tuple[dict[str, Any], ...] = (
-        {"kind": "springs", "rule": "fixed", "stretch": k, "shear": k, "bend": k},
+        {"kind": "springs", "scaling_rule": "fixed", "stretch": k, "shear": k, "bend": k},
         {"kind": "constant-force", "force": ASSIGNMENT_FORCE},
         *([{"kind": "pins", "indices": pins, "weight": ASSIGNMENT_PIN_WEIGHT}] if pins else []),
     )

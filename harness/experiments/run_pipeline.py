@@ -169,7 +169,7 @@ def _find_modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
 
     The result is None without springs or with several rules.
     """
-    rules = {effect.rule for effect in run.scene.effects if isinstance(effect, SpringsEffect)}
+    rules = {effect.scaling_rule for effect in run.scene.effects if isinstance(effect, SpringsEffect)}
     found = {compute_modulus_exponent(rule, scene.mesh.dimension) for rule in rules}
     return found.pop() if len(found) == 1 else None
 

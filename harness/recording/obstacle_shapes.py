@@ -91,7 +91,7 @@ def _draw_capsule(one: CapsuleObstacle, rest: Array, origin: Array) -> rr.Capsul
 
     Rerun's capsule extends along z. It is rotated by 180 degrees about the bisector of z and the capsule's axis.
     """
-    first, last = np.array(one.ends)
+    first, last = np.array(one.end_points)
     length = float(np.linalg.norm(last - first))
     half = (last - first) / length + [0.0, 0.0, 1.0]
     axis = half if np.linalg.norm(half) > 1e-9 else np.array([1.0, 0.0, 0.0])

@@ -152,7 +152,7 @@ def _build_motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, O
     scene = build_exact_scene(spec.with_time_step(interval), size, "substepping", show_warnings=False)
     if not scene.varying_forces and not scene.pin_motions:
         try:
-            ready = prepare(scene, BlanesMoan6(refine=_NUM_REFINEMENTS))
+            ready = prepare(scene, BlanesMoan6(refinement_factor=_NUM_REFINEMENTS))
         except Unsupported:
             pass
         else:

@@ -97,7 +97,7 @@ def _make_sphere(one: SphereObstacle, seen: NDArray[np.floating]) -> pv.PolyData
 
 
 def _make_capsule(one: CapsuleObstacle, seen: NDArray[np.floating]) -> pv.PolyData:
-    first, last = (np.array(end) for end in one.ends)
+    first, last = (np.array(end) for end in one.end_points)
     a, b = np.zeros(3), last - first
     bar = pv.Line(a, b).tube(radius=one.radius, n_sides=32, capping=False)
     balls = [pv.Sphere(radius=one.radius, center=end, theta_resolution=32, phi_resolution=24) for end in (a, b)]

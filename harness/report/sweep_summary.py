@@ -136,7 +136,7 @@ def _compare_strains(coarse_run: RunTimes, ok_runs: RunTimes) -> str:
         power = "" if coarse_run.modulus_exponent == 1 else f"^{coarse_run.modulus_exponent}"
         return (
             f"the largest strain changes {change}, and so does the material: by the springs' rule its modulus is "
-            f"proportional to h{power}, h the spacing of the mesh; `rule: continuum` does not change it."
+            f"proportional to h{power}, h the spacing of the mesh; `scaling_rule: continuum` does not change it."
         )
     if finest <= STRAIN_GROWTH_FACTOR * largest:
         return ""

@@ -65,7 +65,7 @@ def read_assignment_scene(path: Path) -> AssignmentScene:
     cells = replace(read_obj(obj), segments=NO_PAIRS)
     if not cells.polygons:
         raise InputError(InputMistake("has no faces (f lines), so there are no springs", obj))
-    mesh = build_spring_network(cells, "face_pairs", obj)
+    mesh = build_spring_network(cells, "face-pairs", obj)
     fans = np.concatenate(
         [NO_TRIANGLES, *map(fan_triangles, cells.polygons.values())]
     )  # as the assignment's code cuts faces

@@ -109,9 +109,9 @@ def require_intersection_free(
             for x, two, apart in closed[:_MAX_NAMED_PAIRS]
         )
         raise InputError(
-            f"{effect_name}: {len(closed)} pairs start nearer than the thickness of "
+            f"{effect_name}: {len(closed)} pairs start nearer than the min_distance of "
             f"{min_distance:g} m: {near}; move them apart, "
-            "or take a smaller thickness"
+            "or take a smaller min_distance"
         )
 
 

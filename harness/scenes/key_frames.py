@@ -26,25 +26,25 @@ class KeyFrame(ConfigModel):
     """Simulated time [s]."""
     offset: Vector3 = (0.0, 0.0, 0.0)
     """Translation from the declared position [m]."""
-    turn: float = Field(default=0.0, ge=-1e9, le=1e9)
+    angle: float = Field(default=0.0, ge=-1e9, le=1e9)
     """Rotation angle about the axis [degrees]; more than 360 is more than one revolution."""
 
 
 class KeyFrameMotion(ConfigModel):
     """A rigid motion along key frames."""
 
-    keys: tuple[KeyFrame, ...] = Field(min_length=1, max_length=10_000)
+    key_frames: tuple[KeyFrame, ...] = Field(min_length=1, max_length=10_000)
     """Key frames with increasing times."""
     axis: Vector3 = (0.0, 1.0, 0.0)
     """Direction of the rotation axis, of any length but zero."""
-    about: Vector3 = (0.0, 0.0, 0.0)
+    pivot: Vector3 = (0.0, 0.0, 0.0)
     """A point on the rotation axis [m]."""
-    between: Literal["linear", "smooth"] = "linear"
+    interpolation: Literal["linear", "smooth"] = "linear"
     """Interpolation between key frames: linear, or by cubics with zero velocity where the direction reverses."""
 
     @model_validator(mode="after")
     def _check_order(self) -> KeyFrameMotion:
-        times = [key.time for key in self.keys]
+        times = [key.time for key in self.key_frames]
         if any(b <= a for a, b in pairwise(times)):
             raise ValueError("the times of the keys should rise from key to key")
         if not any(self.axis):
@@ -54,18 +54,18 @@ class KeyFrameMotion(ConfigModel):
     @property
     def key_times(self) -> tuple[float, ...]:
         """Times of the key frames [s]."""
-        return tuple(key.time for key in self.keys)
+        return tuple(key.time for key in self.key_frames)
 
     def transform_points(self, points: Positions, time: float) -> Positions:
         """Return the positions (q, 3) [m] of declared points at a time [s]."""
         *offset, turn = self._interpolate_pose(time)
-        arm = points - self.about
+        arm = points - self.pivot
         return points + offset + arm @ (_rotation_matrix(self.axis, np.deg2rad(turn)) - np.eye(3)).T
 
     def invert_points(self, points: Positions, time: float) -> Positions:
         """Return the declared positions (q, 3) [m] of points at a time [s]."""
         *offset, turn = self._interpolate_pose(time)
-        arm = points - offset - self.about
+        arm = points - offset - self.pivot
         return points - offset + arm @ (_rotation_matrix(self.axis, np.deg2rad(turn)) - np.eye(3))
 
     def compute_velocity(self, points: Positions, time: float) -> Positions:
@@ -74,14 +74,14 @@ class KeyFrameMotion(ConfigModel):
         At a key frame, the velocity is the limit from the right.
         """
         (*offset, rise), (*_, turn) = self._interpolate_rate(time), self._interpolate_pose(time)
-        arm = (points - self.about) @ _rotation_matrix(self.axis, np.deg2rad(turn)).T
+        arm = (points - self.pivot) @ _rotation_matrix(self.axis, np.deg2rad(turn)).T
         axis = np.array(self.axis) / np.linalg.norm(self.axis)
         return offset + np.deg2rad(rise) * np.cross(axis, arm)
 
     @property
     def is_piecewise_linear(self) -> bool:
         """Whether points move along straight lines at constant velocity between key frames."""
-        return self.between == "linear" and len({key.turn for key in self.keys}) == 1
+        return self.interpolation == "linear" and len({key.angle for key in self.key_frames}) == 1
 
     def bound_speed(self, start_time: float, end_time: float, points: Positions, *, slack: float = 0.0) -> float:
         """Return an upper bound of the speed [m/s] between two times without a key frame in between.
@@ -97,26 +97,26 @@ class KeyFrameMotion(ConfigModel):
         if len(times) == 1 or start_time >= times[-1] or end_time <= times[0]:
             return 0.0
         *offset, turn = np.abs(values[k] - values[k - 1]) / (times[k] - times[k - 1])
-        arm = float(np.linalg.norm(points - self.about, axis=1).max(initial=0.0)) + slack
-        return _MAX_SLOPE_RATIOS[self.between] * (float(np.linalg.norm(offset)) + float(np.deg2rad(turn)) * arm)
+        arm = float(np.linalg.norm(points - self.pivot, axis=1).max(initial=0.0)) + slack
+        return _MAX_SLOPE_RATIOS[self.interpolation] * (float(np.linalg.norm(offset)) + float(np.deg2rad(turn)) * arm)
 
     @cached_property
     def key_table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Times [s] of the key frames, and their offsets [m] and angles [degrees] (k, 4)."""
-        return np.array(self.key_times), np.array([(*key.offset, key.turn) for key in self.keys])
+        return np.array(self.key_times), np.array([(*key.offset, key.angle) for key in self.key_frames])
 
     def _interpolate_pose(self, time: float) -> NDArray[np.float64]:
         """Interpolate offset [m] and angle [degrees] at a time [s], (4,)."""
         times, values = self.key_table
         t = float(np.clip(time, times[0], times[-1]))
-        return values[0] if len(times) == 1 else _INTERPOLATIONS[self.between](times, values, t)
+        return values[0] if len(times) == 1 else _INTERPOLATIONS[self.interpolation](times, values, t)
 
     def _interpolate_rate(self, time: float) -> NDArray[np.float64]:
         """Interpolate the rates of offset [m/s] and angle [degrees/s] at a time [s], (4,)."""
         times, values = self.key_table
         if not times[0] <= time < times[-1]:
             return np.zeros(4)
-        if self.between == "linear":
+        if self.interpolation == "linear":
             k = int(np.searchsorted(times, time, side="right"))
             return (values[k] - values[k - 1]) / (times[k] - times[k - 1])
         from scipy.interpolate import PchipInterpolator

@@ -76,20 +76,20 @@ class CapsuleObstacle(_MovingObstacle):
     """All points within a radius of a segment."""
 
     kind: Literal["capsule"] = "capsule"
-    ends: tuple[Vector3, Vector3]
+    end_points: tuple[Vector3, Vector3]
     """Two distinct ends of the segment [m]."""
     radius: ObstacleLength
     """Radius [m]."""
 
     @model_validator(mode="after")
     def _check_ends(self) -> CapsuleObstacle:
-        if self.ends[0] == self.ends[1]:
+        if self.end_points[0] == self.end_points[1]:
             raise ValueError("the ends should lie apart; use a sphere")
         return self
 
     def build_obstacle(self) -> ConvexObstacle:
         """Return the obstacle in the solvers' form."""
-        first, last = self.ends
+        first, last = self.end_points
         x, y, z = np.array(last) - first
         high = np.array([0.0, np.linalg.norm([x, y, z]), 0.0])
         return self._build_rounded_box(first, _orthonormal_axes((x, y, z)), np.zeros(3), high, self.radius)

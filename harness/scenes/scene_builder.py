@@ -186,7 +186,7 @@ def _make_coarser_builder(spec: SceneSpec, size: int, integrator: str) -> Callab
     There is none for fixed-size meshes, the coarsest ones, and effects with vertex indices.
     """
     half = (size + 1) // 2
-    numbered = any(isinstance(e, VertexSelection) and (e.indices or e.every > 1) for e in spec.effects)
+    numbered = any(isinstance(e, VertexSelection) and (e.indices or e.stride > 1) for e in spec.effects)
     return None if half < MIN_COARSENING_SIZE or numbered else partial(build_scene, spec, half, integrator)
 
 

@@ -27,7 +27,7 @@ continuum    The material is independent of mesh refinement. With h the spacing:
     h < 8 sqrt(B / stretch) would leave no stiffness and is rejected. This rule is original to this project.
 
 liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m] as given for the size
-    `reference`: Liu et al. 2013 use 150, 300, 600, 1200 for their curtain at 11, 21, 41, 81 vertices per side.
+    `reference_size`: Liu et al. 2013 use 150, 300, 600, 1200 for their curtain at 11, 21, 41, 81 vertices per side.
     Proportional to 1/h, the rule stiffens a cloth under refinement; it exists to reproduce their figures. It
     requires a mesh size and does not support meshes from files; the other two rules do.
 """
@@ -73,11 +73,13 @@ def compute_spring_stiffness(
     if scaling_rule not in SCALING_RULES:
         raise InputError(
             InputMistake(
-                f"unknown rule {scaling_rule!r}; wanted {suggest_name(scaling_rule, SCALING_RULES)}", key="rule"
+                f"unknown rule {scaling_rule!r}; wanted {suggest_name(scaling_rule, SCALING_RULES)}", key="scaling_rule"
             )
         )
     if reference_size is not None and scaling_rule != "liu2013":
-        raise InputError(InputMistake(f"has no meaning for the rule {scaling_rule}; leave it out", key="reference"))
+        raise InputError(
+            InputMistake(f"has no meaning for the rule {scaling_rule}; leave it out", key="reference_size")
+        )
     k = np.zeros(len(mesh.springs))
     for family, constant in ((STRETCH, stretch), (SHEAR, shear), (BEND, bend)):
         of = mesh.spring_families[family]
@@ -136,17 +138,17 @@ def _continuum_scale(mesh: Mesh, family: str, reference: int | None) -> NDArray[
     lengths = mesh.rest_lengths[mesh.spring_families[family]]
     if not lengths.all():
         problem = "continuum divides by rest lengths, and a spring joins two vertices in one place; use fixed"
-        raise InputError(InputMistake(problem, key="rule"))
+        raise InputError(InputMistake(problem, key="scaling_rule"))
     return 1 / lengths
 
 
 def _liu2013_scale(mesh: Mesh, family: str, reference: int | None) -> float:
     if reference is None or reference < 2:
         problem = f"came {reference}; liu2013 needs the mesh size, at least 2, at which the constants hold"
-        raise InputError(InputMistake(problem, key="reference"))
+        raise InputError(InputMistake(problem, key="reference_size"))
     if mesh.resolution < 2:
         problem = f"liu2013 needs a mesh that has a size of at least 2, this one has {mesh.resolution or 'none'}"
-        raise InputError(InputMistake(problem + "; use fixed or continuum", key="rule"))
+        raise InputError(InputMistake(problem + "; use fixed or continuum", key="scaling_rule"))
     return (mesh.resolution - 1) / (reference - 1)
 
 

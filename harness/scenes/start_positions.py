@@ -22,7 +22,7 @@ class RestStart(ConfigModel):
     """The rest shape, optionally with a spin."""
 
     kind: Literal["rest"] = "rest"
-    spin: Vector3 = (0.0, 0.0, 0.0)
+    angular_velocity: Vector3 = (0.0, 0.0, 0.0)
     """Angular velocity about the mean position [rad/s]."""
 
     def compute_positions(self, rest_positions: Positions) -> Positions:
@@ -31,7 +31,7 @@ class RestStart(ConfigModel):
 
     def compute_spin_velocity(self, p: Positions) -> Positions:
         """Return the velocity of the spin (n, 3) [m/s] at positions p (n, 3) [m]."""
-        return np.cross(self.spin, p - p.mean(axis=0))
+        return np.cross(self.angular_velocity, p - p.mean(axis=0))
 
 
 class CollapsedStart(RestStart):
@@ -48,12 +48,12 @@ class FlattenedStart(RestStart):
     """Flattened to a plane or, with two axes, to a line."""
 
     kind: Literal["flattened"] = "flattened"  # pyright: ignore[reportIncompatibleVariableOverride]
-    along: OneOrMany[AxisName]
+    axes: OneOrMany[AxisName]
     """Coordinates that are set to their mean for all vertices."""
 
     def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
-        p, columns = rest_positions.copy(), [_AXES[axis] for axis in self.along]
+        p, columns = rest_positions.copy(), [_AXES[axis] for axis in self.axes]
         p[:, columns] = rest_positions[:, columns].mean(axis=0)
         return p
 
@@ -78,27 +78,29 @@ class RandomStart(RestStart):
     """
 
     kind: Literal["random"] = "random"  # pyright: ignore[reportIncompatibleVariableOverride]
-    side: PositiveFloat
+    side_length: PositiveFloat
     """Side of the cube [m]."""
     seed: NonNegativeInt = 0
 
     def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
         shift = np.random.default_rng(self.seed).uniform(-0.5, 0.5, rest_positions.shape)
-        return rest_positions.mean(axis=0) + self.side * shift
+        return rest_positions.mean(axis=0) + self.side_length * shift
 
 
 class PerturbedStart(RestStart):
     """Each coordinate perturbed by a normal random number."""
 
     kind: Literal["perturbed"] = "perturbed"  # pyright: ignore[reportIncompatibleVariableOverride]
-    deviation: PositiveFloat
+    standard_deviation: PositiveFloat
     """Standard deviation [m]."""
     seed: NonNegativeInt = 0
 
     def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
-        return rest_positions + self.deviation * np.random.default_rng(self.seed).normal(size=rest_positions.shape)
+        return rest_positions + self.standard_deviation * np.random.default_rng(self.seed).normal(
+            size=rest_positions.shape
+        )
 
 
 class MergedStart(RestStart):

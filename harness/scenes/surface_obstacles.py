@@ -68,9 +68,9 @@ class RecordedFrames(ConfigModel):
 
     positions: Path | tuple[tuple[Vector3, ...], ...]
     """An .npz with `positions` (frames, points, 3) [m], as `springbench run --positions` writes it; or inline."""
-    rate: LengthMetres = 60.0
+    frame_rate: LengthMetres = 60.0
     """Frames per second."""
-    begin: float = Field(default=0.0, ge=0.0, le=1e9)
+    start_time: float = Field(default=0.0, ge=0.0, le=1e9)
     """Time of the first frame [s]."""
 
     @cached_property
@@ -86,7 +86,7 @@ class RecordedFrames(ConfigModel):
 
     def interpolate_positions(self, time: float) -> FloatArray:
         """Interpolate the positions at a time [s], (points, 3) [m]."""
-        frame = min(max((time - self.begin) * self.rate, 0.0), len(self.frame_positions) - 1.0)
+        frame = min(max((time - self.start_time) * self.frame_rate, 0.0), len(self.frame_positions) - 1.0)
         k = min(int(frame), max(len(self.frame_positions) - 2, 0))
         one, part = self.frame_positions[k], frame - k
         return one if part == 0.0 else one + part * (self.frame_positions[k + 1] - one)
@@ -261,7 +261,7 @@ def _triangulate_capsule(one: CapsuleObstacle, sag: float) -> SurfaceMesh:
     turn, half = np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(0, np.pi, around // 2 + 1)
     half = np.insert(half, len(half) // 2, 0.5 * np.pi)
     first, x, y, z = one.model_copy(update={"motion": None}).build_obstacle().frame(0.0)
-    long = float(np.linalg.norm(np.subtract(*one.ends)))
+    long = float(np.linalg.norm(np.subtract(*one.end_points)))
     high = one.radius * np.cos(half) + np.where(np.arange(len(half)) < len(half) / 2, long, 0.0)
     wide = np.outer(one.radius * np.sin(half[1:-1]), np.ones(around))
     rings = wide[:, :, None] * (np.cos(turn)[:, None] * x - np.sin(turn)[:, None] * z) + high[1:-1, None, None] * y

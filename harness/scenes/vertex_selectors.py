@@ -55,7 +55,7 @@ class AttributeRange(ConfigModel):
 class VertexSelection(ConfigModel):
     """All vertices that at least one of the selectors names."""
 
-    at: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()
     """Named parts of the mesh, such as corners, top or left, and groups of its file."""
     indices: tuple[NonNegativeInt, ...] = ()
     """Zero-based vertex indices."""
@@ -63,20 +63,20 @@ class VertexSelection(ConfigModel):
     """All vertices with rest positions in this box."""
     sphere: BallRegion | None = None
     """All vertices with rest positions in this ball."""
-    nearest: tuple[Vector3, ...] = ()
+    nearest_to: tuple[Vector3, ...] = ()
     """For each of these points [m] the vertex with the nearest rest position, the first one of equals."""
-    loops: tuple[NonNegativeInt, ...] = ()
+    boundary_loops: tuple[NonNegativeInt, ...] = ()
     """Boundary loops of the mesh's triangles; the longest is 0."""
     holes: tuple[NonNegativeInt, ...] = ()
     """Holes: boundary loops except the longest of each connected surface; the longest hole is 0."""
     attribute: AttributeRange | None = None
     """All vertices with an attribute in this range."""
-    every: PositiveInt = 1
+    stride: PositiveInt = 1
     """Every k-th of the vertices selected so far, from the first; of all vertices if there is no other selector."""
 
     @model_validator(mode="after")
     def _check_selectors(self) -> Self:
-        if not (self.has_selectors or self.every > 1):
+        if not (self.has_selectors or self.stride > 1):
             raise ValueError(
                 "names no vertices; give at, indices, box, sphere, nearest, loops, holes, attribute or every"
             )
@@ -91,14 +91,23 @@ class VertexSelection(ConfigModel):
     @property
     def has_selectors(self) -> bool:
         """Whether any selector except the stride is used."""
-        given = self.at, self.indices, self.box, self.sphere, self.nearest, self.loops, self.holes, self.attribute
+        given = (
+            self.parts,
+            self.indices,
+            self.box,
+            self.sphere,
+            self.nearest_to,
+            self.boundary_loops,
+            self.holes,
+            self.attribute,
+        )
         return any(map(bool, given))
 
     def describe_selection(self) -> str:
         """Describe the used selectors in words."""
         given = self.model_dump(mode="json", include=set(VertexSelection.model_fields), exclude_none=True)
         used = (
-            f"{key} {_describe_value(value)}" for key, value in given.items() if value and (key, value) != ("every", 1)
+            f"{key} {_describe_value(value)}" for key, value in given.items() if value and (key, value) != ("stride", 1)
         )
         return ", ".join(used)
 
@@ -113,37 +122,37 @@ class VertexSelection(ConfigModel):
             InputError: for parts, vertices and attributes that the mesh lacks.
         """
         n, rest = len(mesh.rest_positions), mesh.rest_positions
-        for part in self.at:
+        for part in self.parts:
             if part not in mesh.parts:
-                raise InputError(f"{name}: at: came {part!r}; this mesh has {suggest_name(part, mesh.parts)}")
+                raise InputError(f"{name}: parts: came {part!r}; this mesh has {suggest_name(part, mesh.parts)}")
         outside = [i for i in self.indices if i >= n]
         if outside:
             raise InputError(f"{name}: indices: came {outside[0]}; the mesh has the vertices 0 to {n - 1}")
-        sets = [mesh.parts[part] for part in self.at] + [np.array(self.indices, np.int64)]
+        sets = [mesh.parts[part] for part in self.parts] + [np.array(self.indices, np.int64)]
         if self.box:
             inside = (rest >= self.box.low) & (rest <= self.box.high)
             sets.append(np.flatnonzero(inside.all(axis=1)))
         if self.sphere:
             away = ((rest - self.sphere.center) ** 2).sum(axis=1)
             sets.append(np.flatnonzero(away <= self.sphere.radius**2))
-        sets += [np.argmin(((rest - point) ** 2).sum(axis=1), keepdims=True) for point in self.nearest]
-        if self.loops or self.holes:
+        sets += [np.argmin(((rest - point) ** 2).sum(axis=1), keepdims=True) for point in self.nearest_to]
+        if self.boundary_loops or self.holes:
             every = find_boundary_loops(mesh)
-            sets += _select_loops(every, self.loops, f"{name}: loops", "boundary loops")
+            sets += _select_loops(every, self.boundary_loops, f"{name}: boundary_loops", "boundary loops")
             sets += _select_loops([loop for loop in every if loop.is_hole], self.holes, f"{name}: holes", "holes")
         if self.attribute:
             sets.append(_select_by_attribute(mesh, self.attribute, f"{name}: attribute"))
         vertices = (
-            sort_unique_vertices(np.concatenate(sets), n)[:: self.every]
+            sort_unique_vertices(np.concatenate(sets), n)[:: self.stride]
             if self.has_selectors
-            else np.arange(0, n, self.every)
+            else np.arange(0, n, self.stride)
         )
         if not len(vertices):
             raise InputError(f"{name}: no vertex of the mesh lies in the {self.describe_selection()}")
         return vertices
 
 
-_OPTIONAL_SELECTORS = {"sphere", "nearest", "loops", "holes", "attribute"}
+_OPTIONAL_SELECTORS = {"sphere", "nearest_to", "boundary_loops", "holes", "attribute"}
 
 
 def find_selections(effect: Any) -> Iterator[tuple[str, VertexSelection]]:

@@ -34,7 +34,7 @@ _TINY = 1e-300
 
 @dataclass(frozen=True, slots=True)
 class AutoTolerance:
-    """`tolerance: auto` with a maximum number of iterations."""
+    """`rtol: auto` with a maximum number of iterations."""
 
     max_iterations: int
 

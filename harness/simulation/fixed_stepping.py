@@ -1,4 +1,4 @@
-"""Time stepping by an integrator with a fixed step size and automatic tolerance (`tolerance: auto`)."""
+"""Time stepping by an integrator with a fixed step size and automatic tolerance (`rtol: auto`)."""
 
 from __future__ import annotations
 

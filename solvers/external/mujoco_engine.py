@@ -64,15 +64,15 @@ class MujocoEngine(ExternalEngine):
         package_name="mujoco",
     )
 
-    integrator: MujocoIntegrator = "implicitfast"
+    mujoco_integrator: MujocoIntegrator = "implicitfast"
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_MujocoStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
-        model = library.MjModel.from_xml_string(build_mjcf(network, self.integrator))
-        limit = _STABILITY_LIMIT.get(self.integrator, 2.0)
+        model = library.MjModel.from_xml_string(build_mjcf(network, self.mujoco_integrator))
+        limit = _STABILITY_LIMIT.get(self.mujoco_integrator, 2.0)
         return _MujocoStepper(
             library, model, network
-        ), f"{self.integrator}, stable with springs while omega h < {limit:.2g}"
+        ), f"{self.mujoco_integrator}, stable with springs while omega h < {limit:.2g}"
 
     def write_script(
         self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
@@ -87,7 +87,7 @@ class MujocoEngine(ExternalEngine):
         text = _SCRIPT_TEMPLATE.format(name=file_stem, load=load, steps=num_substeps * num_frames)
         return {
             f"{file_stem}.py": text,
-            f"{file_stem}.xml": build_mjcf(network, self.integrator, problem, num_substeps),
+            f"{file_stem}.xml": build_mjcf(network, self.mujoco_integrator, problem, num_substeps),
         }
 
 

@@ -3,7 +3,7 @@
 - `vbd`, vertex block descent (Chen et al. 2024), and `xpbd`: implicit Euler in substeps with several iterations each.
   Newton's `ModelBuilder.color` considers triangles, tetrahedra and bending edges, but no springs: a spring network has
   one colour, so all its vertices move simultaneously, which diverges for stiff springs. Colours of the springs are
-  therefore set by `set_coloring`, unless `colours` selects Newton's.
+  therefore set by `set_coloring`, unless `colouring_source` selects Newton's.
 - Newton's XPBD projects all springs simultaneously, without relaxation, and discards multipliers between iterations. It
   converges to C = 0, whatever the stiffness of the springs (issue 2933 of newton-physics/newton). Only one iteration
   per substep therefore corresponds to XPBD.
@@ -83,9 +83,9 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
         package_name="newton",
     )
 
-    method: NewtonSolverName = "vbd"
-    iterations: int = 10
-    colours: ColouringSource = "springs"
+    newton_solver: NewtonSolverName = "vbd"
+    iterations_per_substep: int = 10
+    colouring_source: ColouringSource = "springs"
 
     def prepare(self, system: System) -> PreparedEngine:
         """Prepare the engine for a system; raise Unsupported for unsupported features."""
@@ -96,8 +96,10 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_NewtonPhysicsStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
-        if not self.iterations >= 1:
-            raise Unsupported(f"newton-physics: iterations came as {self.iterations}; wanted 1 or more")
+        if not self.iterations_per_substep >= 1:
+            raise Unsupported(
+                f"newton-physics: iterations_per_substep came as {self.iterations_per_substep}; wanted 1 or more"
+            )
         warp = import_module("warp")
         if self.device == "cuda" and not warp.is_cuda_available():
             raise Unsupported("newton-physics: device: cuda: Warp finds no CUDA device, or no driver for it")
@@ -111,19 +113,19 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
             builder.add_spring(i, j, k, 0.0, control=0.0)
         builder.spring_rest_length = network.spring_dashpots.rest_length.tolist()
         description = "explicit"
-        if self.method != "semi-implicit":
-            description = f"{self.iterations} iterations a substep"
-        if self.method == "vbd":
+        if self.newton_solver != "semi-implicit":
+            description = f"{self.iterations_per_substep} iterations a substep"
+        if self.newton_solver == "vbd":
             description += f", {self._set_colouring(builder, network)} colours"
         model = builder.finalize(device=self.device)
-        solver, explicit = self._build_solver(library.solvers, model), self.method == "semi-implicit"
+        solver, explicit = self._build_solver(library.solvers, model), self.newton_solver == "semi-implicit"
         made = _NewtonPhysicsStepper(warp, model, solver, network, explicit=explicit)
         where = f"the device {model.device.name}" if self.device == "cuda" else "the CPU, on one thread"
-        return made, f"{self.method}, {description}, in float32 on {where}"
+        return made, f"{self.newton_solver}, {description}, in float32 on {where}"
 
     def _set_colouring(self, builder: Any, network: EngineNetwork) -> int:
         """Set the colours; return their number."""
-        if self.colours == "newton":
+        if self.colouring_source == "newton":
             builder.color()
         else:
             found = colour_vertices(network.spring_dashpots.ends, len(network.mass))
@@ -131,23 +133,25 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
         return len(builder.particle_color_groups)
 
     def _build_solver(self, solvers: Any, model: Any) -> Any:
-        if self.method == "semi-implicit":
+        if self.newton_solver == "semi-implicit":
             return solvers.SolverSemiImplicit(model)
-        return {"vbd": solvers.SolverVBD, "xpbd": solvers.SolverXPBD}[self.method](model, iterations=self.iterations)
+        return {"vbd": solvers.SolverVBD, "xpbd": solvers.SolverXPBD}[self.newton_solver](
+            model, iterations=self.iterations_per_substep
+        )
 
     def write_script(
         self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
     ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         made = {
-            "vbd": f"SolverVBD(model, iterations={self.iterations})",
-            "xpbd": f"SolverXPBD(model, iterations={self.iterations})",
+            "vbd": f"SolverVBD(model, iterations={self.iterations_per_substep})",
+            "xpbd": f"SolverXPBD(model, iterations={self.iterations_per_substep})",
             "semi-implicit": "SolverSemiImplicit(model)",
         }
         colouring = ""
-        if self.method == "vbd" and self.colours == "newton":
+        if self.newton_solver == "vbd" and self.colouring_source == "newton":
             colouring = "builder.color()\n"
-        elif self.method == "vbd":
+        elif self.newton_solver == "vbd":
             found = colour_vertices(network.spring_dashpots.ends, len(network.mass))
             groups = [group.tolist() for group in np.split(found.item_order, found.colour_starts[1:-1])]
             colouring = f"builder.set_coloring({groups})  # no two of a colour share a spring\n"
@@ -155,7 +159,7 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
             name=file_stem,
             colouring=colouring,
             device=self.device,
-            solver=made[self.method],
+            solver=made[self.newton_solver],
             steps=num_substeps * num_frames,
             h=network.time_step / num_substeps,
         )

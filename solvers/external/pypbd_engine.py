@@ -66,14 +66,14 @@ class PyPbdEngine(ExternalEngine):
         package_name="pyPBD",
     )
 
-    iterations: int = 1
+    iterations_per_substep: int = 1
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_PyPbdStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
-        if not self.iterations >= 1:
-            raise Unsupported(f"pypbd: iterations came as {self.iterations}; wanted 1 or more")
-        made = _PyPbdStepper(library, network, self.iterations)
-        return made, f"{self.iterations} iterations a substep, in {made.precision}"
+        if not self.iterations_per_substep >= 1:
+            raise Unsupported(f"pypbd: iterations_per_substep came as {self.iterations_per_substep}; wanted 1 or more")
+        made = _PyPbdStepper(library, network, self.iterations_per_substep)
+        return made, f"{self.iterations_per_substep} iterations a substep, in {made.precision}"
 
     def write_script(
         self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
@@ -83,7 +83,7 @@ class PyPbdEngine(ExternalEngine):
         given = {
             "time_step": network.time_step,
             "substeps": num_substeps,
-            "iterations": self.iterations,
+            "iterations": self.iterations_per_substep,
             "frames": num_frames,
         }
         return {f"{file_stem}.py": _SCRIPT_TEMPLATE.format(name=file_stem, **given)}

@@ -68,8 +68,8 @@ class TaichiNewtonEngine(ExternalEngine):
         package_name="taichi",
     )
 
-    iterations: int = 1
-    tolerance: float = 1e-6
+    iterations_per_substep: int = 1
+    cg_rtol: float = 1e-6
 
     def prepare(self, system: System) -> PreparedEngine:
         """Prepare the engine for a system; raise Unsupported for unsupported features."""
@@ -78,20 +78,18 @@ class TaichiNewtonEngine(ExternalEngine):
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_TaichiStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
-        if not self.iterations >= 1:
-            raise Unsupported(f"taichi: iterations came as {self.iterations}; wanted 1 or more")
-        if not 0.0 < self.tolerance < 1.0:
-            raise Unsupported(
-                f"taichi: tolerance came as {self.tolerance}; wanted a part of the gradient, such as 1e-6"
-            )
-        made = _TaichiStepper(library, network, self.iterations, self.tolerance)
-        return made, f"{self.iterations} iterations of Newton's method a substep, in float64, on one thread"
+        if not self.iterations_per_substep >= 1:
+            raise Unsupported(f"taichi: iterations_per_substep came as {self.iterations_per_substep}; wanted 1 or more")
+        if not 0.0 < self.cg_rtol < 1.0:
+            raise Unsupported(f"taichi: cg_rtol came as {self.cg_rtol}; wanted a part of the gradient, such as 1e-6")
+        made = _TaichiStepper(library, network, self.iterations_per_substep, self.cg_rtol)
+        return made, f"{self.iterations_per_substep} iterations of Newton's method a substep, in float64, on one thread"
 
     def write_script(
         self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
     ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
-        given = {"tolerance": self.tolerance, "newton": self.iterations, "steps": num_substeps * num_frames}
+        given = {"tolerance": self.cg_rtol, "newton": self.iterations_per_substep, "steps": num_substeps * num_frames}
         driver = _SCRIPT_TEMPLATE.format(name=file_stem, h=network.time_step / num_substeps, **given)
         return {f"{file_stem}.py": Path(taichi_program.__file__).read_text(encoding="utf-8") + driver}
 

@@ -30,7 +30,7 @@ from springbench.solvers.objective.hessian_pattern import BlockMatrix
 from springbench.solvers.objective.psd_projection import PsdProjection
 from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
-PreconditionerName = Literal["factor", "schwarz", "block-jacobi"]
+PreconditionerName = Literal["cholesky", "schwarz", "block-jacobi"]
 """The names of the preconditioners."""
 
 Preconditioner = Callable[[Positions], Positions]
@@ -50,14 +50,14 @@ def build_preconditioner(
 
     Raises Unsupported if an energy without elements must be clamped.
     """
-    if name == "factor":
+    if name == "cholesky":
         return _FactorPreconditioner(metric)
     energies = objective.system.energies
     unknown = {type(energies[k]).__name__ for k in objective.other_energy_indices if not is_barrier_energy(energies[k])}
     if unknown:
         raise Unsupported(
             f"{solver}, preconditioner: {name}: clamps second derivatives element by element, and there are none of "
-            f"{', '.join(sorted(unknown))}; take preconditioner: factor"
+            f"{', '.join(sorted(unknown))}; take preconditioner: cholesky"
         )
     return _SchwarzPreconditioner(metric) if name == "schwarz" else _BlockJacobiPreconditioner(metric)
 

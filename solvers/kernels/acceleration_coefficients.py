@@ -152,4 +152,4 @@ MAX_HISTORY_SIZE = 100
 def require_history_size(pairs: int) -> None:
     """Raise ValueError for a history size outside of the limits."""
     if not 1 <= pairs <= MAX_HISTORY_SIZE:
-        raise ValueError(f"pairs: should be from 1 to {MAX_HISTORY_SIZE}, not {pairs}")
+        raise ValueError(f"history_size: should be from 1 to {MAX_HISTORY_SIZE}, not {pairs}")

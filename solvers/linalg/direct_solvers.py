@@ -81,7 +81,7 @@ class SimplicialCholesky:
             from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
         except ImportError as error:
             raise Unsupported(
-                "cholespy is not installed, for it has no wheel for this machine; leave `linear` out"
+                "cholespy is not installed, for it has no wheel for this machine; leave `linear_solver` out"
             ) from error
         if not np.isfinite(Q.data).all():
             raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE)

@@ -157,7 +157,9 @@ def select_solver(
         Unsupported: if the solver is unknown, does not support the precision, or does not fit in memory.
     """
     if linear not in get_args(LinearSolverName):
-        raise Unsupported(f"linear: {linear!r} is not known; it is one of {', '.join(get_args(LinearSolverName))}")
+        raise Unsupported(
+            f"linear_solver: {linear!r} is not known; it is one of {', '.join(get_args(LinearSolverName))}"
+        )
     if linear == "cholespy" and precision != "float64":
         raise Unsupported(f"{linear}: is used in float64 alone, not in {precision}; use supernodal")
     n = len(Q.indptr) - 1

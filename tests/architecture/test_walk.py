@@ -79,7 +79,7 @@ mass: 1
 time_step: 1/30
 frames: 2
 default_size: 4
-effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, parts: [top_corners]}]
 """
 SWEEP = "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {rounds: 1, max_iterations: 3, pictures: false}\n"
 

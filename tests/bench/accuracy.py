@@ -88,7 +88,9 @@ def flag(stiffness: float | None = None) -> SceneSpec:
     if stiffness is None:
         return spec
     pins = spec.effects[-1]
-    return spec.model_copy(update={"effects": (SpringsEffect(rule="fixed", stretch=stiffness), GravityEffect(), pins)})
+    return spec.model_copy(
+        update={"effects": (SpringsEffect(scaling_rule="fixed", stretch=stiffness), GravityEffect(), pins)}
+    )
 
 
 def reached(solver: str, scored: Scored, error: float, most: int) -> tuple[int, bool]:

@@ -25,7 +25,7 @@ FAR = ContactEffect.model_validate(
 
 def fallen(*effects: ContactEffect, size: int, frames: int) -> Work:
     """Whole steps of the compiled backend; the last positions [m]."""
-    given = SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(at=("top_corners",)), *effects
+    given = SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(parts=("top_corners",)), *effects
     spec = SceneSpec(mesh=GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=given, path=Path("sheet.yaml"))
     scene = build_scene(spec, size)
     prepared = prepare("numba", scene)

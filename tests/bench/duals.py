@@ -56,11 +56,11 @@ LEVELS = (1e-2, 1e-3, 1e-6)
 MOST, STALL = {"xpbd": 20_000, "mgpbd": 60}, 500
 ALONE = "smoothing alone"
 MADE = {
-    ALONE: MultigridXpbd(components=0),
-    "equal tensions": MultigridXpbd(components=0),
+    ALONE: MultigridXpbd(near_null_vectors=0),
+    "equal tensions": MultigridXpbd(near_null_vectors=0),
     "near-kernel": MultigridXpbd(),
-    "equal, smoothed": MultigridXpbd(components=0, smoothed=True),
-    "near-kernel, smoothed": MultigridXpbd(smoothed=True),
+    "equal, smoothed": MultigridXpbd(near_null_vectors=0, smooth_prolongation=True),
+    "near-kernel, smoothed": MultigridXpbd(smooth_prolongation=True),
 }
 
 
@@ -98,7 +98,7 @@ def cube(size: int, modulus: float) -> StepProblem:
 
 def chain() -> StepProblem:
     """The first step of a chain that is held at both ends."""
-    pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
     return build_first_problem(
         build_test_scene(ChainMesh(length=2.0), SpringsEffect(stretch=1e4), GravityEffect(), pins, size=3000)
     )

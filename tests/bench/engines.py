@@ -32,13 +32,13 @@ from springbench.solvers.registry import SOLVER_TABLE, load_target
 
 SCENES = [Path(__file__).parents[2] / "configs" / "scenes" / f"{name}.yaml" for name in ("curtain", "stiff-cloth-sway")]
 ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (
-    *(("mujoco", {"integrator": one}) for one in ("implicitfast", "implicit", "Euler", "RK4")),
-    *(("pypbd", {"iterations": one}) for one in (1, 4, 16)),
-    ("newton-physics", {"method": "vbd", "iterations": 10}),
-    ("newton-physics", {"method": "vbd", "iterations": 10, "colours": "newton"}),
-    ("newton-physics", {"method": "xpbd", "iterations": 1}),
-    ("newton-physics", {"method": "semi-implicit"}),
-    *(("taichi", {"iterations": one}) for one in (1, 4)),
+    *(("mujoco", {"mujoco_integrator": one}) for one in ("implicitfast", "implicit", "Euler", "RK4")),
+    *(("pypbd", {"iterations_per_substep": one}) for one in (1, 4, 16)),
+    ("newton-physics", {"newton_solver": "vbd", "iterations_per_substep": 10}),
+    ("newton-physics", {"newton_solver": "vbd", "iterations_per_substep": 10, "colouring_source": "newton"}),
+    ("newton-physics", {"newton_solver": "xpbd", "iterations_per_substep": 1}),
+    ("newton-physics", {"newton_solver": "semi-implicit"}),
+    *(("taichi", {"iterations_per_substep": one}) for one in (1, 4)),
     ("xpbd-small-steps", {}),
 )
 OURS = (("velocity-verlet", "substepping", StopRule(1)), ("hybrid", "implicit-euler", StopRule(200, 1e-6)))

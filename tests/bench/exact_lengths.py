@@ -39,16 +39,16 @@ from springbench.solvers.model.step_problem import PreparedSolver, Solver, StepP
 from tests.scene_builders import build_test_scene
 
 FRAME, LINKS, HEAVY = 1 / 60, 50, 50_000.0
-FIRST = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
-ENDS = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
-STEEP = Avbd(ramp=1e5, stabilisation=0.95)
+FIRST = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
+ENDS = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
+STEEP = Avbd(stiffness_ramp=1e5, error_stabilisation=0.95)
 FIRM = 1e12
 """The stiffness [N/m] of springs that are to be exact: XPBD takes any, and stretches by it are below round-off."""
 
 
 def pendulum(stiffness: float | str, mesh: ChainMesh, heavy: float = HEAVY) -> Scene:
     """A chain of vertices of a kilogram and a heavy one; stiffness: of its springs [N/m], or `exact`."""
-    held = SpringsEffect.model_validate({"stretch": stiffness, "rule": "fixed"})
+    held = SpringsEffect.model_validate({"stretch": stiffness, "scaling_rule": "fixed"})
     made = build_test_scene(mesh, held, GravityEffect(), FIRST, size=LINKS + 1, mass=float(LINKS), time_step=FRAME)
     mass = made.system.mass.copy()
     mass[-1] = heavy * mass[1]
@@ -81,7 +81,7 @@ def swinging() -> Table:
     )  # stretch by the bob at rest
     of = [
         ("avbd", exact, Avbd()),
-        ("avbd, ramp: 100000, stabilisation: 0.95", exact, STEEP),
+        ("avbd, stiffness_ramp: 100000, error_stabilisation: 0.95", exact, STEEP),
         ("xpbd", firm, Xpbd()),
         ("xpbd-small-steps", firm, XpbdSmallSteps()),
         ("vbd, spectral_radius: 0, stretches .001", stiff, Vbd(spectral_radius=0.0)),
@@ -96,7 +96,8 @@ def swinging() -> Table:
 def ratios() -> Table:
     """The second table."""
     chain = build_test_scene(
-        ChainMesh(), SpringsEffect(stretch=1e4, rule="fixed"), GravityEffect(), ENDS, EtherDragEffect(rate=2.0),
+        ChainMesh(), SpringsEffect(stretch=1e4, scaling_rule="fixed"), GravityEffect(), ENDS,
+        EtherDragEffect(decay_rate=2.0),
         size=12, mass=11.0, time_step=FRAME,
     )  # fmt: skip
     (found,) = chain.system.energies
@@ -114,7 +115,7 @@ def ratios() -> Table:
     sag = np.abs(wanted - chain.mesh.rest_positions).max()
     table = Table("method", "iterations", "off, over the sag", box=SIMPLE_HEAD)
     for name, solver in {
-        "avbd, softened": Avbd(softened=True),
+        "avbd, softened": Avbd(ramp_spring_stiffness=True),
         "vbd, spectral_radius: 0": Vbd(spectral_radius=0.0),
         "vbd": Vbd(),
         "xpbd": Xpbd(),

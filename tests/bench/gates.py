@@ -66,7 +66,7 @@ class Gate:
 
 def sheet(size: int) -> Scene:
     """A cloth with sides and both diagonals, lying flat, that falls about two pinned corners."""
-    effects = (SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(at=("top_corners",)))
+    effects = (SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(parts=("top_corners",)))
     spec = SceneSpec(mesh=GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=Path("sheet.yaml"))
     return build_scene(spec, size)
 
@@ -186,7 +186,9 @@ GATES = (
     Gate(
         short=True,
         name="compiled-local-step-against-numpy-64",
-        candidate=lambda: projected("numba", 64, repeats=50, linear="cholespy"),  # whose local step can be called
+        candidate=lambda: projected(
+            "numba", 64, repeats=50, linear_solver="cholespy"
+        ),  # whose local step can be called
         yardstick=lambda: projected("sparse", 64, repeats=50),
         tolerance=1e-9,
         limit=0.2,

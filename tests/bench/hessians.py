@@ -103,7 +103,7 @@ def main() -> None:
         measured(scenes[0])  # compiles
         for path in scenes:
             found = measured(path)
-            table.add_row(path.stem, *(tally.told(found["graded"]) for tally in found.values()))
+            table.add_row(path.stem, *(tally.told(found["shift-schedule"]) for tally in found.values()))
     Console(width=120).print(table)
 
 

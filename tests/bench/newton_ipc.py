@@ -64,7 +64,7 @@ def stated(made: Folded, contact: Energy) -> StepProblem:
     """The step. Vertices of the lowest layer are held exactly."""
     mesh, p = made.mesh, made.p
     springs = Springs.from_rest_shape(p, mesh.springs, np.full(len(mesh.springs), STRETCH))
-    lowest = np.flatnonzero(p[:, 1] < 0.5 * made.reach)
+    lowest = np.flatnonzero(p[:, 1] < 0.5 * made.dhat)
     pins = DirichletPins(lowest, np.full(len(lowest), np.inf))
     system = System(MASS * mesh.mass_fractions, TIME_STEP, (springs, contact), pins)
     force, velocity = np.zeros_like(p), np.zeros_like(p)
@@ -110,10 +110,10 @@ class Ipctk:
         self.candidate_vertices = SelfContact(surface).candidate_vertices
         of: Any = ipctk
         of.set_num_threads(1)
-        self._of, self._thickness, self._reach = of, made.thickness, made.reach
+        self._of, self._thickness, self._reach = of, made.min_distance, made.dhat
         edges, triangles = collision_primitives(made.mesh)[0].astype(np.int32), made.mesh.triangles
         self._surface = of.CollisionMesh(np.asfortranarray(made.mesh.rest_positions), edges, triangles)
-        t, r = made.thickness, made.reach
+        t, r = made.min_distance, made.dhat
         middle, most = (t + 0.5 * r) ** 2 - t**2, (2.0 * t + r) * r
         slope = (most - middle) * (2.0 * np.log(middle / most) - most / middle + 1.0) * 2.0 * (t + 0.5 * r)
         self._potential = of.BarrierPotential(r, -stiffness * r * (0.5 + np.log(2.0)) / slope)
@@ -231,7 +231,7 @@ def main() -> None:
         made = folded(asked.size)
         mesh, k = made.mesh, np.full(len(made.p), STIFFNESS)
         surface = CollisionMesh.from_rest_shape(
-            mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, made.thickness, made.reach
+            mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, made.min_distance, made.dhat
         )
         problem = stated(made, SelfContact(surface))
         bare = replace(problem, system=without_barriers(problem.system))
@@ -258,7 +258,7 @@ def main() -> None:
             continue
         ratios = sorted(other / took[name][0] for other, took in rounds)
         longer = median(took[name][0] / took[name][1] for _, took in rounds)
-        away = np.linalg.norm(end[0] - there, axis=1).max() / made.reach
+        away = np.linalg.norm(end[0] - there, axis=1).max() / made.dhat
         between = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
         table.add_row(name, f"{end[1]}", f"{median(ratios):.2f} times", between, f"{longer:.1f}", f"{away:.2g}")
     total = sum(other for other, _ in rounds)

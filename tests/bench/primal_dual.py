@@ -4,10 +4,10 @@
 
 A chain of 17 vertices that hangs straight, its first step: every second spring of 1,000 N/m is so many times as
 stiff, or the last vertex of a chain of 100,000 N/m is so many times as heavy. Primal methods change positions vertex
-by vertex: `vbd`, Gauss and Seidel's way, with and without its acceleration, and Jacobi's (`jgs2`, `rings: 0`). Dual
-ones change the tensions of springs: `xpbd`, Gauss and Seidel's way. A cell is how many iterations it takes until
-every vertex is within a thousandth of the step's way of where it ends; a dash: not within 100,000. The line stays
-straight, so what XPBD tends to is the minimum.
+by vertex: `vbd`, Gauss and Seidel's way, with and without its acceleration, and Jacobi's (`jgs2`, `neighbour_rings:
+0`). Dual ones change the tensions of springs: `xpbd`, Gauss and Seidel's way. A cell is how many iterations it takes
+until every vertex is within a thousandth of the step's way of where it ends; a dash: not within 100,000. The line
+stays straight, so what XPBD tends to is the minimum.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tests.scene_builders import build_first_problem, build_test_scene
 
 RATIOS = (1.0, 10.0, 100.0, 1e3, 1e4)
 METHODS: dict[str, Solver] = {
-    "primal, Jacobi: jgs2, rings: 0": Jgs2(rings=0),
+    "primal, Jacobi: jgs2, neighbour_rings: 0": Jgs2(neighbour_rings=0),
     "primal, Gauss-Seidel: vbd, spectral_radius: 0": VertexBlockDescent(spectral_radius=0.0),
     "primal, accelerated: vbd": VertexBlockDescent(),
     "dual, Gauss-Seidel: xpbd": Xpbd(),
@@ -47,10 +47,12 @@ LEVEL, MOST = 1e-3, 100_000
 
 def hanging(stiffness: float, stiffer: float = 1.0, heavier: float = 1.0) -> StepProblem:
     """The chain's first step. stiffness: of springs [N/m]; stiffer: every second one; heavier: the last vertex."""
-    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
     down = ChainMesh(direction=(0.0, -1.0, 0.0))
     stated = build_first_problem(
-        build_test_scene(down, SpringsEffect(rule="fixed", stretch=stiffness), GravityEffect(), pins, size=17, mass=1.0)
+        build_test_scene(
+            down, SpringsEffect(scaling_rule="fixed", stretch=stiffness), GravityEffect(), pins, size=17, mass=1.0
+        )
     )
     mass = stated.system.mass.copy()
     mass[-1] *= heavier

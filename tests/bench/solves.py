@@ -44,7 +44,7 @@ def solves(factorise: Callable[[csr_array], LinearSolver], size: int, repeats: i
 def stepped(linear: LinearSolverName, size: int, repeats: int) -> Work:
     """Whole steps of the compiled backend with a linear solver, from the sheet at rest; the positions [m]."""
     scene = sheet(size)
-    prepared = CompiledLocalGlobal(linear=linear).prepare(scene.system)
+    prepared = CompiledLocalGlobal(linear_solver=linear).prepare(scene.system)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     return lambda: [prepared.solve(stated, STOP) for _ in range(repeats)][-1].positions
 

@@ -233,10 +233,15 @@ def of_eights() -> Iterator[Case]:
     made = folded(SIZE)
     mesh, p = made.mesh, made.p
     surface = CollisionMesh.from_rest_shape(
-        mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, np.ones(len(p)), made.thickness, made.reach
+        mesh.rest_positions,
+        collision_primitives(mesh)[0],
+        mesh.triangles,
+        np.ones(len(p)),
+        made.min_distance,
+        made.dhat,
     )
-    pairs = surface.find_proximity_candidates(p, 1.5 * (made.thickness + made.reach))
-    space = collisions.allocate_collisions(len(pairs.vertices), made.thickness, made.reach)
+    pairs = surface.find_proximity_candidates(p, 1.5 * (made.min_distance + made.dhat))
+    space = collisions.allocate_collisions(len(pairs.vertices), made.min_distance, made.dhat)
     slots = np.empty(1 << (2 * len(pairs.vertices)).bit_length(), np.int32)
     arguments = pairs, collisions.pad_positions(p), np.empty((9, 8)), slots, space
     yield Case(

@@ -8,7 +8,7 @@ SCENE = {
     "mass": "1",
     "time_step": "1/30",
     "frames": "2",
-    "effects": "[{kind: springs, stretch: 100}, {kind: pins, at: [corners]}]",
+    "effects": "[{kind: springs, stretch: 100}, {kind: pins, parts: [corners]}]",
 }
 SWEEP = {"scenes": "[good.yaml]", "sizes": "[4, 6]", "solvers": "[numba]"}
 
@@ -113,12 +113,12 @@ SCENES: dict[str, tuple[str | bytes, str, int | None]] = {
     "more vertices than memory": (scene(mesh="{kind: block}", default_size="5000"), "vertices", None),
     "negative stiffness": (scene(effects="[{kind: springs, stretch: -1}]"), "effects[0].stretch", 6),
     "stiffness as a boolean": (scene(effects="[{kind: springs, stretch: yes}]"), "effects[0].stretch", 6),
-    "unknown rule": (scene(effects="[{kind: springs, stretch: 1, rule: magic}]"), "effects[0].rule", 6),
-    "pins at no part": (scene(effects="[{kind: pins, at: [cornrs]}]"), "effects[0]", 6),
+    "unknown rule": (scene(effects="[{kind: springs, stretch: 1, scaling_rule: magic}]"), "effects[0].scaling_rule", 6),
+    "pins at no part": (scene(effects="[{kind: pins, parts: [cornrs]}]"), "effects[0]", 6),
     "pins that pin nothing": (scene(effects="[{kind: pins}]"), "effects[0]", 6),
     "pins beyond the mesh": (scene(effects="[{kind: pins, indices: [16]}]"), "effects[0]", 6),
     "negative pin": (scene(effects="[{kind: pins, indices: [-1]}]"), "effects[0].indices[0]", 6),
-    "pin weight of a word": (scene(effects="[{kind: pins, at: [top], weight: hard}]"), "'exact'", 6),
+    "pin weight of a word": (scene(effects="[{kind: pins, parts: [top], weight: hard}]"), "'exact'", 6),
     "missing mesh file": (scene(mesh="{kind: file, path: none.obj}"), "mesh.path", 1),
     "folder as mesh file": (scene(mesh="{kind: file, path: folder}"), "mesh.path", 1),
     "mesh file beyond names": (scene(mesh="{kind: file, path: " + "x" * 5000 + "}"), "mesh.path", 1),

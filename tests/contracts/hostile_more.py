@@ -171,18 +171,20 @@ COMMANDS: dict[str, tuple[list[str], int, str]] = {
     "the list of a sweep in a file": (["list", "sweep.yaml", "--results", "good.yaml"], 0, "missing"),
 }
 
-SPHERE = "{kind: sphere, center: [0, -1, 0], radius: 0.5, motion: {keys: [%s]}}"
+SPHERE = "{kind: sphere, center: [0, -1, 0], radius: 0.5, motion: {key_frames: [%s]}}"
 BALL = "{kind: sphere, center: [0.5, -2, 0.5], radius: 0.1}"
-MOVES = "motion: {keys: [{time: 0}, {time: 1, offset: [0, 6, 0]}]}"
+MOVES = "motion: {key_frames: [{time: 0}, {time: 1, offset: [0, 6, 0]}]}"
 RISING = f"{{kind: sphere, center: [0.5, -3, 0.5], radius: 0.1, {MOVES}}}"
 CONTACT = "[{kind: springs, stretch: 100}, {kind: contact, obstacles: [%s]}]"
 KEYS = ", ".join(f"{{time: {i}}}" for i in range(10_001))
-PINNED = "{kind: pins, at: [corners], motion: {keys: [{time: 0}, {time: 1, offset: [0, -4, 0]}]}}"
-PRESS = "{kind: plane, point: [0, -1, 0]}, {kind: plane, point: [0, 1, 0], normal: [0, -1, 0], motion: {keys: %s}}"
+PINNED = "{kind: pins, parts: [corners], motion: {key_frames: [{time: 0}, {time: 1, offset: [0, -4, 0]}]}}"
+PRESS = (
+    "{kind: plane, point: [0, -1, 0]}, {kind: plane, point: [0, 1, 0], normal: [0, -1, 0], motion: {key_frames: %s}}"
+)
 
 SCENES: dict[str, tuple[str, str]] = {
     "gravity twice": (scene(effects="[{kind: gravity}, {kind: springs, stretch: 1}, {kind: gravity}]"), "effects[2]"),
-    "10001 keys": (scene(effects=CONTACT % (SPHERE % KEYS)), "keys"),
+    "10001 keys": (scene(effects=CONTACT % (SPHERE % KEYS)), "key_frames"),
     "keys of one time": (scene(effects=CONTACT % (SPHERE % "{time: 0}, {time: 0}")), "rise"),
     "keys at infinity": (scene(effects=CONTACT % (SPHERE % "{time: .inf}")), "time"),
     "an obstacle of no direction": (scene(effects=CONTACT % "{kind: plane, normal: [0, 0, 0]}"), "direction"),
@@ -195,7 +197,9 @@ SCENES: dict[str, tuple[str, str]] = {
         "leave no room",
     ),
     "a press that closes and opens": (
-        scene(effects=CONTACT % (PRESS % "[{time: 0}, {time: 1, offset: [0, -3, 0]}, {time: 2}], between: smooth")),
+        scene(
+            effects=CONTACT % (PRESS % "[{time: 0}, {time: 1, offset: [0, -3, 0]}, {time: 2}], interpolation: smooth")
+        ),
         "leave no room",
     ),
     "pins that go through a ball": (
@@ -203,28 +207,28 @@ SCENES: dict[str, tuple[str, str]] = {
         "pins hold vertex",
     ),
     "a ball that goes through pins": (
-        scene(effects=f"[{{kind: pins, at: [corners]}}, {{kind: contact, obstacles: [{RISING}]}}]"),
+        scene(effects=f"[{{kind: pins, parts: [corners]}}, {{kind: contact, obstacles: [{RISING}]}}]"),
         "pins hold vertex",
     ),
-    "a part in Unicode": (scene(effects="[{kind: pins, at: ['tоp']}]"), "at"),
+    "a part in Unicode": (scene(effects="[{kind: pins, parts: ['tоp']}]"), "parts"),
     "an index of 1e18": (scene(effects="[{kind: pins, indices: [1000000000000000000]}]"), "indices"),
-    "every 1e18th": (scene(effects="[{kind: pins, every: 0}]"), "every"),
+    "every 1e18th": (scene(effects="[{kind: pins, stride: 0}]"), "stride"),
     "a stiffness of 1e400": (scene(effects="[{kind: springs, stretch: 1e400}]"), "stretch"),
     "gas in a sheet": (scene(effects="[{kind: gas, pressure: 1}]"), "gas"),
     "a thickness of 1e9": (
-        scene(effects="[{kind: springs, stretch: 1}, {kind: contact, obstacles: [{kind: plane}], thickness: 1e9}]"),
-        "thickness",
+        scene(effects="[{kind: springs, stretch: 1}, {kind: contact, obstacles: [{kind: plane}], min_distance: 1e9}]"),
+        "min_distance",
     ),
-    "a spin of NaN": (scene(start="{kind: rest, spin: [0, .nan, 0]}"), "spin"),
+    "a spin of NaN": (scene(start="{kind: rest, angular_velocity: [0, .nan, 0]}"), "angular_velocity"),
     "a start of another kind": (scene(start="{kind: exploded}"), "start"),
     "a merge of what is not there": (scene(start="{kind: merged, vertices: [0, 99]}"), "start.vertices"),
 }
 
 SOLVERS: dict[str, tuple[str, str]] = {
-    "pairs of -3": (sweep(solvers="[{name: lbfgs, pairs: -3}]"), "pairs"),
-    "pairs of 0": (sweep(solvers="[{name: anderson, pairs: 0}]"), "pairs"),
-    "pairs of 1e9": (sweep(solvers="[{name: lbfgs, pairs: 1000000000}]"), "pairs"),
-    "pairs of a fraction": (sweep(solvers="[{name: lbfgs, pairs: 2.5}]"), "pairs"),
+    "pairs of -3": (sweep(solvers="[{name: lbfgs, history_size: -3}]"), "history_size"),
+    "pairs of 0": (sweep(solvers="[{name: anderson, history_size: 0}]"), "history_size"),
+    "pairs of 1e9": (sweep(solvers="[{name: lbfgs, history_size: 1000000000}]"), "history_size"),
+    "pairs of a fraction": (sweep(solvers="[{name: lbfgs, history_size: 2.5}]"), "history_size"),
     "a radius of 1": (sweep(solvers="[{name: vbd, spectral_radius: 1}]"), "spectral_radius"),
     "a precision of words": (sweep(solvers="[{name: numba, precision: best}]"), "precision"),
 }

@@ -429,7 +429,7 @@ def write(folder: Path, case: Hostile) -> Path:
     mesh = name if case.part == "mesh" else "chain"
     hum = f"{{kind: '{name}'}}, " if case.part == "effect" else ""
     shared = "mass: 1.0\ntime_step: 1/30\nframes: 2\ndefault_size: 4\n"
-    effects = "{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, at: [ends]}"
+    effects = "{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, parts: [ends]}"
     (folder / "odd.yaml").write_text(f"mesh: {{kind: '{mesh}', length: 2.0}}\n{shared}effects: [{hum}{effects}]\n")
     (folder / "sound.yaml").write_text(f"mesh: {{kind: chain, length: 2.0}}\n{shared}effects: [{effects}]\n")
     scenes = "[odd.yaml, sound.yaml]" if case.part in ("mesh", "effect") else "[odd.yaml]"

@@ -41,7 +41,7 @@ PRESENT: tuple[SceneEffect, ...] = (
     RAYLEIGH_EFFECT,
     AIR_DRAG_EFFECT,
     ATTACHMENT_EFFECT,
-    WindEffect(per="triangle"),
+    WindEffect(acts_on="triangle"),
 )
 IDLE: dict[str, SceneEffect] = {
     "bending": BENDING_EFFECT.model_copy(update={"stiffness": 0.0}),
@@ -50,9 +50,9 @@ IDLE: dict[str, SceneEffect] = {
     "rayleigh": RAYLEIGH_EFFECT.model_copy(update={"mass": 0.0, "stiffness": 0.0}),
     "air drag": AIR_DRAG_EFFECT.model_copy(update={"coefficient": 0.0}),
     "attachments": ATTACHMENT_EFFECT.model_copy(update={"stiffness": 0.0}),
-    "wind": WindEffect(per="triangle", strength=0.0),
+    "wind": WindEffect(acts_on="triangle", strength=0.0),
     "constant force": ConstantForceEffect(force=(0.0, 0.0, 0.0)),
-    "ether drag": EtherDragEffect(rate=0.0),
+    "ether drag": EtherDragEffect(decay_rate=0.0),
 }
 
 
@@ -79,7 +79,7 @@ def _referents(one: object) -> Iterable[object]:
 
 
 def bound(*effects: SceneEffect) -> tuple[Scene, PreparedSolver]:
-    pins = PinsEffect(at=("top_corners",))
+    pins = PinsEffect(parts=("top_corners",))
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), pins, *effects, size=SIDE)
     made = replace(made, build_coarser=None)  # a recipe, which holds what the effects were described by
     return made, prepare(made, SparseLocalGlobal())

@@ -30,7 +30,7 @@ mesh: {kind: grid}
 mass: 1.0
 time_step: 1/30
 frames: 8
-effects: [{kind: springs, stretch: 100}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+effects: [{kind: springs, stretch: 100}, {kind: gravity}, {kind: pins, parts: [top_corners]}]
 """
 CONFIG = """
 scenes: [cloth.yaml]

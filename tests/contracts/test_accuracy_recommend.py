@@ -33,7 +33,7 @@ mass: 1.0
 time_step: 1/30
 frames: 8
 default_size: 4
-effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, at: [ends]}]
+effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, parts: [ends]}]
 """
 REFINEMENTS = (1, 4)
 WAYS = [

@@ -56,9 +56,13 @@ from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StopRule
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
-HELD = PinsEffect(at=("first",), weight="exact")
+HELD = PinsEffect(parts=("first",), weight="exact")
 MOVED = PinsEffect.model_validate(
-    {"at": ["first"], "weight": "exact", "motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
+    {
+        "parts": ["first"],
+        "weight": "exact",
+        "motion": {"key_frames": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]},
+    }
 )
 END, FRAMES = 0.5, 10
 OWN = ["velocity-verlet", "blanes-moan-4", "blanes-moan-6", "tsitouras-5", "dormand-prince-8", "rodas"]
@@ -197,7 +201,7 @@ CRUMPLING = SceneSpec(
     effects=(
         SpringsEffect(stretch=300.0, shear=60.0),
         GravityEffect(),
-        PinsEffect(at=("top_corners",), weight="exact"),
+        PinsEffect(parts=("top_corners",), weight="exact"),
     ),
     mass=0.3, time_step=1 / 30, frames=60, path=Path("cloth.yaml"), default_size=9,
 )  # fmt: skip
@@ -208,7 +212,9 @@ CRUMPLING = SceneSpec(
     [
         (CRUMPLING, 7, 1.0),
         (
-            chain(SpringsEffect(stretch=40.0), GravityEffect(), AirDragEffect(law="quadratic", coefficient=0.5), HELD),
+            chain(
+                SpringsEffect(stretch=40.0), GravityEffect(), AirDragEffect(drag_law="quadratic", coefficient=0.5), HELD
+            ),
             5,
             0.5,
         ),
@@ -258,7 +264,7 @@ def test_an_error_below_round_off_is_refused_with_the_one_that_can_be_had():
 def test_what_only_round_off_moves_is_at_rest(tmp_path):
     """A flat cloth without a load, pinned at its corners."""
     spec = CRUMPLING.model_copy(
-        update={"effects": (SpringsEffect(stretch=10.0), PinsEffect(at=("corners",), weight="exact"))}
+        update={"effects": (SpringsEffect(stretch=10.0), PinsEffect(parts=("corners",), weight="exact"))}
     )
     assert len({step.positions.tobytes() for step in steps_of(spec, 5)}) > 1, "round-off does move it"
     for ask in (
@@ -294,7 +300,7 @@ def test_ways_are_what_solvers_and_integrators_say_of_themselves():
     ("effect", "what"),
     [
         (MOVED, "moving pins"),
-        (AirDragEffect(law="quadratic", coefficient=0.5), "forces of place, speed and time"),
+        (AirDragEffect(drag_law="quadratic", coefficient=0.5), "forces of place, speed and time"),
     ],
 )
 def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_reason(effect, what):
@@ -331,7 +337,7 @@ def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_er
 
 
 def test_forces_of_the_speed_are_even_within_pieces_of_a_frame_as_short_as_the_error_asks_for():
-    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(law="quadratic", coefficient=0.5), HELD)
+    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(drag_law="quadratic", coefficient=0.5), HELD)
     even = FixedSubstepper(
         build_scene(spec, 5, "substepping"),
         VelocityVerlet(),
@@ -361,7 +367,7 @@ def test_a_rosenbrock_method_keeps_to_an_error_that_is_asked_for():
 
 def test_drag_that_grows_with_the_square_of_the_speed_is_graded_too(tmp_path):
     """As a force: where frames split, it is a filter, which has no equation of motion."""
-    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(law="quadratic", coefficient=0.5), HELD)
+    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(drag_law="quadratic", coefficient=0.5), HELD)
     found = ReferenceStore(tmp_path).load_trajectory(spec, 5, [0.1], error=1e-3)
     asked = ErrorTarget(spec, 5, 0.1, 2)
     path = AdaptiveImplicitStepper(

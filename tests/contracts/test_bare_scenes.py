@@ -12,8 +12,10 @@ from tests.rare_cases import mark_rare_cases
 SCENES = {
     "falls": "[{kind: gravity}]",
     "springs-without-stiffness": "[{kind: springs, stretch: 0}, {kind: gravity}]",
-    "pins-alone": "[{kind: pins, at: [corners]}]",
-    "all-pinned-exactly": "[{kind: springs, stretch: 10}, {kind: pins, at: [boundary], indices: [4], weight: exact}]",
+    "pins-alone": "[{kind: pins, parts: [corners]}]",
+    "all-pinned-exactly": (
+        "[{kind: springs, stretch: 10}, {kind: pins, parts: [boundary], indices: [4], weight: exact}]"
+    ),
     "nothing": "[]",
 }
 

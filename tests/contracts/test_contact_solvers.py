@@ -25,7 +25,7 @@ FALL = (0.5, -6.0, 0.0)
 
 
 def held(weight: float | str) -> Scene:
-    return build_sheet(FLOOR, PinsEffect.model_validate({"at": ["top_corners"], "weight": weight}), velocity=FALL)
+    return build_sheet(FLOOR, PinsEffect.model_validate({"parts": ["top_corners"], "weight": weight}), velocity=FALL)
 
 
 SCENES = {

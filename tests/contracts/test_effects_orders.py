@@ -30,10 +30,10 @@ END, ROUGH_END = 0.15, 0.3
 """Seconds; what begins within steps takes longer to act."""
 MEASURED = ("implicit-euler", "midpoint", "esdirk-4")
 SPRINGS = {"kind": "springs", "stretch": 20.0}
-HELD = {"kind": "pins", "at": ["first"], "weight": "exact"}
-HUNG = {"kind": "pins", "at": ["top"], "weight": "exact"}
+HELD = {"kind": "pins", "parts": ["first"], "weight": "exact"}
+HUNG = {"kind": "pins", "parts": ["top"], "weight": "exact"}
 GRAVITY = {"kind": "gravity"}
-SWUNG = HELD | {"motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
+SWUNG = HELD | {"motion": {"key_frames": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
 DOWN = (0.5, 1.0, 2.0)
 
 
@@ -56,24 +56,37 @@ SMOOTH: dict[str, Case] = {
     "gravity": Case((SPRINGS, GRAVITY, HELD)),
     "pins": Case((SPRINGS, GRAVITY, SWUNG)),
     "constant-force": Case((SPRINGS, {"kind": "constant-force", "force": [0.5, -1.0, 2.0]}, HELD)),
-    "attachments": Case((SPRINGS, {"kind": "attachments", "at": ["first"], "stiffness": 30.0})),
+    "attachments": Case((SPRINGS, {"kind": "attachments", "parts": ["first"], "stiffness": 30.0})),
     "air-drag": Case((SPRINGS, GRAVITY, {"kind": "air-drag", "coefficient": 2.0}, HELD)),
-    "ether-drag": Case((SPRINGS, GRAVITY, {"kind": "ether-drag", "rate": 3.0}, HELD), velocity=(0.0, 0.0, 0.0)),
+    "ether-drag": Case((SPRINGS, GRAVITY, {"kind": "ether-drag", "decay_rate": 3.0}, HELD), velocity=(0.0, 0.0, 0.0)),
     "dashpots": Case((SPRINGS, GRAVITY, {"kind": "dashpots", "stretch": 0.4}, HELD)),
-    "rayleigh": Case((SPRINGS, GRAVITY, {"kind": "rayleigh", "mass": 0.5, "stiffness": 0.02}, HELD)),
+    "rayleigh": Case(
+        (SPRINGS, GRAVITY, {"kind": "rayleigh", "mass_coefficient": 0.5, "stiffness_coefficient": 0.02}, HELD)
+    ),
     "bending": Case((SPRINGS, {"kind": "bending", "stiffness": 0.05}, HUNG), GridMesh(), 4, steps=32),
     "wind": Case((SPRINGS, {"kind": "wind", "field": "assignment", "strength": 0.5}, HUNG), GridMesh(), 4, steps=32),
     "gas": Case(({"kind": "springs", "stretch": 40.0}, {"kind": "gas", "pressure": 100.0}), BalloonMesh(), 3, steps=48),
 }
 STILL = (0.0, 0.0, 0.0)
 PLANE = {"kind": "plane", "point": [0, -0.05, 0]}
-SURFACE = {"obstacles": [{"kind": "plane", "point": [0, -0.1, 0]}], "thickness": 0.01, "range": 0.2, "stiffness": 5.0}
-SELF = {"kind": "self-contact", "thickness": 0.05, "range": 0.2, "stiffness": 1.0}
-SEWN = {"kind": "sewing", "first": {"at": ["first"]}, "second": {"at": ["last"]}, "stiffness": 40.0, "end": 0.2}
+SURFACE = {
+    "obstacles": [{"kind": "plane", "point": [0, -0.1, 0]}],
+    "min_distance": 0.01,
+    "dhat": 0.2,
+    "barrier_stiffness": 5.0,
+}
+SELF = {"kind": "self-contact", "min_distance": 0.05, "dhat": 0.2, "barrier_stiffness": 1.0}
+SEWN = {
+    "kind": "sewing",
+    "first_row": {"parts": ["first"]},
+    "second_row": {"parts": ["last"]},
+    "stiffness": 40.0,
+    "end_time": 0.2,
+}
 SOFT = SPRINGS | {"stretch": 5.0}
 ROUGH: dict[str, Case] = {
     "contact": Case((SPRINGS, GRAVITY, {"kind": "contact", "obstacles": [PLANE]}, HELD), velocity=STILL),
-    "strain-limits": Case((SOFT, GRAVITY, {"kind": "strain-limits", "longest": 1.05, "stiffness": 40.0}, HELD)),
+    "strain-limits": Case((SOFT, GRAVITY, {"kind": "strain-limits", "max_stretch": 1.05, "stiffness": 40.0}, HELD)),
     "sewing": Case((SOFT, GRAVITY, SEWN, HELD)),
     "surface-contact": Case((SPRINGS, GRAVITY, SURFACE | {"kind": "surface-contact"}, HELD), velocity=STILL),
     "self-contact": Case((SPRINGS, GRAVITY, SELF, HELD), velocity=(-4.0, 0.0, 0.6)),  # a chain thrown back upon itself

@@ -21,7 +21,7 @@ frames: 30
 effects:
   - {kind: springs, stretch: 100}
   - {kind: gravity}
-  - {kind: pins, at: [top_corners]}
+  - {kind: pins, parts: [top_corners]}
 """
 SWEEP = "{scenes: [cloth.yaml], sizes: [16], solvers: [sparse, dense], options: {max_iterations: 4, rounds: 1, %s}}"
 WALL = 200.0

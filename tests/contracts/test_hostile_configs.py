@@ -125,11 +125,11 @@ def test_a_flood_of_mistakes_is_cut_short(folder: Path) -> None:
 
 def test_all_mistakes_of_a_sweep_and_its_scenes_come_at_once_in_the_order_of_their_lines(folder: Path) -> None:
     configs = folder / "configs"
-    (configs / "bad.yaml").write_text(scene(mass="-1", frames="x", effects="[{kind: pins, at: [1]}]"))
+    (configs / "bad.yaml").write_text(scene(mass="-1", frames="x", effects="[{kind: pins, parts: [1]}]"))
     (configs / "worse.yaml").write_text(sweep(scenes="[bad.yaml, none.yaml]", sizes="[0]", solvers="[x, y]", z="1"))
     lines = refusal(folder, configs / "worse.yaml")
     keys = [line.split(": ")[2] for line in lines]
     assert keys == [
-        *("mass", "frames", "effects[0].at[0]"),
+        *("mass", "frames", "effects[0].parts[0]"),
         *("scenes[1]", "sizes[0]", "solvers[0].name", "solvers[1].name", "z"),
     ]

@@ -60,12 +60,12 @@ def run(
     return [state.motion, *(step.state.motion for step in path)]
 
 
-HELD = PinsEffect(at=("first",), weight="exact")
+HELD = PinsEffect(parts=("first",), weight="exact")
 SWUNG = PinsEffect.model_validate(
     {
-        "at": ["first"],
+        "parts": ["first"],
         "weight": "exact",
-        "motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0], "turn": 40.0}]},
+        "motion": {"key_frames": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0], "angle": 40.0}]},
     }
 )
 SOFT = SpringsEffect(stretch=20.0)
@@ -79,12 +79,15 @@ def gusts(p: Positions, v: Positions, t: float) -> Positions:
 PROBLEMS: dict[str, tuple[tuple[SceneEffect, ...], tuple, tuple[float, float, float]]] = {
     "swinging": ((SOFT, GravityEffect(), HELD), (), (0.5, 1.0, 2.0)),
     "under a force of time, place and speed": ((SOFT, HELD), (gusts,), (1.0, 0.0, 0.5)),
-    "slowed by ether drag": ((SOFT, GravityEffect(), EtherDragEffect(rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
-    "slowed by quadratic drag": ((SOFT, AirDragEffect(law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by ether drag": ((SOFT, GravityEffect(), EtherDragEffect(decay_rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
+    "slowed by quadratic drag": (
+        (SOFT, AirDragEffect(drag_law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)
+    ),
     "slowed by air": ((SOFT, GravityEffect(), AirDragEffect(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by dashpots": ((SOFT, GravityEffect(), DashpotsEffect(stretch=0.4), HELD), (), (1.0, 0.0, 2.0)),
     "slowed by Rayleigh's damping": (
-        (SOFT, GravityEffect(), RayleighEffect(mass=0.5, stiffness=0.02), HELD), (), (1.0, 0.0, 2.0)
+        (SOFT, GravityEffect(), RayleighEffect(mass_coefficient=0.5, stiffness_coefficient=0.02), HELD),
+        (), (1.0, 0.0, 2.0),
     ),
     "swung by its pin": ((SOFT, GravityEffect(), SWUNG), (), (0.5, 1.0, 0.0)),
 }  # fmt: skip
@@ -203,7 +206,9 @@ def test_the_others_damp_a_quadratic_energy(name):
 @pytest.mark.parametrize("name", ["midpoint", "newmark"])
 def test_the_energy_stays_near_over_a_hundred_thousand_steps(name):
     """Midpoint is symplectic; the trapezoidal rule, Newmark's mean acceleration, is conjugate to it."""
-    scene = made(name, ChainMesh(), SpringsEffect(rule="fixed", stretch=25.0), size=3, time_step=0.02)  # omega h = .3
+    scene = made(
+        name, ChainMesh(), SpringsEffect(scaling_rule="fixed", stretch=25.0), size=3, time_step=0.02
+    )  # omega h = .3
     begun = MotionState(Motion(1.1 * scene.mesh.rest_positions, np.random.default_rng(0).normal(size=(3, 3))), None, 0)
     path = simulate_scene(
         scene, prepare(scene, NewtonSolver()), CONVERGED, initial_guess="inertial", frames=100_000, initial_state=begun
@@ -225,7 +230,7 @@ def test_every_minimiser_takes_the_steps_of_every_integrator(name, solver):
         GridMesh(),
         SpringsEffect(stretch=30.0),
         GravityEffect(),
-        PinsEffect(at=("top_corners",)),
+        PinsEffect(parts=("top_corners",)),
         size=4,
         time_step=1 / 60,
     )

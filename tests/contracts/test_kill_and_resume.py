@@ -36,7 +36,7 @@ frames: {FRAMES}
 effects:
   - {{kind: springs, stretch: 100}}
   - {{kind: gravity}}
-  - {{kind: pins, at: [top_corners]}}
+  - {{kind: pins, parts: [top_corners]}}
 """
 SWEEP = """
 scenes: [cloth.yaml]

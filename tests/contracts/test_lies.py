@@ -40,7 +40,7 @@ mass: 1.0
 time_step: 1/30
 frames: {FRAMES}
 default_size: 5
-effects: [{{kind: springs, stretch: 100}}, {{kind: gravity}}, {{kind: pins, at: [top_corners]}}]
+effects: [{{kind: springs, stretch: 100}}, {{kind: gravity}}, {{kind: pins, parts: [top_corners]}}]
 """
 SOLVE = 0.003
 """Seconds of CPU time that a solve takes at least, so that steps are nothing but solves."""

@@ -46,7 +46,7 @@ mass: 1.0
 time_step: 1/30
 frames: 2
 default_size: 4
-effects: [{kind: springs, stretch: 200}, {kind: hum, force: 0.5}, {kind: pins, at: [ends]}]
+effects: [{kind: springs, stretch: 200}, {kind: hum, force: 0.5}, {kind: pins, parts: [ends]}]
 """
 SWEEP = """
 scenes: [chain.yaml]

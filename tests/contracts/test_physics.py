@@ -60,7 +60,7 @@ def angular_momentum(made: Scene, p: Positions, v: Positions) -> np.ndarray:
 @pytest.mark.parametrize("stretch", [5.0, 500.0, 5e6])
 def test_a_mass_on_a_spring_follows_the_recurrence_of_implicit_euler(backend, stretch):
     """(m/dt^2 + k) u' = m/dt^2 (2 u - u_before) + m g, along the spring's own axis, where it is linear."""
-    pins = PinsEffect(at=("first",), weight="exact")
+    pins = PinsEffect(parts=("first",), weight="exact")
     made = build_test_scene(
         ChainMesh(direction=(0.0, -1.0, 0.0)),
         SpringsEffect(stretch=stretch),
@@ -84,7 +84,7 @@ def test_a_mass_on_a_spring_hangs_at_the_extension_of_its_weight(stretch):
         ChainMesh(direction=(0.0, -1.0, 0.0)),
         SpringsEffect(stretch=stretch),
         GravityEffect(),
-        PinsEffect(at=("first",)),
+        PinsEffect(parts=("first",)),
         size=2,
         mass=2.0,
     )
@@ -116,7 +116,7 @@ def test_linear_momentum_is_conserved_converged_or_not(iterations):
 
 def test_the_centre_of_mass_moves_as_a_particle_under_drag_and_gravity():
     made = build_test_scene(
-        GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), EtherDragEffect(rate=2.0), size=6, time_step=DT
+        GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), EtherDragEffect(decay_rate=2.0), size=6, time_step=DT
     )
     velocity = np.random.default_rng(1).normal(size=made.mesh.rest_positions.shape)
     share = made.system.mass / made.system.mass.sum()

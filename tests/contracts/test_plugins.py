@@ -99,7 +99,7 @@ def configs(folder: Path, names: dict[str, str]) -> Path:
     (folder / "scene.yaml").write_text(
         f"mesh: {{kind: '{names['mesh']}', length: 2.0}}\nmass: 1.0\ntime_step: 1/30\nframes: 2\ndefault_size: 4\n"
         f"effects: [{{kind: springs, stretch: 200}}, {{kind: '{names['effect']}', force: 0.5}}, "
-        "{kind: pins, at: [ends]}]\n"
+        "{kind: pins, parts: [ends]}]\n"
     )
     (folder / "sweep.yaml").write_text(
         f"scenes: [scene.yaml]\nsolvers: [{{name: '{names['solver']}', patience: 5}}]\nreports: ['{names['report']}']\n"

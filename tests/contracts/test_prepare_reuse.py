@@ -18,7 +18,7 @@ from springbench.solvers.registry import SOLVERS, load_target
 from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, make_read_only
 
 FORCED = {
-    f"numba, {solver.linear} in {solver.precision}": solver
+    f"numba, {solver.linear_solver} in {solver.precision}": solver
     for solver in (
         CompiledLocalGlobal("supernodal", "float16"),
         CompiledLocalGlobal("inverse", "float32"),

@@ -45,7 +45,7 @@ def hanging_chain(ea: float, span: float, size: int) -> Positions:
         ChainMesh(length=LENGTH),
         SpringsEffect(stretch=ea),
         GravityEffect(),
-        PinsEffect(at=("ends",), weight="exact"),
+        PinsEffect(parts=("ends",), weight="exact"),
         size=size,
         mass=MASS,
     )
@@ -73,9 +73,9 @@ def test_a_hanging_chain_takes_the_shape_of_the_elastic_catenary(ea, span):
 
 def sag(size: int, **stiffness: float) -> float:
     """How far the middle of a level cloth, held all around, hangs down [m]."""
-    pins = PinsEffect(at=("boundary",), weight="exact")
+    pins = PinsEffect(parts=("boundary",), weight="exact")
     made = build_test_scene(
-        GridMesh(skip_one=True), SpringsEffect.model_validate(stiffness), GravityEffect(), pins, size=size, mass=0.5
+        GridMesh(bend_springs=True), SpringsEffect.model_validate(stiffness), GravityEffect(), pins, size=size, mass=0.5
     )
     p = compute_static_shape(made)
     return -p[len(p) // 2, 1]

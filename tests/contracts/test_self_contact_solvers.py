@@ -45,14 +45,14 @@ SOON = ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "anderson")
 TAKE = (*SOON, "chebyshev", "sparse", "numba")
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 THICKNESS = 0.01
-APART = SelfContactEffect(thickness=THICKNESS)
+APART = SelfContactEffect(min_distance=THICKNESS)
 
 
 def upside_down(*effects: SceneEffect) -> Scene:
     """A sheet that is held at its top corners falls upwards, and onto itself."""
     grid, up = GridMesh(plane="vertical", diagonals="one"), GravityEffect(acceleration=(0.0, 9.81, 0.0))
     return build_test_scene(
-        grid, SpringsEffect(stretch=100.0, shear=20.0), up, PinsEffect(at=("top_corners",)), *effects, size=7
+        grid, SpringsEffect(stretch=100.0, shear=20.0), up, PinsEffect(parts=("top_corners",)), *effects, size=7
     )
 
 
@@ -137,8 +137,8 @@ def test_sheets_that_all_but_touch_fall_as_one(name):
 @pytest.mark.parametrize("name", ["newton", "hybrid", "sparse", "numba", "vbd"])
 def test_where_nothing_is_near_the_motion_is_that_without(name):
     runs = []
-    for effects in ((), (SelfContactEffect(thickness=1e-4),)):
-        pins = PinsEffect(at=("top_corners",))
+    for effects in ((), (SelfContactEffect(min_distance=1e-4),)):
+        pins = PinsEffect(parts=("top_corners",))
         made = build_test_scene(
             GridMesh(), SpringsEffect(stretch=100.0, shear=20.0), GravityEffect(), pins, *effects, size=7
         )
@@ -150,7 +150,7 @@ def test_where_nothing_is_near_the_motion_is_that_without(name):
 
 
 def test_two_free_sheets_that_collide_keep_their_momentum():
-    made = build_test_scene(StackMesh(apart=0.05), SpringsEffect(stretch=100.0, shear=20.0), APART, size=5)
+    made = build_test_scene(StackMesh(layer_spacing=0.05), SpringsEffect(stretch=100.0, shear=20.0), APART, size=5)
     p, v = made.mesh.rest_positions, np.zeros_like(made.mesh.rest_positions)
     v[len(p) // 2 :] = (0.1, -2.0, 0.0)
     state, mass = MotionState(integrators.Motion(p, v), None, 0), made.system.mass
@@ -170,14 +170,14 @@ def test_two_free_sheets_that_collide_keep_their_momentum():
 STARTS = {
     "through itself": (ScaledStart(factors=(1.0, 0.0, 1.0)), "passes through itself"),
     "collapsed": (CollapsedStart(), "passes through itself"),
-    "too near": (ScaledStart(factors=(1.0, 0.02, 1.0)), "pairs start nearer than the thickness.*vertex|edges"),
+    "too near": (ScaledStart(factors=(1.0, 0.02, 1.0)), "pairs start nearer than the min_distance.*vertex|edges"),
 }
 
 
 @pytest.mark.parametrize("name", STARTS)
 def test_a_start_that_is_not_free_is_refused_with_the_pairs(name):
     begin, words = STARTS[name]
-    made = build_test_scene(StackMesh(apart=0.2), SpringsEffect(stretch=100.0), APART, size=3)
+    made = build_test_scene(StackMesh(layer_spacing=0.2), SpringsEffect(stretch=100.0), APART, size=3)
     (check,) = APART.build_contribution(made.mesh, made.system.mass, 1 / 30).scene_checks
     with pytest.raises(InputError, match=words):
         check(begin.compute_positions(made.mesh.rest_positions), ())
@@ -186,12 +186,12 @@ def test_a_start_that_is_not_free_is_refused_with_the_pairs(name):
 
 def test_a_mesh_through_itself_at_rest_is_refused():
     with pytest.raises(InputError, match=r"passes through itself at rest.*edge \d+-\d+ through triangle"):
-        build_test_scene(StackMesh(apart=0.0), SpringsEffect(stretch=100.0), APART, size=3)
+        build_test_scene(StackMesh(layer_spacing=0.0), SpringsEffect(stretch=100.0), APART, size=3)
 
 
 def test_exact_pins_that_move_are_refused():
-    moves = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.1, 0.0, 0.0))))
-    pins = PinsEffect(at=("left",), motion=moves, weight="exact")
+    moves = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.1, 0.0, 0.0))))
+    pins = PinsEffect(parts=("left",), motion=moves, weight="exact")
     with pytest.raises(InputError, match="exact pins that move"):
         build_test_scene(GridMesh(), SpringsEffect(stretch=100.0), pins, APART, size=4)
 
@@ -206,11 +206,11 @@ def test_integrators_whose_unknowns_lie_elsewhere_are_refused(name):
 
 
 def test_a_fine_mesh_with_edges_below_the_thickness_runs():
-    fine = SelfContactEffect(thickness=0.2)
+    fine = SelfContactEffect(min_distance=0.2)
     made = build_test_scene(
-        GridMesh(), SpringsEffect(stretch=100.0, shear=20.0), GravityEffect(), PinsEffect(at=("left",)), fine, size=9
+        GridMesh(), SpringsEffect(stretch=100.0, shear=20.0), GravityEffect(), PinsEffect(parts=("left",)), fine, size=9
     )
-    assert made.mesh.spacing < fine.thickness
+    assert made.mesh.spacing < fine.min_distance
     for step in simulate_scene(
         made, prepare(made, NewtonSolver()), StopRule(30, 1e-4), initial_guess="previous", frames=2
     ):
@@ -222,7 +222,7 @@ def test_a_fine_mesh_with_edges_below_the_thickness_runs():
 def test_the_reference_terms_agree_with_this_barrier_and_no_other(stiff, told, friction, monkeypatch):
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 0.02, "frames": 3, "path": "scene.yaml"}
     spec = SceneSpec.model_validate(
-        given | {"effects": (SpringsEffect(stretch=100.0), SelfContactEffect(thickness=0.4, friction=friction))}
+        given | {"effects": (SpringsEffect(stretch=100.0), SelfContactEffect(min_distance=0.4, friction=friction))}
     )
     monkeypatch.setattr(collision_primitives, "_STIFFNESS_FRACTION", stiff)
     assert verify_terms(spec, build_scene(spec, 3), "implicit-euler").startswith(told)
@@ -230,7 +230,7 @@ def test_the_reference_terms_agree_with_this_barrier_and_no_other(stiff, told, f
 
 def test_the_reference_terms_differ_from_another_friction(monkeypatch):
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 0.02, "frames": 3, "path": "scene.yaml"}
-    rough = SelfContactEffect(thickness=0.4, friction=0.4)
+    rough = SelfContactEffect(min_distance=0.4, friction=0.4)
     spec = SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=100.0), rough)})
     made = build_scene(spec, 3)
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))

@@ -66,7 +66,7 @@ mass: 1.0
 time_step: 1/30
 frames: 3
 default_size: 3
-effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, at: [first]}, {kind: "./mine.py:Hum"}]
+effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, parts: [first]}, {kind: "./mine.py:Hum"}]
 """,
     "accuracy.yaml": """
 scenes: [odd.yaml]

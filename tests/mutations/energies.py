@@ -142,8 +142,8 @@ _TABLE = (
     (
         "ether-decay",
         "harness/scenes/effects/ether_drag_effect.py",
-        "exp(-self.rate * time_step)",
-        "1.0 - self.rate * time_step",
+        "exp(-self.decay_rate * time_step)",
+        "1.0 - self.decay_rate * time_step",
         _STEPS,
     ),
     (
@@ -156,8 +156,8 @@ _TABLE = (
     (
         "wind-density",
         "harness/scenes/effects/wind_effect.py",
-        "f = 0.5 * wind.density",
-        "f = wind.density",
+        "            0.5\n            * wind.air_density",
+        "            1.0\n            * wind.air_density",
         f"{_U}/test_effect_wind.py",
     ),
 )

@@ -51,8 +51,8 @@ EXACT_LENGTHS = (
     Mutation(
         "stabilisation-halved",
         _AVBD,
-        "past = method.stabilisation * np.where",
-        "past = 0.5 * method.stabilisation * np.where",
+        "past = method.error_stabilisation * np.where",
+        "past = 0.5 * method.error_stabilisation * np.where",
         (_TESTS,),
     ),
     Mutation(

@@ -19,7 +19,7 @@ mass: 1.0
 time_step: 1/30
 frames: 7
 default_size: 40
-effects: [{kind: springs, stretch: 100}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+effects: [{kind: springs, stretch: 100}, {kind: gravity}, {kind: pins, parts: [top_corners]}]
 """
 """Its times are long enough that a thousandth of them is not within a millisecond."""
 

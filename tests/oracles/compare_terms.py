@@ -199,7 +199,7 @@ def _compare_lagged_friction(
         at.reference_step.step_moment,
         at.scene_terms.energy_builders[k],
     )
-    if m.normal_force_positions is not None or not getattr(effect, "friction", 0.0) or effect.friction_rounds == 1:
+    if m.normal_force_positions is not None or not getattr(effect, "friction", 0.0) or effect.friction_iterations == 1:
         return
     assert begin
     own = differentiate_along(

@@ -43,10 +43,10 @@ def compute_edge_stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, be
     for family, given in {"stretch": stretch, "shear": shear, "bend": bend}.items():
         for e in mesh.spring_families[family]:
             constant = given if isinstance(given, float) else _woven_stiffness(mesh, given, *mesh.springs[e].tolist())
-            if effect.rule == "fixed":
+            if effect.scaling_rule == "fixed":
                 k[e] = constant
-            elif effect.rule == "liu2013":
-                k[e] = constant * (mesh.resolution - 1) / (effect.reference - 1)
+            elif effect.scaling_rule == "liu2013":
+                k[e] = constant * (mesh.resolution - 1) / (effect.reference_size - 1)
             elif family == "bend":
                 k[e] = 16 * constant / h**2
             elif mesh.dimension == 1:
@@ -54,7 +54,7 @@ def compute_edge_stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, be
                 k[e] = constant / np.linalg.norm(mesh.rest_positions[i] - mesh.rest_positions[j])
             else:
                 k[e] = constant * {2: 1.0, 3: h}[mesh.dimension]
-    if effect.rule == "continuum" and bend:
+    if effect.scaling_rule == "continuum" and bend:
         _subtract_skip_springs(mesh, k)
     return k
 
@@ -129,9 +129,9 @@ def build_strain_limits_terms(effect: Any, declared: SceneDeclaration) -> Effect
     """Build edges that resist strains beyond their limits."""
     given = np.inf if effect.stiffness == "exact" else effect.stiffness
     k = compute_edge_stiffness(declared.mesh, effect, given, given, 0.0)
-    exact, k = _select_exact_lengths(declared, k, effect.shortest, effect.longest), select_finite(k)
+    exact, k = _select_exact_lengths(declared, k, effect.min_stretch, effect.max_stretch), select_finite(k)
     edges, r = declared.mesh.springs, _edge_lengths(declared.rest, declared.mesh.springs)
-    low, high = effect.shortest * r, effect.longest * r
+    low, high = effect.min_stretch * r, effect.max_stretch * r
 
     def values(x: ExtendedArray) -> ExtendedArray:
         l = _edge_lengths(x, edges)
@@ -145,7 +145,7 @@ def build_sewing_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build threads between the vertices that are nearest at rest."""
     rest, rows = (
         declared.mesh.rest_positions,
-        (select_vertices(declared, effect.first), select_vertices(declared, effect.second)),
+        (select_vertices(declared, effect.first_row), select_vertices(declared, effect.second_row)),
     )
     pairs = {(i, min(rows[1], key=lambda j: float(np.linalg.norm(rest[i] - rest[j])))) for i in rows[0]}
     pairs |= {(min(rows[0], key=lambda i: float(np.linalg.norm(rest[i] - rest[j]))), j) for j in rows[1]}
@@ -153,9 +153,9 @@ def build_sewing_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     r, k = _edge_lengths(declared.rest, edges), np.full(len(edges), effect.stiffness / len(edges))
 
     def begin(moment: StepMoment) -> ValueFunction:
-        since, whole = moment.stage_time - effect.begin, effect.end - effect.begin
+        since, whole = moment.stage_time - effect.start_time, effect.end_time - effect.start_time
         done = (1.0 if since >= 0 else 0.0) if whole == 0 else min(max(since / whole, 0.0), 1.0)
-        longest = np.where(r < effect.gap, r, r + done * (effect.gap - r))
+        longest = np.where(r < effect.final_length, r, r + done * (effect.final_length - r))
 
         def values(x: ExtendedArray) -> ExtendedArray:
             l = _edge_lengths(x, edges)

@@ -38,7 +38,7 @@ def build_wind_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     field, phase = _FIELDS[effect.field](effect, declared)
 
     def on_vertices(p: Array, v: Array, t: float) -> tuple[Array, float]:
-        share = np.ones(len(p)) if effect.per == "vertex" else declared.mesh.mass_fractions
+        share = np.ones(len(p)) if effect.acts_on == "vertex" else declared.mesh.mass_fractions
         force = share[:, None] * field(p, t)
         return force, float(share.max() * np.abs(_max_field(effect)).max() * (1.0 + phase(p, t)))
 
@@ -59,7 +59,14 @@ def build_wind_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
             n = np.cross(b - a, c - a) / (2 * area)
             n = n if n @ u >= 0 else -n
             lift = n - (n @ u) * u / speed**2
-            f = effect.density / 2 * area * speed * (n @ u) * (effect.drag * u / speed + effect.lift * lift)
+            f = (
+                effect.air_density
+                / 2
+                * area
+                * speed
+                * (n @ u)
+                * (effect.drag_coefficient * u / speed + effect.lift_coefficient * lift)
+            )
             most = sum(rested * declared.mass[i] / around[i] for i in triangle) * speed / declared.time_step
             magnitude = np.sqrt(f @ f)
             f = f * (most / magnitude) if magnitude > most else f
@@ -67,11 +74,11 @@ def build_wind_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
             size += min(magnitude, most) * (1 + (np.abs(air).max() + np.abs(v[triangle]).max()) / speed)
         return total, size * (1.0 + phase(p, t))
 
-    return EffectTerms(evaluate_force=on_triangles if effect.per == "triangle" else on_vertices)
+    return EffectTerms(evaluate_force=on_triangles if effect.acts_on == "triangle" else on_vertices)
 
 
 def _mean_field(effect: Any) -> Array:
-    return effect.strength * np.array(effect.velocity if effect.per == "triangle" else effect.force)
+    return effect.strength * np.array(effect.velocity if effect.acts_on == "triangle" else effect.force)
 
 
 def _max_field(effect: Any) -> Array:
@@ -111,17 +118,22 @@ def _gust_field(effect: Any, declared: SceneDeclaration) -> tuple[FieldFunction,
     phases = draws.uniform(0, 2 * np.pi, (waves, 3))
     extents = declared.mesh.rest_positions.max(axis=0) - declared.mesh.rest_positions.min(axis=0)
     size = float(np.sqrt((extents**2).sum())) or 1.0
-    slow = mean / speed**2 if effect.per == "triangle" else mean / (speed * size)
+    slow = mean / speed**2 if effect.acts_on == "triangle" else mean / (speed * size)
 
     def field(x: Array, t: float) -> Array:
         blown = np.ones((len(x), 1)) * mean
         for octave, shift in zip(octaves, phases, strict=True):
             w = 2 * np.pi * effect.frequency * np.exp(octave)
-            blown += effect.gustiness * speed * np.sqrt(2 / waves) * np.cos(w * (t - (x @ slow)[:, None]) + shift)
+            blown += (
+                effect.turbulence_intensity * speed * np.sqrt(2 / waves) * np.cos(w * (t - (x @ slow)[:, None]) + shift)
+            )
         return blown
 
     fastest = 8 * np.pi * effect.frequency
-    return field, lambda x, t: (1 + effect.gustiness) * (1 + fastest * (abs(t) + float(np.abs(x @ slow).max())))
+    return (
+        field,
+        lambda x, t: (1 + effect.turbulence_intensity) * (1 + fastest * (abs(t) + float(np.abs(x @ slow).max()))),
+    )
 
 
 _FIELDS: dict[str, Callable[..., tuple[FieldFunction, Callable[[Array, float], float]]]] = {

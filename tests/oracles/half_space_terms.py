@@ -36,10 +36,10 @@ _CONTACT_RTOL = 1e-6
 
 def build_contact_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build contact with every obstacle, with stiffness from the diagonal of Q."""
-    depth = effect.thickness / 10 if effect.tolerance is None else effect.tolerance
+    depth = effect.min_distance / 10 if effect.penetration_tolerance is None else effect.penetration_tolerance
 
     def needs(resists: Array) -> BeginFunction:
-        k = 4 * to_extended(resists) * max(1.0, effect.speed * declared.time_step / depth)
+        k = 4 * to_extended(resists) * max(1.0, effect.max_speed * declared.time_step / depth)
 
         def begin(moment: StepMoment) -> ValueFunction:
             parts = [_build_obstacle_energy(effect, one, k, moment) for one in effect.obstacles]
@@ -53,7 +53,7 @@ def build_contact_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
 
 
 def _build_obstacle_energy(effect: Any, one: Any, k: ExtendedArray, moment: StepMoment) -> ValueFunction:
-    R, slip = obstacle_radius(one) + effect.thickness, float(effect.creep) * (moment.stage_time - moment.time)
+    R, slip = obstacle_radius(one) + effect.min_distance, float(effect.eps_v) * (moment.stage_time - moment.time)
     start_placement, end_placement = (place_at(one.motion, moment.time + dt) for dt in (0.0, moment.time_step))
     a, b = (
         start_placement.inverse_transform(moment.p),
@@ -131,7 +131,7 @@ def find_nearest(one: Any, x: ExtendedArray) -> tuple[ExtendedArray, ExtendedArr
     if one.kind == "sphere":
         touched = np.tile(to_extended(one.center), (len(x), 1))
     elif one.kind == "capsule":
-        first, last = to_extended(one.ends)
+        first, last = to_extended(one.end_points)
         axis = last - first
         part = np.clip((x - first) @ axis / (axis @ axis), 0, 1)
         touched = first + part[:, None] * axis
@@ -161,7 +161,7 @@ def _find_nearest_box(
 def _obstacle_scale(one: Any) -> float:
     """Return the largest declared coordinate [m] of an obstacle; of planes, that of their point."""
     sizes = [np.abs(getattr(one, name)).max() for name in _SIZE_FIELDS[one.kind]]
-    moves = [np.abs(key.offset).max() for key in one.motion.keys] if one.motion else [0.0]
+    moves = [np.abs(key.offset).max() for key in one.motion.key_frames] if one.motion else [0.0]
     return float(max(sizes) + max(moves))
 
 

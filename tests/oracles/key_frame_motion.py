@@ -47,14 +47,16 @@ def place_at(motion: Any, time: float) -> RigidPlacement:
     """Evaluate a motion (None: none) at a time [s]."""
     if motion is None:
         return _IDENTITY
-    times = to_extended([key.time for key in motion.keys])
-    values = to_extended([(*key.offset, key.turn) for key in motion.keys])
-    *offset, turn = _interpolate_keys(times, values, min(max(to_extended(time), times[0]), times[-1]), motion.between)
+    times = to_extended([key.time for key in motion.key_frames])
+    values = to_extended([(*key.offset, key.angle) for key in motion.key_frames])
+    *offset, turn = _interpolate_keys(
+        times, values, min(max(to_extended(time), times[0]), times[-1]), motion.interpolation
+    )
     k, angle = to_extended(motion.axis), np.remainder(turn, 360) * _PI / 180
     k = k / np.sqrt(k @ k)
     cos, sin = np.cos(angle), np.sin(angle)
     columns = [e * cos + np.cross(k, e) * sin + k * (k @ e) * (1 - cos) for e in np.eye(3)]
-    return RigidPlacement(np.stack(columns, axis=1), to_extended(motion.about), to_extended(offset))
+    return RigidPlacement(np.stack(columns, axis=1), to_extended(motion.pivot), to_extended(offset))
 
 
 def velocity_at(motion: Any, q: ExtendedArray, time: float) -> ExtendedArray:
@@ -65,19 +67,19 @@ def velocity_at(motion: Any, q: ExtendedArray, time: float) -> ExtendedArray:
       q: declared point (3,) [m].
       time: time [s].
     """
-    times = to_extended([key.time for key in motion.keys]) if motion else to_extended([0])
+    times = to_extended([key.time for key in motion.key_frames]) if motion else to_extended([0])
     if len(times) == 1 or not times[0] <= time < times[-1]:
         return to_extended([0, 0, 0])
-    values, t = to_extended([(*key.offset, key.turn) for key in motion.keys]), to_extended(time)
+    values, t = to_extended([(*key.offset, key.angle) for key in motion.key_frames]), to_extended(time)
     k = min(int(np.searchsorted(times, t, side="right")) - 1, len(times) - 2)
     h = times[k + 1] - times[k]
     steep = (values[k + 1] - values[k]) / h
-    if motion.between == "smooth":
+    if motion.interpolation == "smooth":
         s = (t - times[k]) / h
         a, b = (np.array([_cubic_slope(times, column, j) for column in values.T]) for j in (k, k + 1))
         steep = 6 * s * (1 - s) * steep + a * (1 - s) * (1 - 3 * s) + b * s * (3 * s - 2)
     axis = to_extended(motion.axis)
-    arm = place_at(motion, time).rotation @ (q - to_extended(motion.about))
+    arm = place_at(motion, time).rotation @ (q - to_extended(motion.pivot))
     return steep[:3] + steep[3] * _PI / 180 * np.cross(axis / np.sqrt(axis @ axis), arm)
 
 
@@ -91,10 +93,10 @@ def bound_roundoff(motion: Any, size: float, time: float) -> float:
     """
     if motion is None:
         return EPS * size
-    keys: list[Any] = list(motion.keys)
-    times, turns = [float(key.time) for key in keys], [float(key.turn) for key in keys]
-    values = np.array([(*key.offset, np.deg2rad(key.turn)) for key in motion.keys])
-    arm = size + float(np.abs(motion.about).max())
+    keys: list[Any] = list(motion.key_frames)
+    times, turns = [float(key.time) for key in keys], [float(key.angle) for key in keys]
+    values = np.array([(*key.offset, np.deg2rad(key.angle)) for key in motion.key_frames])
+    arm = size + float(np.abs(motion.pivot).max())
     steep = np.abs(np.diff(values, axis=0) / np.diff(times)[:, None]).max(axis=0, initial=0.0)
     far = arm + float(np.abs(values[:, :3]).max()) + arm * math.radians(max(map(abs, turns)))
     return EPS * (far + max(time, *times) * (steep[:3].max() + arm * steep[3]))

@@ -63,7 +63,7 @@ class ObstaclePairs(ContactPairs):
         points = self._declared
         if self._frames:
             x = np.asarray(self._frames.frame_positions, float)
-            since = min(max((time - self._frames.begin) * self._frames.rate, 0.0), len(x) - 1.0)
+            since = min(max((time - self._frames.start_time) * self._frames.frame_rate, 0.0), len(x) - 1.0)
             low, high = int(np.floor(since)), int(np.ceil(since))
             between = (1.0 - (since - low)) * x[low] + (since - low) * x[high]
             points = to_extended(self._one.scale * between + np.array(self._one.offset))
@@ -123,7 +123,7 @@ def sample_contact_positions(
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
         found = [move_to_obstacle(effect, one, p, spacing, time, direction, rng) for time in times]
-        if all(other.is_separated(found[0], times[0], its.thickness) for its, other in all_):
+        if all(other.is_separated(found[0], times[0], its.min_distance) for its, other in all_):
             break
     return found
 
@@ -144,13 +144,13 @@ def move_to_obstacle(
       direction: unit vector (3,) from the obstacle.
       rng: random generator.
     """
-    dhat = effect.thickness if effect.range is None else effect.range
+    dhat = effect.min_distance if effect.dhat is None else effect.dhat
     there = np.asarray(one.obstacle_positions(time), float)
     middle = 0.5 * (there.max(axis=0) + there.min(axis=0))
     at = p - p.mean(axis=0)
     # A plane separates them at first.
-    out = float(((there - middle) @ direction).max() - (at @ direction).min()) + effect.thickness + dhat
-    distance = effect.thickness + dhat * rng.uniform(0.3, 0.7)
+    out = float(((there - middle) @ direction).max() - (at @ direction).min()) + effect.min_distance + dhat
+    distance = effect.min_distance + dhat * rng.uniform(0.3, 0.7)
     for _ in range(_MAX_TRIALS):
         free = one.min_distance(np.concatenate([middle + out * direction + at, there]), distance + spacing) - distance
         if free < 1e-3 * dhat:

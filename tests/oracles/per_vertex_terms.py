@@ -35,7 +35,9 @@ def build_attachments_terms(effect: Any, declared: SceneDeclaration) -> EffectTe
     vertices = select_vertices(declared, effect)
     k = np.longdouble(effect.stiffness) / len(vertices)
     given = (
-        declared.rest[vertices] if effect.to is None else np.broadcast_to(to_extended(effect.to), (len(vertices), 3))
+        declared.rest[vertices]
+        if effect.anchors is None
+        else np.broadcast_to(to_extended(effect.anchors), (len(vertices), 3))
     )
 
     def begin(moment: StepMoment) -> ValueFunction:
@@ -49,13 +51,13 @@ def build_attachments_terms(effect: Any, declared: SceneDeclaration) -> EffectTe
 
 def _motion_extent(motion: Any) -> float:
     """Return the largest translation [m] of key frames, without rotations."""
-    return max((float(np.abs(key.offset).max()) for key in motion.keys), default=0.0) if motion else 0.0
+    return max((float(np.abs(key.offset).max()) for key in motion.key_frames), default=0.0) if motion else 0.0
 
 
 def build_air_drag_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build drag in still air, as an energy or as a velocity filter."""
     c = effect.coefficient * declared.mesh.mass_fractions
-    if effect.law == "linear":
+    if effect.drag_law == "linear":
         return EffectTerms(_build_drag(c), c / declared.time_step)
     dt, mass = declared.time_step, declared.mass
 
@@ -88,14 +90,14 @@ def _build_drag(c: Array) -> BeginFunction:
 def build_ether_drag_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build decay of all velocities, or drag proportional to mass."""
     if declared.has_stages:
-        c = effect.rate * declared.mass
+        c = effect.decay_rate * declared.mass
         return EffectTerms(_build_drag(c), c / declared.time_step)
-    return EffectTerms(filter_velocity=lambda v: math.exp(-effect.rate * declared.time_step) * v)
+    return EffectTerms(filter_velocity=lambda v: math.exp(-effect.decay_rate * declared.time_step) * v)
 
 
 def build_rayleigh_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build damping proportional to the masses and to the stiffness of springs and bending."""
-    b, parts = effect.stiffness, [_build_drag(effect.mass * declared.mass)]
+    b, parts = effect.stiffness_coefficient, [_build_drag(effect.mass_coefficient * declared.mass)]
     if b:
         parts += [
             build_edge_damping(declared, b * select_finite(compute_reference_stiffness(s, declared)))
@@ -111,7 +113,7 @@ def build_rayleigh_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms
 
         return values
 
-    return EffectTerms(begin, effect.mass * declared.mass / declared.time_step)
+    return EffectTerms(begin, effect.mass_coefficient * declared.mass / declared.time_step)
 
 
 def build_pins_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:

@@ -28,34 +28,39 @@ def run_reference_check(spec: SceneSpec, size: int = 0, integrator: str = "impli
     return verify_terms(spec, build_scene(spec, size, integrator), integrator)
 
 
-MOTION_SPEC = {"keys": [{"time": 0}, {"time": 0.4, "offset": (0.1, 0.2, 0), "turn": 90}, {"time": 1, "turn": 30}]}
-SMOOTH_MOTION = MOTION_SPEC | {"between": "smooth", "axis": (1, 2, 0), "about": (0.1, 0, 0.3)}
+MOTION_SPEC = {
+    "key_frames": [{"time": 0}, {"time": 0.4, "offset": (0.1, 0.2, 0), "angle": 90}, {"time": 1, "angle": 30}]
+}
+SMOOTH_MOTION = MOTION_SPEC | {"interpolation": "smooth", "axis": (1, 2, 0), "pivot": (0.1, 0, 0.3)}
 OBSTACLE_SPECS = [
     {"kind": "plane", "point": (0, -0.3, 0), "normal": (0.2, 1, 0)},
     {"kind": "sphere", "center": (0, -0.9, 0), "radius": 0.3, "motion": SMOOTH_MOTION},
-    {"kind": "capsule", "ends": [(0, -1, 0), (1, -1, 0.5)], "radius": 0.1, "motion": MOTION_SPEC},
+    {"kind": "capsule", "end_points": [(0, -1, 0), (1, -1, 0.5)], "radius": 0.1, "motion": MOTION_SPEC},
     {"kind": "box", "low": (-0.2, -2, -0.2), "high": (0.3, -1.7, 0.4), "motion": MOTION_SPEC},
 ]
 SPRINGS_SPEC = {"kind": "springs", "stretch": 300, "shear": 60}
 BEND_SPRINGS_SPEC = {"kind": "springs", "stretch": 300, "shear": 60, "bend": 0.01}
-PINS_SPEC = {"kind": "pins", "at": ["top_corners"], "motion": SMOOTH_MOTION}
-ATTACHMENTS_SPEC = {"kind": "attachments", "at": ["bottom"], "stiffness": 50, "motion": MOTION_SPEC}
-STRAIN_LIMITS_SPEC = {"kind": "strain-limits", "longest": 1.02, "shortest": 0.98, "stiffness": 500}
-GUSTS_SPEC = {"kind": "wind", "field": "gusts", "per": "triangle", "velocity": (3, 0, 1), "lift": 0.5}
+PINS_SPEC = {"kind": "pins", "parts": ["top_corners"], "motion": SMOOTH_MOTION}
+ATTACHMENTS_SPEC = {"kind": "attachments", "parts": ["bottom"], "stiffness": 50, "motion": MOTION_SPEC}
+STRAIN_LIMITS_SPEC = {"kind": "strain-limits", "max_stretch": 1.02, "min_stretch": 0.98, "stiffness": 500}
+GUSTS_SPEC = {"kind": "wind", "field": "gusts", "acts_on": "triangle", "velocity": (3, 0, 1), "lift_coefficient": 0.5}
 BENDING_SPEC, DASHPOTS_SPEC = {"kind": "bending", "stiffness": 0.5}, {"kind": "dashpots", "stretch": 2}
-RAYLEIGH_SPEC = {"kind": "rayleigh", "mass": 0.5, "stiffness": 0.02}
+RAYLEIGH_SPEC = {"kind": "rayleigh", "mass_coefficient": 0.5, "stiffness_coefficient": 0.02}
 AIR_DRAG_SPEC, GRAVITY_SPEC = {"kind": "air-drag", "coefficient": 2}, {"kind": "gravity"}
-FLOOR_SPEC = {"kind": "contact", "obstacles": OBSTACLE_SPECS, "friction": 0.3, "creep": 0.08}
+FLOOR_SPEC = {"kind": "contact", "obstacles": OBSTACLE_SPECS, "friction": 0.3, "eps_v": 0.08}
 ASSIGNED_WIND_SPEC = {"kind": "wind", "field": "assignment"}
 FORCE_SPECS = [GRAVITY_SPEC, {"kind": "constant-force", "force": (0, 0, 0.1)}, ASSIGNED_WIND_SPEC]
-DRAG_SPECS = [{"kind": "ether-drag", "rate": 2}, {"kind": "air-drag", "law": "quadratic", "coefficient": 0.3}]
+DRAG_SPECS = [
+    {"kind": "ether-drag", "decay_rate": 2},
+    {"kind": "air-drag", "drag_law": "quadratic", "coefficient": 0.3},
+]
 BALLOON_SPEC = {"kind": "balloon"}
 GAS_SPEC = {"kind": "gas", "pressure": 200}
 
 
 def build_scene_spec(*effects: dict[str, Any], mesh: dict[str, Any] | None = None, **more: Any) -> SceneSpec:
     """Build the specification of a cloth, or of another mesh, with effects as a file declares them."""
-    given = mesh or {"kind": "grid", "skip_one": True}
+    given = mesh or {"kind": "grid", "bend_springs": True}
     made = tuple(load_target(EFFECT_CLASSES[effect["kind"]]).model_validate(effect) for effect in effects)
     fields: dict[str, Any] = {"mass": 1.0, "time_step": 1 / 30, "frames": 40} | more
     return SceneSpec(

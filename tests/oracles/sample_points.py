@@ -112,5 +112,5 @@ def _move_to_obstacle(effect: Any, one: Any, p: Array, time: float, rng: np.rand
     at = place_at(one.motion, time)
     which = int(rng.integers(len(p)))
     far, _, out = find_nearest(one, at.inverse_transform(to_extended(p[which : which + 1])))
-    distance = obstacle_radius(one) + effect.thickness * rng.uniform()
+    distance = obstacle_radius(one) + effect.min_distance * rng.uniform()
     return p + np.asarray((distance - far[0]) * (out @ at.rotation.T)[0], float)

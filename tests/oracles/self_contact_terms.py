@@ -46,13 +46,17 @@ def build_self_contact_terms(effect: Any, declared: SceneDeclaration) -> EffectT
 
 def build_barriers(effect: Any, parts: Sequence[ContactPairs]) -> EffectTerms:
     """Build the barriers of an effect for all pairs of its parts, and their friction."""
-    t, r = effect.thickness, effect.thickness if effect.range is None else effect.range
+    t, r = effect.min_distance, effect.min_distance if effect.dhat is None else effect.dhat
 
     def needs(resists: Array) -> BeginFunction:
-        k = np.full(len(resists), effect.stiffness) if effect.stiffness else 0.1 * np.asarray(resists, float)
+        k = (
+            np.full(len(resists), effect.barrier_stiffness)
+            if effect.barrier_stiffness
+            else 0.1 * np.asarray(resists, float)
+        )
 
         def begin(moment: StepMoment) -> ValueFunction:
-            found, slip = list[ValueFunction](), effect.creep * (moment.stage_time - moment.time)
+            found, slip = list[ValueFunction](), effect.eps_v * (moment.stage_time - moment.time)
             for part in parts:
                 found.append(part.build_barrier_energy(t, r, k, moment.stage_time))
                 if effect.friction:
@@ -335,9 +339,9 @@ def contract_to_contact(effect: Any, declared: SceneDeclaration, p: Array) -> Ar
       declared: declaration of the scene.
       p: positions (n, 3) [m].
     """
-    mesh, r = ContactPairs(declared), effect.thickness if effect.range is None else effect.range
-    contact_distance = effect.thickness + r
+    mesh, r = ContactPairs(declared), effect.min_distance if effect.dhat is None else effect.dhat
+    contact_distance = effect.min_distance + r
     max_distance = max(contact_distance, 2.0 * declared.mesh.spacing)
     nearest = mesh.min_distance(p, max_distance)
-    share = (effect.thickness + 0.5 * r) / max(contact_distance, nearest)
+    share = (effect.min_distance + 0.5 * r) / max(contact_distance, nearest)
     return p.mean(axis=0) + share * (p - p.mean(axis=0))

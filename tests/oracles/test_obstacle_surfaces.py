@@ -22,7 +22,7 @@ from springbench.solvers.contact.contact_potential import ObstacleContact
 from tests.oracles.verify_scene import verify_terms
 
 TURNS = KeyFrameMotion(
-    keys=(KeyFrame(time=0.0), KeyFrame(time=0.1, offset=(0.01, 0.02, 0.0), turn=20.0)), axis=(0.1, 1.0, 0.2)
+    key_frames=(KeyFrame(time=0.0), KeyFrame(time=0.1, offset=(0.01, 0.02, 0.0), angle=20.0)), axis=(0.1, 1.0, 0.2)
 )
 BALL = MeshObstacle(mesh=BalloonMesh(radius=0.3), size=2, offset=(0.1, -0.5, 0.0))
 OBSTACLES: dict[str, tuple[Any, ...]] = {
@@ -31,13 +31,13 @@ OBSTACLES: dict[str, tuple[Any, ...]] = {
     "plane and box": (PlaneObstacle(point=(0, -1, 0)), BoxObstacle(low=(0.0, 0.5, 0.0), high=(0.4, 0.7, 0.3))),
     "sphere and capsule": (
         SphereObstacle(center=(0, -1, 0), radius=0.5),
-        CapsuleObstacle(ends=((0, 1, 0), (0.5, 1, 0)), radius=0.2, motion=TURNS),
+        CapsuleObstacle(end_points=((0, 1, 0), (0.5, 1, 0)), radius=0.2, motion=TURNS),
     ),
 }
 
 
 def spec(*obstacles: Any, more: tuple[Any, ...] = (), friction: float = 0.0) -> SceneSpec:
-    rubs = SurfaceContactEffect(obstacles=obstacles, thickness=0.1, friction=friction)
+    rubs = SurfaceContactEffect(obstacles=obstacles, min_distance=0.1, friction=friction)
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 0.02, "frames": 3, "path": "scene.yaml"}
     return SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=100.0), rubs, *more)})
 
@@ -50,12 +50,12 @@ def test_implementations_agree(name: str, friction: float):
 
 
 def test_implementations_agree_with_bdf2_and_self_contact():
-    given = spec(*OBSTACLES["mesh that turns"], friction=0.4, more=(SelfContactEffect(thickness=0.1),))
+    given = spec(*OBSTACLES["mesh that turns"], friction=0.4, more=(SelfContactEffect(min_distance=0.1),))
     assert verify_terms(given, build_scene(given, 3, "bdf2"), "bdf2") == "agrees"
 
 
 def test_implementations_agree_where_an_obstacle_with_friction_leaves_in_one_step():
-    shot = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=0.1, offset=(5.0, 2.0, 0.0))))
+    shot = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=0.1, offset=(5.0, 2.0, 0.0))))
     given = spec(BALL.model_copy(update={"motion": shot}), PlaneObstacle(point=(0, -1, 0)), friction=0.4)
     assert verify_terms(given, build_scene(given, 3), "implicit-euler") == "agrees"
 

@@ -58,7 +58,7 @@ from tests.oracles.planted_errors import (
     scale_steady_forces,
 )
 
-PER_VERTEX = {"kind": "wind", "field": "constant", "per": "vertex", "force": (1, 0, 2)}
+PER_VERTEX = {"kind": "wind", "field": "constant", "acts_on": "vertex", "force": (1, 0, 2)}
 PLANTED_ERRORS: dict[str, FormulaMutation] = {
     "springs twice as stiff": FormulaMutation(
         [SPRINGS_SPEC], "springs", mutate_energy(Springs, scale_fields(stiffness=2.0))

@@ -18,28 +18,30 @@ def select_vertices(declared: SceneDeclaration, selection: Any) -> list[int]:
     named = set[int](selection.indices)
     rows: list[list[float]] = mesh.rest_positions.tolist()
     places = list(enumerate(rows))
-    for part in one.at:
+    for part in one.parts:
         named |= set(mesh.parts[part].tolist())
     if one.box:
         low, high = one.box.low, one.box.high
         named |= {i for i, x in places if all(a <= c <= b for a, c, b in zip(low, x, high, strict=True))}
     if one.sphere:
         named |= {i for i, x in places if _squared_distance(x, one.sphere.center) <= one.sphere.radius**2}
-    named |= {min((_squared_distance(x, point), i) for i, x in places)[1] for point in one.nearest}
-    if one.loops or one.holes:
+    named |= {min((_squared_distance(x, point), i) for i, x in places)[1] for point in one.nearest_to}
+    if one.boundary_loops or one.holes:
         loops = _find_boundary_loops(mesh)
         holes = [loop for loop, hole in loops if hole]
-        rims: list[int] = [*one.loops]
+        rims: list[int] = [*one.boundary_loops]
         gaps: list[int] = [*one.holes]
         named = named.union(*(loops[k][0] for k in rims), *(holes[k] for k in gaps))
     if one.attribute:
         low, high = one.attribute.low, one.attribute.high
         for i, value in enumerate(mesh.attributes[one.attribute.name].tolist()):
             named |= {i} if (low is None or value >= low) and (high is None or value <= high) else set()
-    nothing = not (one.at or one.indices or one.box or one.sphere or one.nearest or one.loops or one.holes)
+    nothing = not (
+        one.parts or one.indices or one.box or one.sphere or one.nearest_to or one.boundary_loops or one.holes
+    )
     if nothing and not one.attribute:
         named = set(range(len(mesh.rest_positions)))
-    return sorted(named)[:: one.every]
+    return sorted(named)[:: one.stride]
 
 
 def _squared_distance(x: Any, y: Any) -> float:

@@ -29,22 +29,22 @@ from springbench.solvers.model.system_matrix_assembly import assemble_system_mat
 from tests.scene_builders import build_test_scene
 
 TINY, HUGE = 1e-9, 1e9
-LEAP = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1e-6, offset=(0.3, 0.0, 0.0), turn=3e4)))
+LEAP = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1e-6, offset=(0.3, 0.0, 0.0), angle=3e4)))
 
 EFFECTS: dict[str, SceneEffect] = {
     "bending of 1e9 N m": BendingEffect(stiffness=HUGE),
     "bending of 1e-9 N m": BendingEffect(stiffness=TINY),
-    "limits of 1e9 N/m about the rest length": StrainLimitsEffect(longest=1.0, shortest=0.999, stiffness=HUGE),
-    "limits of 1e-9 N/m": StrainLimitsEffect(longest=1.0, stiffness=TINY),
+    "limits of 1e9 N/m about the rest length": StrainLimitsEffect(max_stretch=1.0, min_stretch=0.999, stiffness=HUGE),
+    "limits of 1e-9 N/m": StrainLimitsEffect(max_stretch=1.0, stiffness=TINY),
     "dashpots of 1e9 N s/m": DashpotsEffect(stretch=HUGE),
-    "Rayleigh damping of 1e9": RayleighEffect(mass=HUGE, stiffness=HUGE),
+    "Rayleigh damping of 1e9": RayleighEffect(mass_coefficient=HUGE, stiffness_coefficient=HUGE),
     "linear drag of 1e9 N s/m": AirDragEffect(coefficient=HUGE),
-    "quadratic drag of 1e9 kg/m": AirDragEffect(law="quadratic", coefficient=HUGE),
-    "attachments of 1e9 N/m": AttachmentsEffect(at=("bottom",), stiffness=HUGE),
-    "attachments that leap": AttachmentsEffect(at=("bottom",), stiffness=100.0, motion=LEAP),
-    "pins that leap": PinsEffect(at=("bottom",), motion=LEAP),
-    "a storm of 300 m/s": WindEffect(per="triangle", velocity=(0.0, 300.0, 0.0), lift=2.0),
-    "air as dense as 1e9 kg/m^3": WindEffect(per="triangle", velocity=(0.0, 1.0, 0.0), density=HUGE),
+    "quadratic drag of 1e9 kg/m": AirDragEffect(drag_law="quadratic", coefficient=HUGE),
+    "attachments of 1e9 N/m": AttachmentsEffect(parts=("bottom",), stiffness=HUGE),
+    "attachments that leap": AttachmentsEffect(parts=("bottom",), stiffness=100.0, motion=LEAP),
+    "pins that leap": PinsEffect(parts=("bottom",), motion=LEAP),
+    "a storm of 300 m/s": WindEffect(acts_on="triangle", velocity=(0.0, 300.0, 0.0), lift_coefficient=2.0),
+    "air as dense as 1e9 kg/m^3": WindEffect(acts_on="triangle", velocity=(0.0, 1.0, 0.0), air_density=HUGE),
 }
 TIME_STEPS = (1e-5, 1 / 30, 1.0)
 
@@ -66,7 +66,7 @@ def runs_well(made: Scene, solver: Solver, reach: float) -> None:
 @pytest.mark.parametrize("solver", [SparseLocalGlobal(), Lbfgs()], ids=["sparse", "lbfgs"])
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_a_cloth_with_an_effect_at_its_extreme_stays_in_the_room(effect, solver, time_step):
-    pins = PinsEffect(at=("top",))
+    pins = PinsEffect(parts=("top",))
     made = build_test_scene(
         GridMesh(),
         SpringsEffect(stretch=300.0),
@@ -90,7 +90,7 @@ def test_a_balloon_at_any_pressure_keeps_its_volume_positive(pressure, time_step
         SpringsEffect(stretch=100.0),
         GravityEffect(),
         GasEffect(pressure=pressure),
-        PinsEffect(at=("pole_top",)),
+        PinsEffect(parts=("pole_top",)),
         size=3,
         mass=0.1,
         time_step=time_step,

@@ -31,7 +31,7 @@ mass: 1
 time_step: 0.1
 frames: {FRAMES}
 default_size: 4
-effects: [{{kind: springs, stretch: 1.0e+12}}, {{kind: gravity}}, {{kind: pins, at: [first]}}]
+effects: [{{kind: springs, stretch: 1.0e+12}}, {{kind: gravity}}, {{kind: pins, parts: [first]}}]
 """
 SWEEP = """
 scenes: [scene.yaml]

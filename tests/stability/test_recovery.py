@@ -42,7 +42,7 @@ def held_block() -> Scene:
     return build_test_scene(
         BlockMesh(),
         SpringsEffect(stretch=2e4),
-        PinsEffect.model_validate({"at": ["left"], "weight": "exact"}),
+        PinsEffect.model_validate({"parts": ["left"], "weight": "exact"}),
         size=4,
         mass=10.0,
     )
@@ -54,7 +54,7 @@ def free_block() -> Scene:
 
 def hanging_cloth() -> Scene:
     """In steps of .2 s, which damp."""
-    pins = PinsEffect.model_validate({"at": ["top_corners"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["top_corners"], "weight": "exact"})
     return build_test_scene(
         GridMesh(), SpringsEffect(stretch=30.0, shear=6.0), GravityEffect(), pins, size=5, mass=0.3, time_step=0.2
     )
@@ -81,19 +81,19 @@ def comes_to_a_minimum(made: Scene, p: Positions) -> None:
     np.testing.assert_allclose(p, minimum.positions, rtol=0, atol=1e-2 * made.mesh.bounding_box_diagonal)
 
 
-LINE, PLANE = FlattenedStart(along=("y", "z")), FlattenedStart(along=("y",))
+LINE, PLANE = FlattenedStart(axes=("y", "z")), FlattenedStart(axes=("y",))
 Check = Callable[[Scene, Positions], None]
 CASES: dict[str, tuple[Callable[[], Scene], AnyStart, Check]] = {
     "a held block in one point": (held_block, CollapsedStart(), returns_to_its_rest_shape),
     "a held block in a line": (held_block, LINE, returns_to_its_rest_shape),
     "a held block in a plane": (held_block, PLANE, returns_to_its_rest_shape),
-    "a held block at random": (held_block, RandomStart(side=1.0), comes_to_a_minimum),
+    "a held block at random": (held_block, RandomStart(side_length=1.0), comes_to_a_minimum),
     "a free block in one point": (free_block, CollapsedStart(), returns_to_its_lengths),
     "a free block in a line": (free_block, LINE, returns_to_its_lengths),
     "a free block in a plane": (free_block, PLANE, returns_to_its_lengths),
     "a hanging cloth in one point": (hanging_cloth, CollapsedStart(), comes_to_a_minimum),
     "a hanging cloth in a line": (hanging_cloth, LINE, comes_to_a_minimum),
-    "a hanging cloth at random": (hanging_cloth, RandomStart(side=1.0), comes_to_a_minimum),
+    "a hanging cloth at random": (hanging_cloth, RandomStart(side_length=1.0), comes_to_a_minimum),
 }
 
 

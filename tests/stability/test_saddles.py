@@ -38,7 +38,7 @@ def squeezed(mesh, size: int, pins: str, factors: tuple[float, float, float]) ->
     made = build_test_scene(
         mesh,
         SpringsEffect(stretch=1e3),
-        PinsEffect.model_validate({"at": [pins], "weight": "exact"}),
+        PinsEffect.model_validate({"parts": [pins], "weight": "exact"}),
         size=size,
         time_step=1.0,
     )

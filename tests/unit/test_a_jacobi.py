@@ -80,5 +80,5 @@ def test_what_has_no_rows_in_q_is_refused_by_name(scene, name):
 
 @pytest.mark.parametrize("sweeps", [0, -1, 9])
 def test_sweeps_are_from_one_to_eight(sweeps):
-    with pytest.raises(ValueError, match="sweeps: should be from 1 to 8"):
+    with pytest.raises(ValueError, match="jacobi_sweeps: should be from 1 to 8"):
         AggregatedJacobi(sweeps)

@@ -37,14 +37,14 @@ effects:
   - {kind: gravity}
   - {kind: bending, stiffness: 1.0e-3}
   - {kind: air-drag, coefficient: 0}
-  - {kind: pins, at: [top_corners]}
+  - {kind: pins, parts: [top_corners]}
 """
 HELD = """
 mesh: {kind: network, positions: [[0, 0, 0], [1, 0, 0], [2, 0, 0]], springs: [[0, 1], [1, 2]], mass: [0, 0, 1]}
 time_step: 1/30
 frames: 3
 effects:
-  - {kind: springs, rule: fixed, stretch: 100}
+  - {kind: springs, scaling_rule: fixed, stretch: 100}
   - {kind: gravity}
   - {kind: pins, indices: [0]}
 """
@@ -71,7 +71,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
 
 def test_every_effect_is_left_out_once_and_every_pair_on_request(tmp_path: Path):
     path = tmp_path / "scene.yaml"
-    path.write_text(CLOTH + "  - {kind: pins, at: [bottom]}\n")
+    path.write_text(CLOTH + "  - {kind: pins, parts: [bottom]}\n")
     scene = load_scene(path)
     alone, both = build_variants(scene, with_pairs=False), build_variants(scene, with_pairs=True)
     assert [one.name for one in alone] == [

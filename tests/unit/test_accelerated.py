@@ -66,7 +66,9 @@ def test_the_objective_never_rises(method, name, start):
 )
 def test_the_solution_is_a_stationary_point(method, name, linear, precision):
     problem = PROBLEMS[name]()
-    solution = method(linear=linear, precision=precision).prepare(problem.system).solve(problem, StopRule(4000, 1e-9))
+    solution = (
+        method(linear_solver=linear, precision=precision).prepare(problem.system).solve(problem, StopRule(4000, 1e-9))
+    )
     assert solution.termination_reason in ("converged", "roundoff")
     free = problem.system.unpinned_mask
     begun = np.abs(problem.gradient(problem.current_positions)[free]).max()
@@ -78,7 +80,7 @@ def test_the_solution_is_a_stationary_point(method, name, linear, precision):
 @problems
 def test_a_step_compiled_as_a_whole_is_the_step_with_calls_in_between(method, name):
     problem = PROBLEMS[name]()
-    compiled, called = (iterates(method(linear=linear), problem, 12) for linear in ("supernodal", "cholespy"))
+    compiled, called = (iterates(method(linear_solver=linear), problem, 12) for linear in ("supernodal", "cholespy"))
     for p, q in zip(compiled, called, strict=True):
         # Two factors by the condition of Q, and windows that make a dozen times as much of it in a dozen iterations.
         assert np.abs(p - q).max() <= 1e-7 * np.abs(q).max()
@@ -89,7 +91,7 @@ def test_a_step_compiled_as_a_whole_is_the_step_with_calls_in_between(method, na
 @pytest.mark.parametrize("linear", ["supernodal", "cholespy"])
 def test_a_run_tells_its_gradient_and_by_how_much_the_objective_fell(method, name, linear):
     problem = PROBLEMS[name]()
-    prepared = method(linear=linear).prepare(problem.system)
+    prepared = method(linear_solver=linear).prepare(problem.system)
     run = prepared.init_state(problem, problem.initial_guess)
     run.run_iterations(iteration_limit(0))
     # Of a gradient some units in the last place of stiffness times position: at a pin of its weight times that.
@@ -126,7 +128,7 @@ def test_fewer_iterations_reach_an_accuracy_than_of_local_global(method):
 @pytest.mark.parametrize("linear", ["supernodal", "cholespy"])
 def test_at_a_minimum_iterates_stay_where_they_are(method, linear):
     problem = build_random_problem(2)
-    prepared = method(linear=linear).prepare(problem.system)
+    prepared = method(linear_solver=linear).prepare(problem.system)
     end = prepared.solve(problem, StopRule(4000, 1e-13)).positions
     again = replace(problem, initial_guess=end, current_positions=end)
     solution = prepared.solve(again, StopRule(50))
@@ -150,7 +152,9 @@ def test_a_guess_that_is_no_number_ends_as_stalled(method, linear):
     guess = problem.initial_guess.copy()
     guess[4] = np.nan
     solution = (
-        method(linear=linear).prepare(problem.system).solve(replace(problem, initial_guess=guess), StopRule(20, 1e-3))
+        method(linear_solver=linear)
+        .prepare(problem.system)
+        .solve(replace(problem, initial_guess=guess), StopRule(20, 1e-3))
     )
     assert solution.termination_reason == "stalled"
     assert solution.num_iterations == 0

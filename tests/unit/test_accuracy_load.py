@@ -23,7 +23,7 @@ mesh: {kind: grid}
 mass: 1
 time_step: 1/30
 frames: 5
-effects: [{kind: springs, stretch: 100}, {kind: pins, at: [top]}]
+effects: [{kind: springs, stretch: 100}, {kind: pins, parts: [top]}]
 """
 CONFIG = """
 scenes: [cloth.yaml, other.yaml]

@@ -33,7 +33,7 @@ CHAIN = SceneSpec(
     mass=1.0,
     time_step=1 / 30,
     frames=1,
-    effects=(SpringsEffect(stretch=500.0), GravityEffect(), PinsEffect.model_validate({"at": ["ends"]})),
+    effects=(SpringsEffect(stretch=500.0), GravityEffect(), PinsEffect.model_validate({"parts": ["ends"]})),
     path=Path("chain.yaml"),
 )
 HORIZON = 0.2

@@ -82,5 +82,5 @@ def test_what_has_no_projection_along_edges_is_refused_by_name(scene, name):
 
 @pytest.mark.parametrize("weight", [0.0, -1.0, np.inf, np.nan])
 def test_a_weight_is_positive_and_finite(weight):
-    with pytest.raises(ValueError, match="weight: should be positive and finite"):
+    with pytest.raises(ValueError, match="penalty_weight: should be positive and finite"):
         Admm(weight)

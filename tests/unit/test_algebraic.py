@@ -21,7 +21,7 @@ from springbench.solvers.model.integrators import INTEGRATORS
 from springbench.solvers.model.step_problem import StopRule, Unsupported
 
 END = 0.3
-EFFECTS = (SpringsEffect(stretch=20.0), GravityEffect(), PinsEffect(at=("first",), weight="exact"))
+EFFECTS = (SpringsEffect(stretch=20.0), GravityEffect(), PinsEffect(parts=("first",), weight="exact"))
 
 
 def scene(integrator: str, steps: int) -> Scene:

@@ -36,8 +36,8 @@ from tests.oracles.verify_scene import verify_terms
 from tests.scene_builders import build_first_problem, build_test_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "exact"
-FIRST = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
-EXACT = SpringsEffect.model_validate({"stretch": "exact", "rule": "fixed"})
+FIRST = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
+EXACT = SpringsEffect.model_validate({"stretch": "exact", "scaling_rule": "fixed"})
 DOWN = ChainMesh(direction=(0.0, -1.0, 0.0))
 ROUND_OFF = 1e-9
 """Of metres and newtons of size one, after solves to a residual of 1e-11 of the step's."""
@@ -96,7 +96,9 @@ def test_a_swinging_chain_is_the_limit_of_stiff_ones():
                                                  initial_guess="previous", frames=6)]  # fmt: skip
     away = []
     for k in (1e6, 1e7):
-        stiff = build_test_scene(ChainMesh(), SpringsEffect(stretch=k, rule="fixed"), GravityEffect(), FIRST, size=9)
+        stiff = build_test_scene(
+            ChainMesh(), SpringsEffect(stretch=k, scaling_rule="fixed"), GravityEffect(), FIRST, size=9
+        )
         run = simulate_scene(stiff, prepare(stiff, NewtonSolver()), StopRule(200), initial_guess="previous", frames=6)
         away.append(max(np.abs(step.positions - p).max() for step, p in zip(run, steps, strict=True)))
     assert away[0] < 1e-4
@@ -105,10 +107,10 @@ def test_a_swinging_chain_is_the_limit_of_stiff_ones():
 
 def limited() -> Scene:
     """A net that hangs by its corners, so soft that most of what would be its sag is beyond its limits."""
-    corners = PinsEffect.model_validate({"at": ["corners"], "weight": "exact"})
-    limits = StrainLimitsEffect.model_validate({"stiffness": "exact", "longest": 1.05})
+    corners = PinsEffect.model_validate({"parts": ["corners"], "weight": "exact"})
+    limits = StrainLimitsEffect.model_validate({"stiffness": "exact", "max_stretch": 1.05})
     return build_test_scene(
-        NetMesh(), SpringsEffect(stretch=5.0, rule="fixed"), limits, GravityEffect(), corners, size=5, mass=1.0
+        NetMesh(), SpringsEffect(stretch=5.0, scaling_rule="fixed"), limits, GravityEffect(), corners, size=5, mass=1.0
     )
 
 
@@ -160,14 +162,14 @@ def test_where_nothing_is_exact_it_is_vertex_block_descent():
 def test_softened_springs_end_at_the_minimum():
     """However soft they begin: every second one is a hundred times as stiff as the others."""
     stated = build_first_problem(
-        build_test_scene(DOWN, SpringsEffect(stretch=100.0, rule="fixed"), GravityEffect(), FIRST, size=9)
+        build_test_scene(DOWN, SpringsEffect(stretch=100.0, scaling_rule="fixed"), GravityEffect(), FIRST, size=9)
     )
     (found,) = stated.system.energies
     assert isinstance(found, spring_energy.Springs)
     ratio = replace(found, stiffness=np.where(np.arange(8) % 2, 100.0, 1.0) * found.stiffness)
     stated = replace(stated, system=replace(stated.system, energies=(ratio,)))
     end = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200)).positions
-    assert np.abs(end - solved(stated, softened=True, ramp=1e6).positions).max() < 1e-6
+    assert np.abs(end - solved(stated, ramp_spring_stiffness=True, stiffness_ramp=1e6).positions).max() < 1e-6
 
 
 CLAIMS = {
@@ -215,11 +217,11 @@ def test_multipliers_of_a_hanging_chain_are_what_hangs_below():
 
 def test_multipliers_of_limits_pull_where_a_limit_holds_and_nowhere_else():
     """One vertex between two pins, pulled along the line to beyond one limit: that edge pulls, the other is slack."""
-    ends = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
-    limits = StrainLimitsEffect.model_validate({"stiffness": "exact", "longest": 1.05})
+    ends = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
+    limits = StrainLimitsEffect.model_validate({"stiffness": "exact", "max_stretch": 1.05})
     stated = build_first_problem(
         build_test_scene(
-            ChainMesh(length=2.0), SpringsEffect(stretch=1.0, rule="fixed"), limits, ends, size=3, mass=3.0
+            ChainMesh(length=2.0), SpringsEffect(stretch=1.0, scaling_rule="fixed"), limits, ends, size=3, mass=3.0
         )
     )
     m, dt = stated.system.mass[1], stated.system.time_step
@@ -240,7 +242,7 @@ def test_a_stabilised_step_keeps_that_part_of_the_error_it_begins_with(stabilisa
     begun = stated.step_start.positions.copy()
     begun[1] = begun[0] + 1.1 * (begun[1] - begun[0])
     stated = replace(stated, step_start=replace(stated.step_start, positions=begun))
-    found = Avbd(stabilisation=stabilisation).prepare(stated.system).solve(stated, StopRule(2000))
+    found = Avbd(error_stabilisation=stabilisation).prepare(stated.system).solve(stated, StopRule(2000))
     (away,) = length_errors(concatenate_constraints(stated.system.length_constraints), found.positions)
     np.testing.assert_allclose(away, stabilisation * 0.1, atol=1e-9)
 
@@ -304,7 +306,7 @@ def test_hard_cases_keep_their_lengths(case):
 def test_lengths_that_cannot_all_be_kept_are_missed_and_that_is_told():
     """A chain of 1 m between pins that are 2 m apart: tensions stay bounded, all links give, a metre in all."""
     stated = build_first_problem(
-        build_test_scene(ChainMesh(), EXACT, PinsEffect.model_validate({"at": ["ends"], "weight": "exact"}), size=5)
+        build_test_scene(ChainMesh(), EXACT, PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"}), size=5)
     )
     far = stated.pin_targets.copy()
     far[1] = far[0] + 2.0 * (far[1] - far[0])
@@ -332,10 +334,10 @@ def test_whoever_prepares_a_solver_without_the_harness_is_refused_too():
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"ramp": -1.0}, "ramp"),
-        ({"bound": 0.5}, "bound"),
-        ({"decay": 1.5}, "decay"),
-        ({"stabilisation": 2.0}, "stabilisation"),
+        ({"stiffness_ramp": -1.0}, "stiffness_ramp"),
+        ({"max_stiffness_ratio": 0.5}, "max_stiffness_ratio"),
+        ({"warm_start_decay": 1.5}, "warm_start_decay"),
+        ({"error_stabilisation": 2.0}, "error_stabilisation"),
         ({"spectral_radius": 1.0}, "spectral_radius"),
     ],
 )

@@ -138,7 +138,7 @@ def test_a_process_that_was_stopped_says_so() -> None:
 
 
 PROBLEM = build_first_problem(
-    build_test_scene(ChainMesh(), GravityEffect(), PinsEffect(at=("first",), weight=1e4), size=4)
+    build_test_scene(ChainMesh(), GravityEffect(), PinsEffect(parts=("first",), weight=1e4), size=4)
 )
 KEPT, UNTOUCHED = np.ones((2, 4, 3))
 

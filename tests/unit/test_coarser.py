@@ -16,9 +16,9 @@ from springbench.solvers.model.step_problem import StopRule, Unsupported
 from tests.scene_builders import CLOTH_SCENE_YAML
 
 
-def made(folder, mesh="{kind: grid}", pins="at: [top_corners]", size=21, integrator="implicit-euler"):
+def made(folder, mesh="{kind: grid}", pins="parts: [top_corners]", size=21, integrator="implicit-euler"):
     path = folder / "cloth.yaml"
-    text = CLOTH_SCENE_YAML.replace("{kind: grid}", mesh).replace("at: [top_corners]", pins).replace("300", "3000")
+    text = CLOTH_SCENE_YAML.replace("{kind: grid}", mesh).replace("parts: [top_corners]", pins).replace("300", "3000")
     path.write_text(text, encoding="utf-8")
     (run,) = load_config(path, solvers=["lbfgs"], sizes=[size]).list_runs()
     return build_scene(run.scene, size, integrator)
@@ -26,7 +26,7 @@ def made(folder, mesh="{kind: grid}", pins="at: [top_corners]", size=21, integra
 
 @pytest.mark.parametrize("mesh", ["{kind: chain}", "{kind: grid}", "{kind: net}", "{kind: block}"])
 def test_affine_motions_pass_between_meshes_without_change(tmp_path, mesh):
-    pins = "every: 1000"
+    pins = "stride: 1000"
     fine, coarse = (made(tmp_path, mesh, pins, size).mesh.rest_positions for size in (12, 5))
     rng = np.random.default_rng(0)
     turn, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
@@ -72,8 +72,8 @@ def test_it_goes_on_from_step_to_step(tmp_path):
     ("given", "why"),
     [
         ({"size": 16}, "smaller than 17"),
-        ({"pins": "indices: [0]"}, "effects name vertices by `indices` or `every`"),
-        ({"pins": "every: 7"}, "effects name vertices by `indices` or `every`"),
+        ({"pins": "indices: [0]"}, "effects name vertices by `indices` or `stride`"),
+        ({"pins": "stride: 7"}, "effects name vertices by `indices` or `stride`"),
         ({"integrator": "sdirk-2"}, "coarse-to-fine is for integrators with one stage per step"),
         ({"pins": "box: {low: [0.02, -1, 0.02], high: [0.03, 1, 0.03]}", "size": 41}, "no vertex of the mesh lies in"),
     ],

@@ -43,7 +43,7 @@ ROUND_OFF = 1e-14
 
 
 def named(solver: CompiledLocalGlobal) -> str:
-    return f"{solver.linear}, {solver.precision}"
+    return f"{solver.linear_solver}, {solver.precision}"
 
 
 direct = pytest.mark.parametrize("solver", DIRECT, ids=named)
@@ -254,6 +254,6 @@ def test_a_prepared_solver_says_what_it_chose_and_counts_it():
     system = build_first_problem(build_cloth(8)).system
     for solver in DIRECT:
         prepared = solver.prepare(system)
-        assert prepared.description.startswith(solver.linear)
+        assert prepared.description.startswith(solver.linear_solver)
         assert prepared.stats["factor_bytes"] > 0
         assert prepared.stats["flops_per_solve"] > 0

@@ -32,8 +32,11 @@ def slide(tangent: float, frames: int) -> tuple[np.ndarray, float]:
     accelerate."""
     angle = np.arctan(tangent)
     down = GravityEffect(acceleration=(G * np.sin(angle), -G * np.cos(angle), 0.0))
-    two, rough = StackMesh(width=0.2, height=0.2, apart=0.0202), SelfContactEffect(thickness=0.01, friction=MU)
-    lies = PinsEffect(at=("lowest",))
+    two, rough = (
+        StackMesh(width=0.2, height=0.2, layer_spacing=0.0202),
+        SelfContactEffect(min_distance=0.01, friction=MU),
+    )
+    lies = PinsEffect(parts=("lowest",))
     made = build_test_scene(two, SpringsEffect(stretch=100.0, shear=20.0), down, lies, rough, size=3, time_step=DT)
     upper = made.mesh.parts["highest"]
     steps = simulate_scene(
@@ -64,12 +67,12 @@ def test_it_converges_as_its_thickness_shrinks_and_as_its_barrier_stiffens():
 
 @pytest.mark.long
 def test_a_cloth_that_is_dropped_onto_itself_loses_energy_and_comes_to_rest():
-    floor = SurfaceContactEffect(thickness=0.01, obstacles=(PlaneObstacle(point=(0.0, -0.45, 0.0)),))
+    floor = SurfaceContactEffect(min_distance=0.01, obstacles=(PlaneObstacle(point=(0.0, -0.45, 0.0)),))
     acts = (
         SpringsEffect(stretch=100.0, shear=20.0),
         GravityEffect(),
-        EtherDragEffect(rate=3.0),
-        SelfContactEffect(thickness=0.01),
+        EtherDragEffect(decay_rate=3.0),
+        SelfContactEffect(min_distance=0.01),
         floor,
     )
     made = build_test_scene(GridMesh(plane="vertical", width=0.2, height=0.4), *acts, size=4)

@@ -52,7 +52,7 @@ def test_nothing_ends_a_step_deeper_than_the_tolerance_nor_passes_through(name, 
 @pytest.mark.parametrize("speed", [1.0, 10.0], ids="{:g} m/s".format)
 @pytest.mark.parametrize("name", ["sphere", "capsule", "plate"])
 def test_a_moving_obstacle_takes_a_resting_sheet_along(name, speed):
-    up = {"keys": [{"time": 0}, {"time": 0.2, "offset": (0, 0.2 * speed, 0)}]}
+    up = {"key_frames": [{"time": 0}, {"time": 0.2, "offset": (0, 0.2 * speed, 0)}]}
     made = build_sheet(build_contact(OBSTACLE_SPECS[name] | {"motion": up}))
     deepest = [penetration_depth(made, step.positions, step.index * TIME_STEP) for step in collect_steps(made, 8)]
     assert max(deepest) <= TOLERANCE
@@ -128,18 +128,18 @@ def test_the_momentum_that_a_sheet_loses_is_what_the_obstacle_took():
 
 def test_friction_is_what_a_moving_belt_carries_things_by():
     belt = {"kind": "plane", "point": (0, -CONTACT_THICKNESS, 0)}
-    belt |= {"motion": {"keys": [{"time": 0}, {"time": 10, "offset": (5, 0, 0)}]}}
+    belt |= {"motion": {"key_frames": [{"time": 0}, {"time": 10, "offset": (5, 0, 0)}]}}
     made = build_sheet(build_contact(belt, friction=0.5), size=4)
     last = collect_steps(made, 30)[-1]
     np.testing.assert_allclose(last.state.motion.velocity[:, 0], 0.5, rtol=1e-3)  # the springs still ring
 
 
 def net(**pins: Any) -> PinsEffect:
-    return PinsEffect.model_validate({"at": ["corners"]} | pins)
+    return PinsEffect.model_validate({"parts": ["corners"]} | pins)
 
 
 REFUSED = {
-    "thickness": ([build_contact(OBSTACLE_SPECS["plane"], thickness=0.3)], ["contact", "thickness", "springs"]),
+    "thickness": ([build_contact(OBSTACLE_SPECS["plane"], min_distance=0.3)], ["contact", "min_distance", "springs"]),
     "pin": (
         [build_contact({"kind": "sphere", "center": (0.5, 0, 0.5), "radius": 0.1}), net()],
         ["contact", "pins", "sphere"],
@@ -147,7 +147,7 @@ REFUSED = {
     "pin that moves inside": (
         [
             build_contact(OBSTACLE_SPECS["plane"]),
-            net(motion=KeyFrameMotion(keys=(KeyFrame(time=0), KeyFrame(time=2, offset=(0, -3, 0))))),
+            net(motion=KeyFrameMotion(key_frames=(KeyFrame(time=0), KeyFrame(time=2, offset=(0, -3, 0))))),
         ],
         ["contact", "pins", " s", "plane"],
     ),
@@ -171,10 +171,10 @@ def test_conflicts_are_refused_with_both_names(case):
     [
         {"obstacles": []},
         {"obstacles": [{"kind": "plane", "normal": (0, 0, 0)}]},
-        {"obstacles": [{"kind": "capsule", "ends": ((0, 0, 0), (0, 0, 0)), "radius": 1}]},
+        {"obstacles": [{"kind": "capsule", "end_points": ((0, 0, 0), (0, 0, 0)), "radius": 1}]},
         {"obstacles": [{"kind": "box", "low": (0, 0, 0), "high": (1, 0, 1)}]},
         {"obstacles": [{"kind": "sphere", "radius": -1}]},
-        {"obstacles": [{"kind": "plane"}], "thickness": 0.01, "tolerance": 0.01},
+        {"obstacles": [{"kind": "plane"}], "min_distance": 0.01, "penetration_tolerance": 0.01},
         {"obstacles": [{"kind": "plane"}], "friction": -0.1},
     ],
     ids=str,

@@ -45,7 +45,7 @@ def moving(made: Scene, velocity: Positions, steps: int, at: Positions | None = 
 
 def pendulum(drag: AirDragEffect, dt: float) -> Scene:
     """1 kg at the end of a stiff rod of 1 m; the other kilogramme is at the pivot, and so is half of the drag."""
-    pins = PinsEffect(at=("first",), weight="exact")
+    pins = PinsEffect(parts=("first",), weight="exact")
     made = build_test_scene(
         ChainMesh(direction=(0.0, -1.0, 0.0)),
         SpringsEffect(stretch=1e5),
@@ -83,7 +83,7 @@ def test_a_pendulum_in_linear_drag_decays_at_its_rate():
 def test_a_pendulum_in_quadratic_drag_decays_as_one_over_time():
     """m x'' = -k |x'| x' - m g x / l: 1/A grows by 4 k w l / (3 pi m) a second, by the work done in a period."""
     k, dt = 2.0, PERIOD / 200
-    found = amplitudes(pendulum(AirDragEffect(law="quadratic", coefficient=2 * k), dt), 5 * PERIOD, 0.01)
+    found = amplitudes(pendulum(AirDragEffect(drag_law="quadratic", coefficient=2 * k), dt), 5 * PERIOD, 0.01)
     wanted = 4 * k * G**0.5 / (3 * np.pi)
     growth = (1 / found[-1] - 1 / found[0]) / (5 * PERIOD)
     assert growth == pytest.approx(wanted, rel=0.01)  # averaging over a period errs by some k A/4
@@ -103,7 +103,7 @@ def test_linear_drag_slows_a_free_body_by_each_integrators_own_formula(integrato
 @pytest.mark.parametrize("coefficient", [0.01, 1.0, 1e6])
 def test_quadratic_drag_is_exact_at_any_time_step(coefficient):
     made = build_test_scene(
-        ChainMesh(), AirDragEffect(law="quadratic", coefficient=coefficient), size=3, mass=2.0, time_step=5.0
+        ChainMesh(), AirDragEffect(drag_law="quadratic", coefficient=coefficient), size=3, mass=2.0, time_step=5.0
     )
     v = moving(made, np.tile([3.0, 0.0, 4.0], (3, 1)), 4)[-1].velocity
     # 1/|v| grows by c/m a second,
@@ -119,9 +119,9 @@ def oscillator(*damping: SceneEffect) -> Scene:
 
 DAMPED = {
     "dashpots": (DashpotsEffect(stretch=1.5), 1.5),
-    "Rayleigh, stiffness": (RayleighEffect(stiffness=0.015), 1.5),
-    "Rayleigh, masses": (RayleighEffect(mass=3.0), 1.5),
-    "Rayleigh, both": (RayleighEffect(mass=1.0, stiffness=0.01), 1.5),
+    "Rayleigh, stiffness": (RayleighEffect(stiffness_coefficient=0.015), 1.5),
+    "Rayleigh, masses": (RayleighEffect(mass_coefficient=3.0), 1.5),
+    "Rayleigh, both": (RayleighEffect(mass_coefficient=1.0, stiffness_coefficient=0.01), 1.5),
 }
 
 
@@ -170,11 +170,16 @@ def test_dashpots_let_a_rigid_motion_alone():
 
 
 @pytest.mark.parametrize(
-    "damping", [DashpotsEffect(stretch=1e9), RayleighEffect(mass=1e9, stiffness=1e9), AirDragEffect(coefficient=1e9)]
+    "damping",
+    [
+        DashpotsEffect(stretch=1e9),
+        RayleighEffect(mass_coefficient=1e9, stiffness_coefficient=1e9),
+        AirDragEffect(coefficient=1e9),
+    ],
 )
 def test_damping_beyond_all_measure_stops_motion_and_nothing_else(damping):
     made = build_test_scene(
-        GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), damping, PinsEffect(at=("top",)), size=5
+        GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), damping, PinsEffect(parts=("top",)), size=5
     )
     velocity = np.random.default_rng(2).normal(size=made.mesh.rest_positions.shape)
     prepared, state = (
@@ -187,7 +192,7 @@ def test_damping_beyond_all_measure_stops_motion_and_nothing_else(damping):
 
 
 def test_rayleigh_damping_takes_the_matrix_of_bending():
-    made = build_test_scene(GridMesh(), BendingEffect(stiffness=2.0), RayleighEffect(stiffness=0.5), size=4)
+    made = build_test_scene(GridMesh(), BendingEffect(stiffness=2.0), RayleighEffect(stiffness_coefficient=0.5), size=4)
     bending, damping = made.system.energies
     assert isinstance(damping, RayleighDamping)
     n = len(made.mesh.rest_positions)
@@ -202,7 +207,7 @@ def test_damping_is_the_same_in_the_first_step_of_an_integrator_that_needs_a_his
         SpringsEffect(stretch=100.0),
         DashpotsEffect(stretch=1.0),
         GravityEffect(),
-        PinsEffect(at=("top",)),
+        PinsEffect(parts=("top",)),
         size=4,
     )
     euler, bdf2 = (with_integrator(made, name) for name in ("implicit-euler", "bdf2"))

@@ -106,7 +106,7 @@ def test_a_balloon_that_falls_into_nothing_stays_a_balloon():
         SpringsEffect(stretch=50.0),
         GravityEffect(),
         GasEffect(pressure=5.0),
-        PinsEffect(at=("pole_top",)),
+        PinsEffect(parts=("pole_top",)),
         size=3,
     )
     energy = made.system.energies[1]
@@ -152,7 +152,11 @@ def swollen(size: int, pressure: float) -> StepProblem:
     """A step of a balloon. At 200 Pa it swells to more than twice its radius: there the springs soften as it grows, and
     what keeps its volume is the gas, whose stiffness is the dense part of the Hessian."""
     made = build_test_scene(
-        BalloonMesh(), SpringsEffect(stretch=5.0), GasEffect(pressure=pressure), PinsEffect(at=("pole_top",)), size=size
+        BalloonMesh(),
+        SpringsEffect(stretch=5.0),
+        GasEffect(pressure=pressure),
+        PinsEffect(parts=("pole_top",)),
+        size=size,
     )
     return build_first_problem(replace(made, system=replace(made.system, time_step=0.1)))
 

@@ -27,7 +27,11 @@ from tests.scene_builders import build_test_scene
 
 POINTS = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 1.0]])
 LIFT = KeyFrameMotion(
-    keys=(KeyFrame(time=1.0), KeyFrame(time=2.0, offset=(0.0, 3.0, 0.0)), KeyFrame(time=4.0, offset=(0.0, 1.0, 0.0)))
+    key_frames=(
+        KeyFrame(time=1.0),
+        KeyFrame(time=2.0, offset=(0.0, 3.0, 0.0)),
+        KeyFrame(time=4.0, offset=(0.0, 1.0, 0.0)),
+    )
 )
 INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 
@@ -40,7 +44,7 @@ def test_points_go_straight_from_key_to_key_and_rest_before_and_after(time, heig
 
 
 def test_a_smooth_motion_goes_through_its_keys_and_never_beyond():
-    smooth = LIFT.model_copy(update={"between": "smooth"})
+    smooth = LIFT.model_copy(update={"interpolation": "smooth"})
     times = np.linspace(0.0, 5.0, 501)
     heights = np.array([smooth.transform_points(POINTS, t)[0, 1] for t in times])
     assert heights.min() == 0.0
@@ -55,7 +59,7 @@ def test_a_smooth_motion_goes_through_its_keys_and_never_beyond():
 
 def test_a_turn_is_about_its_axis():
     motion = KeyFrameMotion(
-        keys=(KeyFrame(time=0.0), KeyFrame(time=1.0, turn=180.0)), axis=(0.0, 0.0, 2.0), about=(1.0, 1.0, 5.0)
+        key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, angle=180.0)), axis=(0.0, 0.0, 2.0), pivot=(1.0, 1.0, 5.0)
     )
     np.testing.assert_allclose(motion.transform_points(np.array([[3.0, 1.0, 0.0]]), 0.5), [[1.0, 3.0, 0.0]], atol=1e-15)
     np.testing.assert_allclose(
@@ -64,7 +68,7 @@ def test_a_turn_is_about_its_axis():
 
 
 def test_a_turn_of_many_rounds_keeps_distances():
-    motion = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1.0, turn=3600.0)), axis=(1.0, 2.0, 3.0))
+    motion = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, angle=3600.0)), axis=(1.0, 2.0, 3.0))
     for t in (0.013, 0.4, 0.77):
         a, b = motion.transform_points(POINTS, t)
         assert np.linalg.norm(a - b) == pytest.approx(6**0.5, rel=1e-14)
@@ -74,11 +78,11 @@ def test_a_turn_of_many_rounds_keeps_distances():
 @pytest.mark.parametrize(
     "data",
     [
-        {"keys": []},
-        {"keys": [{"time": 1.0}, {"time": 1.0}]},
-        {"keys": [{"time": 1.0}, {"time": 0.5}]},
-        {"keys": [{"time": -1.0}]},
-        {"keys": [{"time": 0.0}], "axis": [0.0, 0.0, 0.0]},
+        {"key_frames": []},
+        {"key_frames": [{"time": 1.0}, {"time": 1.0}]},
+        {"key_frames": [{"time": 1.0}, {"time": 0.5}]},
+        {"key_frames": [{"time": -1.0}]},
+        {"key_frames": [{"time": 0.0}], "axis": [0.0, 0.0, 0.0]},
     ],
     ids=str,
 )
@@ -87,13 +91,13 @@ def test_key_frames_that_mean_nothing_are_refused(data):
         KeyFrameMotion.model_validate(data)
 
 
-SWING = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=0.3, offset=(0.2, 0.1, 0.0), turn=60.0)))
+SWING = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=0.3, offset=(0.2, 0.1, 0.0), angle=60.0)))
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("weight", [1e10, "exact"])
 def test_pins_are_on_their_path_at_the_end_of_each_step(integrator, weight):
-    pins = PinsEffect.model_validate({"at": ["top"], "weight": weight, "motion": SWING.model_dump()})
+    pins = PinsEffect.model_validate({"parts": ["top"], "weight": weight, "motion": SWING.model_dump()})
     made = with_integrator(
         build_test_scene(GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), pins, size=4), integrator
     )
@@ -108,9 +112,9 @@ def test_pins_are_on_their_path_at_the_end_of_each_step(integrator, weight):
 
 def test_a_chain_pulled_at_both_ends_gets_there():
     """Both ends go 1 m along; what hangs between them follows and comes to rest a metre further, through drag."""
-    along = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=0.5, offset=(1.0, 0.0, 0.0))))
-    pins = PinsEffect(at=("ends",), weight="exact", motion=along)
-    made = build_test_scene(ChainMesh(), SpringsEffect(stretch=100.0), pins, EtherDragEffect(rate=10.0), size=6)
+    along = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=0.5, offset=(1.0, 0.0, 0.0))))
+    pins = PinsEffect(parts=("ends",), weight="exact", motion=along)
+    made = build_test_scene(ChainMesh(), SpringsEffect(stretch=100.0), pins, EtherDragEffect(decay_rate=10.0), size=6)
     *_, last = simulate_scene(
         made, prepare(made, SparseLocalGlobal()), StopRule(50), initial_guess="previous", frames=90
     )
@@ -119,7 +123,7 @@ def test_a_chain_pulled_at_both_ends_gets_there():
 
 def test_pins_that_rest_and_pins_that_move_live_in_one_scene():
     made = build_test_scene(
-        GridMesh(), PinsEffect(at=("bottom",)), PinsEffect(at=("top",), weight="exact", motion=SWING), size=3
+        GridMesh(), PinsEffect(parts=("bottom",)), PinsEffect(parts=("top",), weight="exact", motion=SWING), size=3
     )
     targets = made.pin_targets_at(0.15)
     np.testing.assert_array_equal(made.system.pins.vertices, [0, 1, 2, 6, 7, 8])
@@ -131,9 +135,9 @@ def test_pins_that_rest_and_pins_that_move_live_in_one_scene():
 
 def test_a_vertex_pinned_to_rest_and_to_move_is_refused_with_both_names():
     with pytest.raises(InputError, match=r"vertex 0 is pinned twice, by effects\[0\] and effects\[1\]"):
-        build_test_scene(GridMesh(), PinsEffect(at=("left",)), PinsEffect(at=("top",), motion=SWING), size=3)
+        build_test_scene(GridMesh(), PinsEffect(parts=("left",)), PinsEffect(parts=("top",), motion=SWING), size=3)
     both = build_test_scene(
-        GridMesh(), PinsEffect(at=("left",), motion=SWING), PinsEffect(at=("top",), motion=SWING), size=3
+        GridMesh(), PinsEffect(parts=("left",), motion=SWING), PinsEffect(parts=("top",), motion=SWING), size=3
     )
     assert len(both.system.pins.vertices) == 5
 
@@ -150,33 +154,33 @@ def hanging(*attachments: AttachmentsEffect):
 
 
 def test_an_attachment_gives_way_by_the_weight_over_its_stiffness():
-    p = compute_rest_shape(hanging(AttachmentsEffect(at=("first",), stiffness=50.0)))
+    p = compute_rest_shape(hanging(AttachmentsEffect(parts=("first",), stiffness=50.0)))
     assert p[0, 1] == pytest.approx(-2.0 * 9.81 / 50.0, rel=1e-7)  # inertia holds with 2e-6 N/m
 
 
 def test_attachments_share_their_stiffness():
-    p = compute_rest_shape(hanging(AttachmentsEffect(every=1, indices=(0, 1, 2, 3), stiffness=50.0)))
+    p = compute_rest_shape(hanging(AttachmentsEffect(stride=1, indices=(0, 1, 2, 3), stiffness=50.0)))
     assert p.mean(axis=0)[1] - (-0.5) == pytest.approx(-2.0 * 9.81 / 50.0, rel=1e-3)  # masses are 1 2 2 1
 
 
 def test_attachments_pull_to_the_points_that_they_name():
     one, each = ((2.0, 0.0, 0.0),), ((0.0, 1.0, 0.0), (1.0, 1.0, 0.0))
-    mesh = build_test_scene(ChainMesh(), AttachmentsEffect(at=("ends",), stiffness=3.0, to=each), size=3)
+    mesh = build_test_scene(ChainMesh(), AttachmentsEffect(parts=("ends",), stiffness=3.0, anchors=each), size=3)
     np.testing.assert_allclose(compute_rest_shape(mesh)[[0, 2]], each, rtol=0, atol=1e-6)  # as above
-    mesh = build_test_scene(ChainMesh(), AttachmentsEffect(at=("ends",), stiffness=3.0, to=one), size=3)
+    mesh = build_test_scene(ChainMesh(), AttachmentsEffect(parts=("ends",), stiffness=3.0, anchors=one), size=3)
     np.testing.assert_allclose(compute_rest_shape(mesh)[[0, 2]], one * 2, rtol=0, atol=1e-6)
     with pytest.raises(InputError, match="came 2 points for 1 vertices"):
-        build_test_scene(ChainMesh(), AttachmentsEffect(at=("first",), stiffness=3.0, to=each), size=3)
+        build_test_scene(ChainMesh(), AttachmentsEffect(parts=("first",), stiffness=3.0, anchors=each), size=3)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_an_attachment_pulls_a_free_mass_behind_its_point_as_the_equation_of_motion_says(integrator):
     """m x'' = -k (x - v t): x = v (t - sin(w t) / w)."""
     speed, w, seconds = 2.0, 5.0, 1.0
-    motion = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=10.0, offset=(10 * speed, 0.0, 0.0))))
+    motion = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=10.0, offset=(10 * speed, 0.0, 0.0))))
     wanted, errors = speed * (seconds - np.sin(w * seconds) / w), []
     for dt in (0.01, 0.005, 0.0025):
-        ends = AttachmentsEffect(at=("ends",), stiffness=2 * w**2, motion=motion)
+        ends = AttachmentsEffect(parts=("ends",), stiffness=2 * w**2, motion=motion)
         made = with_integrator(build_test_scene(ChainMesh(), ends, size=2, mass=2.0, time_step=dt), integrator)
         run = simulate_scene(
             made, prepare(made, SparseLocalGlobal()), StopRule(1), initial_guess="previous", frames=round(1 / dt)
@@ -194,7 +198,7 @@ def test_what_does_nothing_is_left_out_and_the_log_says_so(caplog):
             ChainMesh(),
             SpringsEffect(stretch=1.0),
             WindEffect(strength=0.0),
-            AttachmentsEffect(at=("first",), stiffness=0.0),
+            AttachmentsEffect(parts=("first",), stiffness=0.0),
             size=3,
         )
     assert len(made.system.energies) == 1

@@ -27,12 +27,12 @@ def test_no_spring_is_beyond_the_limit_when_converged():
             GridMesh(plane="vertical"),
             SpringsEffect(stretch=10.0),
             GravityEffect(),
-            PinsEffect(at=("top",)),
+            PinsEffect(parts=("top",)),
             *limits,
             size=9,
             mass=0.5,
         )
-        for limits in ((), (StrainLimitsEffect(longest=1.1, stiffness=2e4),))
+        for limits in ((), (StrainLimitsEffect(max_stretch=1.1, stiffness=2e4),))
     )
     assert ratios(free, compute_rest_shape(free)).max() > 1.15
     stretched = ratios(limited, compute_rest_shape(limited))
@@ -47,8 +47,8 @@ def test_a_chain_at_its_limit_gives_way_by_what_the_stiffness_says():
         ChainMesh(direction=(0.0, -1.0, 0.0)),
         SpringsEffect(stretch=ea),
         GravityEffect(),
-        StrainLimitsEffect(longest=1.1, stiffness=stiff),
-        PinsEffect(at=("first",), weight="exact"),
+        StrainLimitsEffect(max_stretch=1.1, stiffness=stiff),
+        PinsEffect(parts=("first",), weight="exact"),
         size=size,
         mass=mass,
     )
@@ -59,7 +59,7 @@ def test_a_chain_at_its_limit_gives_way_by_what_the_stiffness_says():
 
 def test_springs_within_their_limits_feel_nothing():
     mesh = GridMesh().build_mesh(5)
-    limits = StrainLimitsEffect(longest=1.2, shortest=0.8, stiffness=100.0)
+    limits = StrainLimitsEffect(max_stretch=1.2, min_stretch=0.8, stiffness=100.0)
     (energy,) = limits.build_contribution(mesh, np.ones(len(mesh.rest_positions)), 0.1).energies
     for scale in (0.81, 1.0, 1.19):
         p, out = scale * mesh.rest_positions, np.zeros_like(mesh.rest_positions)
@@ -74,7 +74,7 @@ def test_springs_within_their_limits_feel_nothing():
 
 def test_a_spring_pressed_to_a_point_is_pushed_to_its_shortest_length():
     mesh = ChainMesh().build_mesh(2)
-    (energy,) = StrainLimitsEffect(shortest=0.5, stiffness=10.0).build_contribution(mesh, np.ones(2), 0.1).energies
+    (energy,) = StrainLimitsEffect(min_stretch=0.5, stiffness=10.0).build_contribution(mesh, np.ones(2), 0.1).energies
     assert isinstance(energy, strain_limit_energy.StrainLimits)
     p, out = np.zeros((2, 3)), np.zeros((2, 3))
     energy.add_gradient(p, out)
@@ -83,7 +83,9 @@ def test_a_spring_pressed_to_a_point_is_pushed_to_its_shortest_length():
     assert energy.value(p) == pytest.approx(1.25, rel=1e-14)
 
 
-@pytest.mark.parametrize("data", [{"longest": 0.9}, {"shortest": 1.1}, {"longest": 1.0, "shortest": 1.0}], ids=str)
+@pytest.mark.parametrize(
+    "data", [{"max_stretch": 0.9}, {"min_stretch": 1.1}, {"max_stretch": 1.0, "min_stretch": 1.0}], ids=str
+)
 def test_limits_that_mean_nothing_are_refused(data):
     with pytest.raises(ValidationError):
         StrainLimitsEffect.model_validate({"stiffness": 1.0, **data})

@@ -30,7 +30,7 @@ RHO, AREA = 1.2, 3.0
 def force(
     p: Positions = PLATE.rest_positions, v: Positions = STILL, t: float = 0.0, *, mass=HEAVY, dt=0.01, **wind
 ) -> Positions:
-    (blow,) = WindEffect.model_validate({"per": "triangle", **wind}).build_contribution(PLATE, mass, dt).forces
+    (blow,) = WindEffect.model_validate({"acts_on": "triangle", **wind}).build_contribution(PLATE, mass, dt).forces
     return blow(p, v, t)
 
 
@@ -42,7 +42,7 @@ def test_a_plate_feels_drag_along_the_wind_and_lift_across_it(angle):
     across = np.sign(np.cos(a)) * np.array([-np.cos(a), 0.0, np.sin(a)])
     # lift points to the side of the plate that the air leaves by
     across *= np.sign(across[2] * np.cos(a)) if abs(np.cos(a)) > 1e-9 else 1.0
-    found = force(velocity=tuple(speed * along), drag=1.1, lift=0.6).sum(axis=0)
+    found = force(velocity=tuple(speed * along), drag_coefficient=1.1, lift_coefficient=0.6).sum(axis=0)
     pressure = RHO / 2 * AREA * speed**2 * abs(np.cos(a))
     wanted = pressure * (1.1 * along + 0.6 * abs(np.sin(a)) * across)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-13 * RHO * AREA * speed**2)  # sums of 32 triangles
@@ -50,21 +50,21 @@ def test_a_plate_feels_drag_along_the_wind_and_lift_across_it(angle):
 
 def test_only_the_velocity_of_the_air_relative_to_the_triangle_counts():
     v = np.tile([1.0, -2.0, 3.0], (len(PLATE.rest_positions), 1))
-    one = force(velocity=(4.0, 1.0, 5.0), lift=0.3)
-    two = force(velocity=(5.0, -1.0, 8.0), v=v, lift=0.3)
+    one = force(velocity=(4.0, 1.0, 5.0), lift_coefficient=0.3)
+    two = force(velocity=(5.0, -1.0, 8.0), v=v, lift_coefficient=0.3)
     np.testing.assert_allclose(one, two, rtol=1e-13)
     assert not force(velocity=(1.0, -2.0, 3.0), v=v).any()
 
 
 def test_the_force_does_not_depend_on_which_way_triangles_face():
     mirrored = PLATE.rest_positions * [-1.0, 1.0, 1.0]  # their normals now point the other way
-    found, wanted = (force(p, velocity=(0.0, 0.0, 5.0), lift=0.4) for p in (mirrored, PLATE.rest_positions))
+    found, wanted = (force(p, velocity=(0.0, 0.0, 5.0), lift_coefficient=0.4) for p in (mirrored, PLATE.rest_positions))
     np.testing.assert_allclose(found, wanted, rtol=1e-13)
 
 
 def test_a_sheet_falls_at_the_speed_at_which_drag_carries_it():
     """Air at rest: m g = rho/2 A C_D v^2."""
-    wind = WindEffect(per="triangle", velocity=(0.0, 0.0, 0.0), drag=1.3)
+    wind = WindEffect(acts_on="triangle", velocity=(0.0, 0.0, 0.0), drag_coefficient=1.3)
     made = build_test_scene(
         GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), wind, size=5, mass=0.4, time_step=0.01
     )
@@ -81,15 +81,15 @@ def test_no_triangle_is_blown_faster_than_the_air():
     made = build_test_scene(
         GridMesh(),
         SpringsEffect(stretch=50.0),
-        WindEffect(per="triangle", velocity=(0.0, 100.0, 0.0)),
-        PinsEffect(at=("top",)),
+        WindEffect(acts_on="triangle", velocity=(0.0, 100.0, 0.0)),
+        PinsEffect(parts=("top",)),
         size=6,
         mass=1e-3,
     )
     run = simulate_scene(made, prepare(made, SparseLocalGlobal()), StopRule(50), initial_guess="previous", frames=60)
     for step in run:
         assert np.abs(step.state.motion.velocity).max() <= 200.0  # of the air, and of springs let loose
-    free = build_test_scene(GridMesh(), WindEffect(per="triangle", velocity=(0.0, 100.0, 0.0)), size=6, mass=1e-3)
+    free = build_test_scene(GridMesh(), WindEffect(acts_on="triangle", velocity=(0.0, 100.0, 0.0)), size=6, mass=1e-3)
     run = simulate_scene(free, prepare(free, SparseLocalGlobal()), StopRule(1), initial_guess="previous", frames=5)
     for step in run:
         speed = step.state.motion.velocity[:, 1]
@@ -98,7 +98,7 @@ def test_no_triangle_is_blown_faster_than_the_air():
 
 def test_a_closed_surface_in_a_wind_is_pushed_along_it():
     mesh = BalloonMesh().build_mesh(6)
-    wind = WindEffect(per="triangle", velocity=(10.0, 0.0, 0.0))
+    wind = WindEffect(acts_on="triangle", velocity=(10.0, 0.0, 0.0))
     (blow,) = wind.build_contribution(mesh, np.full(len(mesh.rest_positions), 1e6), 0.01).forces
     total = blow(mesh.rest_positions, np.zeros_like(mesh.rest_positions), 0.0).sum(axis=0)
     # Front and back face the air with pi r^2 each; the mesh is inside the sphere by less than 2 %.
@@ -107,7 +107,7 @@ def test_a_closed_surface_in_a_wind_is_pushed_along_it():
 
 
 def gusts(**changed) -> WindEffect:
-    return WindEffect.model_validate({"field": "gusts", "per": "triangle", "velocity": (6.0, 0.0, 8.0), **changed})
+    return WindEffect.model_validate({"field": "gusts", "acts_on": "triangle", "velocity": (6.0, 0.0, 8.0), **changed})
 
 
 def speeds(wind: WindEffect, times: np.ndarray) -> np.ndarray:
@@ -129,7 +129,7 @@ def test_gusts_are_smooth_and_their_seed_is_all_their_chance():
 
 
 def test_gusts_vary_by_their_fraction_about_the_mean():
-    found = speeds(gusts(gustiness=0.1, frequency=0.2), np.linspace(0.0, 2000.0, 4000))
+    found = speeds(gusts(turbulence_intensity=0.1, frequency=0.2), np.linspace(0.0, 2000.0, 4000))
     # The slowest wave has a twentieth of a hertz: 100 of its periods average to a hundredth of its height. The shortest
     # is 12 m long, so that the plate feels all of it in one phase, but for one part in a hundred.
     np.testing.assert_allclose(found.mean(axis=0), [6.0, 0.0, 8.0], rtol=0, atol=0.05)
@@ -139,12 +139,16 @@ def test_gusts_vary_by_their_fraction_about_the_mean():
 
 def test_gusts_of_nothing_are_the_constant_wind():
     wanted = force(velocity=(6.0, 0.0, 8.0))
-    np.testing.assert_allclose(force(velocity=(6.0, 0.0, 8.0), field="gusts", gustiness=0.0), wanted, rtol=1e-14)
+    np.testing.assert_allclose(
+        force(velocity=(6.0, 0.0, 8.0), field="gusts", turbulence_intensity=0.0), wanted, rtol=1e-14
+    )
 
 
 def test_gusts_on_vertices_have_the_force_as_their_mean():
     (blow,) = (
-        WindEffect(field="gusts", force=(2.0, 0.0, 0.0), gustiness=0.2).build_contribution(PLATE, HEAVY, 0.01).forces
+        WindEffect(field="gusts", force=(2.0, 0.0, 0.0), turbulence_intensity=0.2)
+        .build_contribution(PLATE, HEAVY, 0.01)
+        .forces
     )
     total = np.array([blow(PLATE.rest_positions, STILL, t).sum(axis=0) for t in np.linspace(0.0, 200.0, 2000)])
     # As above; the plate is as long as a fortieth to a half of the waves, which averages their height down.
@@ -164,9 +168,9 @@ def test_the_assignments_field_on_triangles_is_a_velocity():
     "wind",
     [
         {"strength": 0.0},
-        {"strength": 0.0, "per": "triangle"},
-        {"per": "triangle", "density": 0.0},
-        {"per": "triangle", "drag": 0.0, "lift": 0.0},
+        {"strength": 0.0, "acts_on": "triangle"},
+        {"acts_on": "triangle", "air_density": 0.0},
+        {"acts_on": "triangle", "drag_coefficient": 0.0, "lift_coefficient": 0.0},
         {"field": "gusts", "force": (0.0, 0.0, 0.0)},
     ],
     ids=str,
@@ -178,9 +182,9 @@ def test_wind_of_nothing_leaves_nothing(wind):
 @pytest.mark.parametrize(
     ("wind", "key"),
     [
-        ({"per": "triangle", "force": (1, 0, 0)}, "force"),
+        ({"acts_on": "triangle", "force": (1, 0, 0)}, "force"),
         ({"velocity": (1, 0, 0)}, "velocity"),
-        ({"lift": 1.0}, "lift"),
+        ({"lift_coefficient": 1.0}, "lift_coefficient"),
         ({"seed": 1}, "seed"),
         ({"field": "assignment", "force": (1, 0, 0)}, "force"),
     ],
@@ -193,4 +197,4 @@ def test_keys_that_mean_nothing_are_refused(wind, key):
 
 def test_wind_on_triangles_needs_triangles():
     with pytest.raises(InputError, match="needs triangles"):
-        WindEffect(per="triangle").build_contribution(ChainMesh().build_mesh(3), np.ones(3), 0.1)
+        WindEffect(acts_on="triangle").build_contribution(ChainMesh().build_mesh(3), np.ones(3), 0.1)

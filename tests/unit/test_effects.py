@@ -26,7 +26,7 @@ from tests.oracles.scene_declaration import SceneDeclaration
 from tests.oracles.vertex_selection import select_vertices as reference_selection
 from tests.scene_builders import build_test_scene
 
-MESH = GridMesh(width=2.0, height=1.0, skip_one=True).build_mesh(5)
+MESH = GridMesh(width=2.0, height=1.0, bend_springs=True).build_mesh(5)
 N = len(MESH.rest_positions)
 MASS = np.linspace(1.0, 2.0, N)
 DT = 0.1
@@ -40,7 +40,7 @@ ABSENT = [
     WindEffect(strength=0.0),
     WindEffect(field="assignment", strength=0.0),
     WindEffect(force=(0.0, 0.0, 0.0)),
-    EtherDragEffect(rate=0.0),
+    EtherDragEffect(decay_rate=0.0),
     SpringsEffect(stretch=0.0),
 ]
 
@@ -109,20 +109,20 @@ def test_a_constant_wind_is_spread_as_the_mass_is():
 
 
 def test_wind_per_vertex_is_the_same_on_every_vertex():
-    force = force_of(WindEffect(force=(2.0, 0.0, 4.0), per="vertex", strength=0.5))
+    force = force_of(WindEffect(force=(2.0, 0.0, 4.0), acts_on="vertex", strength=0.5))
     np.testing.assert_array_equal(force, np.tile([1.0, 0.0, 2.0], (N, 1)))
 
 
 def test_the_assignments_wind_is_its_formula():
     diagonal = np.sqrt(2.0**2 + 1.0**2)
-    for i, force in enumerate(force_of(WindEffect(field="assignment", per="vertex"))):
+    for i, force in enumerate(force_of(WindEffect(field="assignment", acts_on="vertex"))):
         phi = P[i, 0] / diagonal + T
         wanted = [3 + 1.5 * (1 + np.cos(5 * phi)), 1 + np.cos(0.3 + phi), np.sin(phi)]
         np.testing.assert_allclose(force, wanted, rtol=1e-14)  # the phase of a cosine has 1e-15
 
 
 def test_the_assignments_wind_and_force_make_its_external_force():
-    total = force_of(WindEffect(field="assignment", per="vertex")) + force_of(
+    total = force_of(WindEffect(field="assignment", acts_on="vertex")) + force_of(
         ConstantForceEffect(force=(0.0, -9.8, 0.0))
     )
     phi = P[:, 0] / MESH.bounding_box_diagonal + T
@@ -130,19 +130,19 @@ def test_the_assignments_wind_and_force_make_its_external_force():
 
 
 def test_the_assignments_wind_per_share_is_the_mean_over_the_mass():
-    each, shared = (force_of(WindEffect(field="assignment", per=per)) for per in ("vertex", "share"))
+    each, shared = (force_of(WindEffect(field="assignment", acts_on=per)) for per in ("vertex", "mass"))
     np.testing.assert_allclose(shared, MESH.mass_fractions[:, None] * each, rtol=1e-15)
 
 
 def test_ether_drag_scales_the_velocity_once_a_step():
-    (decay,) = bound(EtherDragEffect(rate=3.0)).velocity_filters
+    (decay,) = bound(EtherDragEffect(decay_rate=3.0)).velocity_filters
     np.testing.assert_allclose(decay(V), np.exp(-3.0 * DT) * V, rtol=1e-15)
 
 
 SELECTED = {
-    "a part": ({"at": ("top",)}, MESH.parts["top"]),
+    "a part": ({"parts": ("top",)}, MESH.parts["top"]),
     "two parts that overlap": (
-        {"at": ("top", "left")},
+        {"parts": ("top", "left")},
         np.union1d(MESH.parts["top"], MESH.parts["left"]),
     ),
     "vertices, in any order and twice": ({"indices": (3, 0, 3)}, [0, 3]),
@@ -150,12 +150,12 @@ SELECTED = {
         {"box": {"low": (-1.0, -1.0, -0.5), "high": (0.0, 0.0, -0.5)}},
         [0, 1, 2],
     ),
-    "a part and vertices": ({"at": ("top_corners",), "indices": (7,)}, [0, 4, 7]),
+    "a part and vertices": ({"parts": ("top_corners",), "indices": (7,)}, [0, 4, 7]),
     "a ball, its surface included": ({"sphere": {"center": (0.0, 0.0, -0.5), "radius": 0.5}}, [1, 2, 3, 7]),
-    "what is nearest, the first of two alike": ({"nearest": ((0.0, 9.0, -0.5), (0.25, 0.0, -9.0))}, [2]),
-    "the boundary": ({"loops": (0,)}, MESH.parts["boundary"]),
-    "every third of all": ({"every": 3}, np.arange(N)[::3]),
-    "every second of a part": ({"at": ("top",), "every": 2}, [0, 2, 4]),
+    "what is nearest, the first of two alike": ({"nearest_to": ((0.0, 9.0, -0.5), (0.25, 0.0, -9.0))}, [2]),
+    "the boundary": ({"boundary_loops": (0,)}, MESH.parts["boundary"]),
+    "every third of all": ({"stride": 3}, np.arange(N)[::3]),
+    "every second of a part": ({"parts": ("top",), "stride": 2}, [0, 2, 4]),
 }
 
 
@@ -167,12 +167,12 @@ def test_pins_hold_what_their_selectors_name(case):
 
 @pytest.mark.parametrize(("weight", "wanted"), [(5.0, 5.0), ("exact", np.inf)])
 def test_pins_have_their_weight(weight, wanted):
-    (pin,) = bound(PinsEffect(at=("top",), weight=weight)).pins
+    (pin,) = bound(PinsEffect(parts=("top",), weight=weight)).pins
     assert pin.weight == wanted
 
 
 def test_pins_weigh_what_the_assignments_do_unless_told():
-    (pin,) = bound(PinsEffect(at=("top",))).pins
+    (pin,) = bound(PinsEffect(parts=("top",))).pins
     assert pin.weight == 1e10
 
 
@@ -188,9 +188,9 @@ HOLED = replace(
 @pytest.mark.parametrize(
     ("selectors", "wanted"),
     [
-        ({"loops": (1,)}, [6, 7, 11, 13, 17, 18]),
+        ({"boundary_loops": (1,)}, [6, 7, 11, 13, 17, 18]),
         ({"holes": (0,)}, [6, 7, 11, 13, 17, 18]),
-        ({"holes": (0,), "every": 2}, [6, 11, 17]),
+        ({"holes": (0,), "stride": 2}, [6, 11, 17]),
         ({"attribute": {"name": "weight", "low": 0.9}}, [23, 24]),
         ({"attribute": {"name": "weight", "high": 0.08}, "indices": (9,)}, [0, 1, 2, 9]),
     ],
@@ -207,7 +207,7 @@ def test_holes_and_numbers_of_a_file_select_the_vertices_of_the_reference(select
 def test_a_holeless_sheet_and_unknown_numbers_are_refused():
     for selectors, told in (
         ({"holes": (0,)}, "the mesh has 0 holes"),
-        ({"loops": (1,)}, "the mesh has 1 boundary loops"),
+        ({"boundary_loops": (1,)}, "the mesh has 1 boundary loops"),
         ({"attribute": {"name": "heat"}}, "came 'heat'; this mesh has none"),
         ({"sphere": {"center": (9.0, 0.0, 0.0), "radius": 0.1}}, "no vertex of the mesh lies in the sphere"),
     ):
@@ -216,11 +216,19 @@ def test_a_holeless_sheet_and_unknown_numbers_are_refused():
 
 
 def test_selectors_that_are_not_used_are_not_written_down():
-    assert set(PinsEffect(at=("top",)).model_dump()) == {"at", "indices", "box", "every", "kind", "weight", "motion"}
+    assert set(PinsEffect(parts=("top",)).model_dump()) == {
+        "parts",
+        "indices",
+        "box",
+        "stride",
+        "kind",
+        "weight",
+        "motion",
+    }
 
 
 REFUSED = {
-    "an unknown part": ({"at": ("topp",)}, "did you mean 'top'"),
+    "an unknown part": ({"parts": ("topp",)}, "did you mean 'top'"),
     "a vertex beyond the last": ({"indices": (0, N)}, f"came {N}; the mesh has the vertices 0 to {N - 1}"),
     "an empty box": ({"box": {"low": (5.0, 5.0, 5.0), "high": (6.0, 6.0, 6.0)}}, "no vertex of the mesh lies in"),
 }
@@ -235,7 +243,7 @@ def test_pins_that_do_not_fit_the_mesh_are_refused(case):
 
 @pytest.mark.parametrize(
     "data",
-    [{}, {"every": 1}, {"indices": [-1]}, {"at": ["top"], "weight": 0}, {"at": ["top"], "weight": "hard"}],
+    [{}, {"stride": 1}, {"indices": [-1]}, {"parts": ["top"], "weight": 0}, {"parts": ["top"], "weight": "hard"}],
     ids=str,
 )
 def test_pins_that_mean_nothing_are_refused(data):
@@ -253,7 +261,7 @@ def test_springs_take_the_stiffness_of_their_rule():
 
 
 def test_springs_shear_as_they_stretch_unless_told():
-    (energy,) = bound(SpringsEffect(stretch=100.0, rule="fixed")).energies
+    (energy,) = bound(SpringsEffect(stretch=100.0, scaling_rule="fixed")).energies
     assert isinstance(energy, SpringsEnergy)
     assert set(energy.stiffness) == {100.0}
 
@@ -265,6 +273,6 @@ def test_springs_of_no_stiffness_are_left_out():
 
 
 def test_the_reference_size_sets_the_stiffness_of_liu2013():
-    (energy,) = bound(SpringsEffect(stretch=100.0, rule="liu2013", reference=9)).energies
+    (energy,) = bound(SpringsEffect(stretch=100.0, scaling_rule="liu2013", reference_size=9)).energies
     assert isinstance(energy, SpringsEnergy)
     assert energy.stiffness[0] == 100.0 * (5 - 1) / (9 - 1)

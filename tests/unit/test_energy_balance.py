@@ -42,7 +42,7 @@ from tests.scene_builders import build_test_scene
 
 G, DT, CLOSE = 9.81, 0.1, 1e-9
 """Of gravity [m/s^2], a time step [s], and what sums and solves lose of a joule."""
-PULL = {"keys": [{"time": 0}, {"time": DT, "offset": [-0.2, 0, 0]}]}
+PULL = {"key_frames": [{"time": 0}, {"time": DT, "offset": [-0.2, 0, 0]}]}
 """The pinned end of a chain along x is drawn away from it by 0.2 m in the first step."""
 
 
@@ -52,7 +52,7 @@ def chain(*effects: Any, time_step: float = DT, **settings: Any) -> Scene:
 
 
 def held(weight: str | float = "exact", **settings: Any) -> PinsEffect:
-    return PinsEffect.model_validate({"at": ["first"], "weight": weight, **settings})
+    return PinsEffect.model_validate({"parts": ["first"], "weight": weight, **settings})
 
 
 def taken(bound: Scene, frames: int) -> list[SimulationStep]:
@@ -90,7 +90,7 @@ def test_free_fall_by_implicit_euler_loses_what_its_formula_says():
 
 
 def test_a_vibration_by_midpoint_has_the_energy_that_it_began_with():
-    bound = by_midpoint(chain(SpringsEffect(stretch=50.0, rule="fixed"), held(), velocity=(0.5, 0.0, 0.0)))
+    bound = by_midpoint(chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"), held(), velocity=(0.5, 0.0, 0.0)))
     before = 1.0
     for step, found in zip(taken(bound, 6), balances(bound, 6), strict=True):
         now = step.positions[1, 0]
@@ -104,14 +104,14 @@ def test_a_vibration_by_midpoint_has_the_energy_that_it_began_with():
 def test_a_pin_that_moves_gives_its_force_times_its_way(weight: str | float, inertia: float):
     """The free end follows by u = k d/(m/dt^2 + k), so that the spring pulls with k (d - u); what a penalty holds has
     its inertia as well, m d/dt^2."""
-    (found,) = balances(chain(SpringsEffect(stretch=50.0, rule="fixed"), held(weight, motion=PULL)), 1)
+    (found,) = balances(chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"), held(weight, motion=PULL)), 1)
     pull = 50.0 * 0.2 * (1.0 - 50.0 / (1.0 / DT**2 + 50.0))
     assert found.available_energy == pytest.approx(ROUNDOFF_SAFETY * 0.2 * (pull + inertia), rel=1e-6)
     assert found.gain < 0.0
 
 
 def test_points_that_move_give_the_energy_of_their_springs():
-    tied = AttachmentsEffect.model_validate({"at": ["first"], "stiffness": 50.0, "motion": PULL})
+    tied = AttachmentsEffect.model_validate({"parts": ["first"], "stiffness": 50.0, "motion": PULL})
     first, second = balances(chain(tied), 2)
     assert first.available_energy == pytest.approx(0.5 * 50.0 * 0.2**2, rel=1e-9)
     assert second.available_energy == pytest.approx(first.available_energy, rel=1e-9)
@@ -145,7 +145,7 @@ def test_a_filter_that_speeds_up_is_a_source():
 
 def test_stored_energy_counts_where_a_spring_is_longer_than_twice_its_length():
     """A stiff spring that a solve leaves too long stores much, and moves nothing: 10 s are for a slow way there."""
-    bound = chain(SpringsEffect(stretch=1e9, rule="fixed"), GravityEffect(), held(), time_step=10.0)
+    bound = chain(SpringsEffect(stretch=1e9, scaling_rule="fixed"), GravityEffect(), held(), time_step=10.0)
     (step,) = taken(bound, 1)
     for length, grows in ((1.5, False), (2.5, True)):
         p = np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]])
@@ -162,7 +162,7 @@ def test_a_motion_counts_whatever_velocity_a_solver_claims():
 
 
 def test_round_off_is_no_gain():
-    bound = chain(SpringsEffect(stretch=50.0, rule="fixed"))
+    bound = chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"))
     (step,) = taken(bound, 1)
     p = step.problem.current_positions * (1.0 + 4.0 * np.finfo(float).eps)
     v = (p - step.problem.current_positions) / DT
@@ -200,10 +200,10 @@ time_step: 1/10
 frames: 50
 default_size: 2
 effects:
-  - {kind: springs, rule: fixed, stretch: 10}
-  - {kind: strain-limits, rule: fixed, longest: 1.05, stiffness: 1e4}
+  - {kind: springs, scaling_rule: fixed, stretch: 10}
+  - {kind: strain-limits, scaling_rule: fixed, max_stretch: 1.05, stiffness: 1e4}
   - {kind: gravity}
-  - {kind: pins, at: [first], weight: exact}
+  - {kind: pins, parts: [first], weight: exact}
 """
 """A mass that falls into a stiff limit again and again."""
 OPTIONS = "options: {frames: 50, rtol: 1e-8, record: %s, pictures: false, timing: %s, integrator: %s}\n"

@@ -49,7 +49,7 @@ mesh: {kind: net, width: 2.0, height: 2.0}
 mass: 2.0
 time_step: 1/30
 frames: 3
-effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [corners]}]
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, parts: [corners]}]
 """
 
 
@@ -59,7 +59,11 @@ def made(*effects: Any, mesh: Any = None, size: int = 4, integrator: str = "subs
     return build_scene(spec, size, integrator)
 
 
-HANGING = SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), PinsEffect.model_validate({"at": ["top_corners"]})
+HANGING = (
+    SpringsEffect(stretch=300.0, shear=60.0),
+    GravityEffect(),
+    PinsEffect.model_validate({"parts": ["top_corners"]}),
+)
 
 
 def ready(name: str, system: System, **parameters: Any) -> PreparedEngine:
@@ -105,7 +109,7 @@ def test_what_an_engine_cannot_express_it_refuses_by_name(name: str):
 
 def test_drag_that_an_engine_does_not_have_is_refused():
     with pytest.raises(Unsupported, match="pypbd: expresses springs; the scene has EtherDrag as well"):
-        load_target(OPTIONAL_SOLVERS["pypbd"])().prepare(made(*HANGING, EtherDragEffect(rate=1.0)).system)
+        load_target(OPTIONAL_SOLVERS["pypbd"])().prepare(made(*HANGING, EtherDragEffect(decay_rate=1.0)).system)
 
 
 def semi_implicit(scene: Scene, stated: StepProblem, substeps: int, damping: float) -> tuple[Positions, Positions]:
@@ -132,8 +136,8 @@ def semi_implicit(scene: Scene, stated: StepProblem, substeps: int, damping: flo
 @pytest.mark.parametrize(("integrator", "damping"), [("Euler", 0.5), ("implicitfast", 0.0), ("implicit", 0.0)])
 def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, damping: float):
     parts = (
-        SpringsEffect(rule="fixed", stretch=300.0),
-        DashpotsEffect(rule="fixed", stretch=damping),
+        SpringsEffect(scaling_rule="fixed", stretch=300.0),
+        DashpotsEffect(scaling_rule="fixed", stretch=damping),
         GravityEffect(),
         HANGING[2],
     )
@@ -142,7 +146,7 @@ def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, dampi
     wind = replace(
         stated, external_force=stated.external_force + np.random.default_rng(0).normal(size=stated.external_force.shape)
     )
-    prepared = ready("mujoco", scene.system, integrator=integrator)
+    prepared = ready("mujoco", scene.system, mujoco_integrator=integrator)
     for one in stated, wind:
         found = prepared.solve(one, StopRule(20))
         p, v = semi_implicit(scene, one, 20, damping)
@@ -154,7 +158,7 @@ def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, dampi
 
 
 def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
-    scene = made(GravityEffect(), EtherDragEffect(rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
+    scene = made(GravityEffect(), EtherDragEffect(decay_rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
     found = ready("mujoco", scene.system).solve(
         build_problem(scene, build_initial_state(scene), "previous"), StopRule(400)
     )
@@ -166,7 +170,7 @@ def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
 
 @pytest.mark.parametrize("substeps", [1, 7])
 def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
-    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
     scene = made(SpringsEffect(stretch=500.0), GravityEffect(), pins, mesh=ChainMesh(), size=2)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("pypbd", scene.system).solve(stated, StopRule(substeps))
@@ -178,13 +182,13 @@ def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
 @pytest.mark.parametrize(
     ("parameters", "substeps", "wanted"),
     [
-        ({"method": "vbd", "iterations": 300}, 1, "converged"),
-        ({"method": "semi-implicit"}, 20, "semi-implicit"),
-        ({"method": "xpbd", "iterations": 1}, 7, "xpbd"),
+        ({"newton_solver": "vbd", "iterations_per_substep": 300}, 1, "converged"),
+        ({"newton_solver": "semi-implicit"}, 20, "semi-implicit"),
+        ({"newton_solver": "xpbd", "iterations_per_substep": 1}, 7, "xpbd"),
     ],
 )
 def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, Any], substeps: int, wanted: str):
-    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
     size, velocity = (2 if wanted == "xpbd" else 4), (0.3, 0.1, -0.2)  # its XPBD moves along all springs at once
     effects = SpringsEffect(stretch=500.0), GravityEffect(), pins
     scene = made(*effects, mesh=ChainMesh(), size=size, velocity=velocity)
@@ -203,10 +207,10 @@ def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, A
 
 
 def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linearised_step():
-    effects = HANGING[:2], PinsEffect.model_validate({"at": ["top_corners"], "weight": "exact"})
+    effects = HANGING[:2], PinsEffect.model_validate({"parts": ["top_corners"], "weight": "exact"})
     scene = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2))
     stated = build_problem(scene, build_initial_state(scene), "previous")
-    found = ready("taichi", scene.system, iterations=30, tolerance=1e-9).solve(stated, StopRule(1)).positions
+    found = ready("taichi", scene.system, iterations_per_substep=30, cg_rtol=1e-9).solve(stated, StopRule(1)).positions
     same = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2), integrator="implicit-euler")
     should = (
         load_target(SOLVERS["newton"])()
@@ -214,7 +218,7 @@ def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linea
         .solve(build_problem(same, build_initial_state(same), "previous"), StopRule(100, 1e-12))
     )
     np.testing.assert_allclose(found, should.positions, rtol=0, atol=1e-9)
-    once = ready("taichi", scene.system, iterations=1).solve(stated, StopRule(1)).positions
+    once = ready("taichi", scene.system, iterations_per_substep=1).solve(stated, StopRule(1)).positions
     assert (
         1e-6 < np.abs(once - should.positions).max() < 0.3 * np.abs(should.positions - stated.current_positions).max()
     )
@@ -223,7 +227,7 @@ def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linea
 def test_all_of_a_net_is_one_colour_to_newton_physics_which_sees_no_springs():
     ready("newton-physics", made(*HANGING).system)
     for colours, told in (("newton", "1 colours"), ("springs", "4 colours")):
-        prepared = ready("newton-physics", made(*HANGING).system, colours=colours)
+        prepared = ready("newton-physics", made(*HANGING).system, colouring_source=colours)
         assert told in prepared.description
 
 
@@ -237,7 +241,7 @@ def test_newton_physics_says_where_there_is_no_device():
 @engines
 @pytest.mark.parametrize("weight", [1e10, "exact"])
 def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_number(name: str, weight: float | str):
-    pins = PinsEffect.model_validate({"at": ["top_corners"], "weight": weight})
+    pins = PinsEffect.model_validate({"parts": ["top_corners"], "weight": weight})
     scene = made(*HANGING[:2], pins)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     prepared = ready(name, scene.system)

@@ -38,7 +38,7 @@ from springbench.solvers.model.step_problem import StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
 END, ONCE = 0.3, StopRule(1)
-HELD, SOFT = PinsEffect(at=("first",), weight="exact"), SpringsEffect(stretch=20.0)
+HELD, SOFT = PinsEffect(parts=("first",), weight="exact"), SpringsEffect(stretch=20.0)
 METHODS = {
     "velocity-verlet": (2, 16),
     "blanes-moan-4": (4, 8),
@@ -50,9 +50,9 @@ METHODS = {
 """Order, and substeps to begin with."""
 EFFECTS: dict[str, tuple[Any, ...]] = {
     "none": (),
-    "ether drag": (EtherDragEffect(rate=3.0),),
+    "ether drag": (EtherDragEffect(decay_rate=3.0),),
     "air": (AirDragEffect(coefficient=2.0),),
-    "Rayleigh's damping of masses": (RayleighEffect(mass=1.5),),
+    "Rayleigh's damping of masses": (RayleighEffect(mass_coefficient=1.5),),
 }
 
 
@@ -106,7 +106,7 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
     scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
     errors = [
-        truth("none").measure_error(0, run(scene, prepared(name, scene, error=asked), 3)[-1].positions)
+        truth("none").measure_error(0, run(scene, prepared(name, scene, error_tolerance=asked), 3)[-1].positions)
         for asked in (1e-4, 1e-6, 1e-8, 1e-10)
     ]
     assert errors[0] < 1e-3
@@ -116,7 +116,7 @@ def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
 
 def test_it_agrees_with_an_implicit_integrator():
     """Bending is a force as well; SDIRK of order 4 has it as an energy."""
-    pins = PinsEffect(at=("top_corners",), weight="exact")
+    pins = PinsEffect(parts=("top_corners",), weight="exact")
     effects = (SpringsEffect(stretch=5.0), BendingEffect(stiffness=1e-3), GravityEffect(), pins)
     scene = made(*effects, mesh=GridMesh(), time_step=0.02)
     other = build_scene(SceneSpec(mesh=GridMesh(), mass=1.0, frames=1, path=Path("scene.yaml"), effects=effects,
@@ -125,14 +125,14 @@ def test_it_agrees_with_an_implicit_integrator():
         other, prepare(other, NewtonSolver()), StopRule(100, 1e-12), initial_guess="extrapolated", frames=5
     )
     wanted = [step.positions for step in path][-1]
-    found = run(scene, prepared("dormand-prince-8", scene, error=1e-9), 5)[-1].positions
+    found = run(scene, prepared("dormand-prince-8", scene, error_tolerance=1e-9), 5)[-1].positions
     moved = np.abs(wanted - scene.mesh.rest_positions).max()
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-4 * moved)  # the error of order 4 at these steps
 
 
 @pytest.mark.parametrize("name", ["velocity-verlet", "blanes-moan-4", "blanes-moan-6"])
 def test_the_energy_of_symplectic_methods_stays_near_over_a_hundred_thousand_steps(name):
-    scene = made(SpringsEffect(rule="fixed", stretch=25.0), size=3, time_step=1.0)
+    scene = made(SpringsEffect(scaling_rule="fixed", stretch=25.0), size=3, time_step=1.0)
     ready, substeps = prepared(name, scene), 2000
     h = 0.25 / ready.substep_choice.num_substeps  # of the longest that is stable
     system = replace(scene.system, time_step=substeps * h)
@@ -184,7 +184,7 @@ def test_what_it_does_not_know_is_refused_by_name():
     with pytest.raises(Unsupported, match=r"dormand-prince-8.*Dashpots"):
         prepared("dormand-prince-8", scene)
     with pytest.raises(Unsupported, match="1e-14 to 1"):
-        prepared("tsitouras-5", made(SOFT), error=0.0)
+        prepared("tsitouras-5", made(SOFT), error_tolerance=0.0)
 
 
 def test_an_error_that_no_step_keeps_ends_with_the_part_of_the_frame_that_was_reached():

@@ -83,8 +83,10 @@ def test_all_solvers_fit_a_page(tmp_path: Path, width: float) -> None:
 def test_a_solver_of_two_settings_has_a_column_for_each(tmp_path: Path) -> None:
     folder = priced(tmp_path, ["newton", "numba"], "", {})
     table = read_ablation(folder / "ablation" / "cloth.parquet")
-    graded = [row | {"parameters": '{"indefinite": "graded"}', "overhead_ratio": 9.0} for row in table[:4]]
+    graded = [
+        row | {"parameters": '{"indefinite_strategy": "shift-schedule"}', "overhead_ratio": 9.0} for row in table[:4]
+    ]
     made.write_result_rows(folder / "ablation" / "other.parquet", graded, ABLATION_SCHEMA)
     figure, (grid,) = compose_kind("prices", folder, FigureOptions())
-    assert {cell.column for cell in grid.cells} == {"newton", "newton, indefinite graded", "numba"}
+    assert {cell.column for cell in grid.cells} == {"newton", "newton, indefinite_strategy shift-schedule", "numba"}
     assert find_layout_faults(figure) == []

@@ -53,7 +53,7 @@ TAKE = ("sparse", "numba", "anderson", "chebyshev", "lbfgs", "vbd", "avbd", "hyb
 
 def pebble(friction: float, dt: float = 1 / 60, integrator: str = "implicit-euler", **more: Any) -> Scene:
     """A vertex of 1 kg at rest on a slope, just not pressed."""
-    ground = {"obstacles": [{"kind": "plane", "point": (0.0, -THICKNESS, 0.0)}], "thickness": THICKNESS}
+    ground = {"obstacles": [{"kind": "plane", "point": (0.0, -THICKNESS, 0.0)}], "min_distance": THICKNESS}
     rough = ContactEffect.model_validate(ground | {"friction": friction} | more)
     return with_integrator(
         build_test_scene(NetworkMesh(positions=((0.0, 0.0, 0.0),)), DOWN, rough, size=0, time_step=dt), integrator
@@ -74,7 +74,7 @@ def patch(
     friction: float, surface: Any = SURFACES["mesh"], down: GravityEffect = DOWN, integrator: str = "implicit-euler"
 ) -> Scene:
     """A small sheet in the range of a slope's barrier."""
-    rough = SurfaceContactEffect(thickness=0.01, friction=friction, stiffness=1000.0, obstacles=(surface,))
+    rough = SurfaceContactEffect(min_distance=0.01, friction=friction, barrier_stiffness=1000.0, obstacles=(surface,))
     springs = SpringsEffect(stretch=100.0, shear=20.0)
     made = build_test_scene(GridMesh(width=0.2, height=0.2), springs, down, rough, size=2, time_step=1 / 60)
     return with_integrator(made, integrator)
@@ -155,15 +155,15 @@ def test_a_slide_converges_with_order_1_by_implicit_euler():
 
 @pytest.mark.parametrize("dt", [1 / 60, 1 / 960])
 def test_what_sticks_creeps_at_a_speed_whatever_the_step(dt):
-    """A vertex at y times `creep` is pulled back by y times the limit of friction."""
-    last = steps(pebble(STICKS, dt, creep=2e-4), 16)[-1]
+    """A vertex at y times `eps_v` is pulled back by y times the limit of friction."""
+    last = steps(pebble(STICKS, dt, eps_v=2e-4), 16)[-1]
     assert last.state.motion.velocity[0, 0] == pytest.approx(SLOPE / STICKS * 2e-4, rel=1e-3)
 
 
 def test_a_sheet_on_a_sheet_has_the_steps_own_pressure_too():
     """Momentum law of the upper sheet, from its first step in range on."""
-    rough = SelfContactEffect(thickness=0.01, friction=SLIPS)
-    two = StackMesh(width=0.2, height=0.2, apart=0.0186)
+    rough = SelfContactEffect(min_distance=0.01, friction=SLIPS)
+    two = StackMesh(width=0.2, height=0.2, layer_spacing=0.0186)
     made = build_test_scene(two, SpringsEffect(stretch=100.0, shear=20.0), rough, size=2, time_step=1 / 60)
     upper = made.mesh.parts["highest"]
     velocity = np.zeros_like(made.mesh.rest_positions)
@@ -181,9 +181,9 @@ def test_a_sheet_on_a_sheet_has_the_steps_own_pressure_too():
 
 def test_a_floor_that_slides_and_rises_takes_a_sheet_along_from_the_first_step_on():
     """At 0.5 m/s and 0.1 m/s: friction accelerates the sheet by mu times the normal force where the floor then is."""
-    belt = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=10.0, offset=(5.0, 1.0, 0.0))))
+    belt = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=10.0, offset=(5.0, 1.0, 0.0))))
     floor = SurfaceContactEffect(
-        thickness=0.01, friction=0.2, obstacles=(SURFACES["mesh"].model_copy(update={"motion": belt}),)
+        min_distance=0.01, friction=0.2, obstacles=(SURFACES["mesh"].model_copy(update={"motion": belt}),)
     )
     springs, down = SpringsEffect(stretch=100.0, shear=20.0), GravityEffect()
     made = build_test_scene(GridMesh(width=0.2, height=0.2), springs, down, floor, size=2, time_step=1 / 60)
@@ -208,7 +208,7 @@ def solves(made: Scene, frames: int) -> tuple[list[StepProblem], list[Simulation
 
 
 def test_rounds_are_done_where_friction_acts_and_nowhere_else():
-    for made, rounds in ((pebble(0.0), 0), (pebble(SLIPS, friction_rounds=1), 1)):
+    for made, rounds in ((pebble(0.0), 0), (pebble(SLIPS, friction_iterations=1), 1)):
         problems, run = solves(made, 3)
         assert len(problems) == 3
         assert all(problem.step_start.normal_force_positions is None for problem in problems)
@@ -276,7 +276,7 @@ def test_rounds_that_repeat_end_where_most_friction_acts_and_say_what_is_left(cy
 
 @pytest.mark.parametrize("factor", [-0.5, 0.5, -0.9])
 def test_rounds_that_converge_however_slowly_are_not_cut_short(factor):
-    made = pebble(SLIPS, friction_rounds=20)
+    made = pebble(SLIPS, friction_iterations=20)
     recited: Any = Recited(*((2e-3, -2e-3 * (1.0 + 0.5 * factor**k)) for k in range(20)))
     solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "previous"), EXACTLY)
     assert solved.convergence is not None
@@ -287,7 +287,7 @@ def test_rounds_that_converge_however_slowly_are_not_cut_short(factor):
 def test_a_sheet_on_a_slope_with_very_large_friction_takes_few_rounds():
     """A corner that touches first alternates between sticking out of range and sliding in range."""
     slope = PlaneObstacle(point=(0.0, -0.32, 0.0), normal=(0.5, 1.0, 0.0))
-    rough = SurfaceContactEffect(thickness=0.01, friction=1e3, obstacles=(slope,))
+    rough = SurfaceContactEffect(min_distance=0.01, friction=1e3, obstacles=(slope,))
     made = build_test_scene(
         GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), rough, size=6, time_step=1 / 30
     )

@@ -36,7 +36,12 @@ SPEC = SceneSpec(
     time_step=1 / 30,
     frames=FRAMES,
     velocity=(0.0, 0.0, 0.5),
-    effects=(SpringsEffect(stretch=100.0), GravityEffect(), EtherDragEffect(rate=0.5), PinsEffect(at=("top_corners",))),
+    effects=(
+        SpringsEffect(stretch=100.0),
+        GravityEffect(),
+        EtherDragEffect(decay_rate=0.5),
+        PinsEffect(parts=("top_corners",)),
+    ),
     path=Path("scene.yaml"),
 )
 SIZE = 4
@@ -126,7 +131,7 @@ def test_the_first_guess_is_chosen_at_use(tmp_path):
 
 
 def test_a_first_guess_beyond_an_obstacle_is_where_the_step_starts(tmp_path):
-    below = SurfaceContactEffect(thickness=0.01, obstacles=(PlaneObstacle(point=(0.0, -0.05, 0.0)),))
+    below = SurfaceContactEffect(min_distance=0.01, obstacles=(PlaneObstacle(point=(0.0, -0.05, 0.0)),))
     spec = changed(effects=(SpringsEffect(stretch=50.0), GravityEffect(), below), velocity=(0.0, -8.0, 0.0))
     made = build_exact_scene(spec, 3)
     state = build_initial_state(made)

@@ -32,7 +32,7 @@ frames: 3
 default_size: 4
 effects:
   - {kind: springs, stretch: 100}
-  - {kind: pins, at: [first]}
+  - {kind: pins, parts: [first]}
 """
 
 
@@ -40,7 +40,7 @@ effects:
     "obstacle",
     [
         SphereObstacle(center=(1.0, 2.0, 3.0), radius=0.5),
-        CapsuleObstacle(ends=((0.0, 0.0, 0.0), (1.0, 1.0, 0.0)), radius=0.2),
+        CapsuleObstacle(end_points=((0.0, 0.0, 0.0), (1.0, 1.0, 0.0)), radius=0.2),
         BoxObstacle(low=(-1.0, 0.0, 0.0), high=(1.0, 0.5, 2.0)),
         PlaneObstacle(point=(0.0, 1.0, 0.0), normal=(1.0, 1.0, 0.0)),
     ],
@@ -57,7 +57,7 @@ def test_what_is_drawn_of_an_obstacle_is_its_surface(obstacle):
 
 
 def test_an_obstacle_is_drawn_where_it_has_moved_to():
-    moves = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=2.0, offset=(0.0, 4.0, 0.0))))
+    moves = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=2.0, offset=(0.0, 4.0, 0.0))))
     made = build_obstacle_mesh(SphereObstacle(radius=1.0, motion=moves), 1.0, SEEN)
     assert made is not None
     assert np.asarray(made.points).mean(axis=0) == pytest.approx([0.0, 2.0, 0.0], abs=1e-5)  # single precision

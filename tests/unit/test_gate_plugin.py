@@ -22,7 +22,7 @@ mass: 0.3
 time_step: 1/30
 frames: 30
 default_size: 6
-effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, at: [top_corners]}]
+effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, parts: [top_corners]}]
 """
 
 SPIN = """

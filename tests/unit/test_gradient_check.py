@@ -147,7 +147,7 @@ mass: 1
 time_step: 0.03
 frames: 2
 default_size: 4
-effects: [{{kind: gravity}}, {{kind: springs, stretch: 100}}, {{kind: pins, at: [left]}}{more}]
+effects: [{{kind: gravity}}, {{kind: springs, stretch: 100}}, {{kind: pins, parts: [left]}}{more}]
 """
 USER_CODE = """
 from typing import Literal

@@ -28,7 +28,7 @@ from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem
 from tests.self_contact_scenes import build_touching_sheets
 
-OTHERS = [name for name in get_args(IndefiniteStrategy) if name != "graded"]
+OTHERS = [name for name in get_args(IndefiniteStrategy) if name != "shift-schedule"]
 others = pytest.mark.parametrize("rule", OTHERS)
 
 FILTERS = {"clamp": lambda x: np.maximum(x, 0.0), "absolute": np.abs}
@@ -193,7 +193,10 @@ def test_all_rules_leave_a_saddle(rule):
 @others
 def test_energies_without_elements_are_refused_by_name(rule):
     made = EFFECT_SCENES["gas"]()
-    with pytest.raises(Unsupported, match=f"newton, indefinite: {rule}: .*none of Gas; take indefinite: graded"):
+    with pytest.raises(
+        Unsupported,
+        match=f"newton, indefinite_strategy: {rule}: .*none of Gas; take indefinite_strategy: shift-schedule",
+    ):
         NewtonSolver(rule).prepare(made.system)
 
 

@@ -94,7 +94,7 @@ def powers(name: str, z: complex) -> np.ndarray:
 def test_a_mass_on_a_spring_turns_by_the_methods_own_powers(name, stiffness):
     """Along its axis the spring is linear, and w = v + i omega u turns as w' = i omega w."""
     speed, omega = 0.3, np.sqrt(stiffness)
-    springs, pins = SpringsEffect(rule="fixed", stretch=stiffness), PinsEffect(at=("first",), weight="exact")
+    springs, pins = SpringsEffect(scaling_rule="fixed", stretch=stiffness), PinsEffect(parts=("first",), weight="exact")
     made = by(build_test_scene(ChainMesh(), springs, pins, size=2, mass=2.0, velocity=(speed, 0.0, 0.0)), name)
     found = motions(made)
     w = speed * powers(name, 1j * omega * DT)
@@ -107,7 +107,7 @@ def test_a_mass_on_a_spring_turns_by_the_methods_own_powers(name, stiffness):
 def orbit(name: str, time_step: float) -> np.ndarray:
     """The angular momenta of a mass that circles a pin on a spring of no rest length, which is linear."""
     omega = 4.0
-    pins, springs = PinsEffect(at=("first",), weight="exact"), SpringsEffect(rule="fixed", stretch=omega**2)
+    pins, springs = PinsEffect(parts=("first",), weight="exact"), SpringsEffect(scaling_rule="fixed", stretch=omega**2)
     made = by(
         build_test_scene(ChainMesh(), springs, pins, size=2, mass=2.0, time_step=time_step, velocity=(0.0, omega, 0.0)),
         name,
@@ -159,7 +159,10 @@ def test_the_unknown_moves_with_the_velocity_of_the_start(name):
 @pytest.mark.parametrize("name", TABLEAUX)
 def test_a_spring_far_too_stiff_for_the_step_is_at_rest_after_one(name):
     """L-stability: R(z) falls as 1/z, here with |z| = 1e4, on a spring of no rest length, which is linear."""
-    springs, pins = SpringsEffect(rule="fixed", stretch=(1e4 / DT) ** 2), PinsEffect(at=("first",), weight="exact")
+    springs, pins = (
+        SpringsEffect(scaling_rule="fixed", stretch=(1e4 / DT) ** 2),
+        PinsEffect(parts=("first",), weight="exact"),
+    )
     made = by(build_test_scene(ChainMesh(), springs, pins, size=2, mass=2.0), name)
     linear = replace(made.all_springs, rest_length=np.zeros(1))
     made = replace(made, system=replace(made.system, energies=(linear,)))

@@ -23,7 +23,7 @@ from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem, build_test_scene
 
 HANGING = build_first_problem(build_cloth(8, "exact", stretch=1000.0))
-PINS = PinsEffect.model_validate({"at": ["left"], "weight": "exact"})
+PINS = PinsEffect.model_validate({"parts": ["left"], "weight": "exact"})
 BEAM = build_first_problem(
     build_test_scene(
         BlockMesh(height=0.4, depth=0.4), SpringsEffect(stretch=1e5), GravityEffect(), PINS, size=5, mass=50.0
@@ -77,7 +77,7 @@ def test_what_answers_from_the_whole_mesh_to_a_quadratic_objective_is_newtons_st
     soft = replace(springs, rest_length=np.zeros(len(springs.edges)))
     problem = replace(HANGING, system=replace(HANGING.system, energies=(soft,)))
     wanted = NewtonSolver().prepare(problem.system).solve(problem, StopRule(5, 1e-12)).positions
-    np.testing.assert_allclose(first(Jgs2(rings=8), problem), wanted, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(first(Jgs2(neighbour_rings=8), problem), wanted, rtol=0, atol=1e-10)
 
 
 def first(solver: Jgs2, problem: StepProblem) -> Positions:
@@ -113,7 +113,11 @@ def test_responses_that_do_not_fit_in_memory_are_refused_beforehand(monkeypatch)
         compute_responses(csr_array(np.eye(300)), chain(100), 4)
 
 
-@pytest.mark.parametrize(("given", "words"), [({"rings": -1}, "rings"), ({"lateral": 1.5}, "lateral")], ids=str)
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [({"neighbour_rings": -1}, "neighbour_rings"), ({"lateral_stiffness_ratio": 1.5}, "lateral_stiffness_ratio")],
+    ids=str,
+)
 def test_settings_without_meaning_are_refused(given, words):
     with pytest.raises(ValueError, match=f"{words}: should"):
         Jgs2(**given)

@@ -211,7 +211,7 @@ def test_a_solver_is_scored_by_the_cases_that_it_does_not_refuse():
 
 
 SCENE = "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\n"
-SCENE += "effects: [{kind: gravity}, {kind: springs, stretch: 10}, {kind: pins, at: [first]}]\n"
+SCENE += "effects: [{kind: gravity}, {kind: springs, stretch: 10}, {kind: pins, parts: [first]}]\n"
 SWEEP = "scenes: [scene.yaml]\nsolvers: [newton, xpbd, {name: numba, precision: float32}, numba]\n"
 SWEEP += "options: {rtol: 1e-6, rounds: 1, verify: true, pictures: false, record: %s}\n"
 

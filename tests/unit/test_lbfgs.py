@@ -86,7 +86,7 @@ def test_pairs_of_negative_curvature_are_left_out():
 def test_with_a_sparse_matrix_iterates_are_those_of_the_recursion_with_it(sweeps: int) -> None:
     problem = build_random_problem(8, n=30, m=80)
     S = AggregatedSweeps(free_matrix(problem), sweeps).matrix.toarray()
-    solver = Lbfgs(3, preconditioner="a-jacobi", sweeps=sweeps)
+    solver = Lbfgs(3, preconditioner="a-jacobi", jacobi_sweeps=sweeps)
     wanted = two_loops(problem, 3, 6, S)
     values = [problem.value(p) for p in wanted]
     assert values == sorted(values, reverse=True), "the recursion needs shorter steps here"
@@ -105,8 +105,8 @@ def test_with_a_sparse_matrix_residuals_are_those_of_q() -> None:
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"sweeps": 9}, "sweeps: should be from 1 to 8"),
-        ({"linear": "cg"}, "a-jacobi solves no system"),
+        ({"jacobi_sweeps": 9}, "jacobi_sweeps: should be from 1 to 8"),
+        ({"linear_solver": "cg"}, "a-jacobi solves no system"),
         ({"precision": "float32"}, "is of a factor's entries"),
     ],
 )

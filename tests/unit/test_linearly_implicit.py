@@ -30,16 +30,20 @@ from springbench.solvers.model.step_problem import StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
 END, ONCE = 0.3, StopRule(1)
-HELD, SOFT = PinsEffect(at=("first",), weight="exact"), SpringsEffect(stretch=20.0)
+HELD, SOFT = PinsEffect(parts=("first",), weight="exact"), SpringsEffect(stretch=20.0)
 EVENLY = PinsEffect.model_validate(
-    {"at": ["first"], "weight": "exact", "motion": {"keys": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
+    {
+        "parts": ["first"],
+        "weight": "exact",
+        "motion": {"key_frames": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]},
+    }
 )
 EFFECTS: dict[str, tuple[Any, ...]] = {
     "none": (HELD,),
-    "bending": (PinsEffect(at=("top_corners",), weight="exact"), BendingEffect(stiffness=1e-3)),
-    "ether drag": (HELD, EtherDragEffect(rate=3.0)),
+    "bending": (PinsEffect(parts=("top_corners",), weight="exact"), BendingEffect(stiffness=1e-3)),
+    "ether drag": (HELD, EtherDragEffect(decay_rate=3.0)),
     "air": (HELD, AirDragEffect(coefficient=2.0)),
-    "Rayleigh's damping of masses": (HELD, RayleighEffect(mass=1.5)),
+    "Rayleigh's damping of masses": (HELD, RayleighEffect(mass_coefficient=1.5)),
 }
 ORDERS = {"ros2": 2, "ros3p": 3, "rodas": 4}
 OWN = [("ros2", "substepping"), ("ros3p", "substepping"), ("rodas", "substepping")]
@@ -73,7 +77,7 @@ def truth(effects: str) -> ReferenceTrajectory:
 @pytest.mark.parametrize("name", ORDERS)
 def test_the_error_falls_with_the_methods_order(name, effects):
     scene = made(SOFT, GravityEffect(), *EFFECTS[effects], mesh=mesh_of(effects))
-    errors = [truth(effects).measure_error(0, run(scene, name, refine=k)[-1].positions) for k in (24, 48)]
+    errors = [truth(effects).measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
     # The next term of the error is smaller by a step times the fastest frequency, at most a quarter.
     assert ORDERS[name] - 0.3 < np.log2(errors[0] / errors[1]) < ORDERS[name] + 0.6
 
@@ -92,13 +96,13 @@ def test_the_linearised_step_has_the_order_of_its_integrator(name, integrator, e
 def test_pins_that_move_evenly_keep_the_order(name):
     wanted = integrate_motion(made(SOFT, GravityEffect(), EVENLY, integrator="esdirk-4"), [END])
     scene = made(SOFT, GravityEffect(), EVENLY)
-    errors = [wanted.measure_error(0, run(scene, name, refine=k)[-1].positions) for k in (24, 48)]
+    errors = [wanted.measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
     assert np.log2(errors[0] / errors[1]) > ORDERS[name] - 0.3
 
 
 def test_the_linearised_step_is_that_of_baraff_and_witkin():
     """(M - dt^2 df/dx) dv = dt (f + dt df/dx v), by a dense matrix."""
-    pins = PinsEffect(at=("top_corners",), weight="exact")
+    pins = PinsEffect(parts=("top_corners",), weight="exact")
     effects = SpringsEffect(stretch=300.0), GravityEffect(), pins
     scene = made(*effects, mesh=GridMesh(), integrator="implicit-euler", time_step=1 / 30)
     (p, v), dt, free = build_initial_state(scene).motion, 1 / 30, scene.system.free_vertices
@@ -139,7 +143,7 @@ def test_a_stiff_spring_does_not_ring_after_one_step(name, kept):
 def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
     scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
     asked = (1e-2, 1e-3, 1e-4, 1e-5)
-    errors = [truth("none").measure_error(0, run(scene, name, 3, error=e)[-1].positions) for e in asked]
+    errors = [truth("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions) for e in asked]
     assert errors[-1] < 1e-3
     assert all(b < a for a, b in pairwise(errors))
 
@@ -148,8 +152,8 @@ def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
 def test_a_crushed_sheet_in_long_steps_stays_finite(name):
     """Its springs are compressed to a half, so the exact Hessian of a frame has no factor."""
     integrator = "implicit-euler" if name == "baraff-witkin" else "substepping"
-    scene = made(SpringsEffect(stretch=1e4), PinsEffect(at=("top_corners",), weight="exact"), mesh=GridMesh(), size=6,
-                 integrator=integrator, time_step=1 / 30)  # fmt: skip
+    scene = made(SpringsEffect(stretch=1e4), PinsEffect(parts=("top_corners",), weight="exact"), mesh=GridMesh(),
+                 size=6, integrator=integrator, time_step=1 / 30)  # fmt: skip
     state = build_initial_state(scene)
     crushed = type(state)(Motion(0.5 * scene.mesh.rest_positions, np.zeros_like(scene.mesh.rest_positions)), None, 0)
     ready = prepare(scene, load_target(SOLVERS[name])())

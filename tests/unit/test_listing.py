@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 SWEEP = """
 scenes: [{scene}]
 sizes: [5, 6]
-solvers: [sparse, {{name: lbfgs, pairs: 3}}, {{name: lbfgs, pairs: 5}}]
+solvers: [sparse, {{name: lbfgs, history_size: 3}}, {{name: lbfgs, history_size: 5}}]
 options: {{rtol: [1e-2, 1e-3], frames: 2}}
 """
 SCENE = Path(__file__).resolve().parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"

@@ -38,13 +38,13 @@ def test_every_form_of_a_vertex_token_names_the_same_face(tmp_path, face):
 
 
 def test_a_quad_has_diagonals_only_between_face_pairs(tmp_path):
-    mesh = obj(tmp_path, f"{SQUARE}f 1 2 3 4\n", springs="face_pairs").build_mesh(0)
+    mesh = obj(tmp_path, f"{SQUARE}f 1 2 3 4\n", spring_rule="face-pairs").build_mesh(0)
     assert mesh.springs[mesh.spring_families[STRETCH]].tolist() == SIDES
     assert mesh.springs[mesh.spring_families[SHEAR]].tolist() == [[0, 2], [1, 3]]
 
 
 def test_a_side_of_one_face_is_no_diagonal_of_another(tmp_path):
-    mesh = obj(tmp_path, f"{SQUARE}f 1 2 3 4\nf 1 2 3\n", springs="face_pairs").build_mesh(0)
+    mesh = obj(tmp_path, f"{SQUARE}f 1 2 3 4\nf 1 2 3\n", spring_rule="face-pairs").build_mesh(0)
     assert mesh.springs[mesh.spring_families[STRETCH]].tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
     assert mesh.springs[mesh.spring_families[SHEAR]].tolist() == [[1, 3]]
 
@@ -190,7 +190,7 @@ def test_a_face_of_very_many_corners_is_refused_before_its_pairs_are_listed(tmp_
     face = "f " + " ".join(map(str, range(1, corners + 1)))
     assert len(obj(tmp_path, points + face).build_mesh(0).springs) == corners
     with pytest.raises(InputError, match="pairs on faces"):
-        obj(tmp_path, points + face, springs="face_pairs").build_mesh(0)
+        obj(tmp_path, points + face, spring_rule="face-pairs").build_mesh(0)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".vtk", ".vtu", ".off", ".msh"])
@@ -210,7 +210,7 @@ def test_lines_and_quads_of_meshio_become_springs(tmp_path):
     cells = {"quad": np.array([[0, 1, 2, 3]]), "line": np.array([[2, 4]]), "vertex": np.array([[0]])}
     meshio.Mesh(points, {**cells}).write(path)
     assert FileMesh(path=path).build_mesh(0).springs.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3], [2, 4]]
-    assert len(FileMesh(path=path, springs="face_pairs").build_mesh(0).springs) == 7
+    assert len(FileMesh(path=path, spring_rule="face-pairs").build_mesh(0).springs) == 7
 
 
 @pytest.mark.parametrize("order", [[0, 1, 2, 3], [1, 0, 2, 3]], ids=["upright", "inverted"])
@@ -270,4 +270,4 @@ def test_a_json_scene_stands_for_the_obj_it_names_with_face_pairs(tmp_path):
     path = tmp_path / "scene.json"
     path.write_text(json.dumps({"obj": "deep/mesh.obj", "k": 1, "b": [1]}))
     assert len(FileMesh(path=path).build_mesh(0).springs) == 6
-    assert len(FileMesh(path=path, springs="edges").build_mesh(0).springs) == 4
+    assert len(FileMesh(path=path, spring_rule="edges").build_mesh(0).springs) == 4

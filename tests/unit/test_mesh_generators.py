@@ -20,7 +20,7 @@ ROUND_OFF = 1e-12
 
 
 def test_the_curtain_of_liu_2013_has_its_springs():
-    mesh = GridMesh(diagonals="one", skip_one=True).build_mesh(81)
+    mesh = GridMesh(diagonals="one", bend_springs=True).build_mesh(81)
     assert len(mesh.rest_positions) == 6561
     assert {family: len(springs) for family, springs in mesh.spring_families.items()} == {
         STRETCH: 12960,
@@ -64,7 +64,7 @@ def test_counts_are_those_of_the_lattice(generator, size, vertices, springs, tri
 @pytest.mark.parametrize(
     ("generator", "lengths"),
     [
-        (GridMesh(skip_one=True), {STRETCH: [1], SHEAR: [2**0.5], BEND: [2]}),
+        (GridMesh(bend_springs=True), {STRETCH: [1], SHEAR: [2**0.5], BEND: [2]}),
         (BlockMesh(height=1.0, depth=1.0), {STRETCH: [1], SHEAR: [2**0.5, 3**0.5], BEND: []}),
         (BlockMesh(height=1.0, depth=1.0, diagonals="one"), {STRETCH: [1], SHEAR: [2**0.5], BEND: []}),
     ],
@@ -78,7 +78,7 @@ def test_families_have_the_rest_lengths_of_their_directions(generator, lengths):
 
 
 def test_springs_follow_the_documented_order():
-    mesh = GridMesh(diagonals="both", skip_one=True).build_mesh(3)
+    mesh = GridMesh(diagonals="both", bend_springs=True).build_mesh(3)
     rows = [(0, 1), (1, 2), (3, 4), (4, 5), (6, 7), (7, 8)]
     columns = [(0, 3), (1, 4), (2, 5), (3, 6), (4, 7), (5, 8)]
     right, left = [(0, 4), (1, 5), (3, 7), (4, 8)], [(1, 3), (2, 4), (4, 6), (5, 7)]
@@ -159,8 +159,8 @@ def test_a_tower_tapers_and_stands_on_four_feet():
 
 
 def test_a_stack_is_so_many_grids_each_turned_against_the_one_below():
-    one, mesh = GridMesh().build_mesh(3), StackMesh(layers=3, apart=0.1, turn=90.0).build_mesh(3)
-    assert len(mesh.rest_positions) == StackMesh(layers=3).count_vertices(3) == 27
+    one, mesh = GridMesh().build_mesh(3), StackMesh(num_layers=3, layer_spacing=0.1, layer_angle=90.0).build_mesh(3)
+    assert len(mesh.rest_positions) == StackMesh(num_layers=3).count_vertices(3) == 27
     for k in range(3):
         layer = mesh.rest_positions[9 * k : 9 * k + 9]
         assert layer[:, 1] == pytest.approx(0.1 * k)

@@ -46,7 +46,7 @@ def solved(problem: StepProblem, iterations: int, solver: MultigridXpbd | Xpbd |
 
 
 def hanging(stretch: float, factor: float = 1.0) -> StepProblem:
-    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
     mesh = ChainMesh(length=2.0, direction=(0.0, -1.0, 0.0))
     problem = build_first_problem(
         build_test_scene(mesh, SpringsEffect(stretch=stretch), GravityEffect(), pins, size=10)
@@ -87,7 +87,7 @@ def test_springs_that_do_not_turn_reach_the_minimiser_of_the_step_at_once(stretc
 
 def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_step():
     apart = []
-    pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
     for frames in (24, 48, 96):
         made = build_test_scene(
             ChainMesh(length=2.0), SpringsEffect(stretch=20.0), GravityEffect(), pins, size=10, time_step=0.2 / frames
@@ -98,7 +98,9 @@ def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_
     np.testing.assert_allclose([a / b for a, b in pairwise(apart)], 16.0, rtol=0.1)  # the next order
 
 
-@pytest.mark.parametrize("solver", [MultigridXpbd(), MultigridXpbd(components=0), MultigridXpbd(setup=2)])
+@pytest.mark.parametrize(
+    "solver", [MultigridXpbd(), MultigridXpbd(near_null_vectors=0), MultigridXpbd(setup_interval=2)]
+)
 def test_tensions_end_as_what_their_springs_ask_for_and_xpbd_is_far_from_it(solver):
     by_all, one_by_one = course(mgpbd(STIFF, solver), 30), course(xpbd(STIFF), 300)
     assert by_all.misfits[-1] <= 1e-6
@@ -129,7 +131,7 @@ def test_springs_without_stiffness_and_loops_do_nothing():
 
 @pytest.mark.parametrize("smoothed", [False, True], ids=["unsmoothed", "smoothed"])
 def test_the_cycle_is_symmetric_and_positive_definite(smoothed):
-    A, _, prolongation = dual(STIFF, MultigridXpbd(smoothed=smoothed))
+    A, _, prolongation = dual(STIFF, MultigridXpbd(smooth_prolongation=smoothed))
     cycle = VCycle(A, prolongation)
     assert cycle.level_sizes[0] > 400 >= cycle.level_sizes[-1]
     r, s = np.random.default_rng(0).normal(size=(2, A.shape[0]))
@@ -165,11 +167,11 @@ def test_the_linear_solve_is_that_of_the_dual_system():
 @pytest.mark.parametrize(("components", "most"), [(0, 40), (6, 80)])
 def test_multigrid_makes_up_for_the_length_of_a_chain(components, most):
     """Whose near-kernel is one tension for all; smoothing alone needs hundreds of iterations."""
-    pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
     long = build_first_problem(
         build_test_scene(ChainMesh(length=2.0), SpringsEffect(stretch=1e4), GravityEffect(), pins, size=1500)
     )
-    A, b, prolongation = dual(long, MultigridXpbd(components=components))
+    A, b, prolongation = dual(long, MultigridXpbd(near_null_vectors=components))
     assert PreconditionedSolve(A, VCycle(A, prolongation), b, 1e-6).solve(500) <= most
     prolongation.prolongators.clear()
     assert PreconditionedSolve(A, VCycle(A, prolongation), b, 1e-6).solve(500) > 5 * most
@@ -187,7 +189,9 @@ def test_what_it_cannot_do_is_said_before_any_work(change, told):
         MultigridXpbd().prepare(change(build_random_problem(0).system))
 
 
-@pytest.mark.parametrize(("settings", "told"), [({"components": -1}, "components"), ({"setup": 0}, "setup")])
+@pytest.mark.parametrize(
+    ("settings", "told"), [({"near_null_vectors": -1}, "near_null_vectors"), ({"setup_interval": 0}, "setup_interval")]
+)
 def test_settings_that_mean_nothing_are_refused(settings, told):
     with pytest.raises(ValueError, match=f"{told}: should be at least"):
         MultigridXpbd(**settings)

@@ -116,7 +116,7 @@ def test_newton_ends_within_few_factorisations_where_clamping_takes_many():
 
 def test_newton_leaves_a_saddle():
     """A chain that is pushed together along its own line feels no force sideways, but is not stable."""
-    pins = PinsEffect.model_validate({"at": ["ends"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
     made = build_test_scene(ChainMesh(length=1.0), SpringsEffect(stretch=1e4), pins, size=9, time_step=1.0)
     given = build_first_problem(made)
     middle = 0.5 * (made.mesh.rest_positions[0] + made.mesh.rest_positions[-1])
@@ -151,7 +151,7 @@ def test_nothing_to_solve_for_is_solved(solver):
 @solvers
 def test_all_newtons_find_the_same_minimum_of_a_taut_cloth(solver):
     """Hanging under its own weight far from rest, springs are taut and the minimum is the only one near."""
-    pins = PinsEffect.model_validate({"at": ["top"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["top"], "weight": "exact"})
     made = build_test_scene(
         GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), GravityEffect(), pins, size=8, mass=50.0
     )

@@ -100,7 +100,7 @@ def test_gas_in_a_balloon_is_minimised(solver):
         SpringsEffect(stretch=50.0),
         GravityEffect(),
         GasEffect(pressure=5.0),
-        PinsEffect(at=("pole_top",), weight="exact"),
+        PinsEffect(parts=("pole_top",), weight="exact"),
         size=4,
     )
     given = build_first_problem(made)

@@ -19,9 +19,9 @@ mass: 2
 time_step: 1/30
 frames: 60
 effects:
-  - {kind: springs, rule: fixed, stretch: 100}
+  - {kind: springs, scaling_rule: fixed, stretch: 100}
   - {kind: gravity}
-  - {kind: ether-drag, rate: 20}
+  - {kind: ether-drag, decay_rate: 20}
   - {kind: contact, obstacles: [{kind: plane, point: [0, -0.01, 0], normal: [0, 1, 0]}]}
 """
 

@@ -103,7 +103,7 @@ def test_an_error_asked_beside_stated_steps_is_one_run_and_has_no_part_in_the_ot
 
 
 def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -> None:
-    (folder / "cloth.yaml").write_text(f"{CLOTH}  - {{kind: gravity}}\n  - {{kind: pins, at: [top_corners]}}\n")
+    (folder / "cloth.yaml").write_text(f"{CLOTH}  - {{kind: gravity}}\n  - {{kind: pins, parts: [top_corners]}}\n")
     (folder / "sweep.yaml").write_text(SWEEP.format("dormand-prince-8, xpbd", "error_target: 1e-3, pictures: false"))
     done = CliRunner().invoke(
         app, ["run", str(folder / "sweep.yaml"), "--in-process", "--results", str(folder / "results")]

@@ -121,7 +121,7 @@ def test_less_precise_factors_end_where_float64_ends_and_descend(name, precision
 @scenes
 def test_a_compiled_step_is_the_step_with_calls_in_between(name):
     problem = build_moving_problem(SCENES[name]())
-    compiled, called = (iterates(Lbfgs(linear=linear), problem, 8)[-1] for linear in ("supernodal", "cholespy"))
+    compiled, called = (iterates(Lbfgs(linear_solver=linear), problem, 8)[-1] for linear in ("supernodal", "cholespy"))
     # Two factors by the condition of Q, and windows that make ten times as much of it in each of some iterations.
     np.testing.assert_allclose(compiled, called, rtol=0, atol=1e-7)
 

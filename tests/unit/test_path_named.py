@@ -58,6 +58,6 @@ def test_an_energy_that_the_kernels_do_not_know_shows_in_the_choice(solver: Solv
     assert "compiled" not in unknown
 
 
-@pytest.mark.parametrize("solver", [CompiledLocalGlobal(linear="cg"), Lbfgs(linear="cg")], ids=repr)
+@pytest.mark.parametrize("solver", [CompiledLocalGlobal(linear_solver="cg"), Lbfgs(linear_solver="cg")], ids=repr)
 def test_a_linear_solver_that_is_called_from_python_shows_in_the_choice(solver: Solver):
     assert "iterations through Python: this linear solver" in solver.prepare(SYSTEM).description

@@ -114,7 +114,8 @@ def test_a_cube_of_quadrangles_weighs_the_same_at_all_corners(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "effect", ["{kind: wind, per: triangle, velocity: [3, 1, 2], lift: 0.3}", "{kind: gas, pressure: 9}"]
+    "effect",
+    ["{kind: wind, acts_on: triangle, velocity: [3, 1, 2], lift_coefficient: 0.3}", "{kind: gas, pressure: 9}"],
 )
 def test_forces_on_the_triangles_of_quadrangles_do_not_depend_on_the_first_corner(tmp_path, effect):
     points = [(x, y, z + 0.1 * x * y) for x in (0.0, 1.3) for y in (0.0, 1.0) for z in (0.0, 0.8)]
@@ -136,7 +137,7 @@ def test_forces_on_the_triangles_of_quadrangles_do_not_depend_on_the_first_corne
 def test_the_reference_terms_agree_on_concave_and_convex_faces(tmp_path, first):
     faces = [np.roll([1, 2, 3, 4, 5, 6], first), np.roll([4, 3, 7, 5], first)]
     path = obj(tmp_path, [*L, (2.5, 2, 0.5)], *(" ".join(map(str, face)) for face in faces))
-    wind = "{kind: wind, per: triangle, velocity: [3, 1, 2], lift: 0.3}"
+    wind = "{kind: wind, acts_on: triangle, velocity: [3, 1, 2], lift_coefficient: 0.3}"
     effects = f"{{kind: springs, stretch: 10}}, {{kind: gravity}}, {wind}, {{kind: bending, stiffness: 0.1}}"
     made = scene(tmp_path, path, effects, "mass_per_area: 0.3")
     assert verify_terms(load_scene(tmp_path / "mesh.yaml"), made, "implicit-euler") == "agrees"

@@ -33,7 +33,7 @@ from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem, build_test_scene
 from tests.unit.test_surface_contact import BALL, contact, count_intersections, draped
 
-OTHERS: list[PreconditionerName] = [name for name in get_args(PreconditionerName) if name != "factor"]
+OTHERS: list[PreconditionerName] = [name for name in get_args(PreconditionerName) if name != "cholesky"]
 others = pytest.mark.parametrize("name", OTHERS)
 METHODS = {"newton-cg": NewtonCG, "pncg": NonlinearCG}
 
@@ -196,13 +196,13 @@ def test_schwarz_takes_fewer_iterations_of_conjugate_gradients_than_blocks_on_st
 @others
 def test_energies_without_elements_are_refused_by_name(method, name):
     stated = given("gas")
-    with pytest.raises(Unsupported, match=f"{method}, preconditioner: {name}.*Gas.*take preconditioner: factor"):
+    with pytest.raises(Unsupported, match=f"{method}, preconditioner: {name}.*Gas.*take preconditioner: cholesky"):
         METHODS[method](preconditioner=name).prepare(stated.system)
 
 
 def test_nothing_is_solved_for_where_all_is_held():
     stated = build_first_problem(
-        build_test_scene(ChainMesh(), SpringsEffect(stretch=1.0), PinsEffect(at=("ends",), weight="exact"), size=2)
+        build_test_scene(ChainMesh(), SpringsEffect(stretch=1.0), PinsEffect(parts=("ends",), weight="exact"), size=2)
     )
     for name in OTHERS:
         solution = NewtonCG(preconditioner=name).prepare(stated.system).solve(stated, StopRule(3))

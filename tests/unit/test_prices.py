@@ -24,7 +24,7 @@ default_size: 5
 effects:
   - {kind: springs, stretch: 300, shear: 60}
   - {kind: gravity}
-  - {kind: pins, at: [top_corners]}
+  - {kind: pins, parts: [top_corners]}
   - {kind: bending, stiffness: 1.0e-3}
   - {kind: air-drag, coefficient: 0}
 """

@@ -18,12 +18,13 @@ from springbench.harness.scenes.surface_obstacles import parse_obstacles
 from tests.synthetic_recordings import TIME_STEP, build_recording_info, write_recording
 
 RISES = KeyFrameMotion(
-    keys=(KeyFrame(time=0.0), KeyFrame(time=10 * TIME_STEP, offset=(0.0, 2.0, 0.0), turn=90.0)), axis=(1.0, 2.0, 0.0)
+    key_frames=(KeyFrame(time=0.0), KeyFrame(time=10 * TIME_STEP, offset=(0.0, 2.0, 0.0), angle=90.0)),
+    axis=(1.0, 2.0, 0.0),
 )
 OBSTACLES = (
     SphereObstacle(center=(1.0, 2.0, 3.0), radius=0.5, motion=RISES),
-    CapsuleObstacle(ends=((0.0, 0.5, 0.0), (1.0, -1.0, 0.3)), radius=0.2),
-    CapsuleObstacle(ends=((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), radius=0.2),
+    CapsuleObstacle(end_points=((0.0, 0.5, 0.0), (1.0, -1.0, 0.3)), radius=0.2),
+    CapsuleObstacle(end_points=((0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), radius=0.2),
     BoxObstacle(low=(-1.0, 0.0, 0.0), high=(1.0, 0.5, 2.0), motion=RISES),
     PlaneObstacle(point=(0.0, 1.0, 0.0), normal=(1.0, 1.0, 0.0)),
 )
@@ -73,7 +74,7 @@ def test_a_capsule_is_turned_from_the_axis_z_to_its_own(recorded: Path, k: int):
     x, y, z = np.array(turn["axis"]) / np.linalg.norm(turn["axis"])
     assert turn["angle"] == pytest.approx(np.pi)
     end = np.array(start) + length * np.array([2 * x * z, 2 * y * z, 2 * z * z - 1])  # half a turn of (0, 0, length)
-    np.testing.assert_allclose([start, end], obstacle.ends, atol=1e-6)  # float32
+    np.testing.assert_allclose([start, end], obstacle.end_points, atol=1e-6)  # float32
 
 
 def test_what_moves_is_taken_along_in_each_frame_and_what_rests_is_not(recorded: Path):

@@ -268,17 +268,17 @@ def test_a_picture_does_not_depend_on_the_unit_of_length(make: Callable[[], Reco
 def test_obstacles_far_from_zero_are_drawn_as_near_it() -> None:
     """Of the same numbers: an origin that is a multiple of a power of two moves nothing by less than that."""
     far = np.array([2.0**25, -(2.0**25), 2.0**24])
-    turns = {"keys": [{"time": 0}, {"time": 1, "offset": [0, 0.25, 0], "turn": 90}], "axis": [0, 1, 0]}
+    turns = {"key_frames": [{"time": 0}, {"time": 1, "offset": [0, 0.25, 0], "angle": 90}], "axis": [0, 1, 0]}
 
     def obstacles(o: NDArray[np.float64]) -> str:
         def at(*p: float) -> list[float]:
             return (o + p).tolist()
 
         sphere = {"kind": "sphere", "center": at(0.5, -1.0, 0), "radius": 0.25}
-        capsule = {"kind": "capsule", "ends": [at(0, -1.5, 0), at(1, -1.5, 0)], "radius": 0.1}
+        capsule = {"kind": "capsule", "end_points": [at(0, -1.5, 0), at(1, -1.5, 0)], "radius": 0.1}
         box = {"kind": "box", "low": at(0, -2, 0), "high": at(0.5, -1.75, 0.25)}
         plane = {"kind": "plane", "point": at(0, 0, -1), "normal": [0, 0, 1]}
-        return json.dumps([sphere, capsule, box | {"motion": turns | {"about": at(0, 0, 0)}}, plane])
+        return json.dumps([sphere, capsule, box | {"motion": turns | {"pivot": at(0, 0, 0)}}, plane])
 
     images = []
     with OffscreenRenderer(80, 80) as studio:

@@ -20,12 +20,12 @@ LIMIT = 0.01
 
 
 def moving(*keys: dict[str, Any], **more: Any) -> KeyFrameMotion:
-    return KeyFrameMotion.model_validate({"keys": list(keys), **more})
+    return KeyFrameMotion.model_validate({"key_frames": list(keys), **more})
 
 
 ACROSS = moving({"time": 0.0}, {"time": 1.0, "offset": (4.0, 0.0, 0.0)})
-ROUND = moving({"time": 0.0}, {"time": 1.0, "turn": 360.0}, about=(2.0, 0.0, 0.0))
-SMOOTH = moving({"time": 0.0}, {"time": 1.0, "offset": (4.0, 0.0, 0.0)}, between="smooth")
+ROUND = moving({"time": 0.0}, {"time": 1.0, "angle": 360.0}, pivot=(2.0, 0.0, 0.0))
+SMOOTH = moving({"time": 0.0}, {"time": 1.0, "offset": (4.0, 0.0, 0.0)}, interpolation="smooth")
 BALL = SphereObstacle(center=(2.0, 0.0, 0.0), radius=0.1)
 FAR = SphereObstacle(center=(4.0, 0.0, 0.0), radius=0.05)
 
@@ -83,4 +83,4 @@ def test_four_planes_may_leave_no_room_where_any_three_do():
 def test_planes_that_turn_are_looked_at_between_their_keys():
     assert list(sample_times([ACROSS])) == [0.0, 1.0]
     assert len(list(sample_times([ROUND]))) > 32
-    assert merge_key_times(ACROSS, None, KeyFrameMotion(keys=(KeyFrame(time=0.5),))) == [0.0, 0.5, 1.0]
+    assert merge_key_times(ACROSS, None, KeyFrameMotion(key_frames=(KeyFrame(time=0.5),))) == [0.0, 0.5, 1.0]

@@ -45,7 +45,7 @@ def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, m
 def test_a_run_whose_residual_is_no_number_is_not_ok(tmp_path: Path, solver: str, stretch: str):
     (tmp_path / "scene.yaml").write_text(
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}, "
-        f"{{kind: springs, stretch: {stretch}}}, {{kind: pins, at: [first]}}]\n"
+        f"{{kind: springs, stretch: {stretch}}}, {{kind: pins, parts: [first]}}]\n"
     )
     (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver]).list_runs()
     files = RunFiles.for_run(spec, tmp_path)
@@ -79,7 +79,7 @@ def test_what_a_method_does_not_have_is_null_and_no_failure(tolerance: bool):
 def test_a_method_that_minimises_nothing_may_be_asked_for_a_tolerance(tmp_path: Path, solver: str):
     (tmp_path / "scene.yaml").write_text(
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.01\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}, "
-        "{kind: springs, stretch: 100}, {kind: pins, at: [first]}]\n"
+        "{kind: springs, stretch: 100}, {kind: pins, parts: [first]}]\n"
     )
     (spec,) = load_config(tmp_path / "scene.yaml", solvers=[solver], rtol=1e-6).list_runs()
     files = RunFiles.for_run(spec, tmp_path)

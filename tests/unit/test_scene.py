@@ -63,18 +63,21 @@ def test_pins_of_several_effects_are_joined_in_the_order_of_their_vertices():
 
 
 def test_a_vertex_may_be_pinned_twice_in_the_same_way():
-    made = build_test_scene(ChainMesh(), PinsEffect(at=("ends",)), PinsEffect(indices=(0,)), size=4)
+    made = build_test_scene(ChainMesh(), PinsEffect(parts=("ends",)), PinsEffect(indices=(0,)), size=4)
     assert made.system.pins.vertices.tolist() == [0, 3]
 
 
 def test_a_vertex_pinned_twice_with_different_weights_is_refused():
     with pytest.raises(InputError, match="vertex 0 is pinned twice"):
-        build_test_scene(ChainMesh(), PinsEffect(at=("ends",)), PinsEffect(indices=(0,), weight="exact"), size=4)
+        build_test_scene(ChainMesh(), PinsEffect(parts=("ends",)), PinsEffect(indices=(0,), weight="exact"), size=4)
 
 
 def test_springs_of_several_effects_are_all_the_springs():
     made = build_test_scene(
-        ChainMesh(), SpringsEffect(stretch=1.0, rule="fixed"), SpringsEffect(stretch=2.0, rule="fixed"), size=3
+        ChainMesh(),
+        SpringsEffect(stretch=1.0, scaling_rule="fixed"),
+        SpringsEffect(stretch=2.0, scaling_rule="fixed"),
+        size=3,
     )
     assert made.all_springs.stiffness.tolist() == [1.0, 1.0, 2.0, 2.0]
     assert len(build_test_scene(ChainMesh(), size=3).all_springs.edges) == 0

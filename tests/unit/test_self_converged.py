@@ -21,7 +21,7 @@ from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.scene_spec import SceneSpec
 
 END = 0.2
-HELD = PinsEffect(at=("first",), weight="exact")
+HELD = PinsEffect(parts=("first",), weight="exact")
 
 
 def thrown(*effects: Any, velocity: tuple[float, float, float]) -> SceneSpec:

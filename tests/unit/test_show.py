@@ -21,8 +21,8 @@ frames: 2
 default_size: 5
 effects:
   - {kind: springs, stretch: 100}
-  - {kind: pins, at: [top_corners]}
-  - {kind: sewing, first: {at: [left]}, second: {at: [right], every: 2}, stiffness: 10}
+  - {kind: pins, parts: [top_corners]}
+  - {kind: sewing, first_row: {parts: [left]}, second_row: {parts: [right], stride: 2}, stiffness: 10}
 """
 
 
@@ -33,9 +33,9 @@ def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
     told = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(picture)])
     assert told.exit_code == 0, told.output
     lines = " ".join(told.output.split())
-    assert "effects[1] pins: 2 vertices (at (top_corners)): 0, 4" in lines
-    assert "effects[2] sewing: second: 3 vertices (at (right), every 2): 4, 14, 24" in lines
-    assert "boundary loops (loops): 0: 4 m" in lines
+    assert "effects[1] pins: 2 vertices (parts (top_corners)): 0, 4" in lines
+    assert "effects[2] sewing: second: 3 vertices (parts (right), stride 2): 4, 14, 24" in lines
+    assert "boundary loops (boundary_loops): 0: 4 m" in lines
     with Image.open(picture) as drawn:
         pixels = np.asarray(drawn.convert("RGB"), np.float64) / 255
     hue = pixels - pixels.mean(axis=2, keepdims=True)

@@ -34,7 +34,7 @@ MADE = build_test_scene(
     ChainMesh(),
     SpringsEffect(stretch=10.0),
     GravityEffect(),
-    PinsEffect(at=("first",), weight=1e4),
+    PinsEffect(parts=("first",), weight=1e4),
     size=4,
     time_step=DT,
     velocity=VELOCITY,
@@ -194,7 +194,7 @@ def test_a_simulation_can_be_repeated_to_the_last_bit():
 
 @pytest.mark.parametrize("rate", [0.5, 20.0])
 def test_ether_drag_slows_a_free_particle_exponentially(rate):
-    made = build_test_scene(ChainMesh(), EtherDragEffect(rate=rate), size=2, velocity=VELOCITY, time_step=DT)
+    made = build_test_scene(ChainMesh(), EtherDragEffect(decay_rate=rate), size=2, velocity=VELOCITY, time_step=DT)
     p = simulate_trajectory(made, LOCAL_GLOBAL_BACKENDS[0], 12)
     moved = np.diff(np.concatenate([made.mesh.rest_positions[None], p]), axis=0)
     decay = np.exp(-rate * DT * np.arange(1, 13))

@@ -31,7 +31,7 @@ mass: 1
 time_step: 1/30
 frames: 5
 effects:
-  - {kind: springs, rule: fixed, stretch: 1e3}
+  - {kind: springs, scaling_rule: fixed, stretch: 1e3}
 """
 FILE = CLOTH.replace("{kind: grid, width: 1}", "{kind: file, path: mesh.obj}")
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"

@@ -75,8 +75,8 @@ def test_figures_say_how_near_the_binding_limit_is():
         *timed("eigen", '{"temporaries": "default"}', [9.0, 8.0, 8.0]),
         *timed("eigen", '{"temporaries": "cheap"}', [4.0, 4.0, 4.0]),
         *timed("cholmod", "{}", [2.0, 2.0, 2.0]),
-        *timed("numba", '{"linear": "cholespy"}', [3.0, 3.0, 3.0]),
-        *timed("numba", '{"linear": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400),
+        *timed("numba", '{"linear_solver": "cholespy"}', [3.0, 3.0, 3.0]),
+        *timed("numba", '{"linear_solver": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400),
     ]
     found = {f.label: f for f in compute_speed_figures(pa.Table.from_pylist(rows, schema=RUN_SCHEMA))}
     assert list(found) == ["eigen default", "eigen cheap", "cholmod", "numba cholespy", "numba supernodal"]

@@ -32,8 +32,8 @@ def positions(**keys) -> np.ndarray:
     [
         ({"kind": "rest"}, REST),
         ({"kind": "collapsed"}, [MEAN] * 4),
-        ({"kind": "flattened", "along": "y"}, REST * [1, 0, 1] + [0, 2, 0]),
-        ({"kind": "flattened", "along": ["y", "z"]}, REST * [1, 0, 0] + [0, 2, 2]),
+        ({"kind": "flattened", "axes": "y"}, REST * [1, 0, 1] + [0, 2, 0]),
+        ({"kind": "flattened", "axes": ["y", "z"]}, REST * [1, 0, 0] + [0, 2, 2]),
         ({"kind": "scaled", "factors": [-1, 1, 1]}, REST * [-1, 1, 1] + [2, 0, 0]),
         ({"kind": "scaled", "factors": [3, 3, 3]}, 3 * REST - 2 * np.array(MEAN)),
         ({"kind": "merged", "vertices": [1, 3]}, [REST[0], REST[1], REST[2], REST[1]]),
@@ -45,19 +45,19 @@ def test_a_start_is_where_its_kind_says(keys, wanted):
 
 
 def test_random_starts_fill_their_cube_and_follow_their_seed():
-    p = positions(kind="random", side=0.5)
+    p = positions(kind="random", side_length=0.5)
     assert np.abs(p - MEAN).max() <= 0.25
-    np.testing.assert_array_equal(p, positions(kind="random", side=0.5))
-    assert np.abs(p - positions(kind="random", side=0.5, seed=1)).max() > 0.01
+    np.testing.assert_array_equal(p, positions(kind="random", side_length=0.5))
+    assert np.abs(p - positions(kind="random", side_length=0.5, seed=1)).max() > 0.01
 
 
 def test_perturbed_starts_lie_about_as_far_off_as_they_say():
-    away = positions(kind="perturbed", deviation=1e-3, seed=2) - REST
+    away = positions(kind="perturbed", standard_deviation=1e-3, seed=2) - REST
     assert 2e-4 < away.std() < 5e-3  # twelve normal numbers of deviation 1e-3
 
 
 def test_a_spin_turns_about_the_mean_and_carries_no_momentum():
-    made = TypeAdapter(AnyStart).validate_python({"kind": "rest", "spin": [0, 0, 2]})
+    made = TypeAdapter(AnyStart).validate_python({"kind": "rest", "angular_velocity": [0, 0, 2]})
     v = made.compute_spin_velocity(REST)
     np.testing.assert_allclose(v.sum(axis=0), 0.0, atol=1e-15)
     np.testing.assert_array_equal(v[0], np.cross([0, 0, 2], REST[0] - MEAN))
@@ -73,7 +73,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_a_scene_starts_as_it_says_and_its_digest_tells(tmp_path: Path):
-    spec = load_scene(written(tmp_path, SCENE.format("{kind: collapsed, spin: [0, 5, 0]}")))
+    spec = load_scene(written(tmp_path, SCENE.format("{kind: collapsed, angular_velocity: [0, 5, 0]}")))
     begun = build_initial_state(build_scene(spec, 3)).motion
     np.testing.assert_allclose(
         begun.positions, np.tile(GridMesh().build_mesh(3).rest_positions.mean(axis=0), (9, 1)), atol=1e-15
@@ -89,7 +89,7 @@ def test_a_scene_starts_as_it_says_and_its_digest_tells(tmp_path: Path):
     [
         (SCENE.format("{kind: colapsed}"), "start"),
         (SCENE.format("{kind: scaled, factors: [1, .nan, 1]}"), "start.factors[1]"),
-        (SCENE.format("{kind: random, side: -1}"), "start.side"),
+        (SCENE.format("{kind: random, side_length: -1}"), "start.side"),
         (SCENE.format("{kind: merged, vertices: [1, 1]}"), "twice"),
         (SCENE.format("{kind: merged, vertices: [1, 9]}"), "the mesh has the vertices 0 to 8"),
     ],
@@ -101,7 +101,7 @@ def test_a_start_that_means_nothing_is_refused(tmp_path: Path, text: str, needle
     assert str(tmp_path / "scene.yaml:7: ") in str(caught.value)
 
 
-NETWORK = "mesh: {}\n{}time_step: 0.1\nframes: 1\neffects: [{{kind: springs, rule: fixed, stretch: 1}}]\n"
+NETWORK = "mesh: {}\n{}time_step: 0.1\nframes: 1\neffects: [{{kind: springs, scaling_rule: fixed, stretch: 1}}]\n"
 PAIR = "positions: [[0, 0, 0], [1, 0, 0]]"
 
 
@@ -159,4 +159,4 @@ def test_a_star_has_a_hub_of_as_many_springs_as_its_size():
     assert np.bincount(mesh.springs.ravel())[0] == 1000
     np.testing.assert_allclose(mesh.rest_lengths, 2.0, rtol=1e-15)
     np.testing.assert_allclose(mesh.mass_fractions[0], 0.5, rtol=1e-12)
-    assert PinsEffect(at=("hub",)).select_vertices(mesh, "pins").tolist() == [0]
+    assert PinsEffect(parts=("hub",)).select_vertices(mesh, "pins").tolist() == [0]

@@ -212,7 +212,7 @@ def test_another_component_does_not_change_where_the_first_one_stops(method, awa
 @pytest.mark.parametrize("away", [3.2e7, 1e6])
 def test_a_tolerance_far_from_the_origin_ends_where_round_off_does(away: float):
     """Beside the same motion at the origin: as near as steps without a tolerance come, and not at a bound of sums."""
-    corners = PinsEffect.model_validate({"at": ["corners"], "weight": "exact"})
+    corners = PinsEffect.model_validate({"parts": ["corners"], "weight": "exact"})
     here = build_test_scene(NetMesh(), SpringsEffect(stretch=300.0), GravityEffect(), corners, size=8)
     shift = np.array([away, 0.0, 0.0])
     there = replace(

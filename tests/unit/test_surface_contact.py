@@ -54,7 +54,7 @@ RULE = StopRule(100, 1e-4)
 
 def draped(*obstacles: object, size: int = 7, **options: float) -> Scene:
     """A level sheet of 1 m over obstacles."""
-    effect = SurfaceContactEffect.model_validate({"thickness": 0.01, "obstacles": obstacles or (BALL,), **options})
+    effect = SurfaceContactEffect.model_validate({"min_distance": 0.01, "obstacles": obstacles or (BALL,), **options})
     return build_test_scene(GridMesh(), SpringsEffect(stretch=100.0, shear=20.0), GravityEffect(), effect, size=size)
 
 
@@ -111,7 +111,7 @@ OBSTACLES = {
     "mesh": BALL,
     "body": MeshObstacle(mesh=BodyMesh(height=0.6), size=8, offset=(0.0, -0.63, 0.0)),
     "sphere": SphereObstacle(center=(0.0, -0.33, 0.0), radius=0.3),
-    "capsule": CapsuleObstacle(ends=((-0.3, -0.15, 0.1), (0.2, -0.15, 0.0)), radius=0.1),
+    "capsule": CapsuleObstacle(end_points=((-0.3, -0.15, 0.1), (0.2, -0.15, 0.0)), radius=0.1),
     "box": BoxObstacle(low=(-0.2, -0.3, -0.2), high=(0.13, -0.04, 0.17)),
     "plane": PlaneObstacle(point=(0.0, -0.09, 0.0), normal=(0.1, 1.0, 0.0)),
 }
@@ -133,9 +133,9 @@ def test_an_obstacle_that_moves_pushes_the_sheet_and_never_passes_it(name, sidew
     keys = (
         KeyFrame(time=0.0),
         KeyFrame(time=0.1, offset=(0.0, 0.3, 0.0)),
-        KeyFrame(time=0.3, offset=(0.2, 0.3, 0.0), turn=120.0),
+        KeyFrame(time=0.3, offset=(0.2, 0.3, 0.0), angle=120.0),
     )
-    speed = {"motion": KeyFrameMotion(keys=keys, axis=(0.0, 1.0, 0.3))}
+    speed = {"motion": KeyFrameMotion(key_frames=keys, axis=(0.0, 1.0, 0.3))}
     table = PlaneObstacle(point=(0.0, -0.7, 0.0))
     made = draped(BALL.model_copy(update=speed), table, friction=0.3, size=6)
     begun = build_initial_state(made).motion
@@ -158,7 +158,7 @@ def deforming(path: Path, rate: float) -> MeshObstacle:
     ball = BalloonMesh(radius=0.3).build_mesh(4).rest_positions
     stored = [ball * (1 / s, s, 1 / s) + (0.0, 0.4 * (s - 1), 0.0) for s in 1 + 0.08 * np.arange(7)]
     np.savez(path / "ball.npz", positions=np.array(stored))
-    frames = {"positions": str(path / "ball.npz"), "rate": rate}
+    frames = {"positions": str(path / "ball.npz"), "frame_rate": rate}
     return MeshObstacle.model_validate(
         BALL.model_dump() | {"mesh": {"kind": "balloon", "radius": 0.3}, "frames": frames}
     )
@@ -185,7 +185,7 @@ def test_an_obstacle_that_deforms_along_stored_frames_lifts_the_sheet(tmp_path):
 
 
 def test_the_reference_terms_agree_on_an_obstacle_that_deforms(tmp_path):
-    effect = SurfaceContactEffect(thickness=0.01, friction=0.3, obstacles=(deforming(tmp_path, 3.0),))
+    effect = SurfaceContactEffect(min_distance=0.01, friction=0.3, obstacles=(deforming(tmp_path, 3.0),))
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 1 / 30, "frames": 6, "path": Path("scene.yaml")}
     spec = SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=100.0), effect)})
     assert verify_terms(spec, build_scene(spec, 4), "implicit-euler") == "agrees"
@@ -200,7 +200,7 @@ def test_frames_of_another_mesh_are_refused(tmp_path):
 
 
 def test_what_is_squeezed_between_obstacles_is_said():
-    down = KeyFrameMotion(keys=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.0, -5.0, 0.0))))
+    down = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.0, -5.0, 0.0))))
     press = PlaneObstacle(point=(0.0, 0.05, 0.0), normal=(0.0, -1.0, 0.0), motion=down)
     made = draped(PlaneObstacle(point=(0, -0.05, 0)), press, size=4)
     with pytest.raises(NoClearance, match="obstacles leave no room"):
@@ -213,7 +213,7 @@ def test_what_is_squeezed_between_obstacles_is_said():
         (SphereObstacle(center=(0.0, 0.0, 0.0), radius=0.3), "passes through obstacles, .* edge .* of the obstacles"),
         (
             PlaneObstacle(point=(0.0, -0.005, 0.0)),
-            "nearer than the thickness of 0.01 m: .* of the obstacles 0.005 m apart",
+            "nearer than the min_distance of 0.01 m: .* of the obstacles 0.005 m apart",
         ),
     ],
 )
@@ -273,7 +273,7 @@ def slide(tangent: float) -> tuple[np.ndarray, float]:
     """How fast a small sheet slides down a slope at the end of each step [m/s], and how it should accelerate."""
     angle, g = np.arctan(tangent), 9.81
     down = GravityEffect(acceleration=(g * np.sin(angle), -g * np.cos(angle), 0.0))
-    floor = SurfaceContactEffect(thickness=0.01, friction=MU, obstacles=(PlaneObstacle(point=(0.0, -0.0186, 0.0)),))
+    floor = SurfaceContactEffect(min_distance=0.01, friction=MU, obstacles=(PlaneObstacle(point=(0.0, -0.0186, 0.0)),))
     made = build_test_scene(
         GridMesh(width=0.2, height=0.2), SpringsEffect(stretch=100.0, shear=20.0), down, floor, size=3, time_step=DT
     )
@@ -296,8 +296,8 @@ def test_it_slides_above_the_angle_of_friction_and_rests_below_within_a_twentiet
 
 
 def test_sheets_that_collide_with_friction_keep_their_momentum():
-    rough = SelfContactEffect(thickness=0.01, friction=0.5)
-    made = build_test_scene(StackMesh(apart=0.05), SpringsEffect(stretch=100.0, shear=20.0), rough, size=5)
+    rough = SelfContactEffect(min_distance=0.01, friction=0.5)
+    made = build_test_scene(StackMesh(layer_spacing=0.05), SpringsEffect(stretch=100.0, shear=20.0), rough, size=5)
     p, v = made.mesh.rest_positions, np.zeros_like(made.mesh.rest_positions)
     upper = np.arange(len(p)) >= len(p) // 2
     v[upper] = (1.0, -2.0, 0.0)

@@ -60,7 +60,7 @@ VELOCITY = np.random.default_rng(0).normal(size=FREE.mesh.rest_positions.shape)
 
 def spring(stretch: float = 500.0, time_step: float = 1e-3) -> tuple[Scene, float]:
     """A mass of 1 kg on a vertical spring of 1 m, and its angular frequency [rad/s]."""
-    pins = PinsEffect.model_validate({"at": ["first"], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
     mesh = ChainMesh(direction=(0.0, -1.0, 0.0))
     made = build_test_scene(mesh, SpringsEffect(stretch=stretch), pins, size=2, mass=2.0, time_step=time_step)
     return made, stretch**0.5

@@ -20,7 +20,7 @@ default_size: 3
 effects:
   - {kind: springs, stretch: 20}
   - {kind: gravity}
-  - {kind: pins, at: [first], weight: exact}
+  - {kind: pins, parts: [first], weight: exact}
 """
 BENCH = Path(targets.__file__).parent
 

@@ -49,9 +49,9 @@ def made(mesh: MeshSource, *effects: SceneEffect, size: int, velocity=(0.0, 0.0,
 
 
 K, C, SPEED = 40.0, 1.5, 0.4
-SPRING, HELD = SpringsEffect(rule="fixed", stretch=K), PinsEffect(at=("first",))
+SPRING, HELD = SpringsEffect(scaling_rule="fixed", stretch=K), PinsEffect(parts=("first",))
 DRAGGED = PinsEffect.model_validate(
-    {"at": ["first"], "motion": {"keys": [{"time": 0.0}, {"time": 9.0, "offset": [9.0 * SPEED, 0.0, 0.0]}]}}
+    {"parts": ["first"], "motion": {"key_frames": [{"time": 0.0}, {"time": 9.0, "offset": [9.0 * SPEED, 0.0, 0.0]}]}}
 )
 
 
@@ -64,13 +64,16 @@ def damped(t: np.ndarray, rate: float) -> np.ndarray:
 FAST = (SPEED, 0.0, 0.0)
 ALONG = {  # the place of the second vertex of two along x, each of 1 kg, less 1 m
     "spring": ((SPRING, HELD), FAST, lambda t: damped(t, 0.0)),
-    "spring and ether drag": ((SPRING, HELD, EtherDragEffect(rate=C)), FAST, lambda t: damped(t, C)),
+    "spring and ether drag": ((SPRING, HELD, EtherDragEffect(decay_rate=C)), FAST, lambda t: damped(t, C)),
     "spring and air drag": ((SPRING, HELD, AirDragEffect(coefficient=2.0 * C)), FAST, lambda t: damped(t, C)),
-    "spring and dashpot": ((SPRING, HELD, DashpotsEffect(rule="fixed", stretch=C)), FAST, lambda t: damped(t, C)),
-    "ether drag": ((EtherDragEffect(rate=C),), FAST, lambda t: SPEED / C * (1.0 - np.exp(-C * t))),
+    "spring and dashpot": (
+        (SPRING, HELD, DashpotsEffect(scaling_rule="fixed", stretch=C)), FAST, lambda t: damped(t, C)
+    ),
+    "ether drag": ((EtherDragEffect(decay_rate=C),), FAST, lambda t: SPEED / C * (1.0 - np.exp(-C * t))),
     "spring whose pin moves": ((SPRING, DRAGGED), (0.0, 0.0, 0.0), lambda t: SPEED * t - damped(t, 0.0)),
     "dashpot whose pin moves": (
-        (SPRING, DashpotsEffect(rule="fixed", stretch=C), DRAGGED), (0.0, 0.0, 0.0), lambda t: SPEED * t - damped(t, C)
+        (SPRING, DashpotsEffect(scaling_rule="fixed", stretch=C), DRAGGED),
+        (0.0, 0.0, 0.0), lambda t: SPEED * t - damped(t, C),
     ),
 }  # fmt: skip
 
@@ -123,7 +126,7 @@ def test_the_acceleration_is_the_force_of_the_scene_over_the_mass():
         np.testing.assert_allclose(field(0.7, y), wanted, rtol=1e-12, atol=1e-10)  # sums of terms of some hundred
 
 
-HELD_CORNERS = PinsEffect(at=("corners",))
+HELD_CORNERS = PinsEffect(parts=("corners",))
 
 # The position errors at 1 s that a prototype found, relative to the displacement from the start.
 KNOWN = {
@@ -153,7 +156,7 @@ CHAOS = spec(
     ChainMesh(length=1.0),
     SpringsEffect(stretch=2000.0),
     GravityEffect(),
-    PinsEffect(at=("first",)),
+    PinsEffect(parts=("first",)),
     velocity=(0.0, 9.0, 1.0),
 )
 """A pendulum of three links, thrown over its pin."""
@@ -201,7 +204,7 @@ def test_what_has_no_equation_of_motion_is_refused_with_the_reason(case):
     assert issubclass(NotIntegrable, RunFailed)
 
 
-SWING = (SPRING, HELD, GravityEffect(), EtherDragEffect(rate=C))
+SWING = (SPRING, HELD, GravityEffect(), EtherDragEffect(decay_rate=C))
 
 
 def test_a_trajectory_is_integrated_once_for_all_time_steps(tmp_path, monkeypatch):
@@ -217,7 +220,7 @@ def test_a_trajectory_is_integrated_once_for_all_time_steps(tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("other", "size", "times"),
     [
-        (spec(ChainMesh(), SpringsEffect(rule="fixed", stretch=K + 1.0), *SWING[1:]), 3, TIMES),
+        (spec(ChainMesh(), SpringsEffect(scaling_rule="fixed", stretch=K + 1.0), *SWING[1:]), 3, TIMES),
         (spec(ChainMesh(), *SWING, velocity=(0.0, 0.0, 0.1)), 3, TIMES),
         (spec(ChainMesh(), *SWING), 4, TIMES),
         (spec(ChainMesh(), *SWING), 3, (0.3, 0.9)),
@@ -235,7 +238,7 @@ def test_a_trajectory_of_equations_that_have_changed_is_integrated_anew(tmp_path
     """As after a change of the code: the scene's digest is the same, its springs are not."""
     kept, asked = ReferenceStore(tmp_path), spec(ChainMesh(), *SWING)
     before = kept.load_trajectory(asked, 3, TIMES, error=1e-3)
-    stiffer = build_exact_scene(spec(ChainMesh(), SpringsEffect(rule="fixed", stretch=K + 1.0), *SWING[1:]), 3)
+    stiffer = build_exact_scene(spec(ChainMesh(), SpringsEffect(scaling_rule="fixed", stretch=K + 1.0), *SWING[1:]), 3)
     monkeypatch.setattr(equations_of_motion, "build_exact_scene", lambda *question: stiffer)
     after = kept.load_trajectory(asked, 3, TIMES, error=1e-3)
     assert np.abs(after.positions - before.positions).max() > 1e-4

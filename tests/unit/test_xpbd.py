@@ -35,7 +35,7 @@ methods = pytest.mark.parametrize("method", [Xpbd(), XpbdSmallSteps()], ids=lamb
 
 
 def chain(time_step: float = DT, *, direction=(1.0, 0.0, 0.0), stretch: float = 20.0, at: str = "ends") -> Scene:
-    pins = PinsEffect.model_validate({"at": [at], "weight": "exact"})
+    pins = PinsEffect.model_validate({"parts": [at], "weight": "exact"})
     mesh = ChainMesh(length=2.0, direction=direction)
     return build_test_scene(mesh, SpringsEffect(stretch=stretch), GravityEffect(), pins, size=10, time_step=time_step)
 

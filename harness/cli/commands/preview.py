@@ -105,7 +105,7 @@ def _list_selectors(mesh: Any) -> list[tuple[str, str]]:
     rims = find_boundary_loops(mesh)
     found = {
         "parts (at)": [f"{name} {len(part):,}" for name, part in sorted(mesh.parts.items())],
-        "boundary loops (loops)": [f"{k}: {rim.length:.3g} m" for k, rim in enumerate(rims)],
+        "boundary loops (boundary_loops)": [f"{k}: {rim.length:.3g} m" for k, rim in enumerate(rims)],
         "holes": [f"{k}: {rim.length:.3g} m" for k, rim in enumerate(rim for rim in rims if rim.is_hole)],
         "numbers (attribute)": [f"{name} {x.min():.3g} to {x.max():.3g}" for name, x in mesh.attributes.items()],
     }

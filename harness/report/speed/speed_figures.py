@@ -271,7 +271,7 @@ def _single_thread_label(group: Mapping[str, list[ResultRow]], predicate: Callab
 
 def _uses_cholespy(row: ResultRow) -> bool:
     """Return whether a candidate solves with cholespy."""
-    return json.loads(row["parameters"]).get("linear") == "cholespy"
+    return json.loads(row["parameters"]).get("linear_solver") == "cholespy"
 
 
 def _compute_speedup(

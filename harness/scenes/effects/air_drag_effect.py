@@ -32,7 +32,7 @@ class AirDragEffect(ConfigModel):
     is_dissipative: ClassVar[bool] = True
 
     kind: Literal["air-drag"] = "air-drag"
-    law: Literal["linear", "quadratic"] = "linear"
+    drag_law: Literal["linear", "quadratic"] = "linear"
     """Growth of the drag with the speed: linear or quadratic."""
     coefficient: NonNegativeFloat
     """Drag of the whole mesh at a speed of 1 m/s [N]: c [N s/m] if linear; if quadratic, half of the air density times
@@ -43,7 +43,7 @@ class AirDragEffect(ConfigModel):
         c = self.coefficient * mesh.mass_fractions
         if not c.any():
             return EffectContribution()
-        if self.law == "linear":
+        if self.drag_law == "linear":
             return EffectContribution(energies=(Energy.from_vertices(c),))
 
         def force() -> EffectContribution:

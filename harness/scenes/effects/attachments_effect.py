@@ -24,7 +24,7 @@ class AttachmentsEffect(VertexSelection):
     kind: Literal["attachments"] = "attachments"
     stiffness: NonNegativeFloat
     """Total stiffness of the springs [N/m], divided equally, so that it is independent of the mesh size."""
-    to: tuple[Vector3, ...] | None = None
+    anchors: tuple[Vector3, ...] | None = None
     """Anchors [m]: one for all vertices, or one for each in their order; by default their rest positions."""
     motion: KeyFrameMotion | None = None
     """Key frames of the motion of all anchors."""
@@ -35,13 +35,13 @@ class AttachmentsEffect(VertexSelection):
         Raise InputError if they do not fit the mesh.
         """
         vertices = self.select_vertices(mesh, self.kind)
-        if self.to and len(self.to) not in (1, len(vertices)):
+        if self.anchors and len(self.anchors) not in (1, len(vertices)):
             raise InputError(
-                f"attachments: to: came {len(self.to)} points for {len(vertices)} vertices; give one or all"
+                f"attachments: anchors: came {len(self.anchors)} points for {len(vertices)} vertices; give one or all"
             )
         if not self.stiffness:
             return EffectContribution()
-        fixed = np.broadcast_to(self.to, (len(vertices), 3)) if self.to else mesh.rest_positions[vertices]
+        fixed = np.broadcast_to(self.anchors, (len(vertices), 3)) if self.anchors else mesh.rest_positions[vertices]
         motion = self.motion
 
         def points(time: float) -> Positions:

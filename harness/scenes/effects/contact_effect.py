@@ -41,30 +41,30 @@ class ContactEffect(ConfigModel):
     kind: Literal["contact"] = "contact"
     obstacles: tuple[AnyObstacle, ...] = Field(min_length=1)
     """Obstacles that the vertices collide with."""
-    thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.005
+    min_distance: Annotated[PositiveFloat, Field(le=1e9)] = 0.005
     """Distance [m] that vertices keep from an obstacle's surface; shorter than every spring at rest."""
     friction: NonNegativeFloat = 0.0
     """Coulomb's friction coefficient mu, both static and kinetic."""
-    tolerance: PositiveFloat | None = None
-    """Penetration [m] into `thickness` that is allowed at the end of a step; by default a tenth of `thickness`."""
-    speed: PositiveFloat = 10.0
+    penetration_tolerance: PositiveFloat | None = None
+    """Penetration [m] into `min_distance` that is allowed at the end of a step; by default a tenth of it."""
+    max_speed: PositiveFloat = 10.0
     """Largest speed [m/s] at which the penetration tolerance is met."""
-    creep: PositiveFloat = 1e-5
+    eps_v: PositiveFloat = 1e-5
     """Tangential speed [m/s] below which vertices count as sticking, and creep."""
-    friction_rounds: PositiveInt = MAX_FRICTION_ITERATIONS
+    friction_iterations: PositiveInt = MAX_FRICTION_ITERATIONS
     """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
     uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
     @model_validator(mode="after")
     def _check_tolerance(self) -> ContactEffect:
-        if not self.max_penetration < self.thickness:
-            raise ValueError(f"the tolerance of {self.max_penetration:g} m should be less than the thickness")
+        if not self.max_penetration < self.min_distance:
+            raise ValueError(f"the tolerance of {self.max_penetration:g} m should be less than `min_distance`")
         return self
 
     @property
     def max_penetration(self) -> float:
         """Penetration tolerance [m]."""
-        return self.thickness / 10.0 if self.tolerance is None else self.tolerance
+        return self.min_distance / 10.0 if self.penetration_tolerance is None else self.penetration_tolerance
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the contact as one energy, with a stiffness from the other effects.
@@ -73,10 +73,10 @@ class ContactEffect(ConfigModel):
             InputError: if the mesh is too fine for the thickness.
         """
         lengths = mesh.rest_lengths
-        if len(lengths) and not self.thickness < lengths.min():
+        if len(lengths) and not self.min_distance < lengths.min():
             raise InputError(
-                f"contact: came a thickness of {self.thickness:g} m, which is not below the shortest of the springs "
-                f"at rest, {lengths.min():.3g} m; take a smaller thickness, or a coarser mesh"
+                f"contact: came a min_distance of {self.min_distance:g} m, which is not below the shortest of the "
+                f"springs at rest, {lengths.min():.3g} m; take a smaller one, or a coarser mesh"
             )
         obstacles = tuple(one.build_obstacle() for one in self.obstacles)
 
@@ -85,9 +85,9 @@ class ContactEffect(ConfigModel):
             everything = np.arange(len(mass))
             pinned_system = System(mass, time_step, pins=DirichletPins(everything, np.full(len(mass), np.inf)))
             resists = np.asarray(assemble_system_matrix(pinned_system, projective).diagonal(), np.float64)
-            stiffness = _STIFFNESS_SAFETY * max(1.0, self.speed * time_step / self.max_penetration) * resists
-            rubs = self.creep, _MARGIN_FRACTION * mesh.bounding_box_diagonal, time_step, self.friction_rounds
-            return (Energy(obstacles, self.thickness, self.friction, stiffness, *rubs),)
+            stiffness = _STIFFNESS_SAFETY * max(1.0, self.max_speed * time_step / self.max_penetration) * resists
+            rubs = self.eps_v, _MARGIN_FRACTION * mesh.bounding_box_diagonal, time_step, self.friction_iterations
+            return (Energy(obstacles, self.min_distance, self.friction, stiffness, *rubs),)
 
         return EffectContribution(derived_energies=(derived,), scene_checks=(partial(self._check_start, mesh),))
 
@@ -96,7 +96,7 @@ class ContactEffect(ConfigModel):
 
         Also raise it for planes without a gap between them.
         """
-        limit = self.thickness - self.max_penetration
+        limit = self.min_distance - self.max_penetration
         for k, given in enumerate(self.obstacles):
             obstacle = given.build_obstacle()
             for pin in pins:
@@ -113,18 +113,18 @@ class ContactEffect(ConfigModel):
                 if (radius := largest_gap_radius(solid, time)) < limit:
                     raise InputError(
                         f"contact: the planes leave no room at {time:g} s: {max(2.0 * radius, 0.0):.3g} m at most lie "
-                        f"between them, and vertices stay {self.thickness:g} m away from each; move them less"
+                        f"between them, and vertices stay {self.min_distance:g} m away from each; move them less"
                     )
 
     def _raise_penetration(
         self, mesh: Mesh, who: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]
     ) -> None:
-        near = np.flatnonzero(distance < self.thickness - self.max_penetration)
+        near = np.flatnonzero(distance < self.min_distance - self.max_penetration)
         if len(near):
             worst = near[distance[near].argmin()]
             vertex = f"{vertices[worst]}{mesh.format_file_numbers(int(vertices[worst]))}"
             raise InputError(
                 f"contact: {who.format(vertex)} {distance[worst]:.3g} m from the surface of obstacles[{k}] "
-                f"({self.obstacles[k].kind}), which is nearer than the thickness of {self.thickness:g} m; move one of "
-                "them" + (" (negative distances are inside)" if distance[worst] < 0.0 else "")
+                f"({self.obstacles[k].kind}), which is nearer than the min_distance of {self.min_distance:g} m; move "
+                "one of them" + (" (negative distances are inside)" if distance[worst] < 0.0 else "")
             )

@@ -21,20 +21,25 @@ class DashpotsEffect(ConfigModel):
     is_dissipative: ClassVar[bool] = True
 
     kind: Literal["dashpots"] = "dashpots"
-    rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
+    scaling_rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
     """Scaling rule of the coefficients with the mesh size, as for springs."""
     stretch: NonNegativeFloat
     """Along the mesh's lines, in the unit of spring stiffness times seconds: `fixed` [N s/m] each."""
     shear: NonNegativeFloat | None = None
     """Across the mesh's cells, in the same unit; equal to `stretch` by default."""
-    reference: PositiveInt | None = None
+    reference_size: PositiveInt | None = None
     """liu2013: the mesh size for which the coefficients above are given."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the dashpots as one energy; empty if no spring is damped."""
         shear = self.stretch if self.shear is None else self.shear
         c = compute_spring_stiffness(
-            mesh, scaling_rule=self.rule, stretch=self.stretch, shear=shear, bend=0.0, reference_size=self.reference
+            mesh,
+            scaling_rule=self.scaling_rule,
+            stretch=self.stretch,
+            shear=shear,
+            bend=0.0,
+            reference_size=self.reference_size,
         )
         damped = np.flatnonzero(c)
         if not len(damped):

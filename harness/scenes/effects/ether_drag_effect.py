@@ -25,17 +25,17 @@ class EtherDragEffect(ConfigModel):
     is_baseline_effect: ClassVar[bool] = True
 
     kind: Literal["ether-drag"] = "ether-drag"
-    rate: NonNegativeFloat
+    decay_rate: NonNegativeFloat
     """Decay rate c [1/s]; the paper's factor per step is exp(-c dt)."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return a filter that scales the velocity; empty for a zero rate."""
-        if self.rate == 0.0:
+        if self.decay_rate == 0.0:
             return EffectContribution()
 
         def drag() -> EffectContribution:
-            return EffectContribution(energies=(Energy.from_vertices(self.rate * mass),))
+            return EffectContribution(energies=(Energy.from_vertices(self.decay_rate * mass),))
 
         return EffectContribution(
-            velocity_filters=(ExponentialDecay(exp(-self.rate * time_step)),), continuous_forms=(drag,)
+            velocity_filters=(ExponentialDecay(exp(-self.decay_rate * time_step)),), continuous_forms=(drag,)
         )

@@ -28,21 +28,21 @@ class RayleighEffect(ConfigModel):
     is_dissipative: ClassVar[bool] = True
 
     kind: Literal["rayleigh"] = "rayleigh"
-    mass: NonNegativeFloat = 0.0
+    mass_coefficient: NonNegativeFloat = 0.0
     """Mass coefficient a [1/s]: damps slow modes and rigid motion, v by exp(-a t)."""
-    stiffness: NonNegativeFloat = 0.0
+    stiffness_coefficient: NonNegativeFloat = 0.0
     """Stiffness coefficient b [s]: damps fast modes."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the mass damping as an energy, and the damping derived from the other effects' energies."""
-        damping = self.mass * mass
+        damping = self.mass_coefficient * mass
         return EffectContribution(
             energies=(RayleighDamping.from_vertices(damping),) if damping.any() else (),
-            derived_energies=(self._damp_energies,) if self.stiffness else (),
+            derived_energies=(self._damp_energies,) if self.stiffness_coefficient else (),
         )
 
     def _damp_energies(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
-        b = self.stiffness
+        b = self.stiffness_coefficient
         springs = [energy for energy in energies if isinstance(energy, Springs)]
         constant = [e for e in energies if isinstance(e, Quadratic) and not is_lagged(e)]
         return (

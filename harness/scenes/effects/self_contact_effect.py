@@ -45,18 +45,18 @@ class SelfContactEffect(ConfigModel):
     max_convergence_order: ClassVar[float] = 1.0
 
     kind: Literal["self-contact"] = "self-contact"
-    thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.002
+    min_distance: Annotated[PositiveFloat, Field(le=1e9)] = 0.002
     """Minimum distance [m] between points and triangles, and between edges: two layers rest at slightly more than this
     distance."""
-    range: PositiveFloat | None = None
-    """Distance [m] beyond the thickness at which the barrier activates; equal to the thickness by default."""
-    stiffness: PositiveFloat | None = None
+    dhat: PositiveFloat | None = None
+    """Distance [m] beyond `min_distance` at which the barrier activates; equal to `min_distance` by default."""
+    barrier_stiffness: PositiveFloat | None = None
     """Barrier stiffness k [N/m] at each vertex; by default a tenth of the resistance of inertia and springs."""
     friction: NonNegativeFloat = 0.0
     """Coulomb's friction coefficient mu, both static and kinetic."""
-    creep: PositiveFloat = 1e-3
+    eps_v: PositiveFloat = 1e-3
     """Tangential speed [m/s] below which pairs count as sticking, and creep."""
-    friction_rounds: PositiveInt = MAX_FRICTION_ITERATIONS
+    friction_iterations: PositiveInt = MAX_FRICTION_ITERATIONS
     """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
     uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
@@ -69,7 +69,7 @@ class SelfContactEffect(ConfigModel):
         (edges, faces), rest = collision_primitives(mesh), mesh.rest_positions
         if not len(edges):
             return EffectContribution()
-        reach = self.thickness if self.range is None else self.range
+        reach = self.min_distance if self.dhat is None else self.dhat
         if crossed := find_edge_triangle_intersections(rest, edges, mesh.triangles):
             raise InputError(
                 "self-contact: the mesh passes through itself at rest, "
@@ -77,13 +77,13 @@ class SelfContactEffect(ConfigModel):
             )
 
         def energy(stiffness: NDArray[np.float64]) -> Energy:
-            surface = CollisionMesh.from_rest_shape(rest, edges, faces, stiffness, self.thickness, reach)
+            surface = CollisionMesh.from_rest_shape(rest, edges, faces, stiffness, self.min_distance, reach)
             if (surface.rest_close_pairs[1] <= 0.0).any():
                 raise InputError("self-contact: the mesh touches itself at rest; move what touches apart, or join it")
-            return Energy(surface, self.friction, self.creep, self.friction_rounds)
+            return Energy(surface, self.friction, self.eps_v, self.friction_iterations)
 
         def derived(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
-            return (energy(compute_barrier_stiffness(self.stiffness, mass, time_step, energies)),)
+            return (energy(compute_barrier_stiffness(self.barrier_stiffness, mass, time_step, energies)),)
 
         def check(start: Positions, pins: Sequence[PinGroup]) -> None:
             """Raise InputError for exact pins that move, and for a start (n, 3) [m] with intersections."""
@@ -93,7 +93,7 @@ class SelfContactEffect(ConfigModel):
                     "self-contact: the start passes through itself, "
                     f"{describe_intersections(crossed, mesh)}; move them apart"
                 )
-            require_intersection_free("self-contact", energy(np.ones(len(mass))), start, self.thickness, mesh)
+            require_intersection_free("self-contact", energy(np.ones(len(mass))), start, self.min_distance, mesh)
 
         apart = (IntersectionCheck(((edges, mesh.triangles),)),)
         return EffectContribution(

@@ -18,37 +18,37 @@ IndexArray = NDArray[np.int64]
 class SewingEffect(ConfigModel):
     """Threads between each vertex of one row and the nearest vertex at rest of the other row, in both directions.
 
-    A thread pulls if it is longer than its current limit, which decreases linearly from `begin` to `end`; it never
-    pushes.
+    A thread pulls if it is longer than its current limit, which decreases linearly from `start_time` to `end_time`; it
+    never pushes.
     """
 
     max_convergence_order: ClassVar[float] = 1.0
 
     kind: Literal["sewing"] = "sewing"
-    first: VertexSelection
+    first_row: VertexSelection
     """First row: a vertex selection as for pins."""
-    second: VertexSelection
+    second_row: VertexSelection
     """Second row."""
     stiffness: NonNegativeFloat
     """Total stiffness of the threads [N/m], divided equally, so that it is independent of the mesh size."""
-    begin: NonNegativeFloat = 0.0
+    start_time: NonNegativeFloat = 0.0
     """Time [s] at which the threads start to shorten; until then they have their rest lengths."""
-    end: NonNegativeFloat = 1.0
-    """Time [s] at which the threads reach their final length; equal to `begin` for an instantaneous change."""
-    gap: NonNegativeFloat = 0.0
-    """Final length [m]; with self-contact at least its thickness plus range, or contact forces oppose it."""
+    end_time: NonNegativeFloat = 1.0
+    """Time [s] at which the threads reach their final length; equal to `start_time` for an instantaneous change."""
+    final_length: NonNegativeFloat = 0.0
+    """Final length [m]; with self-contact at least its min_distance plus dhat, or contact forces oppose it."""
 
     @model_validator(mode="after")
     def _check_times(self) -> "SewingEffect":
-        if self.end < self.begin:
-            raise ValueError(f"end at {self.end:g} s, before they begin at {self.begin:g} s")
+        if self.end_time < self.start_time:
+            raise ValueError(f"end at {self.end_time:g} s, before they begin at {self.start_time:g} s")
         return self
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the threads as one energy, empty for zero stiffness; raise InputError if the rows overlap."""
         rows = (
-            self.first.select_vertices(mesh, f"{self.kind}: first"),
-            self.second.select_vertices(mesh, f"{self.kind}: second"),
+            self.first_row.select_vertices(mesh, f"{self.kind}: first"),
+            self.second_row.select_vertices(mesh, f"{self.kind}: second"),
         )
         if len(both := np.intersect1d(*rows)):
             raise InputError(
@@ -59,11 +59,11 @@ class SewingEffect(ConfigModel):
             return EffectContribution()
         pairs = _match_rows(mesh, *rows)
         at_rest = np.linalg.norm(mesh.rest_positions[pairs[:, 0]] - mesh.rest_positions[pairs[:, 1]], axis=1)
-        drawn = np.minimum(at_rest, self.gap)
+        drawn = np.minimum(at_rest, self.final_length)
 
         def longest(time: float) -> NDArray[np.float64]:
-            long = self.end - self.begin
-            done = float(np.clip((time - self.begin) / long, 0.0, 1.0)) if long else float(time >= self.begin)
+            long = self.end_time - self.start_time
+            done = float(np.clip((time - self.start_time) / long, 0.0, 1.0)) if long else float(time >= self.start_time)
             return at_rest + done * (drawn - at_rest)
 
         k = np.full(len(pairs), self.stiffness / len(pairs))

@@ -29,10 +29,10 @@ class SpringsEffect(ConfigModel):
     is_baseline_effect: ClassVar[bool] = True
 
     kind: Literal["springs"] = "springs"
-    rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
+    scaling_rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
     """Scaling rule of the values below with the mesh size. `continuum`: the material is independent of the mesh;
     `fixed`: each spring has the given stiffness [N/m]; `liu2013`: stiffness proportional to the resolution,
-    given at the size `reference`."""
+    given at the size `reference_size`."""
     stretch: NonNegativeFloat | Literal["exact"] | OrthotropicStiffness
     """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids; or one value
     each for warp, weft and bias of a woven cloth; or `exact`: length constraints, supported by `avbd` only."""
@@ -40,7 +40,7 @@ class SpringsEffect(ConfigModel):
     """Across the mesh's cells, in the same unit; equal to `stretch` by default."""
     bend: NonNegativeFloat = 0.0
     """Springs that skip one vertex. Continuum: bending stiffness [N m]; otherwise [N/m]."""
-    reference: PositiveInt | None = None
+    reference_size: PositiveInt | None = None
     """liu2013: the mesh size for which the stiffnesses above are given."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
@@ -48,7 +48,12 @@ class SpringsEffect(ConfigModel):
         given = self.stretch if self.shear is None else self.shear
         stretch, shear = (inf if x == "exact" else x for x in (self.stretch, given))
         k = compute_spring_stiffness(
-            mesh, scaling_rule=self.rule, stretch=stretch, shear=shear, bend=self.bend, reference_size=self.reference
+            mesh,
+            scaling_rule=self.scaling_rule,
+            stretch=stretch,
+            shear=shear,
+            bend=self.bend,
+            reference_size=self.reference_size,
         )
         stiff, exact = np.flatnonzero((k > 0.0) & (k < inf)), mesh.springs[k == inf]
         found = build_length_constraints(mesh, exact, 1.0, 1.0)

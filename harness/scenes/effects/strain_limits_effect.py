@@ -27,21 +27,21 @@ class StrainLimitsEffect(ConfigModel):
     max_convergence_order: ClassVar[float] = 1.0
 
     kind: Literal["strain-limits"] = "strain-limits"
-    longest: float = Field(default=1.1, ge=1.0, le=1e6)
+    max_stretch: float = Field(default=1.1, ge=1.0, le=1e6)
     """Largest length relative to the rest length."""
-    shortest: float = Field(default=0.0, ge=0.0, le=1.0)
+    min_stretch: float = Field(default=0.0, ge=0.0, le=1.0)
     """Smallest length relative to the rest length; 0 lets springs shrink freely."""
     stiffness: NonNegativeFloat | Literal["exact"]
     """Stiffness of a spring beyond its limits, in the unit of the `stretch` of springs by the same rule; or `exact`:
     inequality constraints of the length, supported by `avbd` only."""
-    rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
+    scaling_rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
     """Scaling rule of the stiffness with the mesh size, as for springs."""
-    reference: PositiveInt | None = None
+    reference_size: PositiveInt | None = None
     """liu2013: the mesh size for which the stiffness is given."""
 
     @model_validator(mode="after")
     def _check_limits(self) -> "StrainLimitsEffect":
-        if self.shortest == self.longest:
+        if self.min_stretch == self.max_stretch:
             raise ValueError("leave no length but one; use springs")
         return self
 
@@ -49,15 +49,15 @@ class StrainLimitsEffect(ConfigModel):
         """Return the limits as one energy, empty for zero stiffness, or as length constraints."""
         s = 1.0 if self.stiffness == "exact" else self.stiffness
         k = compute_spring_stiffness(
-            mesh, scaling_rule=self.rule, stretch=s, shear=s, bend=0.0, reference_size=self.reference
+            mesh, scaling_rule=self.scaling_rule, stretch=s, shear=s, bend=0.0, reference_size=self.reference_size
         )
         edges = mesh.springs[k > 0.0]
         if not len(edges):
             return EffectContribution()
         if self.stiffness == "exact":
-            return build_length_constraints(mesh, edges, self.shortest, self.longest)
+            return build_length_constraints(mesh, edges, self.min_stretch, self.max_stretch)
         rest, direction = rest_directions(mesh.rest_positions, edges)
-        limits = self.shortest * rest, self.longest * rest
+        limits = self.min_stretch * rest, self.max_stretch * rest
         return EffectContribution(energies=(strain_limit_energy.StrainLimits(edges, k[k > 0.0], *limits, direction),))
 
     @classmethod

@@ -53,29 +53,29 @@ class SurfaceContactEffect(ConfigModel):
     kind: Literal["surface-contact"] = "surface-contact"
     obstacles: tuple[AnySurface, ...] = Field(min_length=1)
     """Obstacles that the mesh collides with."""
-    thickness: Annotated[PositiveFloat, Field(le=1e9)] = 0.002
+    min_distance: Annotated[PositiveFloat, Field(le=1e9)] = 0.002
     """Minimum distance [m] from an obstacle's triangles; the mesh rests at slightly more."""
-    range: PositiveFloat | None = None
-    """Distance [m] beyond the thickness at which the barrier activates; equal to the thickness by default."""
-    stiffness: PositiveFloat | None = None
+    dhat: PositiveFloat | None = None
+    """Distance [m] beyond `min_distance` at which the barrier activates; equal to `min_distance` by default."""
+    barrier_stiffness: PositiveFloat | None = None
     """Barrier stiffness k [N/m] at each vertex; by default a tenth of the resistance of inertia and springs."""
     friction: NonNegativeFloat = 0.0
     """Coulomb's friction coefficient mu, both static and kinetic."""
-    creep: PositiveFloat = 1e-3
+    eps_v: PositiveFloat = 1e-3
     """Tangential speed [m/s] below which pairs count as sticking, and creep."""
-    friction_rounds: PositiveInt = MAX_FRICTION_ITERATIONS
+    friction_iterations: PositiveInt = MAX_FRICTION_ITERATIONS
     """Maximum number of solves per step until friction converges, each with the normal forces of the previous one; 1
     uses those of the step's start, which is of order 1 and misses the first step of contact."""
 
     @property
     def resolved_dhat(self) -> float:
         """Barrier activation distance beyond the thickness [m], with its default resolved."""
-        return self.thickness if self.range is None else self.range
+        return self.min_distance if self.dhat is None else self.dhat
 
     def build_obstacle_surfaces(self, rest_positions: Positions) -> list[SurfaceMesh]:
         """Build the surfaces of the obstacles in their declared poses; `rest_positions` (n, 3) [m] of the mesh."""
         return [
-            build_obstacle_surface(one, _MAX_SAG_FRACTION * self.thickness, rest_positions) for one in self.obstacles
+            build_obstacle_surface(one, _MAX_SAG_FRACTION * self.min_distance, rest_positions) for one in self.obstacles
         ]
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
@@ -121,13 +121,13 @@ class SurfaceContactEffect(ConfigModel):
                 MeshPrimitives.from_rest_shape(mesh.rest_positions, edges, faces),
                 MeshPrimitives.from_rest_shape(points, ends, triangles, n),
             )
-            against = ObstacleCollisionMesh(own, others, stiffness, self.thickness, self.resolved_dhat)
+            against = ObstacleCollisionMesh(own, others, stiffness, self.min_distance, self.resolved_dhat)
             return ObstacleContact.from_collision_mesh(
-                against, place, carry, self.friction, self.creep, self.friction_rounds
+                against, place, carry, self.friction, self.eps_v, self.friction_iterations
             )
 
         def derived(energies: Sequence[Energy]) -> tuple[Energy, ...]:
-            return (energy(compute_barrier_stiffness(self.stiffness, mass, time_step, energies)),)
+            return (energy(compute_barrier_stiffness(self.barrier_stiffness, mass, time_step, energies)),)
 
         apart = IntersectionCheck(((edges, n + triangles), (n + ends, mesh.triangles)), place)
 
@@ -139,7 +139,7 @@ class SurfaceContactEffect(ConfigModel):
                     f"{self.kind}: the start passes through obstacles, "
                     f"{describe_intersections(crossed, mesh)}; move them apart"
                 )
-            require_intersection_free(self.kind, energy(np.ones(n)), start, self.thickness, mesh)
+            require_intersection_free(self.kind, energy(np.ones(n)), start, self.min_distance, mesh)
 
         return EffectContribution(
             derived_energies=(derived,),

@@ -10,7 +10,8 @@ of the air in one step, f dt <= m |u|; otherwise light cloth is unstable in a st
 
     constant    uniform in space and time
     gusts       the constant one, and waves that it advects (after Kraichnan 1970): each component varies by the
-                fraction `gustiness` of the mean's magnitude (root mean square), at 16 frequencies around `frequency`
+                fraction `turbulence_intensity` of the mean's magnitude (root mean square), at 16 frequencies
+                around `frequency`
     assignment  that of the University of Toronto assignment, with t the simulated time [s], b the diagonal of
                 the rest bounding box and phi = x / b + t at the current x:
 
@@ -48,9 +49,9 @@ class WindEffect(ConfigModel):
     kind: Literal["wind"] = "wind"
     field: Literal["constant", "gusts", "assignment"] = "constant"
     """Variation of the field: constant, random gusts, or the assignment's waves along x."""
-    per: Literal["vertex", "share", "triangle"] = "share"
+    acts_on: Literal["vertex", "mass", "triangle"] = "mass"
     """Target of the field. `vertex`: the force acts on every vertex, as in the assignment, so the total grows with the
-    mesh size; `share`: the field is the total force, distributed like the mass, independent of the mesh size;
+    mesh size; `mass`: the field is the total force, distributed like the mass, independent of the mesh size;
     `triangle`: the field is the velocity of the air, with drag and lift on triangles."""
     force: Vector3 = (1.0, 0.0, 0.0)
     """Constant field, or mean of the gusts, on vertices [N]."""
@@ -58,42 +59,44 @@ class WindEffect(ConfigModel):
     """Constant field, or mean of the gusts, on triangles [m/s]; zero is still air, which causes drag."""
     strength: float = 1.0
     """Factor of the field; zero disables the wind, including its drag."""
-    gustiness: NonNegativeFloat = 0.3
+    turbulence_intensity: NonNegativeFloat = 0.3
     """gusts: root mean square variation of each component relative to the mean."""
     frequency: PositiveFloat = 1.0
     """gusts: centre frequency [1/s]; frequencies range from a quarter to four times of it."""
     seed: NonNegativeInt = 0
     """gusts: random seed; the same seed gives the same gusts at all times and mesh sizes."""
-    density: NonNegativeFloat = 1.2
+    air_density: NonNegativeFloat = 1.2
     """triangle: density of the air [kg/m^3]."""
-    drag: NonNegativeFloat = 1.0
+    drag_coefficient: NonNegativeFloat = 1.0
     """triangle: drag coefficient C_D."""
-    lift: NonNegativeFloat = 0.0
+    lift_coefficient: NonNegativeFloat = 0.0
     """triangle: lift coefficient C_L."""
 
     @model_validator(mode="after")
     def _check_options(self) -> "WindEffect":
-        unused = {"triangle": {"force"}}.get(self.per, {"velocity", "density", "drag", "lift"})
+        unused = {"triangle": {"force"}}.get(
+            self.acts_on, {"velocity", "air_density", "drag_coefficient", "lift_coefficient"}
+        )
         if self.field != "gusts":
-            unused = unused | {"gustiness", "frequency", "seed"}
+            unused = unused | {"turbulence_intensity", "frequency", "seed"}
         if self.field == "assignment":
             unused = unused | {"force", "velocity"}
         for key in sorted(unused & self.model_fields_set):
-            raise ValueError(f"`{key}` has no meaning for the field {self.field} per {self.per}; leave it out")
+            raise ValueError(f"`{key}` has no meaning for the field {self.field} per {self.acts_on}; leave it out")
         return self
 
     @property
     def mean_field(self) -> NDArray[np.float64]:
         """Constant field or mean of the gusts, (3,) [N] or [m/s], including the strength."""
-        return self.strength * np.array(self.velocity if self.per == "triangle" else self.force)
+        return self.strength * np.array(self.velocity if self.acts_on == "triangle" else self.force)
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the field as one force, empty for zero strength; raise InputError if triangles are missing."""
         if not self.strength:
             return EffectContribution()
-        if self.per == "triangle":
+        if self.acts_on == "triangle":
             return EffectContribution(forces=_triangle_wind(self, mesh, mass, time_step))
-        weight = np.ones(len(mass)) if self.per == "vertex" else mesh.mass_fractions
+        weight = np.ones(len(mass)) if self.acts_on == "vertex" else mesh.mass_fractions
         return EffectContribution(forces=_vertex_wind(self, mesh, weight[:, None]))
 
 
@@ -112,8 +115,8 @@ def _vertex_wind(wind: WindEffect, mesh: Mesh, weight: NDArray[np.float64]) -> t
 def _triangle_wind(wind: WindEffect, mesh: Mesh, mass: NDArray[np.float64], dt: float) -> tuple[ForceFunction, ...]:
     triangles, field = mesh.triangles, _FIELD_BUILDERS[wind.field](wind, mesh)
     if not len(triangles):
-        raise InputError("wind: per: triangle needs triangles, and this mesh has none; let it act per share")
-    if not wind.density or not (wind.drag or wind.lift):
+        raise InputError("wind: acts_on: triangle needs triangles, and this mesh has none; take acts_on: mass")
+    if not wind.air_density or not (wind.drag_coefficient or wind.lift_coefficient):
         return ()
     limit = _lump_triangle_masses(mesh, mass) / dt
 
@@ -127,7 +130,12 @@ def _triangle_wind(wind: WindEffect, mesh: Mesh, mass: NDArray[np.float64], dt: 
         size = np.linalg.norm(area, axis=1)[:, None]
         normal = np.sign(wide)[:, None] * np.divide(area, size, out=np.zeros_like(area), where=size > 0.0)
         across = normal - np.einsum("ij,ij->i", normal, ahead)[:, None] * ahead
-        f = 0.5 * wind.density * (np.abs(wide) * speed)[:, None] * (wind.drag * ahead + wind.lift * across)
+        f = (
+            0.5
+            * wind.air_density
+            * (np.abs(wide) * speed)[:, None]
+            * (wind.drag_coefficient * ahead + wind.lift_coefficient * across)
+        )
         most, wanted_force = limit * speed, np.linalg.norm(f, axis=1)
         f *= np.divide(most, wanted_force, out=np.ones_like(wanted_force), where=wanted_force > most)[:, None]
         out = np.zeros_like(p)
@@ -156,9 +164,9 @@ def _gust_field(wind: WindEffect, mesh: Mesh) -> WindField:
     size = float(np.linalg.norm(mean))
     turns = 2.0 * np.pi * wind.frequency * np.exp(rng.uniform(np.log(0.25), np.log(4.0), _GUST_WAVES))
     phase = rng.uniform(0.0, 2.0 * np.pi, (_GUST_WAVES, 3))
-    height = wind.gustiness * size * (2.0 / _GUST_WAVES) ** 0.5  # a cosine's mean square is 1/2
+    height = wind.turbulence_intensity * size * (2.0 / _GUST_WAVES) ** 0.5  # a cosine's mean square is 1/2
     # Moving air advects its gusts. A force field has no speed; its waves cross the mesh in a second.
-    carried = mean / size**2 if wind.per == "triangle" else mean / size / (mesh.bounding_box_diagonal or 1.0)
+    carried = mean / size**2 if wind.acts_on == "triangle" else mean / size / (mesh.bounding_box_diagonal or 1.0)
 
     def field(x: Positions, t: float) -> Positions:
         late = (t - x @ carried)[:, None]

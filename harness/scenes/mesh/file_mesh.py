@@ -45,8 +45,8 @@ class FileMesh(ConfigModel):
     kind: Literal["file"] = "file"
     path: Path
     """Path of an OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, a VTP, or a meshio format (VTK, ...)."""
-    springs: SpringRule | None = None
-    """Springs along `edges` of faces only, or between all corners of a face (`face_pairs`); by default face_pairs for
+    spring_rule: SpringRule | None = None
+    """Springs along `edges` of faces only, or between all corners of a face (`face-pairs`); by default face-pairs for
     JSON scenes, and edges for all other files."""
 
     def build_mesh(self, size: int = 0) -> Mesh:
@@ -56,7 +56,7 @@ class FileMesh(ConfigModel):
             InputError: for a file that is missing, malformed, empty or too large.
         """
         path, suffix = self.path, self.path.suffix.lower()
-        rule = self.springs or ("face_pairs" if suffix == ".json" else "edges")
+        rule = self.spring_rule or ("face-pairs" if suffix == ".json" else "edges")
         if suffix == ".json":
             path = path.parent / read_assignment_json(path).obj
             suffix = path.suffix.lower()

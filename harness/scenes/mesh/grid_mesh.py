@@ -64,7 +64,7 @@ class GridMesh(_SheetMesh):
     kind: Literal["grid"] = "grid"
     diagonals: Literal["none", "one", "both"] = "both"
     """Diagonal springs per cell, against shear."""
-    skip_one: bool = False
+    bend_springs: bool = False
     """Springs from a vertex to the next but one, against bending."""
 
     SIZE_MEANING: ClassVar[str] = "vertices along its width"
@@ -89,7 +89,7 @@ class GridMesh(_SheetMesh):
             springs={
                 STRETCH: build_offset_pairs(index, (0, 1), (1, 0)),
                 SHEAR: build_offset_pairs(index, *_DIAGONAL_OFFSETS[self.diagonals]),
-                BEND: build_offset_pairs(index, *(((0, 2), (2, 0)) if self.skip_one else ())),
+                BEND: build_offset_pairs(index, *(((0, 2), (2, 0)) if self.bend_springs else ())),
             },
             triangles=triangles,
             vertex_weights=lump_areas(rest, triangles),

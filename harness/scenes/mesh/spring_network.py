@@ -37,7 +37,7 @@ from springbench.harness.scenes.mesh.polygon_triangulation import (
     triangulate_polygons,
 )
 
-SpringRule = Literal["edges", "face_pairs"]
+SpringRule = Literal["edges", "face-pairs"]
 
 MAX_FILE_BYTES = 2**30
 """Maximum size of a file; larger files are rejected before reading."""
@@ -105,7 +105,7 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
 
     If every cell has two vertices, each is a spring (STRETCH), in file order: polygons, then segments.
     Otherwise the springs are unique pairs in lexicographic order: the sides of polygons, the segments and the
-    edges of tetrahedra (STRETCH), then with `face_pairs` the other pairs of corners of a face (SHEAR).
+    edges of tetrahedra (STRETCH), then with `face-pairs` the other pairs of corners of a face (SHEAR).
     Triangles: those of the polygons, or the surface of the tetrahedra, facing outwards. Mass is proportional to volume
     if there are tetrahedra, else to area, else to length; a vertex without such a cell has none. A cell that
     repeats another, or is a part of it, counts once, with a warning.
@@ -138,7 +138,7 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
         springs = {STRETCH: np.concatenate([NO_PAIRS, *groups, cells.segments])}
     else:
         springs = {STRETCH: sort_unique_pairs(along)}
-        if spring_rule == "face_pairs":
+        if spring_rule == "face-pairs":
             springs[SHEAR] = _exclude_pairs(
                 sort_unique_pairs(np.concatenate([NO_PAIRS, *map(polygon_corner_pairs, groups)])), springs[STRETCH]
             )

@@ -47,7 +47,7 @@ class Admm:
     """ADMM for springs, strain limits and constant quadratic forms.
 
     Args:
-        weight: W, relative to the stiffness of each edge.
+        penalty_weight: W, relative to the stiffness of each edge.
     """
 
     is_minimiser: ClassVar[bool] = True
@@ -62,12 +62,12 @@ class Admm:
         ),
     )
 
-    weight: float = 1.0
+    penalty_weight: float = 1.0
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
-        if not 0.0 < self.weight < np.inf:
-            raise ValueError(f"weight: should be positive and finite, not {self.weight}")
+        if not 0.0 < self.penalty_weight < np.inf:
+            raise ValueError(f"penalty_weight: should be positive and finite, not {self.penalty_weight}")
 
     def prepare(self, system: System) -> PreparedAdmm:
         """Prepare the method for a system.
@@ -84,13 +84,14 @@ class Admm:
             )
         energies = require_projective(system, "admm")
         weighted = [
-            replace(e, stiffness=self.weight * e.stiffness) if isinstance(e, EdgeEnergy) else e for e in energies
+            replace(e, stiffness=self.penalty_weight * e.stiffness) if isinstance(e, EdgeEnergy) else e
+            for e in energies
         ]
         base = measure = prepare_local_global(system, weighted, lambda Q: build_linear_solver(Q))
-        if self.weight != 1.0:
+        if self.penalty_weight != 1.0:
             measure = prepare_local_global(system, energies, lambda Q: build_linear_solver(Q))
         return PreparedAdmm(
-            base, measure, FixedObjective(system), _ProjectedEdges.from_energies(system.energies), self.weight
+            base, measure, FixedObjective(system), _ProjectedEdges.from_energies(system.energies), self.penalty_weight
         )
 
 
@@ -140,7 +141,7 @@ class PreparedAdmm(IterativeSolver):
         edges: _ProjectedEdges,
         weight: float,
     ) -> None:
-        self.local_global, self.residual_metric, self.fixed_objective, self.projected_edges, self.weight = (
+        self.local_global, self.residual_metric, self.fixed_objective, self.projected_edges, self.penalty_weight = (
             base,
             measure,
             objective,

@@ -71,11 +71,11 @@ class AggregatedJacobi:
         ),
     )
 
-    sweeps: int = 2
+    jacobi_sweeps: int = 2
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
-        require_valid_sweeps(self.sweeps)
+        require_valid_sweeps(self.jacobi_sweeps)
 
     def prepare(self, system: System) -> PreparedAggregatedJacobi:
         """Prepare the method for a system.
@@ -92,7 +92,9 @@ class AggregatedJacobi:
         energies = require_projective(system, "a-jacobi")
         measure = cast("ContactFreeSolver", CompiledLocalGlobal().prepare(system))
         base = prepare_local_global(
-            system, energies, lambda Q: (AggregatedSweeps(Q, self.sweeps), f"{self.sweeps} sweeps of Jacobi")
+            system,
+            energies,
+            lambda Q: (AggregatedSweeps(Q, self.jacobi_sweeps), f"{self.jacobi_sweeps} sweeps of Jacobi"),
         )
         return PreparedAggregatedJacobi(base, measure, FixedObjective(system))
 
@@ -100,7 +102,7 @@ class AggregatedJacobi:
 def require_valid_sweeps(sweeps: int) -> None:
     """Raise ValueError unless the number of sweeps is in the supported range."""
     if not 1 <= sweeps <= _MAX_SWEEPS:
-        raise ValueError(f"sweeps: should be from 1 to {_MAX_SWEEPS}, not {sweeps}")
+        raise ValueError(f"jacobi_sweeps: should be from 1 to {_MAX_SWEEPS}, not {sweeps}")
 
 
 class AggregatedSweeps:

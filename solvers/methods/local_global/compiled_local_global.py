@@ -40,7 +40,7 @@ class CompiledLocalGlobal:
     is_monotone: ClassVar[bool] = True
     solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013, is_family_default=True)
 
-    linear: LinearSolverName = "auto"
+    linear_solver: LinearSolverName = "auto"
     precision: Precision = "float64"
 
     def prepare(self, system: System) -> PreparedSolver:
@@ -66,7 +66,7 @@ class CompiledLocalGlobal:
         base = prepare_local_global(
             system,
             alone or energies,
-            lambda Q: build_linear_solver(Q, self.linear, self.precision),
+            lambda Q: build_linear_solver(Q, self.linear_solver, self.precision),
             is_low_precision=self.precision != "float64",
         )
         found = compile_iterations(base)

@@ -36,7 +36,7 @@ factor is used."""
 _CONTACT_SCHEDULE = (*((keep, 0.0) for keep in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.25)), *SHIFT_SCHEDULE[3:])
 """The schedule with active collisions."""
 
-IndefiniteStrategy = Literal["graded", "clamp", "absolute", "trust-region", "progressive"]
+IndefiniteStrategy = Literal["shift-schedule", "clamp", "absolute", "trust-region", "progressive"]
 
 _TRUST_TOLERANCE = 0.01
 """Largest deviation from 1 of the ratio of actual to predicted decrease for which eigenvalues are clamped, as in the
@@ -188,7 +188,7 @@ class ProgressiveRule(ClampRule):
 
 
 REGULARISATION_RULES: dict[IndefiniteStrategy, Callable[[], RegularisationRule]] = {
-    "graded": ShiftScheduleRule,
+    "shift-schedule": ShiftScheduleRule,
     "clamp": ClampRule,
     "absolute": lambda: ClampRule(use_absolute=True),
     "trust-region": TrustRegionRule,

@@ -75,7 +75,7 @@ class NewtonCG(PrecisionOptions):
         ),
     )
 
-    preconditioner: PreconditionerName = "factor"
+    preconditioner: PreconditionerName = "cholesky"
 
     def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
@@ -105,10 +105,10 @@ class TruncatedNewtonIteration:
     """The iteration for one system; `compiled_cg` is the fused CG kernel, None if unavailable."""
 
     def __init__(
-        self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "factor"
+        self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "cholesky"
     ) -> None:
         self._metric, self._linearise_at = metric, build_preconditioner(preconditioner, metric, objective, "newton-cg")
-        factor = _compiled_factor(metric) if preconditioner == "factor" else None
+        factor = _compiled_factor(metric) if preconditioner == "cholesky" else None
         self.compiled_cg = _CompiledCG(objective, factor) if factor else None
         self._friction_search = make_friction_search(metric)
 

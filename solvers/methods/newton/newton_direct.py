@@ -4,11 +4,10 @@
 
 The Hessian of compressed springs may be indefinite. It remains exact wherever it has a Cholesky factor, which preserves
 quadratic convergence. Where it has none, an increasing part of the springs' negative lateral stiffness is removed, and
-finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite`, see
-`springbench.solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005)
-converges linearly. Where the
-slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a saddle. From a stationary
-point whose exact Hessian has no factor, the method escapes
+finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite_strategy`,
+see `springbench.solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005) converges
+linearly. Where the slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a
+saddle. From a stationary point whose exact Hessian has no factor, the method escapes
 (`springbench.solvers.methods.newton.negative_curvature`).
 
 With active contacts, an iteration converges friction and may consist of several steps
@@ -70,7 +69,7 @@ class NewtonSolver:
         supports_error_control=True,
     )
 
-    indefinite: IndefiniteStrategy = "graded"
+    indefinite_strategy: IndefiniteStrategy = "shift-schedule"
 
     def prepare(self, system: System) -> PreparedDescent:
         """Prepare the method for a system.
@@ -86,22 +85,22 @@ class NewtonSolver:
             for k in objective.other_energy_indices
             if not is_barrier_energy(system.energies[k])
         }
-        if whole and self.indefinite != "graded":
+        if whole and self.indefinite_strategy != "shift-schedule":
             raise Unsupported(
-                f"newton, indefinite: {self.indefinite}: changes second derivatives element by element, and there are "
-                f"none of {', '.join(sorted(whole))}; take indefinite: graded"
+                f"newton, indefinite_strategy: {self.indefinite_strategy}: changes second derivatives element by "
+                f"element, and there are none of {', '.join(sorted(whole))}; take indefinite_strategy: shift-schedule"
             )
         factor = objective.hessian_matrix.factor
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.description}"
         choice += objective.interpreted_energies
-        return PreparedDescent(objective, metric, NewtonIteration(metric, self.indefinite), choice, facts)
+        return PreparedDescent(objective, metric, NewtonIteration(metric, self.indefinite_strategy), choice, facts)
 
 
 class NewtonIteration:
     """The iteration of Newton's method for one system."""
 
-    def __init__(self, metric: ResidualMetric, indefinite: IndefiniteStrategy = "graded") -> None:
+    def __init__(self, metric: ResidualMetric, indefinite: IndefiniteStrategy = "shift-schedule") -> None:
         self._metric, self._modification_rule = metric, REGULARISATION_RULES[indefinite]
         self._system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
         self._friction_search = make_friction_search(metric)

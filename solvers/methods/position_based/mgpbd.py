@@ -82,13 +82,13 @@ class MultigridXpbd:
         ),
     )
 
-    components: int = 6
-    setup: int = 20
-    smoothed: bool = False
+    near_null_vectors: int = 6
+    setup_interval: int = 20
+    smooth_prolongation: bool = False
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
-        for name, least in (("components", 0), ("setup", 1)):
+        for name, least in (("near_null_vectors", 0), ("setup_interval", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: should be at least {least}, not {getattr(self, name)}")
 
@@ -119,7 +119,7 @@ class MultigridXpbd:
             springs.rest_length[keep],
             springs.rest_direction[keep],
             1.0 / anchor_stiffness,
-            f"{self.components or 'no'} components of the near-kernel, conjugate gradients with multigrid",
+            f"{self.near_null_vectors or 'no'} near-null vectors, conjugate gradients with multigrid",
             {"nnz_system": float(coupling.nnz)},
         )
 
@@ -171,14 +171,14 @@ class PreparedMultigridXpbd(IterativeSolver):
         made = self.parameters
         if is_coarsest_level(A):
             return ProlongationHierarchy(A, np.empty((A.shape[0], 0)))
-        if made.components:
+        if made.near_null_vectors:
             return ProlongationHierarchy(
-                A, compute_near_nullspace(A, made.components, _NEAR_NULL_SWEEPS), made.smoothed
+                A, compute_near_nullspace(A, made.near_null_vectors, _NEAR_NULL_SWEEPS), made.smooth_prolongation
             )
         equal = np.divide(
             1.0, self.root_stiffness, out=np.zeros_like(self.root_stiffness), where=self.root_stiffness > 0.0
         )
-        return ProlongationHierarchy(A, normalise_columns(equal[:, None]), made.smoothed)
+        return ProlongationHierarchy(A, normalise_columns(equal[:, None]), made.smooth_prolongation)
 
 
 class MgpbdState(SolverState):
@@ -204,7 +204,7 @@ class MgpbdState(SolverState):
         if not round_off < before < np.inf:
             return False
         A = made.dual_matrix(self._directions)
-        if self._num_iterations % made.parameters.setup == 0:
+        if self._num_iterations % made.parameters.setup_interval == 0:
             self._prolongation = made.build_prolongation(A)
         solving = PreconditionedSolve(A, VCycle(A, self._prolongation), self.dual_residual, _CG_RTOL)
         self.num_cg_iterations = solving.solve(_MAX_CG_ITERATIONS)

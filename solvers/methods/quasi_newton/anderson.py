@@ -54,5 +54,8 @@ class Anderson(WindowedAcceleration):
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         return prepare_accelerated(
-            system, AccelerationScheme("anderson", ANDERSON_RULE, self.pairs, 0, True), self.linear, self.precision
+            system,
+            AccelerationScheme("anderson", ANDERSON_RULE, self.history_size, 0, True),
+            self.linear_solver,
+            self.precision,
         )

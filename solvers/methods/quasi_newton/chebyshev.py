@@ -51,7 +51,7 @@ class Chebyshev:
         ),
     )
 
-    linear: LinearSolverName = "auto"
+    linear_solver: LinearSolverName = "auto"
     precision: Precision = "float64"
 
     def prepare(self, system: System) -> PreparedAccelerated:
@@ -62,5 +62,5 @@ class Chebyshev:
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         return prepare_accelerated(
-            system, AccelerationScheme("chebyshev", CHEBYSHEV_RULE, 1, 0, True), self.linear, self.precision
+            system, AccelerationScheme("chebyshev", CHEBYSHEV_RULE, 1, 0, True), self.linear_solver, self.precision
         )

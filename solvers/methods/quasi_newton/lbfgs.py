@@ -58,7 +58,7 @@ class Lbfgs(WindowedAcceleration):
         jacobi_sweeps: number of Jacobi sweeps of that approximation, 1 to 8.
     """
 
-    omitted_defaults: ClassVar[frozenset[str]] = frozenset({"preconditioner", "sweeps"})
+    omitted_defaults: ClassVar[frozenset[str]] = frozenset({"preconditioner", "jacobi_sweeps"})
 
     solver_info: ClassVar[SolverInfo] = SolverInfo(
         "quasi-Newton",
@@ -72,17 +72,19 @@ class Lbfgs(WindowedAcceleration):
         supports_error_control=True,
     )
 
-    preconditioner: Literal["factor", "a-jacobi"] = "factor"
-    sweeps: int = 2
+    preconditioner: Literal["cholesky", "a-jacobi"] = "cholesky"
+    jacobi_sweeps: int = 2
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
         super().__post_init__()
-        require_valid_sweeps(self.sweeps)
-        if self.preconditioner == "factor":
+        require_valid_sweeps(self.jacobi_sweeps)
+        if self.preconditioner == "cholesky":
             return
-        if self.linear != "auto":
-            raise ValueError(f"linear: {self.linear} is for `preconditioner: factor`; a-jacobi solves no system")
+        if self.linear_solver != "auto":
+            raise ValueError(
+                f"linear_solver: {self.linear_solver} is for `preconditioner: cholesky`; a-jacobi solves no system"
+            )
         if self.precision != "float64":
             raise ValueError(f"precision: {self.precision} is of a factor's entries")
 
@@ -96,22 +98,26 @@ class Lbfgs(WindowedAcceleration):
         if self.preconditioner == "a-jacobi" and without_barriers(without_vertex_contact(system)) is not system:
             raise Unsupported(
                 "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
-                "touch; take preconditioner: factor"
+                "touch; take preconditioner: cholesky"
             )
-        if self.preconditioner == "factor":
+        if self.preconditioner == "cholesky":
             return self.prepare_with_factor(system)
-        words, scheme, metric = f"{self.sweeps} sweeps of Jacobi", self._acceleration_scheme, ResidualMetric(system)
+        words, scheme, metric = (
+            f"{self.jacobi_sweeps} sweeps of Jacobi",
+            self._acceleration_scheme,
+            ResidualMetric(system),
+        )
         energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
-        base = prepare_local_global(system, energies, lambda Q: (AggregatedSweeps(Q, self.sweeps), words))
+        base = prepare_local_global(system, energies, lambda Q: (AggregatedSweeps(Q, self.jacobi_sweeps), words))
         return _PreparedLbfgsJacobi(base, metric, scheme, FixedObjective(system))
 
     def prepare_with_factor(self, system: System) -> PreparedAccelerated:
         """Prepare with the factor of Q; raises as `prepare` does."""
-        return prepare_accelerated(system, self._acceleration_scheme, self.linear, self.precision)
+        return prepare_accelerated(system, self._acceleration_scheme, self.linear_solver, self.precision)
 
     @property
     def _acceleration_scheme(self) -> AccelerationScheme:
-        return AccelerationScheme("lbfgs", LBFGS_RULE, self.pairs, 5, False)
+        return AccelerationScheme("lbfgs", LBFGS_RULE, self.history_size, 5, False)
 
 
 class _PreparedLbfgsJacobi(IterativeSolver):

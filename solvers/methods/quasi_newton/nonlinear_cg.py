@@ -62,7 +62,7 @@ class NonlinearCG:
         ),
     )
 
-    preconditioner: PreconditionerName = "factor"
+    preconditioner: PreconditionerName = "cholesky"
 
     def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.

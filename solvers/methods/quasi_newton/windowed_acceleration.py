@@ -97,13 +97,13 @@ class WindowedAcceleration:
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = True
 
-    pairs: int = 5
-    linear: LinearSolverName = "auto"
+    history_size: int = 5
+    linear_solver: LinearSolverName = "auto"
     precision: Precision = "float64"
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
-        require_history_size(self.pairs)
+        require_history_size(self.history_size)
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,7 +115,7 @@ class _FixedStepSolver(ExplicitSolver):
         refinement_factor: number of substeps as a multiple of the smallest stable number.
     """
 
-    refine: int = 1
+    refinement_factor: int = 1
 
     def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
@@ -124,9 +124,11 @@ class _FixedStepSolver(ExplicitSolver):
             Unsupported: for energies other than springs, constant quadratic forms and drag on vertices; for integrators
                 other than `substepping` and implicit Euler; for unpinned vertices without mass; for too many substeps.
         """
-        if not self.refine >= 1:
-            raise Unsupported(f"{self.solver_name}: refine came as {self.refine}; wanted 1 or more")
-        return self._prepare_explicit(system, self.refine, 0.0)
+        if not self.refinement_factor >= 1:
+            raise Unsupported(
+                f"{self.solver_name}: refinement_factor came as {self.refinement_factor}; wanted 1 or more"
+            )
+        return self._prepare_explicit(system, self.refinement_factor, 0.0)
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,7 @@ class _AdaptiveStepSolver(ExplicitSolver):
             An error of velocity counts by the displacement that it causes in a frame.
     """
 
-    error: float = 1e-6
+    error_tolerance: float = 1e-6
 
     def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
@@ -146,9 +148,11 @@ class _AdaptiveStepSolver(ExplicitSolver):
         Raises:
             Unsupported: as for fixed substeps, and for a tolerance outside [1e-14, 1].
         """
-        if not 1e-14 <= self.error <= 1.0:
-            raise Unsupported(f"{self.solver_name}: error came as {self.error}; wanted a number from 1e-14 to 1")
-        return self._prepare_explicit(system, 1, self.error)
+        if not 1e-14 <= self.error_tolerance <= 1.0:
+            raise Unsupported(
+                f"{self.solver_name}: error_tolerance came as {self.error_tolerance}; wanted a number from 1e-14 to 1"
+            )
+        return self._prepare_explicit(system, 1, self.error_tolerance)
 
 
 def _explicit_info(authors: str, year: int, title: str, doi: str = "", *, has_fixed_step: bool = False) -> SolverInfo:

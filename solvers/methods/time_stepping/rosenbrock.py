@@ -65,8 +65,8 @@ class _RosenbrockSolver:
             length. An error of velocity counts by the displacement that it causes in a frame.
     """
 
-    refine: int = 1
-    error: float = 0.0
+    refinement_factor: int = 1
+    error_tolerance: float = 0.0
 
     is_minimiser: ClassVar[bool] = False
     is_monotone: ClassVar[bool] = False
@@ -80,10 +80,10 @@ class _RosenbrockSolver:
             Unsupported: for integrators other than `substepping` and implicit Euler, for unpinned vertices without
                 mass, and for energies that depend on the start of a step, except drag on vertices.
         """
-        if self.refine < 1 or not 0.0 <= self.error <= 1.0:
+        if self.refinement_factor < 1 or not 0.0 <= self.error_tolerance <= 1.0:
             raise Unsupported(
-                f"{self.solver_name}: refine came as {self.refine} and error as "
-                f"{self.error}; wanted 1 or more, and a number "
+                f"{self.solver_name}: refinement_factor came as {self.refinement_factor} and error_tolerance as "
+                f"{self.error_tolerance}; wanted 1 or more, and a number "
                 "from 0 to 1"
             )
         vertex_terms.require_implicit_euler(system, self.solver_name)
@@ -102,13 +102,19 @@ class _RosenbrockSolver:
                 remaining_energies.append(energy)
         objective = FixedObjective(replace(system, energies=tuple(remaining_energies), inertia_factor=0.0))
         lengths, factor = objective.springs.rest_length, objective.hessian_matrix.factor
-        tolerance = self.error * (float(lengths.mean()) if len(lengths) else 1.0)
-        step_rule = f"steps by an error of {self.error:.3g}" if self.error else f"{self.refine} steps a frame"
+        tolerance = self.error_tolerance * (float(lengths.mean()) if len(lengths) else 1.0)
+        step_rule = (
+            f"steps by an error of {self.error_tolerance:.3g}"
+            if self.error_tolerance
+            else f"{self.refinement_factor} steps a frame"
+        )
         choice = (
             f"{step_rule}, a factor of the Hessian with {factor.nonzeros:,} entries{objective.interpreted_energies}"
         )
         facts = {"nnz_hessian_factor": float(factor.nonzeros)}
-        return PreparedRosenbrock(system, self.coefficients, objective, drag, self.refine, tolerance, choice, facts)
+        return PreparedRosenbrock(
+            system, self.coefficients, objective, drag, self.refinement_factor, tolerance, choice, facts
+        )
 
 
 def _rosenbrock_info(authors: str, year: int, title: str, doi: str) -> SolverInfo:
@@ -199,7 +205,7 @@ class PreparedRosenbrock(IterativeSolver):
     coefficients: RosenbrockTableau
     fixed_objective: FixedObjective
     drag: NDArray[np.float64]
-    refine: int
+    refinement_factor: int
     error_tolerance: float
     description: str
     stats: dict[str, float] = field(default_factory=dict[str, float])
@@ -239,11 +245,15 @@ class PreparedRosenbrock(IterativeSolver):
         within = _FrameIntegration(self, problem)
         p, v = within.initial_motion()
         if not self.error_tolerance:
-            for k in range(self.refine):
-                p, v, _ = within.try_step(p, v, frame / self.refine, require_exact=False) or within.raise_failure(
-                    k * frame / self.refine
-                )
-            return within.apply_pins(p, 1.0), v, AdaptiveStepStats(self.refine, 0, frame / self.refine, frame)
+            for k in range(self.refinement_factor):
+                p, v, _ = within.try_step(
+                    p, v, frame / self.refinement_factor, require_exact=False
+                ) or within.raise_failure(k * frame / self.refinement_factor)
+            return (
+                within.apply_pins(p, 1.0),
+                v,
+                AdaptiveStepStats(self.refinement_factor, 0, frame / self.refinement_factor, frame),
+            )
         t, accepted, rejected, h, before = 0.0, 0, 0, min(frame, h or frame), 1.0
         error_order = 1.0 + min(self.coefficients.order, self.coefficients.embedded_order)
         control = build_pi_controller(error_order, _MAX_STEP_FACTOR, _FAILURE_FACTOR)

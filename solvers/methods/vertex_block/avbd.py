@@ -87,16 +87,21 @@ class AugmentedVertexBlockDescent:
         ),
     )
 
-    ramp: float = 1e3
-    bound: float = 1e6
-    decay: float = 0.99
-    stabilisation: float = 0.0
-    softened: bool = False
+    stiffness_ramp: float = 1e3
+    max_stiffness_ratio: float = 1e6
+    warm_start_decay: float = 0.99
+    error_stabilisation: float = 0.0
+    ramp_spring_stiffness: bool = False
     spectral_radius: float = 0.999
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
-        for name, least, most in (("ramp", 0, np.inf), ("bound", 1, np.inf), ("decay", 0, 1), ("stabilisation", 0, 1)):
+        for name, least, most in (
+            ("stiffness_ramp", 0, np.inf),
+            ("max_stiffness_ratio", 1, np.inf),
+            ("warm_start_decay", 0, 1),
+            ("error_stabilisation", 0, 1),
+        ):
             if not least <= (came := getattr(self, name)) <= most:
                 wanted = f"from {least} to {most}" if most == 1 else f"at least {least}"
                 raise ValueError(f"{name}: should be {wanted}, not {came}")
@@ -110,7 +115,7 @@ class AugmentedVertexBlockDescent:
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         usual = VertexBlockDescent(self.spectral_radius)
-        if not (system.length_constraints or self.softened):
+        if not (system.length_constraints or self.ramp_spring_stiffness):
             return usual.prepare(system)
         if any(map(is_barrier_energy, system.energies)):
             raise Unsupported(
@@ -118,7 +123,7 @@ class AugmentedVertexBlockDescent:
                 "surface-contact, or give springs and strain limits a numerical stiffness"
             )
         edges, energies, k = concatenate_constraints(system.length_constraints), system.energies, np.empty(0)
-        if self.softened:
+        if self.ramp_spring_stiffness:
             springs = Springs.from_parts([energy for energy in energies if isinstance(energy, Springs)])
             energies = tuple(energy for energy in energies if not isinstance(energy, Springs))
             r, k = springs.rest_length, springs.stiffness
@@ -126,7 +131,7 @@ class AugmentedVertexBlockDescent:
         exact = np.arange(len(edges.min_length)) < len(edges.min_length) - len(k)
         bare = replace(system, energies=energies)
         least = compute_penalty_stiffness(bare, edges)
-        most = np.concatenate([self.bound * least[exact], k])
+        most = np.concatenate([self.max_stiffness_ratio * least[exact], k])
         least = np.minimum(least, most)
         made = usual.prepare(build_augmented_system(bare, edges, least, np.zeros(len(least))))
         return PreparedAugmentedVertexBlockDescent(
@@ -223,8 +228,10 @@ class AugmentedSweepState(SweepState):
         super().__init__(made, replace(problem, system=made.system), guess)
         self._augmented_solver, self._problem = prepared, problem
         warm_start = problem.step_start.warm_start
-        begun = np.zeros((len(prepared.min_stiffness), 2)) if warm_start is None else method.decay * warm_start
-        past = method.stabilisation * np.where(
+        begun = (
+            np.zeros((len(prepared.min_stiffness), 2)) if warm_start is None else method.warm_start_decay * warm_start
+        )
+        past = method.error_stabilisation * np.where(
             prepared.exact_mask, length_errors(edges, problem.step_start.positions), 0.0
         )
         base = np.ones(made.system.num_vertices + 2)
@@ -234,7 +241,7 @@ class AugmentedSweepState(SweepState):
             edges.min_length + past,
             edges.max_length + past,
             prepared.exact_mask,
-            method.ramp * prepared.min_stiffness / np.where(edges.max_length > 0.0, edges.max_length, 1.0),
+            method.stiffness_ramp * prepared.min_stiffness / np.where(edges.max_length > 0.0, edges.max_length, 1.0),
             prepared.max_stiffness,
             prepared.max_stiffness * edges.max_length,
             np.clip(begun[:, 1], prepared.min_stiffness, prepared.max_stiffness),

@@ -9,7 +9,7 @@ within a few rings of springs, along U_i: their equilibrium response to a displa
 fixed. If P were the whole mesh and H0 the Hessian H, d would be Newton's step, because U_i' H U_i is then the Schur
 complement of i. H0 is the Hessian of the rest shape, so W_i is computed once. W_i is rotated by per-vertex rotations R,
 those nearest to the rotation of the incident springs (polar decomposition). At rest springs have no lateral stiffness;
-in H0 they have the fraction `lateral` of their stiffness there, as if they were stretched.
+in H0 they have the fraction `lateral_stiffness_ratio` of their stiffness there, as if they were stretched.
 
 The paper approximates U'HU by a sum over sampled elements (cubature); here the sum is over all springs of P. Elements
 of H with negative eigenvalues are clamped, so that U'HU is positive definite. The step size t is halved from 1 until
@@ -75,15 +75,15 @@ class Jgs2:
         ),
     )
 
-    rings: int = 4
-    lateral: float = 0.03
+    neighbour_rings: int = 4
+    lateral_stiffness_ratio: float = 0.03
 
     def __post_init__(self) -> None:
         """Raise ValueError if a parameter is out of range."""
-        if self.rings < 0:
-            raise ValueError(f"rings: should not be negative, not {self.rings}")
-        if not 0.0 <= self.lateral <= 1.0:
-            raise ValueError(f"lateral: should be from 0 to 1, not {self.lateral}")
+        if self.neighbour_rings < 0:
+            raise ValueError(f"neighbour_rings: should not be negative, not {self.neighbour_rings}")
+        if not 0.0 <= self.lateral_stiffness_ratio <= 1.0:
+            raise ValueError(f"lateral_stiffness_ratio: should be from 0 to 1, not {self.lateral_stiffness_ratio}")
 
     def prepare(self, system: System) -> PreparedDescent:
         """Prepare the method for a system.
@@ -102,7 +102,9 @@ class Jgs2:
             )
         metric, objective = ResidualMetric(system), FixedObjective(system)
         patches = compute_responses(
-            assemble_rest_hessian(system, objective.springs, self.lateral), objective.hessian_matrix.graph, self.rings
+            assemble_rest_hessian(system, objective.springs, self.lateral_stiffness_ratio),
+            objective.hessian_matrix.graph,
+            self.neighbour_rings,
         )
         mean = len(patches.patch_vertices) / max(1, len(patches.patch_starts) - 1)
         choice = (
