@@ -188,8 +188,8 @@ def _build_runs(folder: Path, part: int) -> list[RunSpec]:
         "frames": FRAME_COUNT,
     }
     options |= {"record": False, "pictures": False}
-    asked = {"scenes": ["scene.yaml"], "sizes": list(MESH_SIZES), "solvers": list(SOLVER_NAMES), "options": options}
-    (folder / "sweep.yaml").write_text(json.dumps(asked))
+    settings = {"scenes": ["scene.yaml"], "sizes": list(MESH_SIZES), "solvers": list(SOLVER_NAMES), "options": options}
+    (folder / "sweep.yaml").write_text(json.dumps(settings))
     return load_config(folder / "sweep.yaml").list_runs()
 
 
@@ -199,7 +199,7 @@ def simulate_cluster(count: int, runs: int, folder: Path, seconds: float) -> dic
     (folder / "scene.yaml").write_text(SCENE_SOURCE)
     began, context = monotonic(), get_context("spawn")
     found = [run for part in range(ceil(runs / MAX_CONFIG_RUNS)) for run in _build_runs(folder, part)][:runs]
-    told: dict[str, Any] = {"workers": count, "runs": len(found), "expanded_seconds": monotonic() - began}
+    values: dict[str, Any] = {"workers": count, "runs": len(found), "expanded_seconds": monotonic() - began}
     (mine, theirs), (ours, others) = context.Pipe(), context.Pipe()
     processes = {"scheduler": context.Process(target=run_scheduler, args=(theirs,))}
     processes["scheduler"].start()
@@ -207,30 +207,30 @@ def simulate_cluster(count: int, runs: int, folder: Path, seconds: float) -> dic
     processes["workers"] = context.Process(target=run_workers, args=(others, address, count))
     processes["workers"].start()
     ours.recv()
-    told["workers_seconds"] = monotonic() - began - told["expanded_seconds"]
+    values["workers_seconds"] = monotonic() - began - values["expanded_seconds"]
     pids = {"client": os.getpid()} | {name: process.pid or 0 for name, process in processes.items()}
     before, done, display = (
         {name: _process_cpu_seconds(pid) for name, pid in pids.items()},
         monotonic(),
         ProgressCounter(runs, seconds),
     )
-    told["ended"] = "all runs are done"
+    values["ended"] = "all runs are done"
     try:
-        told["rows"] = len(run_sweep("sweep", found, folder / "r", display, print, scheduler_address=address))
+        values["rows"] = len(run_sweep("sweep", found, folder / "r", display, print, scheduler_address=address))
     except TimeIsUp:
-        told["ended"] = f"after {seconds:g} s; the same command, with the same folder, does the rest"
+        values["ended"] = f"after {seconds:g} s; the same command, with the same folder, does the rest"
     took = {name: _process_cpu_seconds(pid) - before[name] for name, pid in pids.items()}
-    told |= {"done": display.finished_units, "seconds": monotonic() - done, "client_bore": _measure_usage()._asdict()}
+    values |= {"done": display.finished_units, "seconds": monotonic() - done, "client_bore": _measure_usage()._asdict()}
     for name, pipe in (("workers", ours), ("scheduler", mine)):
         pipe.send(None)
-        told[f"{name}_bore"] = pipe.recv()._asdict()
+        values[f"{name}_bore"] = pipe.recv()._asdict()
         processes[name].join(60.0)
         processes[name].kill()
     each = {name: 1e3 * cpu / max(1, display.finished_units) for name, cpu in took.items()}
-    told |= {"runs_per_second": told["done"] / told["seconds"], "cpu_ms_per_run": each}
-    told["binds"] = max(each, key=lambda name: each[name])
+    values |= {"runs_per_second": values["done"] / values["seconds"], "cpu_ms_per_run": each}
+    values["binds"] = max(each, key=lambda name: each[name])
     here = max(sum(each.values()) / (os.cpu_count() or 1), max(each.values()))
-    return told | {"runs_per_second_idle": 1e3 / here, "runs_per_second_own_cores": 1e3 / max(each.values())}
+    return values | {"runs_per_second_idle": 1e3 / here, "runs_per_second_own_cores": 1e3 / max(each.values())}
 
 
 def _process_cpu_seconds(pid: int) -> float:

@@ -33,9 +33,9 @@ def grid_springs(*shape: int) -> np.ndarray:
 def grid_matrix(*shape: int, stiffness=SPRING_STIFFNESS) -> csr_array:
     """A grid of mass 1 in all at dt = 1/30, two corners held by 1e10: a sheet of two numbers, a solid of three."""
     n = int(np.prod(shape))
-    held = np.full(n, 1.0 / n / TIME_STEP**2)
-    held[[0, shape[-1] - 1]] += 1e10
-    return network_matrix(grid_springs(*shape), stiffness, held)
+    diagonal = np.full(n, 1.0 / n / TIME_STEP**2)
+    diagonal[[0, shape[-1] - 1]] += 1e10
+    return network_matrix(grid_springs(*shape), stiffness, diagonal)
 
 
 def random_right_hand_sides(n: int, seed: int = 0) -> np.ndarray:

@@ -112,9 +112,9 @@ def _run_in_child(answer: Any, runs: list[RunSpec], folder: Path, workers: int |
     answer.send(SweepCost(wall, cpu, *mib, *map(sum, zip(*noted, strict=True))))
 
 
-def _load_runs(folder: Path, **asked: Any) -> list[RunSpec]:
+def _load_runs(folder: Path, **requested: Any) -> list[RunSpec]:
     path = folder / "costs.yaml"
-    path.write_text(json.dumps(asked))
+    path.write_text(json.dumps(requested))
     return load_config(path).list_runs()
 
 
@@ -131,11 +131,11 @@ def _build_short_runs(count: int, folder: Path) -> list[RunSpec]:
 
 def _untimed_cost(cost: SweepCost, count: int) -> dict[str, float]:
     """What a run takes beside its timed passes, in milliseconds."""
-    beside = {
+    other = {
         "wall_ms_beside": cost.wall_seconds - cost.timed_seconds,
         "cpu_ms_beside": cost.cpu_seconds - cost.timed_cpu_seconds,
     }
-    return {name: 1e3 * seconds / count for name, seconds in beside.items()}
+    return {name: 1e3 * seconds / count for name, seconds in other.items()}
 
 
 def measure_short_runs(count: int, folder: Path) -> dict[str, Any]:
@@ -159,20 +159,20 @@ def measure_cores(cases: int, folder: Path) -> dict[str, Any]:
     """What two workers save of a sweep of hard cases, one worker's share of timed passes, and what that allows."""
     hard = load_config(CONFIG_FOLDER / "hard.yaml").list_runs()
     scenes = list(dict.fromkeys(run.scene_name for run in hard))
-    kept = scenes[:: max(1, len(scenes) // cases)][:cases]
-    runs = [run for run in hard if run.scene_name in kept and run.solver.name in SOLVER_NAMES]
+    saved = scenes[:: max(1, len(scenes) // cases)][:cases]
+    runs = [run for run in hard if run.scene_name in saved and run.solver.name in SOLVER_NAMES]
     run_timed_sweep(runs, folder / "first", None)
     one, two = (run_timed_sweep(runs, folder / f"by{workers}", workers) for workers in (1, 2))
     t = one.timed_seconds / one.wall_seconds
     allowed = 1.0 / (t + (1.0 - t) / 2.0)
-    told = {
+    values = {
         "runs": len(runs),
         "t": t,
         "wall_by_1": one.wall_seconds,
         "wall_by_2": two.wall_seconds,
         "speed_up": one.wall_seconds / two.wall_seconds,
     }
-    return told | {"allowed": allowed, "share_of_allowed": one.wall_seconds / two.wall_seconds / allowed}
+    return values | {"allowed": allowed, "share_of_allowed": one.wall_seconds / two.wall_seconds / allowed}
 
 
 MEASUREMENT_COMMANDS = {

@@ -23,7 +23,7 @@ def write_benchmark_files(folder: Path, series_by_benchmark: dict[str, Any], *, 
     """Results as pytest-benchmark stores them, a file a commit; in the names' order they are shuffled."""
     folder.mkdir(parents=True, exist_ok=True)
     for k in range(len(next(iter(series_by_benchmark.values())))):
-        told = [
+        records = [
             {
                 "fullname": f"tests/bench/test_gates.py::{gate}",
                 "extra_info": {"ratio": {"median": v[k], "low": 0.98 * v[k], "high": 1.02 * v[k]}} if is_ratio else {},
@@ -33,6 +33,6 @@ def write_benchmark_files(folder: Path, series_by_benchmark: dict[str, Any], *, 
         ]
         commit = {"id": f"{k:07x}" * 5, "time": f"2026-01-{k + 1:02}T12:00:00+00:00", "dirty": False}
         stored = {"machine_info": {"cpu": {"brand_raw": "A processor", "count": 2}, "affinity": 2}}
-        stored |= {"commit_info": commit, "datetime": "2026-03-01T00:00:00", "benchmarks": told}
+        stored |= {"commit_info": commit, "datetime": "2026-03-01T00:00:00", "benchmarks": records}
         (folder / f"{k * 7 % 31:04}_gates.json").write_text(json.dumps(stored))
     return folder

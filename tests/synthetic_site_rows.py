@@ -76,9 +76,9 @@ def write_site_results(results: Path, count: int, name: str = "made") -> Path:
     """The rows of so many runs in the packed file of a sweep; returns the sweep's folder."""
     folder = results / name
     folder.mkdir(parents=True, exist_ok=True)
-    told = [row for number in range(count) for row in build_run_rows(number)]
+    given_rows = [row for number in range(count) for row in build_run_rows(number)]
     schema = RUN_SCHEMA.append(pa.field(FILE_COLUMN, pa.string()))
-    columns = {field.name: [row.get(field.name) for row in told] for field in schema}
+    columns = {field.name: [row.get(field.name) for row in given_rows] for field in schema}
     pq.write_table(pa.table(columns, schema=schema), folder / "rows.parquet")
     return folder
 

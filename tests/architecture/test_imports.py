@@ -21,15 +21,15 @@ PROGRAM = (
 
 def loads(arguments: list[str], cache: Path) -> list[str]:
     """The modules that a command has loaded when it ends."""
-    told = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", PROGRAM, *arguments],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache)},
         capture_output=True,
         text=True,
     )
-    assert told.returncode == 0, told.stderr
-    return told.stdout.rpartition("loaded")[2].split()
+    assert completed.returncode == 0, completed.stderr
+    return completed.stdout.rpartition("loaded")[2].split()
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ def files() -> list[Path]:
     if not (ROOT / ".git").exists():
         pytest.skip("which files are the project's is only known in a git checkout")
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    return [Path(name) for name in sorted(set(told.split("\0")) - {""}) if (ROOT / name).is_file()]
+    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [Path(name) for name in sorted(set(printed.split("\0")) - {""}) if (ROOT / name).is_file()]
 
 
 def lines_that_match(pattern: str, files: list[Path]) -> list[str]:

@@ -115,9 +115,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
     (folder / "sweep.yaml").write_text(SWEEP)
 
     def run() -> None:
-        asked = ["run", str(folder / "sweep.yaml"), "--in-process", "--rerun", "--results", str(folder / "results")]
-        told = CliRunner().invoke(app, asked)
-        assert told.exit_code == 0, told.output
+        arguments = ["run", str(folder / "sweep.yaml"), "--in-process", "--rerun", "--results", str(folder / "results")]
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, result.output
 
     def trace(frame: FrameType, event: str, argument: Any) -> None:
         if event != "call" or ours(frame) is not frame or frame.f_code.co_name == "<module>":

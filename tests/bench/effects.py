@@ -56,19 +56,21 @@ def main() -> None:
     for name, given in (("--size", 33), ("--rounds", 3), ("--frames", 8)):
         parser.add_argument(name, type=int, default=given)
     parser.add_argument("--effects", nargs="*", default=list(KINDS))
-    asked = parser.parse_args()
+    options = parser.parse_args()
     whole = load_scene(PRICES)
-    table = Table(box=SIMPLE_HEAD, title=f"an iteration with the effect over one without, {asked.size} vertices a side")
-    for heading in ("effect", *asked.solvers):
+    table = Table(
+        box=SIMPLE_HEAD, title=f"an iteration with the effect over one without, {options.size} vertices a side"
+    )
+    for heading in ("effect", *options.solvers):
         table.add_column(heading, justify="right")
     with limit_threads(1):
-        for effect in asked.effects:
+        for effect in options.effects:
             cells = []
-            for solver in asked.solvers:
+            for solver in options.solvers:
                 made = load_target(SOLVERS[solver])()
                 try:
-                    both = prepare_scene(whole, asked.size, made, effect), prepare_scene(whole, asked.size, made)
-                    found = measure_overhead(effect, *both, STOP, frames=asked.frames, max_rounds=asked.rounds)
+                    both = prepare_scene(whole, options.size, made, effect), prepare_scene(whole, options.size, made)
+                    found = measure_overhead(effect, *both, STOP, frames=options.frames, max_rounds=options.rounds)
                 except Unsupported:
                     cells.append("refused")
                     continue

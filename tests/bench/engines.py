@@ -96,14 +96,14 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=9)
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--substeps", type=int, nargs="+", default=[4, 16, 64, 256])
-    asked = parser.parse_args()
+    options = parser.parse_args()
     with limit_threads(1):
-        for path in asked.scenes:
-            system = build_exact_scene(load_scene(path), asked.size, "substepping").system
+        for path in options.scenes:
+            system = build_exact_scene(load_scene(path), options.size, "substepping").system
             least = estimate_max_frequency(system) * system.time_step / 2.0
-            title = f"{path.stem} {asked.size}: omega h is 2 at {least:.3g} substeps"
-            table = Table("substeps", *map(str, asked.substeps), box=SIMPLE_HEAD, title=title)
-            for row in rows(path, asked.size, asked.frames, asked.substeps):
+            title = f"{path.stem} {options.size}: omega h is 2 at {least:.3g} substeps"
+            table = Table("substeps", *map(str, options.substeps), box=SIMPLE_HEAD, title=title)
+            for row in rows(path, options.size, options.frames, options.substeps):
                 table.add_row(*row)
             Console(width=140).print(table)
 

@@ -48,8 +48,8 @@ FIRM = 1e12
 
 def pendulum(stiffness: float | str, mesh: ChainMesh, heavy: float = HEAVY) -> Scene:
     """A chain of vertices of a kilogram and a heavy one; stiffness: of its springs [N/m], or `exact`."""
-    held = SpringsEffect.model_validate({"stretch": stiffness, "scaling_rule": "fixed"})
-    made = build_test_scene(mesh, held, GravityEffect(), FIRST, size=LINKS + 1, mass=float(LINKS), time_step=FRAME)
+    pinned = SpringsEffect.model_validate({"stretch": stiffness, "scaling_rule": "fixed"})
+    made = build_test_scene(mesh, pinned, GravityEffect(), FIRST, size=LINKS + 1, mass=float(LINKS), time_step=FRAME)
     mass = made.system.mass.copy()
     mass[-1] = heavy * mass[1]
     load = made.constant_force * (mass / made.system.mass)[:, None]
@@ -62,11 +62,11 @@ def errors(made: Scene, solver: Solver, iterations: int, seconds: float) -> tupl
     lengths = concatenate_constraints(pendulum("exact", ChainMesh()).system.length_constraints)
     run = simulate_scene(made, solver.prepare(made.system), StopRule(iterations), initial_guess="inertial",
                    frames=round(seconds / FRAME))  # fmt: skip
-    told = [
+    relative_errors = [
         (np.abs(length_errors(lengths, p) / lengths.max_length).max(), -p[-1, 1])
         for p in (step.positions for step in run)
     ]
-    found, fallen = np.array(told).T
+    found, fallen = np.array(relative_errors).T
     if not np.isfinite(found).all():
         return np.inf, np.inf, np.inf
     return float(found.mean()), float(found.max()), float(fallen.max() / lengths.max_length.sum())

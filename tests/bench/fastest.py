@@ -75,11 +75,11 @@ class Ratio:
 def steps(config: Path, only: str) -> Iterator[tuple[SnapshotEvaluation, list[CurveSpec]]]:
     """The frozen steps of a config whose words are among their names, each once, and who is to solve them."""
     store = open_reference_store(ROOT / "results")
-    asked: dict[tuple[str, str, str | int], list[CurveSpec]] = {}
+    options: dict[tuple[str, str, str | int], list[CurveSpec]] = {}
     for spec in load_accuracy(config).curves:
-        asked.setdefault((spec.case.title, spec.case.integrator, spec.snapshot), []).append(spec)
+        options.setdefault((spec.case.title, spec.case.integrator, spec.snapshot), []).append(spec)
     known: set[str] = set()
-    for (title, _, moment), specs in asked.items():
+    for (title, _, moment), specs in options.items():
         if all(word in f"{title} {moment}" for word in only.split()):
             step = SnapshotEvaluation.load_snapshot(specs[0].case, moment, store)
             if step.step_snapshot.digest not in known and step.known_minima.minima:

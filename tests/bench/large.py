@@ -79,12 +79,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("config", nargs="?", type=Path, default=GROWTH, metavar="CONFIG")
     parser.add_argument("--only", default="", metavar="WORDS")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     smallest: dict[tuple[str, str, str], Took] = {}
     print("run | vertices | prepare s | step s | wall s | iterations | left | peak GiB | growth")
-    for run in load_sweep(asked.config).list_runs():
+    for run in load_sweep(options.config).list_runs():
         title = f"{run.title} {run.initial_guess}"
-        if asked.only not in title:
+        if options.only not in title:
             continue
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
             t = alone.submit(took, run).result()

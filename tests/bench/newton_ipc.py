@@ -226,9 +226,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--rounds", type=int, default=3)
-    asked, console = parser.parse_args(), Console(highlight=False)
+    options, console = parser.parse_args(), Console(highlight=False)
     with limit_threads(1):
-        made = folded(asked.size)
+        made = folded(options.size)
         mesh, k = made.mesh, np.full(len(made.p), STIFFNESS)
         surface = CollisionMesh.from_rest_shape(
             mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, made.min_distance, made.dhat
@@ -247,9 +247,9 @@ def main() -> None:
                 seconds(newton_ipc(theirs)),
                 {name: (seconds(ours(problem, name)), seconds(ours(bare, name))) for name in OURS if ends[name]},
             )
-            for _ in range(asked.timed_trajectories)
+            for _ in range(options.timed_trajectories)
         ]
-    title = f"{asked.size} x {asked.size}: Newton-IPC in {count} iterations; {describe_machine().cpu}"
+    title = f"{options.size} x {options.size}: Newton-IPC in {count} iterations; {describe_machine().cpu}"
     columns = ("", "iterations", "Newton-IPC takes", "between", "steps without contact", "ranges from its end")
     table = Table(*columns, title=title, box=SIMPLE_HEAD)
     for name, end in ends.items():

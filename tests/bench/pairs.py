@@ -37,13 +37,13 @@ GAP, LAYERS = 0.004, 4
 
 
 class Folded(NamedTuple):
-    """mesh: at rest; p (n, 3) [m]: folded; d (n, 3) [m]: a step; thickness, reach [m]."""
+    """mesh: at rest; p (n, 3) [m]: folded; d (n, 3) [m]: a step; min_distance, dhat [m]."""
 
     mesh: Mesh
     p: Positions
     d: Positions
-    thickness: float
-    reach: float
+    min_distance: float
+    dhat: float
 
 
 def folded(size: int) -> Folded:
@@ -143,16 +143,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128])
     parser.add_argument("--rounds", type=int, default=5)
-    asked, console = parser.parse_args(), Console()
+    options, console = parser.parse_args(), Console()
     with limit_threads(1):
-        for size in asked.sizes:
+        for size in options.sizes:
             made = folded(size)
             (one, contact), (other, pairs) = ours(made), theirs(made)
             table = Table("", "ipctk takes", "between", "ours [ms]", box=SIMPLE_HEAD)
             for name, work in one.items():
                 for one_of in (work, other[name]):  # compiled, and in the caches
                     one_of()
-                both = [(seconds(work), seconds(other[name])) for _ in range(asked.rounds)]
+                both = [(seconds(work), seconds(other[name])) for _ in range(options.rounds)]
                 ratios = sorted(b / a for a, b in both)
                 ends = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
                 table.add_row(name, f"{median(ratios):.2f} times", ends, f"{1e3 * min(a for a, _ in both):.3g}")

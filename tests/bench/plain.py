@@ -49,15 +49,15 @@ def newton(bundles, number, x, right, majorant, near):
     own, neighbour, kind, weights = bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights
     for lane in range(LANES):
         i, at = own[LANES * number + lane], RHS_STRIDE * number + lane
-        held = right[at + 3 * LANES]
+        fixed = right[at + 3 * LANES]
         p0, p1, p2 = x[i], x[i + 1], x[i + 2]
         load0, load1, load2 = (
-            right[at] - held * p0,
-            right[at + LANES] - held * p1,
-            right[at + 2 * LANES] - held * p2,
+            right[at] - fixed * p0,
+            right[at + LANES] - fixed * p1,
+            right[at + 2 * LANES] - fixed * p2,
         )
         g0, g1, g2 = load0, load1, load2
-        a, b, c, d, e, f = held, 0.0, 0.0, held, 0.0, held
+        a, b, c, d, e, f = fixed, 0.0, 0.0, fixed, 0.0, fixed
         for entry in range(bundles.packet_start[number], bundles.packet_start[number + 1]):
             j, w = neighbour[LANES * entry + lane], kind[entry] + lane
             v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]
@@ -77,7 +77,7 @@ def newton(bundles, number, x, right, majorant, near):
         s1 = y1 / second - l3 * s2
         s0 = g0 / a - l1 * s1 - l2 * s2
         least = 1e-14 * (a + d + f)
-        rise = 0.5 * held * (s0 * s0 + s1 * s1 + s2 * s2) - s0 * load0 - s1 * load1 - s2 * load2
+        rise = 0.5 * fixed * (s0 * s0 + s1 * s1 + s2 * s2) - s0 * load0 - s1 * load1 - s2 * load2
         for entry in range(bundles.packet_start[number], bundles.packet_start[number + 1]):
             j, w = neighbour[LANES * entry + lane], kind[entry] + lane
             v0, v1, v2 = p0 - x[j], p1 - x[j + 1], p2 - x[j + 2]

@@ -34,7 +34,7 @@ STOP = StopRule(5000, 1e-6)
 NAMES: tuple[PreconditionerName, ...] = get_args(PreconditionerName)
 
 
-def told(path: Path, solver: Solver) -> str:
+def format_counts(path: Path, solver: Solver) -> str:
     """The cell of a scene and a solver."""
     spec = load_scene(path)
     made = build_scene(spec, spec.default_size or 0)
@@ -61,7 +61,7 @@ def main() -> None:
     with limit_threads(1):
         for path in parser.parse_args().scenes:
             for name, solver in (("newton-cg", NewtonCG), ("pncg", NonlinearCG)):
-                table.add_row(path.stem, name, *(told(path, solver(preconditioner=by)) for by in NAMES))
+                table.add_row(path.stem, name, *(format_counts(path, solver(preconditioner=by)) for by in NAMES))
     Console(width=120).print(table)
 
 

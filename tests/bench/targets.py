@@ -139,12 +139,12 @@ def measure_targets(
     """
     for one in targets.cases:
         print_message(f"{one.scene} {one.size or ''} to {one.error:g} after {one.target.t_end:g} s:")
-        asked = None
+        requested = None
         try:
-            asked = ErrorTarget.from_scene(targets.scenes[one.scene], one.size, one.target.t_end)
-            yield _measure_target(one, asked, reference_store, print_message)
+            requested = ErrorTarget.from_scene(targets.scenes[one.scene], one.size, one.target.t_end)
+            yield _measure_target(one, requested, reference_store, print_message)
         except (RunFailed, Unsupported, NotPositiveDefinite) as error:
-            yield TargetResult(one, asked.size if asked else one.size or 0, reason=str(error))
+            yield TargetResult(one, requested.size if requested else one.size or 0, reason=str(error))
 
 
 def _measure_target(

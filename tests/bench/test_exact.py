@@ -102,11 +102,11 @@ class Factorisations:
 @pytest.fixture
 def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
     """Counts the factorisations of the test."""
-    found, kept, once = Factorisations(), BlockCholesky.factorise, BlockCholesky.factorise_and_solve
+    found, saved, once = Factorisations(), BlockCholesky.factorise, BlockCholesky.factorise_and_solve
 
     def factorise(self: BlockCholesky, *given: Any) -> Any:
         found.kept += 1
-        return kept(self, *given)
+        return saved(self, *given)
 
     def solve_anew(self: BlockCholesky, *given: Any) -> Any:
         found.once += 1
@@ -118,7 +118,7 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
 
 
 @pytest.mark.parametrize(
-    ("solver", "size", "iterations", "kept", "once"),
+    ("solver", "size", "iterations", "saved", "once"),
     [
         ("newton", 16, [6, 5, 5], 19, 0),
         ("newton", 32, [8, 23, 11], 90, 0),
@@ -127,7 +127,7 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
     ],
 )
 def test_an_accuracy_takes_as_many_iterations_as_stored(
-    solver: str, size: int, iterations: list[int], kept: int, once: int, factorisations: Factorisations
+    solver: str, size: int, iterations: list[int], saved: int, once: int, factorisations: Factorisations
 ):
     scene, stop = sheet(size), StopRule(max_iterations=1000, rtol=1e-6)
     with limit_threads(THREADS):
@@ -139,7 +139,7 @@ def test_an_accuracy_takes_as_many_iterations_as_stored(
     # that leaves a Newton step to do it takes a factorisation, or some on an indefinite Hessian.
     room, more = (0, 0) if solver == "newton" else (2, 4)
     assert [step.solution.num_iterations for step in found] == pytest.approx(iterations, abs=room)
-    assert factorisations.kept == pytest.approx(kept, abs=room)
+    assert factorisations.kept == pytest.approx(saved, abs=room)
     assert factorisations.once == pytest.approx(once, abs=more)
 
 

@@ -46,16 +46,16 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=50)
     parser.add_argument("--background-load", default="busy")
     parser.add_argument("--budget", type=float, default=10.0)
-    asked = parser.parse_args()
-    if unknown := sorted({*asked.gates} - NAMED.keys()):
+    options = parser.parse_args()
+    if unknown := sorted({*options.gates} - NAMED.keys()):
         parser.error(f"{', '.join(unknown)}: no such gate; there are {', '.join(NAMED)}")
     console = Console(width=120)
-    found: dict[str, list[BenchmarkResult]] = {name: [] for name in asked.gates or ASKED}
-    with limit_threads(THREADS), run_background_load(asked.background_load):
-        for number in range(asked.times):
+    found: dict[str, list[BenchmarkResult]] = {name: [] for name in options.gates or ASKED}
+    with limit_threads(THREADS), run_background_load(options.background_load):
+        for number in range(options.times):
             for name, results in found.items():
-                results.append(run_gate(NAMED[name], asked.budget))
-                console.print(f"{number + 1} of {asked.times}, {name}: {results[-1]}", style="dim")
+                results.append(run_gate(NAMED[name], options.budget))
+                console.print(f"{number + 1} of {options.times}, {name}: {results[-1]}", style="dim")
     table = Table("gate", "limit", "fail", "pass", "inconclusive", "ratio", "median s", "load", box=SIMPLE_HEAD)
     for name, results in found.items():
         answers = Counter(result.verdict for result in results)

@@ -169,11 +169,11 @@ def of_dots() -> Iterator[Case]:
 
 def of_vbd() -> Iterator[Case]:
     """Over colours."""
-    blocks, spaces, beside, right, _, work, p, _ = given(vbd_sweeps, "run_iterations", solving("vbd"))
+    blocks, spaces, other, right, _, work, p, _ = given(vbd_sweeps, "run_iterations", solving("vbd"))
     yield Case(
         "sweep",
         vbd_sweeps._sweep_vertices,
-        (blocks, spaces, beside, right, p, work),
+        (blocks, spaces, other, right, p, work),
         {"vbd_newton_step": plain.newton},
         (4,),
     )
@@ -270,12 +270,12 @@ def ratio(case: Case) -> tuple[float, float, float]:
     """Plain over vectors: the median, and the interval around it. Raises AssertionError where they find otherwise."""
     assert _reaches(case.kernel, set(case.plain)), f"{case.what}: calls none of {sorted(case.plain)}"
     kernels = [recompiled(case.kernel, names) for names in (case.plain, {})]
-    kept, answers = [np.copy(case.arguments[k]) for k in case.found], []
+    saved, answers = [np.copy(case.arguments[k]) for k in case.found], []
     for kernel in kernels:
-        for k, before in zip(case.found, kept, strict=True):
+        for k, before in zip(case.found, saved, strict=True):
             case.arguments[k][...] = before
-        told = kernel(*case.arguments)
-        answers.append([np.copy(case.arguments[k]) for k in case.found] + [told] * isinstance(told, float))
+        returned = kernel(*case.arguments)
+        answers.append([np.copy(case.arguments[k]) for k in case.found] + [returned] * isinstance(returned, float))
     for one, other in zip(*answers, strict=True):
         assert np.abs(one - other).max() <= ROUND_OFF * np.abs(other).max(), f"{case.what}: others"
     once = min(_seconds(kernel, case, 3) for kernel in kernels)

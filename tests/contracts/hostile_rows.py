@@ -123,9 +123,9 @@ SHOWN: dict[str, tuple[str, Any]] = {
 def rows_with(column: str, value: Any, number: int = 0) -> pa.Table:
     """The rows of two runs, of which the first has the value in all rows of the column; number: in the runs' ids."""
     first, second = ({"run_id": f"{2 * number + k:012x}"} for k in range(2))
-    told = [row | first | {column: value} for row in synthetic_site_rows.build_run_rows(0)]
-    told += [row | second for row in synthetic_site_rows.build_run_rows(5)]
-    columns = {field.name: [row.get(field.name) for row in told] for field in RUN_SCHEMA}
+    given_rows = [row | first | {column: value} for row in synthetic_site_rows.build_run_rows(0)]
+    given_rows += [row | second for row in synthetic_site_rows.build_run_rows(5)]
+    columns = {field.name: [row.get(field.name) for row in given_rows] for field in RUN_SCHEMA}
     return pa.table(columns, schema=RUN_SCHEMA)
 
 

@@ -83,8 +83,8 @@ print(json.dumps({{"modules": sorted(sys.modules), "digests": digests}}))
 def probe(*, hidden: Sequence[str] = (), load: bool = False) -> dict:
     """What a fresh process imports and computes, with modules hidden, or with all effects loaded first."""
     script = PROBE.format(hidden=hidden, load=load, scene=str(SCENE))
-    told = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
-    return json.loads(told.stdout)
+    completed = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=True)
+    return json.loads(completed.stdout)
 
 
 def modules(effects: list[str]) -> list[str]:

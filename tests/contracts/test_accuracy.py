@@ -280,15 +280,15 @@ def commanded(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("sys.argv", ["springbench", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out + told.err
+    captured = capsys.readouterr()
+    return int(ended.value.code or 0), captured.out + captured.err
 
 
 def test_the_command_measures_and_draws(
     home: Home, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code, told = commanded(capsys, monkeypatch, "accuracy", str(home.config), "--results", str(home.folder.parent))
-    assert code == 0, told
-    assert f"{UNITS} of {UNITS} units are there already" in told
+    code, printed = commanded(capsys, monkeypatch, "accuracy", str(home.config), "--results", str(home.folder.parent))
+    assert code == 0, printed
+    assert f"{UNITS} of {UNITS} units are there already" in printed
     assert (home.folder.parent / "index.html").is_file()
     assert (home.folder.parent / "site" / "data" / home.folder.name / "convergence.js").is_file()

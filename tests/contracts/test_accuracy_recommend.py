@@ -56,7 +56,7 @@ def scene(tmp_path: Path) -> Path:
     return tmp_path / "chain.yaml"
 
 
-def asked(scene: Path, error: float, **more: Any) -> tuple[MethodRecommendation, int]:
+def recommend(scene: Path, error: float, **more: Any) -> tuple[MethodRecommendation, int]:
     """The answer, and how many simulations were measured for it."""
     display, results = SilentDisplay(), scene.parent / "results"
     options: dict[str, Any] = {"size": None, "t_end": 0.2, "time_limit": 60.0} | more
@@ -71,7 +71,7 @@ def measured(scene: Path) -> list[Path]:
 
 def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: Path) -> None:
     said = list[str]()
-    found, count = asked(scene, 0.1, print_message=said.append)
+    found, count = recommend(scene, 0.1, print_message=said.append)
     assert count == len(measured(scene)) <= COUNT
     assert any(line.startswith(f"chain 4: {count} of {COUNT} settings measured") for line in said)
     table = parquet_rows.read_rows(measured(scene), ACCURACY_SCHEMA).to_pylist()
@@ -98,25 +98,25 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
 
 
 def test_what_was_measured_is_not_measured_again(scene: Path) -> None:
-    first, _ = asked(scene, 0.1)
-    again, count = asked(scene, 0.1)
+    first, _ = recommend(scene, 0.1)
+    again, count = recommend(scene, 0.1)
     assert count == 0
     assert again.best_method == first.best_method
 
 
 @pytest.mark.long
 def test_what_was_measured_of_another_scene_or_on_another_machine_is_no_answer(scene: Path) -> None:
-    asked(scene, 0.1)
+    recommend(scene, 0.1)
     scene.write_text(SCENE.replace("200", "210"))
-    assert asked(scene, 0.1)[1] > 0
+    assert recommend(scene, 0.1)[1] > 0
     for path in measured(scene):
         table = pq.read_table(path)
         for column, value in (("machine_id", "0" * 12), ("unit_id", "measured there")):
             k = table.schema.get_field_index(column)
             table = table.set_column(k, column, pa.array([value] * len(table)))
         pq.write_table(table, path)
-    assert asked(scene, 0.1)[1] > 0
-    assert asked(scene, 0.1, t_end=0.4)[1] > 0
+    assert recommend(scene, 0.1)[1] > 0
+    assert recommend(scene, 0.1, t_end=0.4)[1] > 0
 
 
 def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -> None:
@@ -125,20 +125,20 @@ def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -
     other.write_text(SCENE)
     claim_folder(scene.parent / "results" / f"recommend-{scene.stem}", other)
     with pytest.raises(InputError, match="holds the results of another file of this name"):
-        asked(scene, 0.1)
+        recommend(scene, 0.1)
     assert not measured(scene)
 
 
 def test_an_error_that_nothing_keeps_to_is_told_with_the_nearest(scene: Path) -> None:
-    with pytest.raises(RunFailed, match=r"nothing that was measured keeps to an error of 1e-08 .* midpoint") as told:
-        asked(scene, 1e-8)
-    assert "ask for a larger --error or a shorter --t-end" in str(told.value)
+    with pytest.raises(RunFailed, match=r"nothing that was measured keeps to an error of 1e-08 .* midpoint") as raised:
+        recommend(scene, 1e-8)
+    assert "ask for a larger --error or a shorter --t-end" in str(raised.value)
 
 
 def test_a_budget_that_is_used_up_is_stated_and_the_search_goes_on_from_there(scene: Path) -> None:
     with pytest.raises(RunFailed, match=rf"settings remain \(0 of {COUNT} settings measured; 6 not: the budget"):
-        asked(scene, 0.1, budget=1e-9)
-    found, count = asked(scene, 0.1)
+        recommend(scene, 0.1, budget=1e-9)
+    found, count = recommend(scene, 0.1)
     assert count > 0
     assert found.best_method.error <= 0.1
 
@@ -147,15 +147,15 @@ def test_a_budget_that_is_used_up_is_stated_and_the_search_goes_on_from_there(sc
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
 def test_what_is_no_number_above_zero_is_a_mistake(scene: Path, option: str, value: float) -> None:
     with pytest.raises(InputError, match="wanted a number above 0"):
-        asked(scene, **{"error": 0.1, option: value})
+        recommend(scene, **{"error": 0.1, option: value})
 
 
 def test_a_mesh_has_to_have_a_size(scene: Path) -> None:
     scene.write_text(SCENE.replace("default_size: 4", ""))
     with pytest.raises(InputError, match=r"^--size: is missing; the scene chain needs a mesh size"):
-        asked(scene, 0.1)
+        recommend(scene, 0.1)
     with pytest.raises(InputError, match=r"^--size: came 1; should be greater than or equal to 2$"):
-        asked(scene, 0.1, size=1)
+        recommend(scene, 0.1, size=1)
 
 
 def test_the_command_shows_what_it_predicts_and_what_it_measured(
@@ -166,11 +166,11 @@ def test_the_command_shows_what_it_predicts_and_what_it_measured(
     monkeypatch.setattr("sys.argv", ["springbench", "recommend", str(scene), *options])
     with pytest.raises(SystemExit) as ended:
         main()
-    told = capsys.readouterr()
-    assert not ended.value.code, told.err
-    assert all(word in told.out for word in ("predicted", "measured", "sparse", "time step"))
+    captured = capsys.readouterr()
+    assert not ended.value.code, captured.err
+    assert all(word in captured.out for word in ("predicted", "measured", "sparse", "time step"))
     assert list((scene.parent / "results" / "recommend-chain" / "pictures").glob("ways-chain-4-0_1-0_2.png"))
-    said = (told.out + told.err).splitlines()
+    said = (captured.out + captured.err).splitlines()
     command = next(line for line in said if line.startswith("  springbench run "))
     _, _, config, *given = shlex.split(command)
     options = {
@@ -187,7 +187,7 @@ def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scen
     scene.write_text(SCENE.replace("{kind: gravity}", "{kind: contact, obstacles: [{kind: plane, point: [0, -9, 0]}]}"))
     said = list[str]()
     with pytest.raises(RunFailed, match="nothing moves"):
-        asked(scene, 0.1, print_message=said.append)
+        recommend(scene, 0.1, print_message=said.append)
     assert said[0].startswith("chain: contact has")
     assert sum("no certified reference" in line for line in said) == 1
     assert not measured(scene)

@@ -39,7 +39,7 @@ SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (("--error", "2"), "--error: came 2; wanted a number between 0 and 1"),
         (("--error", "nan"), "--error: came nan"),
@@ -50,11 +50,11 @@ SCENES = Path(__file__).parents[2] / "configs" / "scenes"
         (("--verify",), "--verify: is of a run with --error"),
     ],
 )
-def test_what_cannot_be_asked_is_the_users_mistake(options, told, tmp_path, capsys):
+def test_what_cannot_be_asked_is_the_users_mistake(options, message, tmp_path, capsys):
     given = ["run", str(SCENES / "chain.yaml"), "--results", str(tmp_path), *options]
     found = CliRunner().invoke(app, given)
     assert found.exit_code == 2
-    assert told in " ".join((found.stderr + capsys.readouterr().err).split())
+    assert message in " ".join((found.stderr + capsys.readouterr().err).split())
 
 
 def rows_of(folder: Path, *options: str) -> list[dict[str, Any]]:
@@ -127,32 +127,32 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
     monkeypatch.setattr(
         "springbench.harness.experiments.error_control.stored_trials.list_candidate_methods", lambda: few
     )
-    asked = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 0.2)
-    seen = compute_predictability_horizon(asked, 1e-3, lambda line: None)
-    answer = search_cheapest_method(asked, 1e-3, seen, lambda line: None)
+    error_target = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 0.2)
+    seen = compute_predictability_horizon(error_target, 1e-3, lambda line: None)
+    answer = search_cheapest_method(error_target, 1e-3, seen, lambda line: None)
     promises: dict[str, float] = {"velocity-verlet": 1.0, "blanes-moan-4": 1.9, "rodas": 2.1}
     answer = replace(answer, trials=tuple((one, promises[one.method.solver]) for one, _ in answer.trials))
-    shared = {"problem_digest": format_problem_id(asked), "error_requested": 1e-3} | build_provenance_columns()
+    shared = {"problem_digest": format_problem_id(error_target), "error_requested": 1e-3} | build_provenance_columns()
     parquet_rows.write_rows(
         tmp_path / "s-2-asked-0.001.parquet",
         [shared | row for row in build_trial_rows(answer, [], 1e-3)],
         ACCURACY_SCHEMA,
     )
 
-    found = read_stored_trials(tmp_path, asked)
+    found = read_stored_trials(tmp_path, error_target)
     assert select_promising_methods(found, 4e-3) == (1e-3, few[:2])
     assert select_promising_methods(found, 2e-2) == (1e-3, [])
     assert select_promising_methods([], 1e-3)[1] == []
     again = build_trial_rows(replace(answer, trials=answer.trials[:1]), found, 1e-3)
     assert {row["solver"] for row in again} == set(promises), "what is not tried again is not forgotten"
-    assert not read_stored_trials(tmp_path, replace(asked, num_frames=asked.num_frames + 1))
+    assert not read_stored_trials(tmp_path, replace(error_target, num_frames=error_target.num_frames + 1))
     monkeypatch.setattr("springbench.harness.execution.machine_info.hash_sources", lambda: "other")
-    assert not read_stored_trials(tmp_path, asked)
+    assert not read_stored_trials(tmp_path, error_target)
 
 
 @pytest.mark.long
 def test_peers_have_rows_beside_it(tmp_path):
-    beside = [row for row in rows_of(tmp_path, "--compare") if row["kind"] == "third-party"]
-    assert [peer["solver"] for peer in beside] == list(THIRD_PARTY_INTEGRATORS)
-    assert all(peer["reason"] or peer["error_estimated"] <= 1e-3 for peer in beside)
-    assert [peer["status"] for peer in beside][:2] == ["ok", "ok"]
+    other = [row for row in rows_of(tmp_path, "--compare") if row["kind"] == "third-party"]
+    assert [peer["solver"] for peer in other] == list(THIRD_PARTY_INTEGRATORS)
+    assert all(peer["reason"] or peer["error_estimated"] <= 1e-3 for peer in other)
+    assert [peer["status"] for peer in other][:2] == ["ok", "ok"]

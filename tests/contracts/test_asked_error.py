@@ -158,23 +158,23 @@ def test_hermites_cubic_is_exact_for_cubics():
 def test_the_error_is_never_above_the_one_that_was_asked_for_whichever_way_wins(
     scene, size, horizon, error, monkeypatch
 ):
-    asked = ErrorTarget.from_scene(load_scene(SCENES / f"{scene}.yaml"), size, horizon)
-    told = list[str]()
+    error_target = ErrorTarget.from_scene(load_scene(SCENES / f"{scene}.yaml"), size, horizon)
+    messages = list[str]()
     seen, truth = (
-        compute_predictability_horizon(asked, error, told.append),
-        integrate_motion(asked.build_scene(asked.frame_seconds, "substepping"), [horizon]),
+        compute_predictability_horizon(error_target, error, messages.append),
+        integrate_motion(error_target.build_scene(error_target.frame_seconds, "substepping"), [horizon]),
     )
-    for way in prepare_candidate_methods(asked, told.append):
+    for way in prepare_candidate_methods(error_target, messages.append):
         monkeypatch.setattr(
             "springbench.harness.experiments.error_control.method_search.prepare_candidate_methods",
             lambda *_, way=way: [way],
         )
-        found = search_cheapest_method(asked, error, seen, told.append).best_trial
+        found = search_cheapest_method(error_target, error, seen, messages.append).best_trial
         true = truth.measure_error(0, found.trajectory.positions[-1])
         assert true <= found.error_estimated <= error, found.method
         # The doubt, and the closer tolerance, which no estimate is below.
         assert found.error_estimated <= 1.5 * true + 0.02 * error, found.method
-    assert any("an error of" in line for line in told)
+    assert any("an error of" in line for line in messages)
 
 
 def steps_of(spec: SceneSpec, size: int) -> list[Any]:
@@ -238,16 +238,16 @@ def test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known
 
 
 def test_a_refusal_names_the_longest_horizon_that_works(tmp_path):
-    asked, error = ErrorTarget.from_scene(CRUMPLING, 7, 1.6), 1e-7
+    error_target, error = ErrorTarget.from_scene(CRUMPLING, 7, 1.6), 1e-7
     with pytest.raises(UnpredictableMotion, match=r"after 1.6 s .* a --t-end of [\d.]+ s or less") as refused:
-        compute_predictability_horizon(asked, error, lambda line: None)
+        compute_predictability_horizon(error_target, error, lambda line: None)
     horizon = float(str(refused.value).rpartition("--t-end of ")[2].split()[0])
     assert 0.3 < horizon < 1.6
     compute_predictability_horizon(ErrorTarget.from_scene(CRUMPLING, 7, horizon), error, lambda line: None)
-    kept = ReferenceStore(tmp_path)
-    assert kept.load_trajectory(CRUMPLING, 7, [horizon], error=error).growth[0] <= 0.1 * error
+    store = ReferenceStore(tmp_path)
+    assert store.load_trajectory(CRUMPLING, 7, [horizon], error=error).growth[0] <= 0.1 * error
     with pytest.raises(UnpredictableMotion, match=f"a --t-end of {horizon:g} s or less"):
-        kept.load_trajectory(CRUMPLING, 7, [1.6], error=error)
+        store.load_trajectory(CRUMPLING, 7, [1.6], error=error)
 
 
 def test_an_error_below_round_off_is_refused_with_the_one_that_can_be_had():
@@ -304,15 +304,15 @@ def test_ways_are_what_solvers_and_integrators_say_of_themselves():
     ],
 )
 def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_reason(effect, what):
-    held = () if effect is MOVED else (HELD,)
-    told, asked = list[str](), ErrorTarget(chain(SpringsEffect(stretch=40.0), effect, *held), 5, 0.1, 2)
-    found = prepare_candidate_methods(asked, told.append)
+    fixed = () if effect is MOVED else (HELD,)
+    messages, error_target = list[str](), ErrorTarget(chain(SpringsEffect(stretch=40.0), effect, *fixed), 5, 0.1, 2)
+    found = prepare_candidate_methods(error_target, messages.append)
     assert {way.solver: way.stepper.order for way in found if way.integrator == "substepping"} == dict.fromkeys(
         OWN[:3], 1
     )
     assert {way.integrator for way in found} == {"substepping", "esdirk-4", "midpoint"}
-    assert [line.split(":")[0].removeprefix("  not by ") for line in told] == OWN[3:]
-    assert all(what in line for line in told)
+    assert [line.split(":")[0].removeprefix("  not by ") for line in messages] == OWN[3:]
+    assert all(what in line for line in messages)
 
 
 def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_error_asks_for():
@@ -369,9 +369,9 @@ def test_drag_that_grows_with_the_square_of_the_speed_is_graded_too(tmp_path):
     """As a force: where frames split, it is a filter, which has no equation of motion."""
     spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(drag_law="quadratic", coefficient=0.5), HELD)
     found = ReferenceStore(tmp_path).load_trajectory(spec, 5, [0.1], error=1e-3)
-    asked = ErrorTarget(spec, 5, 0.1, 2)
+    error_target = ErrorTarget(spec, 5, 0.1, 2)
     path = AdaptiveImplicitStepper(
-        lambda h: asked.build_scene(h, "esdirk-4"), NewtonSolver(), asked.t_end, asked.num_frames
+        lambda h: error_target.build_scene(h, "esdirk-4"), NewtonSolver(), error_target.t_end, error_target.num_frames
     ).integrate_motion(1e-6)
     assert found.measure_error(0, path.positions[-1]) < 1e-3
 
@@ -383,10 +383,10 @@ def test_contact_is_refused_with_what_can_be_had(monkeypatch):
     monkeypatch.setattr(module, "_STEP_DOUBLING_SECONDS", 0.5)
     with pytest.raises(RunFailed, match=r"contact begins and ends within steps.*steps of .* s end within .* of where"):
         ErrorTarget.from_scene(spec, 5, END)
-    asked = ErrorTarget(chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD), 5, END, FRAMES)
-    found = estimate_by_step_doubling(asked.build_scene, END, FRAMES, time_budget=0.5)
-    error = integrate_motion(asked.build_scene(asked.frame_seconds, "substepping"), [END]).measure_error
-    scene, steps = asked.build_scene(found.time_step, "implicit-euler"), round(END / found.time_step)
+    error_target = ErrorTarget(chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD), 5, END, FRAMES)
+    found = estimate_by_step_doubling(error_target.build_scene, END, FRAMES, time_budget=0.5)
+    error = integrate_motion(error_target.build_scene(error_target.frame_seconds, "substepping"), [END]).measure_error
+    scene, steps = error_target.build_scene(found.time_step, "implicit-euler"), round(END / found.time_step)
     path = simulate_scene(
         scene, prepare(scene, NewtonSolver()), StopRule(50, 1e-9), initial_guess="previous", frames=steps
     )

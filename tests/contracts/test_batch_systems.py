@@ -67,13 +67,13 @@ def test_runs_are_done_by_jobs_that_are_submitted_and_cancelled(tmp_path: Path, 
     )
     (tmp_path / "r").mkdir()
     found = load_config(tmp_path / "sweep.yaml")
-    told: list[Any] = []
+    messages: list[Any] = []
     table = run_sweep(
         "sweep",
         found.list_runs(),
         tmp_path / "r",
         SilentDisplay(),
-        told.append,
+        messages.append,
         scheduler_address=str(tmp_path / "slurm.yaml"),
     )
     assert set(table["status"].to_pylist()) == {"ok"}

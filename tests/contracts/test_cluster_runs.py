@@ -125,7 +125,9 @@ def test_of_four_workers_of_a_machine_one_is_timed_at_a_time(tmp_path: Path, sha
         measured, second = solves[:-FRAMES], solves[-FRAMES:]
         took = [row["seconds"] for row in rows if row["max_iterations"] == run and row["phase"] == "step"]
         own = [ended - began for began, ended in measured[-FRAMES * ROUNDS :]]
-        assert all(SLEEP <= mine <= told for mine, told in zip(own, took, strict=True))  # these are what rows time
+        assert all(
+            SLEEP <= mine <= reported for mine, reported in zip(own, took, strict=True)
+        )  # these are what rows time
         timed.append((run, measured[0][0], measured[-1][1]))
         looked += [(run, *solve) for solve in second]
     at_once = {
@@ -162,8 +164,10 @@ def all_but_times(table: pa.Table) -> list[str]:
 
 @pytest.mark.long
 def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(tmp_path: Path):
-    told = tmp_path / "told"
-    (tmp_path / "counted.py").write_text(SOLVER_SOURCE.replace("pass  # while solving", TELL.format(told=str(told))))
+    log_path = tmp_path / "told"
+    (tmp_path / "counted.py").write_text(
+        SOLVER_SOURCE.replace("pass  # while solving", TELL.format(told=str(log_path)))
+    )
     (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     sweep = tmp_path / "sweep.yaml"
     options = f"frames: 2, rounds: 1, max_iterations: {list(range(1, MANY + 1))}, record: false, pictures: false"
@@ -176,7 +180,7 @@ def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(
         def kill() -> None:
             while not over.wait(EVERY):
                 workers = [nanny.pid for nanny in found.workers.values() if nanny.pid]
-                if len(found.scheduler.workers) == 4 and told.exists():  # else a slow machine would do nothing else
+                if len(found.scheduler.workers) == 4 and log_path.exists():  # else a slow machine would do nothing else
                     killed.append(workers[len(killed) % len(workers)])
                     os.kill(killed[-1], signal.SIGKILL)
 
@@ -185,7 +189,7 @@ def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(
         disturbed = done(sweep, tmp_path / "r", found.scheduler_address)
         over.set()
         killer.join()
-        began = set(told.read_text().splitlines())
+        began = set(log_path.read_text().splitlines())
         whole = done(sweep, tmp_path / "s", found.scheduler_address)
     print(f"{len(killed)} workers were killed, and {len(began) - MANY} of {MANY} runs begun again")
     assert killed

@@ -24,7 +24,7 @@ FLOOR = build_contact(OBSTACLE_SPECS["plane"], friction=0.4)
 FALL = (0.5, -6.0, 0.0)
 
 
-def held(weight: float | str) -> Scene:
+def build_pinned_scene(weight: float | str) -> Scene:
     return build_sheet(FLOOR, PinsEffect.model_validate({"parts": ["top_corners"], "weight": weight}), velocity=FALL)
 
 
@@ -34,8 +34,8 @@ SCENES = {
     "two obstacles": lambda: build_sheet(
         build_contact(OBSTACLE_SPECS["sphere"], OBSTACLE_SPECS["capsule"], friction=0.2), velocity=FALL
     ),
-    "held by penalty": lambda: held(1e10),
-    "held exactly": lambda: held("exact"),
+    "held by penalty": lambda: build_pinned_scene(1e10),
+    "held exactly": lambda: build_pinned_scene("exact"),
 }
 
 

@@ -29,8 +29,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bytes]:
     home = tmp_path_factory.mktemp("finished")
     (home / "good.yaml").write_text(scene())
     (home / "sweep.yaml").write_text(SWEEP)
-    told = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])
-    assert told.exit_code == 0, told.output
+    result = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])
+    assert result.exit_code == 0, result.output
     return {path.relative_to(home): path.read_bytes() for path in home.rglob("*") if path.is_file()}
 
 
@@ -82,8 +82,8 @@ def test_damaged_rows_are_named_and_refused(home: Path, damage: str):
     reported = attempt(home, ["report", "results/sweep"])
     assert (reported.code, reported.error) == (2, "")
     assert path.name in reported.said
-    asked = attempt(home, ["query", "SELECT * FROM rows"])
-    assert (asked.code, asked.error) in ((0, ""), (2, ""))
+    requested = attempt(home, ["query", "SELECT * FROM rows"])
+    assert (requested.code, requested.error) in ((0, ""), (2, ""))
 
 
 def test_the_runs_of_damaged_rows_and_recordings_are_done_again(home: Path):
@@ -91,9 +91,9 @@ def test_the_runs_of_damaged_rows_and_recordings_are_done_again(home: Path):
     recording = home / "results/sweep/recordings" / f"{second.stem}.rrd"
     os.truncate(first, 100)
     os.truncate(recording, recording.stat().st_size - 100)
-    told = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])
-    assert told.exit_code == 0, told.output
-    said = " ".join(told.output.split())
+    result = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])
+    assert result.exit_code == 0, result.output
+    said = " ".join(result.output.split())
     assert f"{first.name} holds no rows" in said
     assert f"{recording.name} is cut before its end" in said
     assert parquet_rows.read_rows([first, second], required_columns=("status",)).num_rows > 0
@@ -115,9 +115,9 @@ def test_what_lies_in_the_place_of_the_lock_is_a_mistake(home: Path, lock: str):
     (home / "victim").write_text("precious")
     path = home / "results" / "sweep" / ".lock"
     replaced(path, LOCKS[lock])
-    told = attempt(home, ["run", "sweep.yaml"])
-    assert (told.code, told.error, told.outside) == (2, "", [])
-    assert ".lock" in told.said
+    result = attempt(home, ["run", "sweep.yaml"])
+    assert (result.code, result.error, result.outside) == (2, "", [])
+    assert ".lock" in result.said
     assert (home / "victim").read_text() == "precious"
 
 
@@ -125,9 +125,9 @@ def test_two_configs_of_one_name_do_not_share_their_results(home: Path):
     (home / "other").mkdir()
     (home / "other" / "sweep.yaml").write_text((home / "sweep.yaml").read_text())
     (home / "other" / "good.yaml").write_text(scene(frames="3"))
-    told = attempt(home, ["run", "other/sweep.yaml"])
-    assert told.code == 2
-    assert "holds the results of another file of this name" in told.said
+    result = attempt(home, ["run", "other/sweep.yaml"])
+    assert result.code == 2
+    assert "holds the results of another file of this name" in result.said
     (home / "sweep.yaml").unlink()  # it was moved
     assert attempt(home, ["run", "other/sweep.yaml"]).code == 0
 
@@ -136,10 +136,10 @@ def test_an_answer_is_text_and_no_markup(home: Path):
     parquet_rows.write_rows(
         home / "results/sweep/rows/x.parquet", [{"scene": "[red]x[/nothing]", "status": "ok", "run_id": "\x1b[2J"}]
     )
-    told = attempt(home, ["query", 'SELECT scene, run_id AS "[bold" FROM rows WHERE solver IS NULL'])
-    assert (told.code, told.error) == (0, "")
-    assert "[red]x[/nothing]" in told.said
-    assert "\x1b[2J" not in told.said
+    result = attempt(home, ["query", 'SELECT scene, run_id AS "[bold" FROM rows WHERE solver IS NULL'])
+    assert (result.code, result.error) == (0, "")
+    assert "[red]x[/nothing]" in result.said
+    assert "\x1b[2J" not in result.said
 
 
 def flips(count: int, seed: int, tmp_path: Path) -> tuple[int, int]:

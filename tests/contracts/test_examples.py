@@ -44,9 +44,9 @@ PUBLIC_NAMES = {
 def python(*arguments: str, folder: Path) -> str:
     """What a program says, run in a folder."""
     env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "MPLBACKEND": "agg"}
-    told = subprocess.run([sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True)
-    assert told.returncode == 0, told.stderr
-    return told.stdout
+    completed = subprocess.run([sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True)
+    assert completed.returncode == 0, completed.stderr
+    return completed.stdout
 
 
 def test_every_example_is_run_here():

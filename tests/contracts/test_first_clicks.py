@@ -26,9 +26,9 @@ options: {frames: 3, rounds: 2, max_iterations: 20}
 
 
 def did(*words: str) -> str:
-    told = CliRunner().invoke(app, [*words, "--in-process"])
-    assert told.exit_code == 0, told.output
-    return told.output
+    result = CliRunner().invoke(app, [*words, "--in-process"])
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
 def ends(folder: Path) -> dict[str, dict[str, str]]:

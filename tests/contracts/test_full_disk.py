@@ -70,11 +70,11 @@ SIZES = ["200k", *(pytest.param(size, marks=pytest.mark.long) for size in ("8k",
 def test_a_full_disk_is_said_by_name_and_what_failed_is_done_again(size: str, config: Path, tmp_path: Path):
     results = tmp_path / "disk"
     with small_disk(results, size):
-        told = start(config, results)
-        assert told.returncode == 1, told.stderr
-        assert "No space left on device" in told.stderr
-        assert "Traceback" not in told.stderr
-        assert "shut down prematurely" not in told.stderr
+        result = start(config, results)
+        assert result.returncode == 1, result.stderr
+        assert "No space left on device" in result.stderr
+        assert "Traceback" not in result.stderr
+        assert "shut down prematurely" not in result.stderr
         left = [path for path in results.rglob("*") if "partial" in path.name]
         assert left == []
         done = parquet_rows.read_rows(results.glob("sweep/rows/*.parquet"))
@@ -89,10 +89,10 @@ LARGEST = "import resource\nresource.setrlimit(resource.RLIMIT_FSIZE, (2**16, re
 
 
 def test_a_limit_to_the_size_of_files_is_no_outcome_of_a_run_either(config: Path, tmp_path: Path):
-    told = start(config, tmp_path / "results", LARGEST)
-    assert told.returncode == 1, told.stderr
-    assert "cannot be written: File too large" in told.stderr
-    assert "Traceback" not in told.stderr
+    result = start(config, tmp_path / "results", LARGEST)
+    assert result.returncode == 1, result.stderr
+    assert "cannot be written: File too large" in result.stderr
+    assert "Traceback" not in result.stderr
     outcomes = parquet_rows.read_rows(tmp_path.rglob("rows/*.parquet")).select(["status", "reason"]).to_pylist()
     assert list(tmp_path.rglob("*.parquet")) == [], outcomes
 

@@ -36,13 +36,13 @@ def test_a_command_survives_its_plugins(name: str, tmp_path: Path, monkeypatch: 
     began = monotonic()
     monkeypatch.chdir(tmp_path)
     before = state()
-    told = CliRunner().invoke(app, ["run", "sweep.yaml"])
-    said = re.sub(r"\s+", " ", told.output)
-    assert told.exit_code == case.code, told.output[-3000:]
-    assert told.exception is None or isinstance(told.exception, SystemExit)
+    result = CliRunner().invoke(app, ["run", "sweep.yaml"])
+    said = re.sub(r"\s+", " ", result.output)
+    assert result.exit_code == case.code, result.output[-3000:]
+    assert result.exception is None or isinstance(result.exception, SystemExit)
     assert "Traceback" not in said
-    assert case.said in said, told.output[-3000:]
-    assert len(told.output) < 50_000
+    assert case.said in said, result.output[-3000:]
+    assert len(result.output) < 50_000
     assert state() == before
     assert monotonic() - began < HANGS
     assert not [child for child in psutil.Process().children(recursive=True) if child.name() == "sleep"]
@@ -67,10 +67,10 @@ def test_listing_and_showing_survive_plugins(command: str, name: str, tmp_path: 
     monkeypatch.chdir(tmp_path)
     before, began = state(), monotonic()
     arguments = ["list", "sweep.yaml"] if command == "list" else ["preview", "odd.yaml", "-o", "picture.png"]
-    told = CliRunner().invoke(app, arguments)
-    assert told.exit_code in ((0, 2) if command == "list" else (0, 1, 2)), told.output[-3000:]
-    assert told.exception is None or isinstance(told.exception, SystemExit)
-    assert "Traceback" not in told.output
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code in ((0, 2) if command == "list" else (0, 1, 2)), result.output[-3000:]
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert "Traceback" not in result.output
     assert state() == before
     assert monotonic() - began < HANGS
     assert not [child for child in psutil.Process().children(recursive=True) if child.name() == "sleep"]

@@ -106,32 +106,32 @@ def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
     "recording", ["/etc/hostname", "../../secret.rrd", "a/../../secret.rrd", "a\0b", "recordings/" + "x" * 300]
 )
 def test_a_recording_is_looked_for_below_its_folder(tmp_path: Path, recording: str):
-    told = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
+    given_rows = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
         synthetic_accuracy_rows.build_curve_rows("net", 6, "early", "numba")
     )
-    for row in told:
+    for row in given_rows:
         if row["kind"] == "curve":
             row["recording_path"] = recording
-    synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
+    synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", given_rows)
     found = reported(tmp_path)
     assert "recording_path: came" in " ".join(found.said.split())
 
 
 def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path):
-    told = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
+    given_rows = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
         synthetic_accuracy_rows.build_curve_rows("net", 6, "early", "numba")
     )
-    for row in told:
+    for row in given_rows:
         row["objective_initial"] = row["time_step"] = None
-    synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", told)
+    synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", given_rows)
     assert reported(tmp_path).code in (0, 2)
 
 
 def test_who_reads_without_leaving_out_is_told_of_every_file(tmp_path: Path):
     files = write_cases(tmp_path / "cases", dict(list(LEFT_OUT.items())[:2]))
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as raised:
         read_rows(files)
-    assert [(mistake.key, mistake.file) for mistake in told.value.mistakes] == [("run_id", file) for file in files]
+    assert [(mistake.key, mistake.file) for mistake in raised.value.mistakes] == [("run_id", file) for file in files]
 
 
 def test_folders_have_safe_links_and_names_of_their_own():

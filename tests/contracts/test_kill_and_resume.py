@@ -57,10 +57,10 @@ PROCESSES.set_forkserver_preload(
 )
 
 
-def command(arguments: list[str], told: Path) -> None:
+def command(arguments: list[str], output_path: Path) -> None:
     """The command line in a process of its own, which writes what it says to a file."""
     sys.stderr.flush()
-    with told.open("w") as file:
+    with output_path.open("w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     sys.argv = ["springbench", *arguments]
@@ -217,10 +217,10 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     while not (sweep.folder / "recordings").exists() and process.poll() is None:
         sleep(0.002)
     process.send_signal(signal.SIGINT)
-    _, told = process.communicate()
-    assert process.returncode == 130, told
-    assert "the same command goes on from there" in told
-    assert "Traceback" not in told
+    _, completed = process.communicate()
+    assert process.returncode == 130, completed
+    assert "the same command goes on from there" in completed
+    assert "Traceback" not in completed
     sweep.finish()
     undisturbed = Sweep.write(tmp_path / "undisturbed", "sparse, numba", pictures=False)
     undisturbed.finish()

@@ -141,11 +141,11 @@ def test_a_run_with_a_phase_that_does_nothing_fails(ran, monkeypatch: pytest.Mon
 
 def late(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each frame has the positions of the one before."""
-    record, held = RerunRecorder.record_frame, []
+    record, fixed = RerunRecorder.record_frame, []
 
     def frame(self: RerunRecorder, frame: RecordedFrame) -> None:
-        held.append(frame.positions)
-        record(self, replace(frame, positions=held[-2] if len(held) > 1 else held[0]))
+        fixed.append(frame.positions)
+        record(self, replace(frame, positions=fixed[-2] if len(fixed) > 1 else fixed[0]))
 
     monkeypatch.setattr(RerunRecorder, "record_frame", frame)
 

@@ -139,14 +139,14 @@ def test_a_sweep_and_its_reports_take_a_new_solver_and_effect(configs: Path):
 
 
 def test_the_accuracy_report_takes_a_new_solver_and_effect(configs: Path):
-    asked = load_accuracy(configs / "accuracy.yaml")
-    files = run_accuracy_study(asked, configs / "results", SilentDisplay(), lambda line: None, isolated=False)
+    requested = load_accuracy(configs / "accuracy.yaml")
+    files = run_accuracy_study(requested, configs / "results", SilentDisplay(), lambda line: None, isolated=False)
     drawn = {path.name: path for path in draw_accuracy_report(configs / "results", files)}
     assert "@misc{noether1918," in drawn["references.bib"].read_text()
     assert "mine: Noether 1918, Invariante Variationsprobleme" in drawn["findings.md"].read_text()
     update_page(configs / "results")
-    told = (configs / "results" / "site" / "data" / "this" / "work.js").read_text()
-    assert "Noether 1918" in told
+    script_text = (configs / "results" / "site" / "data" / "this" / "work.js").read_text()
+    assert "Noether 1918" in script_text
 
 
 def test_a_new_solver_has_a_look_that_nobody_else_has():

@@ -144,8 +144,8 @@ def test_every_view_is_legible_and_fits(browser: Any, studies: str, width: int):
             shown.wait_for_timeout(50)  # colours begin to change
             shown.wait_for_function("!document.getAnimations().length")
             found = shown.evaluate("rules => axe.run(rules).then(found => found.violations)", rules)
-            told = {one["id"]: [node["html"][:160] for node in one["nodes"][:3]] for one in found}
-            assert not told, f"{name} at {width} pixels, {scheme}: {told}"
+            values = {one["id"]: [node["html"][:160] for node in one["nodes"][:3]] for one in found}
+            assert not values, f"{name} at {width} pixels, {scheme}: {values}"
     tab.close()
 
 

@@ -26,10 +26,10 @@ SPRING = Path(__file__).parents[2] / "configs" / "scenes" / "single-spring.yaml"
 
 @pytest.mark.parametrize("name", ["cvode-adams", "cvode-bdf"])
 def test_cvode_follows_the_motion_to_its_tolerance(name):
-    asked = ErrorTarget.from_scene(load_scene(SPRING), 2, 0.5)
+    error_target = ErrorTarget.from_scene(load_scene(SPRING), 2, 0.5)
     scene, truth = (
-        asked.build_scene(asked.frame_seconds, "newmark"),
-        integrate_motion(asked.build_scene(asked.frame_seconds, "substepping"), [0.5]),
+        error_target.build_scene(error_target.frame_seconds, "newmark"),
+        integrate_motion(error_target.build_scene(error_target.frame_seconds, "substepping"), [0.5]),
     )
     field = OdeField(scene)
     ends = (
@@ -45,11 +45,11 @@ def test_cvode_follows_the_motion_to_its_tolerance(name):
 
 def test_a_peer_that_is_not_installed_is_a_row_that_says_which_command_installs_it(monkeypatch):
     monkeypatch.setattr(third_party_integrators, "find_spec", lambda name: None)
-    asked = ErrorTarget.from_scene(load_scene(SPRING), 2, 0.1)
-    seen = compute_predictability_horizon(asked, 1e-2, lambda line: None)
+    error_target = ErrorTarget.from_scene(load_scene(SPRING), 2, 0.1)
+    seen = compute_predictability_horizon(error_target, 1e-2, lambda line: None)
     answer = search_cheapest_method(
-        asked, 1e-2, seen, lambda line: None, [("substepping", SolverSpec("velocity-verlet", {}))]
+        error_target, 1e-2, seen, lambda line: None, [("substepping", SolverSpec("velocity-verlet", {}))]
     )
-    (peer,) = compare_third_party(asked, 1e-2, answer, ["cvode-bdf"])
+    (peer,) = compare_third_party(error_target, 1e-2, answer, ["cvode-bdf"])
     assert "pip install -e '.[sundials]'" in peer.reason
     assert not THIRD_PARTY_INTEGRATORS["scipy-radau"].missing_reason

@@ -112,9 +112,11 @@ def springbench(folder: Path, *arguments: str, code: int = 0) -> str:
     """What a command says in a process of its own, to which the folder's `installed` are packages."""
     command = [sys.executable, "-m", "springbench", *arguments]
     path = os.pathsep.join([str(ROOT / ".src"), str(folder / "installed")])
-    told = subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True)
-    assert told.returncode == code, told.stdout + told.stderr
-    return told.stdout + told.stderr
+    completed = subprocess.run(
+        command, cwd=folder, env={**os.environ, "PYTHONPATH": path}, capture_output=True, text=True
+    )
+    assert completed.returncode == code, completed.stdout + completed.stderr
+    return completed.stdout + completed.stderr
 
 
 def packed(folder: Path) -> Path:
@@ -137,7 +139,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def beside(tmp_path: Path) -> Path:
+def plugin_folder(tmp_path: Path) -> Path:
     """A folder with own code in a file, and nothing installed."""
     (tmp_path / "own").mkdir()
     for path in (tmp_path / "mine.py", tmp_path / "own" / "mine.py"):
@@ -146,20 +148,20 @@ def beside(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("way", mark_rare_cases(WAYS, ["beside", "entry-point"]))
-def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, beside: Path, installed: Path):
-    (beside / "installed").symlink_to(installed)
-    for mark in [*beside.rglob("*.was-run"), *installed.rglob("*.was-run")]:
+def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, plugin_folder: Path, installed: Path):
+    (plugin_folder / "installed").symlink_to(installed)
+    for mark in [*plugin_folder.rglob("*.was-run"), *installed.rglob("*.was-run")]:
         mark.unlink()
-    configs(beside, WAYS[way])
+    configs(plugin_folder, WAYS[way])
 
     def ran() -> bool:
-        return any(next(folder.rglob("*.was-run"), None) for folder in (beside, installed))
+        return any(next(folder.rglob("*.was-run"), None) for folder in (plugin_folder, installed))
 
-    assert "missing" in springbench(beside, "list", "sweep.yaml")
+    assert "missing" in springbench(plugin_folder, "list", "sweep.yaml")
     assert not ran(), "to list a config runs nothing that it names"
-    springbench(beside, "run", "sweep.yaml")
+    springbench(plugin_folder, "run", "sweep.yaml")
     assert ran()
-    (rows,) = (beside / "results" / "sweep" / "rows").glob("*.parquet")
+    (rows,) = (plugin_folder / "results" / "sweep" / "rows").glob("*.parquet")
     row = pq.read_table(rows).to_pylist()[0]
     assert row["status"] == "ok", row["reason"]
     assert (row["solver"], row["integrator"]) == (WAYS[way]["solver"], WAYS[way]["integrator"])
@@ -172,15 +174,15 @@ def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, beside: Path, inst
         else:
             assert module == "somebodys"
             assert version.startswith("4.2+")
-    assert (beside / "results" / "sweep" / "told.txt").read_text().endswith("rows")
-    for mark in [*beside.rglob("*.was-run"), *installed.rglob("*.was-run")]:
+    assert (plugin_folder / "results" / "sweep" / "told.txt").read_text().endswith("rows")
+    for mark in [*plugin_folder.rglob("*.was-run"), *installed.rglob("*.was-run")]:
         mark.unlink()
-    assert "done" in springbench(beside, "list", "sweep.yaml"), "the run has the same name, opened or not"
+    assert "done" in springbench(plugin_folder, "list", "sweep.yaml"), "the run has the same name, opened or not"
     if way in ("below", "module"):
         return  # their rows are like the others'
-    springbench(beside, "schema")
-    springbench(beside, "query", "select plugins from rows")
-    springbench(beside, "report", "results/sweep")
+    springbench(plugin_folder, "schema")
+    springbench(plugin_folder, "query", "select plugins from rows")
+    springbench(plugin_folder, "report", "results/sweep")
     assert not ran(), "rows are read without the code that they are of"
 
 
@@ -200,15 +202,15 @@ def test_a_fresh_environment_takes_both_packages_and_sweeps_with_them(tmp_path: 
     assert (tmp_path / "results" / "sweep" / "told.txt").exists()
 
 
-def test_a_changed_file_is_another_run(beside: Path):
-    sweep = configs(beside, WAYS["beside"])
-    springbench(beside, "run", "sweep.yaml")
-    (beside / "mine.py").write_text(CODE.replace("patience: int = 3", "patience: int = 4"))
-    assert "missing" in springbench(beside, "list", sweep.name)
+def test_a_changed_file_is_another_run(plugin_folder: Path):
+    sweep = configs(plugin_folder, WAYS["beside"])
+    springbench(plugin_folder, "run", "sweep.yaml")
+    (plugin_folder / "mine.py").write_text(CODE.replace("patience: int = 3", "patience: int = 4"))
+    assert "missing" in springbench(plugin_folder, "list", sweep.name)
 
 
-def test_opened_or_not_a_run_has_one_name_and_one_code(beside: Path):
-    sweep = configs(beside, WAYS["beside"])
+def test_opened_or_not_a_run_has_one_name_and_one_code(plugin_folder: Path):
+    sweep = configs(plugin_folder, WAYS["beside"])
     closed, opened = (load_config(sweep, imports_code=opens).list_runs()[0] for opens in (False, True))
     assert closed.build_identity() == opened.build_identity()
     assert compute_source_fingerprint(collect_source_parts(closed)) == compute_source_fingerprint(
@@ -218,24 +220,28 @@ def test_opened_or_not_a_run_has_one_name_and_one_code(beside: Path):
     assert not shipped.find_plugins()
 
 
-def test_two_of_one_solver_are_told_apart_by_what_only_one_of_them_says(beside: Path):
-    sweep = configs(beside, WAYS["beside"])
+def test_two_of_one_solver_are_told_apart_by_what_only_one_of_them_says(plugin_folder: Path):
+    sweep = configs(plugin_folder, WAYS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5}", "patience: 5}, './mine.py:Mine'"))
-    (group,) = group_by_scene([PictureJob(run, beside, beside) for run in load_config(sweep).list_runs()], beside)
+    (group,) = group_by_scene(
+        [PictureJob(run, plugin_folder, plugin_folder) for run in load_config(sweep).list_runs()], plugin_folder
+    )
     assert list(group.jobs_by_label) == ["./mine.py:Mine, patience 5", "./mine.py:Mine"]
 
 
-def test_a_file_beside_the_config_travels_between_processes(beside: Path):
+def test_a_file_beside_the_config_travels_between_processes(plugin_folder: Path):
     import pickle
 
-    run = load_config(configs(beside, WAYS["beside"])).list_runs()[0]
-    (beside / "run.pickle").write_bytes(pickle.dumps(run))
+    run = load_config(configs(plugin_folder, WAYS["beside"])).list_runs()[0]
+    (plugin_folder / "run.pickle").write_bytes(pickle.dumps(run))
     program = "import pickle; run = pickle.load(open('run.pickle', 'rb')); "
     program += "print(run.scene.load_plugins().effects[1], run.build_identity())"
     env = {**os.environ, "PYTHONPATH": str(ROOT / ".src")}
-    told = subprocess.run([sys.executable, "-c", program], cwd=beside, env=env, capture_output=True, text=True)
-    assert told.stdout.split(" ", 2)[:2] == ["kind='hum'", "force=0.5"], told.stderr
-    assert told.stdout.rstrip().endswith(run.build_identity())
+    completed = subprocess.run(
+        [sys.executable, "-c", program], cwd=plugin_folder, env=env, capture_output=True, text=True
+    )
+    assert completed.stdout.split(" ", 2)[:2] == ["kind='hum'", "force=0.5"], completed.stderr
+    assert completed.stdout.rstrip().endswith(run.build_identity())
 
 
 REFUSED = {
@@ -254,12 +260,12 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_code_elsewhere_is_refused(name: str, beside: Path):
-    inside = beside / "inside"
+def test_code_elsewhere_is_refused(name: str, plugin_folder: Path):
+    inside = plugin_folder / "inside"
     (inside / "own").mkdir(parents=True)
     (inside / "mine.py").write_text(CODE)
-    (inside / "link.py").symlink_to(beside / "mine.py")
-    (inside / "linked").symlink_to(beside / "own")
+    (inside / "link.py").symlink_to(plugin_folder / "mine.py")
+    (inside / "linked").symlink_to(plugin_folder / "own")
     with pytest.raises(InvalidPluginName, match=r".") as caught:
         SOLVER_TABLE.resolve_name(name, inside)
     assert REFUSED[name] in str(caught.value) or "from the config's folder on" in str(caught.value)
@@ -276,16 +282,16 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("part", "name"), WRONG)
-def test_what_a_name_leads_to_is_checked_when_it_is_run(part: str, name: str, beside: Path):
-    sweep = configs(beside, WAYS["beside"] | {part: name})
+def test_what_a_name_leads_to_is_checked_when_it_is_run(part: str, name: str, plugin_folder: Path):
+    sweep = configs(plugin_folder, WAYS["beside"] | {part: name})
     assert load_config(sweep, imports_code=False).list_runs()
     with pytest.raises(InputError) as caught:
         load_config(sweep)
     assert WRONG[part, name] in str(caught.value)
 
 
-def test_wrong_parameters_of_own_code_are_told_with_their_line(beside: Path):
-    sweep = configs(beside, WAYS["beside"])
+def test_wrong_parameters_of_own_code_are_told_with_their_line(plugin_folder: Path):
+    sweep = configs(plugin_folder, WAYS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5", "patience: soon"))
     with pytest.raises(InputError, match=r"sweep\.yaml:2: solvers\[0\]\.patience: came \"soon\"; should be"):
         load_config(sweep)

@@ -179,10 +179,10 @@ def test_convergence_is_one_entity_by_iteration_with_a_value_for_each_frame(tmp_
     recorder.record_convergence(5, [3.0], [np.nan])  # a method without an objective
     found = summarise_recording(recorder.finish_recording({}))
     rows = [row for row in found.scalars.to_pylist() if row["entity"] == "/convergence/residual"]
-    told = {(row["frame"], row["iteration"], row["time"]): row["value"] for row in rows}
+    values = {(row["frame"], row["iteration"], row["time"]): row["value"] for row in rows}
     expected = {(3, 1, 0.03): 1.0, (3, 2, 0.03): 0.1, (3, 3, 0.03): 0.0, (7, 1, 0.07): 2.0, (7, 2, 0.07): 0.2}
     expected |= {(5, 1, 0.05): 3.0}
-    assert {key: value for key, value in told.items() if not np.isnan(value)} == expected
+    assert {key: value for key, value in values.items() if not np.isnan(value)} == expected
     entities = [entity for entity in found.entities if "convergence" in entity]
     assert entities == [
         "/convergence",

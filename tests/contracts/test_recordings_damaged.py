@@ -56,21 +56,21 @@ def run(code: str, path: Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_full_disk_is_a_failure_and_not_a_damaged_file(tmp_path: Path):
-    told = run(FULL, tmp_path / "a.rrd")
-    assert "WriteError" in told.stderr
-    assert "cannot be written" in told.stderr
+    result = run(FULL, tmp_path / "a.rrd")
+    assert "WriteError" in result.stderr
+    assert "cannot be written" in result.stderr
     assert list(tmp_path.iterdir()) == []
 
 
 def test_many_recordings_leave_no_threads_behind(tmp_path: Path):
-    told = run(THREADS, tmp_path / "a.rrd")
-    one, *more = map(int, told.stdout.split())  # those of a recording are there until the next one begins
-    assert more == [one] * 3, told.stderr
+    result = run(THREADS, tmp_path / "a.rrd")
+    one, *more = map(int, result.stdout.split())  # those of a recording are there until the next one begins
+    assert more == [one] * 3, result.stderr
 
 
 def test_a_killed_run_leaves_all_frames_up_to_the_last_flush(tmp_path: Path):
-    told = run(KILLED, tmp_path / "a.rrd")
-    assert told.returncode == -signal.SIGKILL, told.stderr
+    result = run(KILLED, tmp_path / "a.rrd")
+    assert result.returncode == -signal.SIGKILL, result.stderr
     (left,) = tmp_path.iterdir()
     assert left.name != "a.rrd"
     found, replay = summarise_recording(left), read_replay(left)

@@ -54,7 +54,7 @@ os._exit(0)
 """
 
 
-def told(code: str, path: Path) -> int:
+def count_threads_left(code: str, path: Path) -> int:
     return said(f"{STREAM}\nprint({code})", path)
 
 
@@ -65,13 +65,15 @@ def said(program: str, path: Path) -> int:
 
 def test_a_stream_that_is_gone_leaves_threads_which_no_public_call_ends(tmp_path: Path):
     # Way round: `flush_and_cleanup_orphaned_recordings` of the bindings.
-    assert told("left(clean=True)", tmp_path / "a.rrd") == 0
-    assert told("left()", tmp_path / "a.rrd") > 0, "streams end their threads by themselves: leave the bindings alone"
+    assert count_threads_left("left(clean=True)", tmp_path / "a.rrd") == 0
+    assert count_threads_left("left()", tmp_path / "a.rrd") > 0, (
+        "streams end their threads by themselves: leave the bindings alone"
+    )
 
 
 def test_the_public_call_for_layouts_leaves_threads_that_nothing_ends(tmp_path: Path):
     # Way round: `PartialFile.lay_out`.
-    found = told("left(layout=True, clean=True)", tmp_path / "a.rrd")
+    found = count_threads_left("left(layout=True, clean=True)", tmp_path / "a.rrd")
     assert found > 0, "send_blueprint leaves no threads any more: call it instead"
 
 

@@ -44,19 +44,19 @@ CALLED = ("this scene calls for it", "without it this is another scene", "the sc
 @pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.long) for name in LONG | TOUCH)])
 def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: str, tmp_path: Path):
     size, folder = (QUICK | LONG | TOUCH)[name], CONFIGS / ("touch" if name in TOUCH else "scenes")
-    asked = {
+    options = {
         "solvers": [DEFAULT_ABLATION_SOLVER],
         "rtol": DEFAULT_ABLATION_TOLERANCE,
         "sizes": [size] if size else [],
         "rounds": 1,
         "threads": 1,
     }
-    sweep = load_config(folder / f"{name}.yaml", **asked)
+    sweep = load_config(folder / f"{name}.yaml", **options)
     rows = read_ablation(
         run_ablation(sweep, tmp_path, SilentDisplay(), lambda line: None, with_pairs=False, isolated=False)
     )
-    told = {row["name"]: describe_effect(row, rows) for row in select_kind(rows, "ablated")}
-    assert {name: words for name, words in told.items() if not any(called in words for called in CALLED)} == {}
+    values = {row["name"]: describe_effect(row, rows) for row in select_kind(rows, "ablated")}
+    assert {name: words for name, words in values.items() if not any(called in words for called in CALLED)} == {}
     # Scenes that all solvers take leave out contact of a mesh with itself, which few solvers know.
     assert {
         row["name"]: row["reason"] for row in select_kind(rows, "suggestion") if row["name"] != "self-contact"

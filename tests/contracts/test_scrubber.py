@@ -61,16 +61,16 @@ def test_each_iterate_is_shown_beside_the_reference_by_its_distance(tmp_path: Pa
         point = tab.get_by_role("region", name="The chosen point")
         slider = point.get_by_label("Iteration")
         slider.wait_for()
-        told, of = point.get_by_role("status"), slider.get_attribute("aria-valuetext")
+        expected, of = point.get_by_role("status"), slider.get_attribute("aria-valuetext")
         assert of
-        solver = told.inner_text().partition(",")[0]
+        solver = expected.inner_text().partition(",")[0]
         (reference,) = (s for s in AMPLITUDES if point.get_by_text(f"the last iterate of {s}").count())
         left, right = (point.locator("canvas").nth(k) for k in (0, 1))
         for key, frame in (("Home", 0), ("End", -1)):
             slider.press(key)
             shown, best = files[solver].positions[frame], files[reference].positions[-1]
             far = float(np.linalg.norm(shown - best, axis=1).max())
-            words = told.inner_text()
+            words = expected.inner_text()
             assert f"iteration {files[solver].frames[frame]}:" in words
             assert float(words.split(" is ")[1].split(" m ")[0].replace("−", "-")) == pytest.approx(far, rel=0.01)
         slider.press("Home")
@@ -79,13 +79,13 @@ def test_each_iterate_is_shown_beside_the_reference_by_its_distance(tmp_path: Pa
         slider.press("ArrowRight")
         left.press("ArrowRight")
         tab.wait_for_function("/at=.*turn=/.test(location.hash)")
-        link, told_then = tab.evaluate("location.href"), told.inner_text()
+        link, told_then = tab.evaluate("location.href"), expected.inner_text()
         seen = left.evaluate("canvas => canvas.toDataURL()")
         tab.goto("about:blank")
         tab.goto(link)
         slider.wait_for()
         tab.wait_for_function("document.documentElement.dataset.ready === location.hash")
-        assert told.inner_text() == told_then, "a link shows the iterate"
+        assert expected.inner_text() == told_then, "a link shows the iterate"
         assert left.evaluate("canvas => canvas.toDataURL()") == seen, "turned as it was"
         tab.screenshot(path=tmp_path / "scrubber.png")
         assert not said

@@ -55,15 +55,15 @@ class Tolerant(Formula):
         return super().integrate_motion(max(1.0, setting ** (-1.0 / (self.order + 1.0))))
 
 
-def found(monkeypatch: pytest.MonkeyPatch, error: float, told: list[str], **followers: Stepper) -> SearchResult:
+def found(monkeypatch: pytest.MonkeyPatch, error: float, messages: list[str], **followers: Stepper) -> SearchResult:
     """The answer among ways of these names, the last of which tells the errors of all."""
     exact = Tolerant(lambda steps: 5.0 * steps**-4.0, 0.5, 4)
     named = [Method("substepping", name, one) for name, one in {**followers, "exact": exact}.items()]
     monkeypatch.setattr(
         "springbench.harness.experiments.error_control.method_search.prepare_candidate_methods", lambda *_: named
     )
-    asked = ErrorTarget.from_scene(SPRING, 2, 0.2)
-    return search_cheapest_method(asked, error, estimate_growth(SPRING, 2, 0.2), told.append)
+    error_target = ErrorTarget.from_scene(SPRING, 2, 0.2)
+    return search_cheapest_method(error_target, error, estimate_growth(SPRING, 2, 0.2), messages.append)
 
 
 def test_the_order_is_measured_and_the_cost_predicted_by_it(monkeypatch):
@@ -80,34 +80,34 @@ def test_the_order_is_measured_and_the_cost_predicted_by_it(monkeypatch):
 
 
 def test_ways_are_sorted_chosen_and_printed_by_one_statistic(monkeypatch):
-    told = list[str]()
+    messages = list[str]()
     ways = {f"w{k}": Formula(lambda steps: 1.0 / steps**2, 1e-3 * cost) for k, cost in enumerate((3.0, 1.0, 2.0))}
-    answer = found(monkeypatch, 1e-2, told, **ways)
+    answer = found(monkeypatch, 1e-2, messages, **ways)
     promises = [promise for _, promise in answer.trials]
     assert promises == sorted(promises)
     assert answer.best_trial.method is answer.trials[0][0].method
     assert answer.best_trial.method.solver == "w1"
-    printed = [line.split(": ")[1].split(" s ")[0] for line in told if " predicted; " in line]
+    printed = [line.split(": ")[1].split(" s ")[0] for line in messages if " predicted; " in line]
     assert printed == [f"{promise:.3g}" for promise in promises]
 
 
 def test_a_way_that_comes_no_nearer_is_followed_by_the_next(monkeypatch):
-    told = list[str]()
+    messages = list[str]()
     stuck = Formula(lambda steps: 0.03 + 1.0 / steps**2, 1e-4)
-    answer = found(monkeypatch, 1e-2, told, stuck=stuck, slower=Formula(lambda steps: 1.0 / steps, 1e-2))
+    answer = found(monkeypatch, 1e-2, messages, stuck=stuck, slower=Formula(lambda steps: 1.0 / steps, 1e-2))
     assert answer.best_trial.method.solver != "stuck"
     assert answer.best_trial.error_estimated <= 1e-2
-    assert any(line.startswith("  stuck: reaches 3.") and "come no nearer" in line for line in told)
+    assert any(line.startswith("  stuck: reaches 3.") and "come no nearer" in line for line in messages)
 
 
 def test_a_way_that_takes_longer_than_the_next_promises_is_tried_after_it(monkeypatch):
     """Its error falls as promised at first, and then by order a half alone."""
-    told = list[str]()
+    messages = list[str]()
     late = Formula(lambda steps: 20.0 / steps**2 if steps < 40 else 0.0125 * (40 / steps) ** 0.5, 1e-4)
-    answer = found(monkeypatch, 1e-3, told, late=late, steady=Formula(lambda steps: 1.0 / steps, 3e-4))
+    answer = found(monkeypatch, 1e-3, messages, late=late, steady=Formula(lambda steps: 1.0 / steps, 3e-4))
     assert answer.trials[0][0].method.solver == "late"
     assert answer.best_trial.method.solver == "steady"
-    assert any(line.startswith("  late: takes more than") for line in told)
+    assert any(line.startswith("  late: takes more than") for line in messages)
 
 
 def test_an_error_that_no_way_comes_near_is_refused_with_the_nearest(monkeypatch):

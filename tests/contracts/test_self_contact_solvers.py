@@ -218,14 +218,14 @@ def test_a_fine_mesh_with_edges_below_the_thickness_runs():
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.4])
-@pytest.mark.parametrize(("stiff", "told"), [(0.1, "agrees"), (0.1001, "disagrees: effects[1] self-contact")])
-def test_the_reference_terms_agree_with_this_barrier_and_no_other(stiff, told, friction, monkeypatch):
+@pytest.mark.parametrize(("stiff", "expected"), [(0.1, "agrees"), (0.1001, "disagrees: effects[1] self-contact")])
+def test_the_reference_terms_agree_with_this_barrier_and_no_other(stiff, expected, friction, monkeypatch):
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 0.02, "frames": 3, "path": "scene.yaml"}
     spec = SceneSpec.model_validate(
         given | {"effects": (SpringsEffect(stretch=100.0), SelfContactEffect(min_distance=0.4, friction=friction))}
     )
     monkeypatch.setattr(collision_primitives, "_STIFFNESS_FRACTION", stiff)
-    assert verify_terms(spec, build_scene(spec, 3), "implicit-euler").startswith(told)
+    assert verify_terms(spec, build_scene(spec, 3), "implicit-euler").startswith(expected)
 
 
 def test_the_reference_terms_differ_from_another_friction(monkeypatch):

@@ -52,9 +52,9 @@ def test_each_run_is_done_by_one_of_two_commands(tmp_path: Path):
 
 @pytest.mark.long
 def test_what_a_killed_command_had_claimed_is_done_by_the_other(tmp_path: Path):
-    config, kept = sweep(tmp_path), tmp_path / "r" / "sweep" / "rows"
+    config, saved = sweep(tmp_path), tmp_path / "r" / "sweep" / "rows"
     first = begun(config)
-    while not list(kept.glob("*.parquet")) and first.poll() is None:
+    while not list(saved.glob("*.parquet")) and first.poll() is None:
         sleep(0.01)
     second = begun(config)
     sleep(0.5)
@@ -62,7 +62,7 @@ def test_what_a_killed_command_had_claimed_is_done_by_the_other(tmp_path: Path):
     first.communicate()
     said, _ = second.communicate()
     assert second.returncode == 0, said
-    assert len(list(kept.glob("*.parquet"))) == RUNS
+    assert len(list(saved.glob("*.parquet"))) == RUNS
     assert not list((tmp_path / "r").rglob(".*partial*"))
 
 

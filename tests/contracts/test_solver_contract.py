@@ -113,9 +113,9 @@ def test_two_preparations_of_a_system_give_the_same_bits(solver, problem):
 def test_a_solution_belongs_to_its_caller(solver, problem):
     prepared = solver.prepare(problem.system)
     positions = prepared.solve(problem, StopRule(3)).positions
-    kept = positions.copy()
+    original = positions.copy()
     prepared.solve(replace(problem, initial_guess=problem.initial_guess + 1.0), StopRule(4))
-    np.testing.assert_array_equal(positions, kept)
+    np.testing.assert_array_equal(positions, original)
     assert positions.flags.c_contiguous
     assert positions.dtype == np.float64
     given = (
@@ -154,12 +154,12 @@ def test_each_phase_does_what_it_returns(solver, problem):
         first = call()
         assert first is not None
         if isinstance(first, np.ndarray):
-            kept = first.copy()
+            original = first.copy()
             first.fill(np.nan)
             again = np.asarray(call())
             written = ~np.isnan(again)
             assert written.sum() >= 3 * len(problem.system.free_vertices)
-            np.testing.assert_array_equal(again[written], kept[written])
+            np.testing.assert_array_equal(again[written], original[written])
 
 
 @over(FLOAT64)

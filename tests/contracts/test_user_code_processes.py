@@ -146,5 +146,7 @@ print(blocked, signal.SIGTERM in signal.pthread_sigmask(signal.SIG_BLOCK, ()), c
 
 def test_a_stop_of_a_supervisor_waits_until_its_import_is_complete():
     """The handler of the stop imports the same module, and would find a part of it."""
-    told = subprocess.run([sys.executable, "-c", STOPPED_WHILE_IMPORTING], capture_output=True, text=True, timeout=100)
-    assert told.stdout == "[True] False True\n", told.stderr
+    completed = subprocess.run(
+        [sys.executable, "-c", STOPPED_WHILE_IMPORTING], capture_output=True, text=True, timeout=100
+    )
+    assert completed.stdout == "[True] False True\n", completed.stderr

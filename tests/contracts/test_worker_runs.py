@@ -55,12 +55,12 @@ CASES = {
 def limited(made: PluginSweep, limit: str) -> int:
     """Limit the solver's run, and leave the other out, which a busy machine might keep as long; how many remain."""
     if limit:
-        told = (
+        config_text = (
             made.sweep_path.read_text()
             .replace("[mine, sparse]", "[mine]")
             .replace("options: {", f"options: {{{limit}, ")
         )
-        made.sweep_path.write_text(told)
+        made.sweep_path.write_text(config_text)
     return 1 if limit else 2
 
 
@@ -83,9 +83,9 @@ def test_a_sweep_survives_its_solvers(name: str, tmp_path: Path, monkeypatch: py
     case = CASES[name]
     made = write_plugin_solver(tmp_path, monkeypatch, solve_code=case.does)
     runs = limited(made, case.limit)
-    told = ran(made)
-    assert told.exit_code == 1, told.output
-    assert "Traceback" not in told.output
+    result = ran(made)
+    assert result.exit_code == 1, result.output
+    assert "Traceback" not in result.output
     found = first_rows(made)
     others = [row for solver, row in found.items() if solver != "mine"]
     assert [(row["status"], row["reason"]) for row in others] == [("ok", None)] * (runs - 1)
@@ -109,13 +109,13 @@ def test_a_run_that_took_too_long_is_done_again_with_another_limit(tmp_path: Pat
     flag.touch()
     assert "1 of 1 runs are there already" in re.sub(r"\s+", " ", ran(made).output)
     made.sweep_path.write_text(made.sweep_path.read_text().replace("time_limit: 8", "time_limit: 800"))
-    assert (told := ran(made)).exit_code == 0, told.output
+    assert (result := ran(made)).exit_code == 0, result.output
     assert {row["status"] for row in first_rows(made).values()} == {"ok"}
 
 
 def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made = write_plugin_solver(tmp_path, monkeypatch, solve_code="import os; globals()['seen'] = os.getpid()")
-    assert (told := ran(made)).exit_code == 0, told.output
+    assert (result := ran(made)).exit_code == 0, result.output
     module = made.solver_path.stem
     assert not hasattr(sys.modules.get(module), "seen")
     assert ran(made, "--rerun", "--in-process").exit_code == 0
@@ -165,7 +165,7 @@ def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.Monk
     made = write_plugin_solver(
         tmp_path, monkeypatch, solve_code=does, options=SWEEP_OPTIONS + ", rtol: [1e-2, 1e-3, 1e-4]"
     )
-    assert (told := ran(made, "--workers", "1")).exit_code == 0, told.output
+    assert (result := ran(made, "--workers", "1")).exit_code == 0, result.output
     workers = set(note.read_text().split())
     assert len(workers) == 1
     assert str(os.getpid()) not in workers
@@ -181,9 +181,9 @@ def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_mea
         sweep_pictures, "draw_sweep_pictures", leave
     )  # where it draws: that process is a fork of this one
     made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, max_iterations: 5")
-    told = ran(made)
-    assert told.exit_code == 1
-    assert "the process that draws ended its process with exit code 3" in " ".join(told.output.split())
+    result = ran(made)
+    assert result.exit_code == 1
+    assert "the process that draws ended its process with exit code 3" in " ".join(result.output.split())
     assert len([*(tmp_path / "r").rglob("*.parquet")]) == 2
 
 

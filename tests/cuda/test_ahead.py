@@ -116,9 +116,9 @@ def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: py
     file.write_bytes(pickle.dumps(launches))
     without = {name: value for name, value in os.environ.items() if name != "NUMBA_ENABLE_CUDASIM"}
     command = [sys.executable, "-m", "tests.cuda.ahead", str(file)]
-    told = subprocess.run(command, cwd=ROOT, env=without, capture_output=True, text=True, check=False)
-    assert told.returncode == 0, told.stderr
-    found = {name: [ahead.Compiled(*one) for one in each] for name, each in json.loads(told.stdout).items()}
+    completed = subprocess.run(command, cwd=ROOT, env=without, capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, completed.stderr
+    found = {name: [ahead.Compiled(*one) for one in each] for name, each in json.loads(completed.stdout).items()}
     assert set(found) == set(launches)
     assert {name: one.wrong for name, each in found.items() for one in each if one.wrong} == {}
     for name, each in found.items():

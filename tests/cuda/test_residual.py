@@ -49,6 +49,6 @@ def test_it_is_the_oracles(name: str, method: str) -> None:
     rng = np.random.default_rng(0)
     for p in (problem.initial_guess, problem.initial_guess + 0.01 * rng.normal(size=problem.inertial_target.shape)):
         p = vertex_terms.apply_exact_pins(p, problem)
-        told, begun = prepared.residual_at(problem, p), prepared.init_state(problem, p)
-        assert told == pytest.approx(oracle.compute_residual(problem, p), rel=ROUND_OFF)
-        assert begun.residual() == pytest.approx(told, rel=1e-9)
+        residual, begun = prepared.residual_at(problem, p), prepared.init_state(problem, p)
+        assert residual == pytest.approx(oracle.compute_residual(problem, p), rel=ROUND_OFF)
+        assert begun.residual() == pytest.approx(residual, rel=1e-9)

@@ -31,34 +31,34 @@ def ran(folder: Path) -> tuple[Result, list[list[dict[str, Any]]]]:
     (folder / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     sweep = folder / "sweep.yaml"
     sweep.write_text(SWEEP)
-    told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(folder / "r"), "--in-process"])
+    result = CliRunner().invoke(app, ["run", str(sweep), "--results", str(folder / "r"), "--in-process"])
     found = [
         parquet_rows.read_rows([RunFiles.for_run(run, folder / "r" / "sweep").rows_path]).to_pylist()
         for run in load_config(sweep).list_runs()
     ]
-    return told, found
+    return result, found
 
 
 def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, timed = list[float](), list[tuple[int, int]]()
+    requests, timed = list[float](), list[tuple[int, int]]()
     residual, replay = device_solver.DeviceSolverState.residual, device_solver.DeviceSolver.replay_iterations
 
     def counted(self: Any) -> float:
-        asked.append(residual(self))
-        return asked[-1]
+        requests.append(residual(self))
+        return requests[-1]
 
     def seen(self: Any, problem: StepProblem, iterations: int) -> Any:
-        before = len(asked)
+        before = len(requests)
         found = replay(self, problem, iterations)
-        timed.append((iterations, len(asked) - before))
+        timed.append((iterations, len(requests) - before))
         return found
 
     monkeypatch.setattr(device_solver.DeviceSolverState, "residual", counted)
     monkeypatch.setattr(device_solver.DeviceSolver, "replay_iterations", seen)
-    told, (here, there) = ran(tmp_path)
-    assert told.exit_code == 0, told.output
+    result, (here, there) = ran(tmp_path)
+    assert result.exit_code == 0, result.output
     assert {row["device"] for row in here} == {cuda_device.describe_device()["device"]}
     assert {row["device"] for row in there} == {None}
     phases = Counter(row["phase"] for row in here)
@@ -68,8 +68,8 @@ def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
     assert {row["termination_reason"] for row in steps} == {"converged"}
     assert timed == [(row["num_iterations"], 0) for row in steps]
     assert all(count % device_solver.ITERATIONS_PER_RESIDUAL == 0 for count, _ in timed)
-    assert asked
-    assert "vbd, device cuda" in " ".join(told.output.split())
+    assert requests
+    assert "vbd, device cuda" in " ".join(result.output.split())
 
 
 class OutOfMemory(Exception):
@@ -101,8 +101,8 @@ def test_a_device_that_fails_is_a_row_and_the_sweep_goes_on(
         raise error
 
     monkeypatch.setattr(cuda_target.DeviceStream, "download_array", fails)
-    told, (here, there) = ran(tmp_path)
-    assert told.exit_code == 1
+    result, (here, there) = ran(tmp_path)
+    assert result.exit_code == 1
     assert [row["status"] for row in here] == ["failed"]
     assert said in here[0]["reason"]
     assert {row["status"] for row in there} == {"ok"}

@@ -23,46 +23,46 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--again", action="store_true", help="also those whose outcome is known")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="how many at once (2)")
     parser.add_argument("--whole", type=int, default=0, metavar="N", help="N of them, with all tests instead")
-    asked = parser.parse_args()
-    unknown = set(asked.names) - {lie.name for lie in TABLE}
+    options = parser.parse_args()
+    unknown = set(options.names) - {lie.name for lie in TABLE}
     if unknown:
         parser.error(f"there is no lie {', '.join(sorted(unknown))}; there are {', '.join(lie.name for lie in TABLE)}")
-    if asked.jobs < 1 or not 0 <= asked.whole <= len(TABLE):
+    if options.jobs < 1 or not 0 <= options.whole <= len(TABLE):
         parser.error(f"--jobs should be at least 1, and --whole from 0 to {len(TABLE)}")
-    return asked
+    return options
 
 
 def main() -> int:
     """Exit code 0 where all were found out, 1 where not, 2 where the sources do not fit the table any more."""
-    asked = arguments()
-    chosen = [lie for lie in TABLE if not asked.names or lie.name in asked.names]
-    if asked.whole:
-        chosen = random.Random(0).sample(chosen, min(asked.whole, len(chosen)))
+    options = arguments()
+    chosen = [lie for lie in TABLE if not options.names or lie.name in options.names]
+    if options.whole:
+        chosen = random.Random(0).sample(chosen, min(options.whole, len(chosen)))
     try:
         for lie in chosen:
             lie.applied(ROOT)
     except Stale as error:
         print(error, file=sys.stderr)
         return 2
-    suffix = " whole" if asked.whole else ""
-    today, kept = runner.sources(), runner.known()
+    suffix = " whole" if options.whole else ""
+    today, saved = runner.sources(), runner.known()
 
     def done(lie: Mutation) -> bool:
-        found = kept.get(lie.name + suffix)
-        return bool(found and (found.entry, found.sources) == (lie.digest, today) and not asked.again)
+        found = saved.get(lie.name + suffix)
+        return bool(found and (found.entry, found.sources) == (lie.digest, today) and not options.again)
 
-    outcomes = [kept[lie.name + suffix] for lie in chosen if done(lie)]
+    outcomes = [saved[lie.name + suffix] for lie in chosen if done(lie)]
     if outcomes:
         print(f"{len(outcomes)} of {len(chosen)} are known already")
-    with TemporaryDirectory() as folder, ThreadPoolExecutor(asked.jobs) as workers:
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(options.jobs) as workers:
         copies: SimpleQueue[Copy] = SimpleQueue()
-        for job in range(asked.jobs):
+        for job in range(options.jobs):
             copies.put(Copy(Path(folder) / str(job)))
 
         def one(lie: Mutation) -> Outcome:
             copy = copies.get()
             try:
-                return examine(copy, lie, whole=bool(asked.whole))
+                return examine(copy, lie, whole=bool(options.whole))
             finally:
                 copies.put(copy)
 

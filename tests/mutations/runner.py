@@ -137,8 +137,8 @@ def _run(copy: Copy, lie: Mutation, chosen: Iterable[str], limit: float, most: i
     """The exit code of the tests with a lie in place, which end at so many failures, and the tests that failed, or what
     was said last."""
     with copy.planted(lie):
-        code, told = copy.told(lie, [*PYTEST, f"--maxfail={most}", *chosen], limit)
-    lines = told.splitlines()
+        code, output = copy.told(lie, [*PYTEST, f"--maxfail={most}", *chosen], limit)
+    lines = output.splitlines()
     failures = [line.removeprefix("FAILED ").split(" - ")[0] for line in lines if line.startswith("FAILED ")]
     return code, failures or lines[-1:] or [""]
 

@@ -186,8 +186,8 @@ def test_a_factor_in_single_precision_leaves_the_motion_where_it_was(case: str):
 
 def test_the_sweep_runs_every_case_by_every_solver():
     sweep = load_sweep(CONFIGS / "hard.yaml")
-    asked = {(run.scene_name, run.solver.name) for run in sweep.list_runs()}
-    assert asked == {(case, name) for case in CASES for name in SOLVER_TABLE.keys() - ALIKE}
+    options = {(run.scene_name, run.solver.name) for run in sweep.list_runs()}
+    assert options == {(case, name) for case in CASES for name in SOLVER_TABLE.keys() - ALIKE}
     assert len(CASES) >= 60
     assert {run.solver.parameters["precision"] for run in sweep.list_runs() if run.solver.name == "numba"} == {
         "float32",

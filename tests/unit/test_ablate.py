@@ -65,7 +65,7 @@ def by_name(rows: Sequence[dict[str, Any]], kind: str = "ablated") -> dict[str, 
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+def ablation_rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     return rows_of(CLOTH, tmp_path_factory.mktemp("cloth"), pairs=True, max_iterations=20)
 
 
@@ -88,8 +88,8 @@ def test_every_effect_is_left_out_once_and_every_pair_on_request(tmp_path: Path)
     assert alone[0].scene.effects == scene.effects
 
 
-def test_an_effect_that_does_nothing_costs_no_entry_and_moves_nothing(told):
-    (whole,), row = by_name(told, "full-scene").values(), by_name(told)["air-drag"]
+def test_an_effect_that_does_nothing_costs_no_entry_and_moves_nothing(ablation_rows):
+    (whole,), row = by_name(ablation_rows, "full-scene").values(), by_name(ablation_rows)["air-drag"]
     assert (
         row["displacement_max"],
         row["displacement_rms"],
@@ -97,19 +97,19 @@ def test_an_effect_that_does_nothing_costs_no_entry_and_moves_nothing(told):
         row["centroid_displacement"],
     ) == (0.0, 0.0, 0.0, 0.0)
     assert row["nnz_factor"] == whole["nnz_factor"]
-    assert "changes nothing at all" in describe_effect(row, told)
+    assert "changes nothing at all" in describe_effect(row, ablation_rows)
 
 
-def test_fill_in_and_memory_are_those_that_bending_brings(told):
-    (whole,), row = by_name(told, "full-scene").values(), by_name(told)["bending"]
+def test_fill_in_and_memory_are_those_that_bending_brings(ablation_rows):
+    (whole,), row = by_name(ablation_rows, "full-scene").values(), by_name(ablation_rows)["bending"]
     assert row["nnz_system"] < whole["nnz_system"]
     assert row["nnz_factor"] < whole["nnz_factor"]
     assert row["memory_bytes"] < whole["memory_bytes"]
 
 
-def test_without_gravity_the_centre_of_mass_stays_where_it_was(told):
-    row = by_name(told)["gravity"]
-    (whole,) = by_name(told, "full-scene").values()
+def test_without_gravity_the_centre_of_mass_stays_where_it_was(ablation_rows):
+    row = by_name(ablation_rows)["gravity"]
+    (whole,) = by_name(ablation_rows, "full-scene").values()
     # It cannot fall further than freely, by g t^2/2 and the first order of implicit Euler: g t dt/2.
     t, spacing = 8 / 30, 0.25
     assert 0.0 < row["centroid_displacement"] <= 9.81 * t * (t + 1 / 30) / 2 / spacing
@@ -117,23 +117,23 @@ def test_without_gravity_the_centre_of_mass_stays_where_it_was(told):
     assert row["energy_difference"] == pytest.approx(1.0)  # a scene without gravity and at rest has no energy at all
 
 
-def test_pairs_are_told_of_under_both_names(told):
-    assert {"gravity+bending", "springs+pins"} <= set(by_name(told))
+def test_pairs_are_told_of_under_both_names(ablation_rows):
+    assert {"gravity+bending", "springs+pins"} <= set(by_name(ablation_rows))
     # Without gravity nothing moves, and so bending has nothing to do.
-    both, one = (by_name(told)[name]["displacement_max"] for name in ("gravity+bending", "gravity"))
+    both, one = (by_name(ablation_rows)[name]["displacement_max"] for name in ("gravity+bending", "gravity"))
     assert both == pytest.approx(one, rel=1e-9)  # round-off of a step at rest
 
 
 def test_a_scene_that_cannot_be_without_an_effect_says_so(tmp_path: Path):
-    told = rows_of(HELD, tmp_path, max_iterations=5)
-    assert by_name(told)["springs"]["status"] == "unsolvable"
-    assert "impossible without it (" in describe_effect(by_name(told)["springs"], told)
-    assert by_name(told)["gravity"]["status"] == "ok"
+    ablation_rows = rows_of(HELD, tmp_path, max_iterations=5)
+    assert by_name(ablation_rows)["springs"]["status"] == "unsolvable"
+    assert "impossible without it (" in describe_effect(by_name(ablation_rows)["springs"], ablation_rows)
+    assert by_name(ablation_rows)["gravity"]["status"] == "ok"
 
 
 def test_the_error_of_the_solver_falls_with_its_iterations_and_that_of_the_step_does_not(tmp_path: Path):
     few, many = (rows_of(CLOTH, tmp_path, max_iterations=count) for count in (2, 500))
-    before, after = (by_name(told, "error") for told in (few, many))
+    before, after = (by_name(ablation_rows, "error") for ablation_rows in (few, many))
     assert after["solver"]["displacement_max"] < 1e-3 * before["solver"]["displacement_max"]
     assert after["time-step"]["displacement_max"] == pytest.approx(
         before["time-step"]["displacement_max"], rel=1e-6
@@ -203,7 +203,7 @@ def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: 
     for handler in list((log := logging.getLogger("springbench")).handlers):  # of another test, written elsewhere
         log.removeHandler(handler)
     (scene := tmp_path / "cloth.yaml").write_text(CLOTH)
-    asked = [
+    arguments = [
         "ablate",
         str(scene),
         "--results",
@@ -215,10 +215,10 @@ def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: 
         "--max-iterations",
         "5",
     ]
-    told = CliRunner().invoke(app, asked)
-    assert told.exit_code == 0, told.output
-    assert "air-drag: " in told.stderr
-    assert "effects[3] (air-drag) does nothing with these parameters and is left out" in " ".join(told.stderr.split())
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+    assert "air-drag: " in result.stderr
+    assert "effects[3] (air-drag) does nothing with these parameters and is left out" in " ".join(result.stderr.split())
     (rows,) = tmp_path.glob("cloth/ablation/*.parquet")
     (picture,) = tmp_path.glob("cloth/pictures/*.png")
     assert len(read_ablation(rows)) >= 1 + 5 + 2
@@ -235,9 +235,9 @@ def test_every_column_of_its_own_is_documented(column: ColumnSpec):
 
 
 def test_a_sweep_is_refused(tmp_path: Path):
-    told = CliRunner().invoke(app, ["ablate", str(ROOT / "configs" / "quickstart.yaml"), "--results", str(tmp_path)])
-    assert told.exit_code == 2
-    assert "is a sweep" in told.stderr
+    result = CliRunner().invoke(app, ["ablate", str(ROOT / "configs" / "quickstart.yaml"), "--results", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "is a sweep" in result.stderr
 
 
 def test_the_command_leaves_the_results_of_another_scene_of_this_name_alone(tmp_path: Path):
@@ -245,8 +245,15 @@ def test_the_command_leaves_the_results_of_another_scene_of_this_name_alone(tmp_
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "cloth.yaml").write_text(CLOTH)
     claim_folder(tmp_path / "results" / "cloth", tmp_path / "one" / "cloth.yaml")
-    asked = ["ablate", str(tmp_path / "other" / "cloth.yaml"), "--results", str(tmp_path / "results"), "--frames", "2"]
-    told = CliRunner().invoke(app, asked)
-    assert told.exit_code == 2
-    assert "holds the results of another file of this name" in " ".join(told.stderr.split())
+    arguments = [
+        "ablate",
+        str(tmp_path / "other" / "cloth.yaml"),
+        "--results",
+        str(tmp_path / "results"),
+        "--frames",
+        "2",
+    ]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert "holds the results of another file of this name" in " ".join(result.stderr.split())
     assert not list(tmp_path.glob("results/cloth/ablation/*"))

@@ -63,8 +63,8 @@ def test_a_study_of_curves_asks_for_each_moment_and_solver_that_minimises(folder
 def test_studies_take_every_first_guess_that_is_no_solve_and_reports_have_words_for_each(folder: Path) -> None:
     *guesses, coarse = get_args(InitialGuess)
     assert coarse == COARSE_TO_FINE
-    asked = CONFIG.replace("rounds: 7", f"rounds: 7, initial_guess: [{', '.join(guesses)}]")
-    assert {unit.initial_guesses for unit in loaded(folder, asked).curves} == {tuple(guesses)}
+    requested = CONFIG.replace("rounds: 7", f"rounds: 7, initial_guess: [{', '.join(guesses)}]")
+    assert {unit.initial_guesses for unit in loaded(folder, requested).curves} == {tuple(guesses)}
     assert set(INITIAL_GUESS_LABELS) == set(INITIAL_GUESSES) == set(guesses)
 
 
@@ -137,8 +137,8 @@ def test_a_sweep_and_an_accuracy_config_are_not_taken_for_each_other(folder: Pat
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_every_shipped_config_asks_for_curves_and_names_its_schema(path: Path) -> None:
-    asked = load_accuracy(path)
-    assert asked.curves or asked.work
+    requested = load_accuracy(path)
+    assert requested.curves or requested.work
     assert path.read_text().splitlines()[0] == "# yaml-language-server: $schema=schema.json"
 
 

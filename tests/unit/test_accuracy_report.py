@@ -256,10 +256,10 @@ def test_the_paper_s_table_shows_every_curve_of_both_figures_with_its_ratios(tmp
 
 def test_the_paper_s_short_curves_are_not_mixed_with_the_others(tmp_path: Path) -> None:
     everything = table(tmp_path, made.build_liu2013_rows())
-    kept = without_short_curves(everything)
+    saved = without_short_curves(everything)
     assert len(everything.problems) == 2 * len(LIU2013_FIGURE_3)
-    assert [(p.vertices, p.snapshot) for p in kept.problems] == [(81 * 81, "frame-1")]
-    assert kept.problems[0].objective_initial == made.LOWEST_ENERGY + 0.5 * made.ENERGY_DROP, (
+    assert [(p.vertices, p.snapshot) for p in saved.problems] == [(81 * 81, "frame-1")]
+    assert saved.problems[0].objective_initial == made.LOWEST_ENERGY + 0.5 * made.ENERGY_DROP, (
         "at the inertial target, as in the paper"
     )
 

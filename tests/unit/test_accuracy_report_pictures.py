@@ -144,7 +144,7 @@ def test_what_other_code_measured_is_hollow_in_every_picture_and_told(
         draw_all(table, tmp_path / name)
     for draw_one, name in ((draw_scalings, "growth"), (draw_profiles, "profiles")):
         draw_one(table, tmp_path / name / name)
-    told = {"profiles": "Measured by other code than today's, in whole or in part: newton."}
+    values = {"profiles": "Measured by other code than today's, in whole or in part: newton."}
     for name, solver in {"convergence": "newton", "times": "newton", "work": "hybrid", "growth": "newton"}.items():
         lines = [one for ax in pages[name].axes for one in ax.lines if len(np.asarray(one.get_xdata())) > 1]
         hollow = {
@@ -153,8 +153,8 @@ def test_what_other_code_measured_is_hollow_in_every_picture_and_told(
             if one.get_marker() != "None" and one.get_markerfacecolor() == BACKGROUND_COLOUR
         }
         assert hollow == {assign_solver_styles([])[solver].color}, name
-        told[name] = STALE_NOTE
-    for name, words in told.items():
+        values[name] = STALE_NOTE
+    for name, words in values.items():
         assert words in written(pages[name]), name
 
 
@@ -198,9 +198,9 @@ def test_families_are_far_apart_and_members_of_one_differ_in_lightness_line_and_
         assert apart >= 7.5, f"{a} and {b}: {apart:.1f}"
         assert one.dash != other.dash
         assert one.marker != other.marker
-        shown, beside = plotly_style(one), plotly_style(other)
-        assert shown["dash"] != beside["dash"]
-        assert shown["symbol"] != beside["symbol"]
+        shown, neighbour = plotly_style(one), plotly_style(other)
+        assert shown["dash"] != neighbour["dash"]
+        assert shown["symbol"] != neighbour["symbol"]
 
 
 def luminance(color: Sequence[float]) -> float:

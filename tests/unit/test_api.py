@@ -51,9 +51,9 @@ def test_a_recording_is_drawn_alone_and_several_side_by_side(tmp_path: Path, dra
     replay = springbench.open_recording(path)
     picture = springbench.draw_picture(replay)
     springbench.draw_picture({"one": path, "other": replay})
-    alone, beside = drawn
+    alone, other = drawn
     assert alone is replay
-    assert isinstance(beside, dict)
-    assert list(beside) == ["one", "other"]
-    np.testing.assert_array_equal(beside["one"].positions, replay.positions)
+    assert isinstance(other, dict)
+    assert list(other) == ["one", "other"]
+    np.testing.assert_array_equal(other["one"].positions, replay.positions)
     assert picture._repr_png_() == picture.save(tmp_path / "a.png").read_bytes() == b"a picture"

@@ -65,9 +65,9 @@ def test_a_type_checker_finds_names_and_keys_that_do_not_exist(tmp_path: Path):
         "-p",
         tmp_path,
     ]
-    told = json.loads(subprocess.run(command, capture_output=True, text=True, cwd=tmp_path).stdout)
-    found = {problem["range"]["start"]["line"] + 1 for problem in told["generalDiagnostics"]}
-    assert found == {i for i, line in enumerate(MISTAKEN.splitlines(), 1) if "  # " in line}, told
+    completed = json.loads(subprocess.run(command, capture_output=True, text=True, cwd=tmp_path).stdout)
+    found = {problem["range"]["start"]["line"] + 1 for problem in completed["generalDiagnostics"]}
+    assert found == {i for i, line in enumerate(MISTAKEN.splitlines(), 1) if "  # " in line}, completed
 
 
 class Mine:

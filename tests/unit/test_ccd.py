@@ -159,9 +159,9 @@ def test_what_is_kept_between_steps_bounds_them_as_well():
         d = np.zeros_like(rest)
         d[:3, 2], d[3:, 2] = 0.5 * speed, -0.5 * speed
         contact = SelfContact(CollisionMesh.from_rest_shape(rest, edges, triangles, np.ones(6), THICKNESS, 1 / 16))
-        for kept in (0.0, 0.125 / speed):  # what the last look found is kept for the next one
+        for saved in (0.0, 0.125 / speed):  # what the last look found is kept for the next one
             contact.value(rest)
-            contact.collision_free_step_size(rest, kept * d)
+            contact.collision_free_step_size(rest, saved * d)
             step = Fraction(contact.collision_free_step_size(rest, d))
             assert step * Fraction(speed) <= (1 - LEFT) * gap
 

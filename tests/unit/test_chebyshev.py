@@ -31,10 +31,10 @@ def radius(problem: StepProblem, p) -> float:
         np.ix_(free, free)
     ]
     _, soft, weight = system.penalty_pins
-    held = system.inertia_diagonal.copy()
-    held[soft] += weight
+    diagonal = system.inertia_diagonal.copy()
+    diagonal[soft] += weight
     coordinates = (3 * free[:, None] + np.arange(3)).ravel()
-    H = np.diag(np.repeat(held, 3)) + np.sum([e.hessian(p).toarray() for e in system.energies], axis=0)
+    H = np.diag(np.repeat(diagonal, 3)) + np.sum([e.hessian(p).toarray() for e in system.energies], axis=0)
     H, Q3 = H[np.ix_(coordinates, coordinates)], np.kron(Q, np.eye(3))
     return 1.0 - float(eigh(H, Q3, eigvals_only=True)[0])
 

@@ -44,10 +44,10 @@ LIES = {
 }
 
 
-@pytest.mark.parametrize(("watch", "told"), LIES.values(), ids=LIES)
-def test_times_that_another_clock_did_not_see_are_refused(watch: PhaseWatch, told: float) -> None:
+@pytest.mark.parametrize(("watch", "reported"), LIES.values(), ids=LIES)
+def test_times_that_another_clock_did_not_see_are_refused(watch: PhaseWatch, reported: float) -> None:
     with pytest.raises(RunFailed, match="the times of step add up to"):
-        watch.build_columns("step", [told / 4] * 4)
+        watch.build_columns("step", [reported / 4] * 4)
 
 
 @pytest.mark.parametrize("lies", [0, 1, 2])
@@ -85,12 +85,12 @@ HONEST = {
 }
 
 
-@pytest.mark.parametrize(("watch", "told"), HONEST.values(), ids=HONEST)
-def test_times_that_another_clock_saw_are_believed_and_both_are_told(watch: PhaseWatch, told: float) -> None:
-    columns = watch.build_columns("step", [told / 2] * 2)
+@pytest.mark.parametrize(("watch", "reported"), HONEST.values(), ids=HONEST)
+def test_times_that_another_clock_saw_are_believed_and_both_are_told(watch: PhaseWatch, reported: float) -> None:
+    columns = watch.build_columns("step", [reported / 2] * 2)
     assert columns == {
         "wall_seconds_check": watch.wall_seconds,
-        "wall_seconds_sum": told,
+        "wall_seconds_sum": reported,
         "cpu_seconds": watch.process_seconds,
         "preempted": watch is HALF_LOST,
     }

@@ -38,8 +38,8 @@ class Own(NamedTuple):
 
 def machines(client: Workers, *plugins: PluginName, say: Callable[[str], None] = print) -> list[str]:
     runs: Any = [Own(plugins)]
-    asked: Any = client
-    return dask_cluster.check_workers(asked, list[RunSpec](runs), say)
+    requested: Any = client
+    return dask_cluster.check_workers(requested, list[RunSpec](runs), say)
 
 
 def test_workers_like_this_one_can_do_runs():
@@ -73,20 +73,20 @@ def test_a_worker_that_cannot_be_asked_is_told():
 
 
 def test_a_worker_that_is_lost_meanwhile_is_no_mistake():
-    told: list[str] = []
-    assert machines(Workers(None, OSError("Stream is closed")), say=told.append) == [
+    messages: list[str] = []
+    assert machines(Workers(None, OSError("Stream is closed")), say=messages.append) == [
         WorkerInfo.from_this_process().machine_id
     ]
-    assert "worker-1" in told[0]
+    assert "worker-1" in messages[0]
     with pytest.raises(InputError, match="all workers were lost"):
         machines(Workers(OSError("Stream is closed")))
 
 
 @pytest.mark.parametrize(("off", "words"), [(3600.0, "ahead"), (-3600.0, "behind"), (1.0, "")])
 def test_clocks_that_differ_are_said(off: float, words: str):
-    told: list[str] = []
-    machines(Workers((WorkerInfo.from_this_process()._replace(clock_seconds=time() + off), {})), say=told.append)
-    assert [words in line for line in told] == [True] * bool(words)
+    messages: list[str] = []
+    machines(Workers((WorkerInfo.from_this_process()._replace(clock_seconds=time() + off), {})), say=messages.append)
+    assert [words in line for line in messages] == [True] * bool(words)
 
 
 @pytest.mark.parametrize(

@@ -39,9 +39,9 @@ def rough(n, decades):
 
 
 def pinned_rows(n):
-    held = np.full(n * n, 1e-3)
-    held[::7] = 1e10
-    return network_matrix(grid_springs(n, n), 1e5, held)
+    diagonal = np.full(n * n, 1e-3)
+    diagonal[::7] = 1e10
+    return network_matrix(grid_springs(n, n), 1e5, diagonal)
 
 
 CASES = {
@@ -135,12 +135,12 @@ def test_a_solve_depends_on_its_right_hand_sides_alone():
     b = random_right_hand_sides(3600)
     factor = ConjugateGradients(grid_matrix(60, 60))
     first, between, last = (np.empty_like(b) for _ in range(3))
-    kept = b.copy()
+    original = b.copy()
     factor.solve(b, first)
     factor.solve(b[::-1].copy(), between)
     factor.solve(b, last)
     np.testing.assert_array_equal(last, first)
-    np.testing.assert_array_equal(b, kept)
+    np.testing.assert_array_equal(b, original)
 
 
 def test_gives_the_same_bits_whatever_the_number_of_threads():
@@ -179,10 +179,10 @@ def test_names_a_vertex_near_springs_that_push():
     springs = grid_springs(60, 60)
     k = np.ones(len(springs))
     k[np.abs(springs - 1830).min(axis=1) == 0] = -0.9  # about vertex 1830, whose diagonal a mass keeps positive
-    held = np.full(3600, 1e-3)
-    held[1830] = 10.0
+    diagonal = np.full(3600, 1e-3)
+    diagonal[1830] = 10.0
     with pytest.raises(NotPositiveDefinite):
-        solved(network_matrix(springs, k, held), random_right_hand_sides(3600))
+        solved(network_matrix(springs, k, diagonal), random_right_hand_sides(3600))
 
 
 def test_says_so_where_stiffnesses_lie_too_far_apart():

@@ -42,8 +42,8 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_without_a_device_a_run_is_refused_and_the_others_are_done(sweep: Path) -> None:
-    told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(sweep.parent / "r")])
-    assert told.exit_code == 1, told.output
+    result = CliRunner().invoke(app, ["run", str(sweep), "--results", str(sweep.parent / "r")])
+    assert result.exit_code == 1, result.output
     found: list[dict[str, Any]] = []
     for run in load_config(sweep).list_runs():
         row = parquet_rows.read_first_row(RunFiles.for_run(run, sweep.parent / "r" / "sweep").rows_path)
@@ -86,9 +86,9 @@ def test_runs_on_the_processor_are_named_as_before_there_were_devices(sweep: Pat
 )
 def test_what_no_device_knows_is_refused(entry: str, said: str, sweep: Path) -> None:
     sweep.write_text(SWEEP.replace("{name: vbd, device: cuda}", entry))
-    told = CliRunner().invoke(app, ["run", str(sweep), "--results", str(sweep.parent / "r")])
-    assert told.exit_code == 2
-    assert said in " ".join(told.output.split())
+    result = CliRunner().invoke(app, ["run", str(sweep), "--results", str(sweep.parent / "r")])
+    assert result.exit_code == 2
+    assert said in " ".join(result.output.split())
 
 
 class At:
@@ -102,8 +102,8 @@ class At:
 
 
 def test_events_tell_kernels_and_transfers_apart() -> None:
-    told = compute_event_seconds(SolveEvents(At(1.0), At(3.0), At(10.0), At(10.5)))
-    assert told == pytest.approx({"kernel_seconds": 7e-3, "transfer_seconds": 2.5e-3})
+    durations = compute_event_seconds(SolveEvents(At(1.0), At(3.0), At(10.0), At(10.5)))
+    assert durations == pytest.approx({"kernel_seconds": 7e-3, "transfer_seconds": 2.5e-3})
     assert compute_event_seconds(None) == {}, "of a device without a clock nothing is told"
 
 
@@ -138,8 +138,8 @@ def nvml(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 def test_a_row_has_what_the_device_tells_of_its_state_and_null_for_what_it_does_not(nvml: SimpleNamespace) -> None:
-    told = {"sm_clock_mhz": 1980.0, "memory_clock_mhz": 2619.0, "power_w": None, "power_limit_w": 700.0}
-    assert cuda_device.read_device_state() == told | {"performance_state": 0.0, "temperature_c": 41.0}
+    values = {"sm_clock_mhz": 1980.0, "memory_clock_mhz": 2619.0, "power_w": None, "power_limit_w": 700.0}
+    assert cuda_device.read_device_state() == values | {"performance_state": 0.0, "temperature_c": 41.0}
 
 
 def test_where_the_library_cannot_begin_all_is_null(nvml: SimpleNamespace) -> None:

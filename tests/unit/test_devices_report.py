@@ -1,4 +1,4 @@
-"""What a device saves, told from rows alone: made ones, in a test's folder."""
+"""What a device saves, derived from synthetic rows."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def made(
     number: int, solver: str, vertices: int, seconds: float, *, on: bool = False, tolerance: float = 1e-3, **more: Any
 ) -> list[dict[str, Any]]:
     """The rows of a run of two steps; more: columns that differ."""
-    told = {"run_id": f"{number:012x}", "sweep": "gpu", "scene": "cloth", "size": round(vertices**0.5), "phase": "step"}
-    told |= {"solver": solver, "parameters": ON if on else "{}", "vertices": vertices, "residual_rtol": tolerance}
-    told |= {
+    row = {"run_id": f"{number:012x}", "sweep": "gpu", "scene": "cloth", "size": round(vertices**0.5), "phase": "step"}
+    row |= {"solver": solver, "parameters": ON if on else "{}", "vertices": vertices, "residual_rtol": tolerance}
+    row |= {
         "status": "ok",
         "termination_reason": "converged",
         "machine_id": "m",
@@ -38,21 +38,21 @@ def made(
         "num_iterations": 10,
         "round": 0,
     }
-    told |= {
+    row |= {
         "integrator": "implicit-euler",
         "time_step": 1 / 30,
         "is_minimiser": True,
         "started_at": "2026-01-01T00:00:00",
     }
     if on:
-        told |= {"device": "a device", "kernel_seconds": 0.01}
-    return [told | {"frame": frame, "seconds": seconds} | more for frame in (1, 2)]
+        row |= {"device": "a device", "kernel_seconds": 0.01}
+    return [row | {"frame": frame, "seconds": seconds} | more for frame in (1, 2)]
 
 
 def refused(number: int, reason: str) -> dict[str, Any]:
-    told = made(number, "vbd", 0, 0.0, on=True)[0]
+    row = made(number, "vbd", 0, 0.0, on=True)[0]
     gone = ("vertices", "seconds", "termination_reason", "frame", "device", "kernel_seconds")
-    return told | dict.fromkeys(gone) | {"phase": "run", "status": "unsupported", "reason": reason}
+    return row | dict.fromkeys(gone) | {"phase": "run", "status": "unsupported", "reason": reason}
 
 
 MEASURED = [
@@ -66,12 +66,12 @@ MEASURED = [
 ]
 
 
-def told(some: list[dict[str, Any]], config: str = "configs/gpu.yaml") -> str:
+def describe_report(some: list[dict[str, Any]], config: str = "configs/gpu.yaml") -> str:
     return " ".join(summarise_runs(read_device_runs(table_of(some)), config)).replace("\u2009", ",")
 
 
 def test_a_device_pays_from_where_it_is_faster_on_all_larger_meshes() -> None:
-    said = told(MEASURED)
+    said = describe_report(MEASURED)
     assert "cloth, to 0.001 of the residual at a step's start: a device pays from 100,000 vertices on" in said
     assert "vbd there is 4 times as fast as hybrid on the processor" in said
     assert "vbd there is 30 times as fast as numba on the processor at 1,000,000" in said
@@ -97,16 +97,16 @@ def test_a_mesh_in_between_that_is_slower_moves_the_size(ratios: list[float], fi
 
 
 def test_without_a_device_nothing_is_claimed_and_the_command_is_told() -> None:
-    said = told([*made(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")])
+    said = describe_report([*made(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")])
     assert "nothing is said of what one saves (vbd: there is no CUDA device)" in said
     assert "`.venv/bin/springbench run configs/gpu.yaml` fills this in" in said
     assert "times as fast" not in said
-    assert told(made(0, "hybrid", 10_000, 0.1)) == "", "of sweeps that ask for none nothing is said"
+    assert describe_report(made(0, "hybrid", 10_000, 0.1)) == "", "of sweeps that ask for none nothing is said"
 
 
 def test_times_of_the_simulator_are_no_devices() -> None:
     some = made(0, "vbd", 10_000, 0.1, on=True, device=SIMULATOR_NAME) + made(1, "hybrid", 10_000, 0.2)
-    said = told(some)
+    said = describe_report(some)
     assert f"nothing is said of what one saves ({SIMULATOR_NAME})" in said
     assert "pays" not in said
     assert pair_fastest_runs(read_device_runs(table_of(some))) == {}
@@ -114,18 +114,18 @@ def test_times_of_the_simulator_are_no_devices() -> None:
 
 def test_what_has_no_time_is_told() -> None:
     some = [*made(0, "vbd", 100, 0.1, on=True), refused(1, "the device has no memory left")]
-    said = told(some)
+    said = describe_report(some)
     assert "1 of 2 runs on a device have no time: the device has no memory left." in said
     assert "at no size did both sides get there (the device alone), so nothing is compared" in said
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["measured", "no device"])
 def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -> None:
-    kept = MEASURED if there else [*made(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")]
+    saved = MEASURED if there else [*made(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")]
     folder = tmp_path / "r" / "gpu" / "rows"
     folder.mkdir(parents=True)
-    for unit in {row["run_id"] for row in kept}:
-        parquet_rows.write_rows(folder / f"{unit}.parquet", [row for row in kept if row["run_id"] == unit])
+    for unit in {row["run_id"] for row in saved}:
+        parquet_rows.write_rows(folder / f"{unit}.parquet", [row for row in saved if row["run_id"] == unit])
     done = CliRunner().invoke(app, ["report", str(tmp_path / "r"), "--no-viewer"])
     assert done.exit_code == 0, done.output
     said = " ".join(done.output.split())

@@ -31,10 +31,10 @@ from tests.scene_builders import build_cloth, build_first_problem
 class DiagonalDescent:
     def prepare(self, system: System) -> PreparedDiagonal:
         springs, (_, soft, weight) = require_only_springs(system, "diagonal"), system.penalty_pins
-        held = system.inertia_diagonal + np.bincount(soft, weight, minlength=system.num_vertices)
+        diagonal = system.inertia_diagonal + np.bincount(soft, weight, minlength=system.num_vertices)
         stiffness = np.repeat(springs.stiffness, 2)
         return PreparedDiagonal(
-            held + 2.0 * np.bincount(springs.edges.ravel(), stiffness, minlength=system.num_vertices)
+            diagonal + 2.0 * np.bincount(springs.edges.ravel(), stiffness, minlength=system.num_vertices)
         )
 
 
@@ -79,11 +79,11 @@ def test_a_method_of_thirty_lines_is_a_solver():
 
 
 def test_without_a_tolerance_only_the_last_residual_is_asked_for(monkeypatch):
-    problem, asked = build_first_problem(build_cloth(3)), []
+    problem, arguments = build_first_problem(build_cloth(3)), []
     measured = Diagonal.residual
-    monkeypatch.setattr(Diagonal, "residual", lambda self: asked.append(0) or measured(self))
+    monkeypatch.setattr(Diagonal, "residual", lambda self: arguments.append(0) or measured(self))
     solution = DiagonalDescent().prepare(problem.system).solve(problem, StopRule(6))
-    assert (solution.num_iterations, solution.termination_reason, len(asked)) == (6, "max-iter", 1)
+    assert (solution.num_iterations, solution.termination_reason, len(arguments)) == (6, "max-iter", 1)
 
 
 class Table(SolverState):
@@ -133,10 +133,10 @@ LOOPS = {
 
 @pytest.mark.parametrize("what", LOOPS)
 def test_a_loop_ends_by(what):
-    residuals, limits, wanted, asked = LOOPS[what]
+    residuals, limits, wanted, requested = LOOPS[what]
     state = Table(*residuals)
     np.testing.assert_equal(state.run_iterations(limits), wanted)
-    assert state.asked == asked
+    assert state.asked == requested
 
 
 class Batched(SolverState):

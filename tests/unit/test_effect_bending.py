@@ -111,6 +111,6 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_mesh_that_is_no_surface_is_refused(case):
-    mesh, told = BAD[case]
-    with pytest.raises(InputError, match=told):
+    mesh, message = BAD[case]
+    with pytest.raises(InputError, match=message):
         BendingEffect(stiffness=1.0).build_contribution(mesh, np.ones(len(mesh.rest_positions)), 0.1)

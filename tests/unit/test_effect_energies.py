@@ -99,8 +99,8 @@ def test_the_system_matrix_has_the_stiffness_of_the_step(case):
     projective = [energy for energy in problem.system.energies if isinstance(energy, ProjectiveEnergy)]
     Q = assemble_system_matrix(problem.system, projective).toarray()
     s = problem.system
-    held = s.inertia_diagonal + np.bincount(*s.penalty_pins[1:], minlength=n)
-    wanted = np.diag(held)
+    pinned = s.inertia_diagonal + np.bincount(*s.penalty_pins[1:], minlength=n)
+    wanted = np.diag(pinned)
     for energy in problem.energies:
         wanted = wanted + (energy.stiffness_matrix(n).toarray() if isinstance(energy, ProjectiveEnergy) else 0.0)
     assert np.abs(Q - wanted).max() <= 1e-13 * np.abs(wanted).max()  # the order of sums

@@ -143,8 +143,8 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_mesh_that_is_not_closed_is_refused(case):
-    mesh, told = BAD[case]
-    with pytest.raises(InputError, match=told):
+    mesh, message = BAD[case]
+    with pytest.raises(InputError, match=message):
         bound(mesh)
 
 

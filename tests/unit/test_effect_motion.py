@@ -49,7 +49,7 @@ def test_a_smooth_motion_goes_through_its_keys_and_never_beyond():
     heights = np.array([smooth.transform_points(POINTS, t)[0, 1] for t in times])
     assert heights.min() == 0.0
     assert heights.max() == 3.0
-    for key in LIFT.keys:
+    for key in LIFT.key_frames:
         np.testing.assert_allclose(
             smooth.transform_points(POINTS, key.time), LIFT.transform_points(POINTS, key.time), rtol=1e-15
         )
@@ -101,13 +101,13 @@ def test_pins_are_on_their_path_at_the_end_of_each_step(integrator, weight):
     made = with_integrator(
         build_test_scene(GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), pins, size=4), integrator
     )
-    held = made.system.pins.vertices
+    pinned = made.system.pins.vertices
     for step in simulate_scene(
         made, prepare(made, SparseLocalGlobal()), StopRule(60), initial_guess="previous", frames=12
     ):
-        wanted = SWING.transform_points(made.mesh.rest_positions[held], step.index / 30)
+        wanted = SWING.transform_points(made.mesh.rest_positions[pinned], step.index / 30)
         # A penalty gives way by some newtons over 1e10 N/m, which midpoint carries on from step to step.
-        np.testing.assert_allclose(step.positions[held], wanted, rtol=0, atol=1e-8 if weight == 1e10 else 1e-14)
+        np.testing.assert_allclose(step.positions[pinned], wanted, rtol=0, atol=1e-8 if weight == 1e10 else 1e-14)
 
 
 def test_a_chain_pulled_at_both_ends_gets_there():

@@ -205,13 +205,13 @@ def test_holes_and_numbers_of_a_file_select_the_vertices_of_the_reference(select
 
 
 def test_a_holeless_sheet_and_unknown_numbers_are_refused():
-    for selectors, told in (
+    for selectors, message in (
         ({"holes": (0,)}, "the mesh has 0 holes"),
         ({"boundary_loops": (1,)}, "the mesh has 1 boundary loops"),
         ({"attribute": {"name": "heat"}}, "came 'heat'; this mesh has none"),
         ({"sphere": {"center": (9.0, 0.0, 0.0), "radius": 0.1}}, "no vertex of the mesh lies in the sphere"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             bound(PinsEffect.model_validate(selectors))
 
 
@@ -236,8 +236,8 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_pins_that_do_not_fit_the_mesh_are_refused(case):
-    selectors, told = REFUSED[case]
-    with pytest.raises(InputError, match=told):
+    selectors, message = REFUSED[case]
+    with pytest.raises(InputError, match=message):
         bound(PinsEffect(**selectors))
 
 

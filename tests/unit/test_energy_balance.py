@@ -51,7 +51,7 @@ def chain(*effects: Any, time_step: float = DT, **settings: Any) -> Scene:
     return build_test_scene(ChainMesh(length=1.0), *effects, size=2, mass=2.0, time_step=time_step, **settings)
 
 
-def held(weight: str | float = "exact", **settings: Any) -> PinsEffect:
+def build_pins(weight: str | float = "exact", **settings: Any) -> PinsEffect:
     return PinsEffect.model_validate({"parts": ["first"], "weight": weight, **settings})
 
 
@@ -90,7 +90,9 @@ def test_free_fall_by_implicit_euler_loses_what_its_formula_says():
 
 
 def test_a_vibration_by_midpoint_has_the_energy_that_it_began_with():
-    bound = by_midpoint(chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"), held(), velocity=(0.5, 0.0, 0.0)))
+    bound = by_midpoint(
+        chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"), build_pins(), velocity=(0.5, 0.0, 0.0))
+    )
     before = 1.0
     for step, found in zip(taken(bound, 6), balances(bound, 6), strict=True):
         now = step.positions[1, 0]
@@ -104,7 +106,7 @@ def test_a_vibration_by_midpoint_has_the_energy_that_it_began_with():
 def test_a_pin_that_moves_gives_its_force_times_its_way(weight: str | float, inertia: float):
     """The free end follows by u = k d/(m/dt^2 + k), so that the spring pulls with k (d - u); what a penalty holds has
     its inertia as well, m d/dt^2."""
-    (found,) = balances(chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"), held(weight, motion=PULL)), 1)
+    (found,) = balances(chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"), build_pins(weight, motion=PULL)), 1)
     pull = 50.0 * 0.2 * (1.0 - 50.0 / (1.0 / DT**2 + 50.0))
     assert found.available_energy == pytest.approx(ROUNDOFF_SAFETY * 0.2 * (pull + inertia), rel=1e-6)
     assert found.gain < 0.0
@@ -145,7 +147,7 @@ def test_a_filter_that_speeds_up_is_a_source():
 
 def test_stored_energy_counts_where_a_spring_is_longer_than_twice_its_length():
     """A stiff spring that a solve leaves too long stores much, and moves nothing: 10 s are for a slow way there."""
-    bound = chain(SpringsEffect(stretch=1e9, scaling_rule="fixed"), GravityEffect(), held(), time_step=10.0)
+    bound = chain(SpringsEffect(stretch=1e9, scaling_rule="fixed"), GravityEffect(), build_pins(), time_step=10.0)
     (step,) = taken(bound, 1)
     for length, grows in ((1.5, False), (2.5, True)):
         p = np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]])

@@ -226,9 +226,9 @@ def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linea
 
 def test_all_of_a_net_is_one_colour_to_newton_physics_which_sees_no_springs():
     ready("newton-physics", made(*HANGING).system)
-    for colours, told in (("newton", "1 colours"), ("springs", "4 colours")):
+    for colours, message in (("newton", "1 colours"), ("springs", "4 colours")):
         prepared = ready("newton-physics", made(*HANGING).system, colouring_source=colours)
-        assert told in prepared.description
+        assert message in prepared.description
 
 
 def test_newton_physics_says_where_there_is_no_device():
@@ -245,16 +245,16 @@ def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_num
     scene = made(*HANGING[:2], pins)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     prepared = ready(name, scene.system)
-    kept = stated.step_start.positions.copy()
+    original = stated.step_start.positions.copy()
     other = falling(build_random_problem(0))
     elsewhere = ready(name, other.system)
     alone = prepared.solve(stated, StopRule(5))
     together = zip(prepared.iterates(stated), elsewhere.iterates(other), strict=False)
     iterates = [p.copy() for p, _ in islice(together, 5)]
     np.testing.assert_array_equal(alone.positions, iterates[-1])
-    np.testing.assert_array_equal(stated.step_start.positions, kept)
+    np.testing.assert_array_equal(stated.step_start.positions, original)
     assert (alone.residual_iterate, alone.termination_reason, alone.num_iterations) == ("none", "max-iter", 5)
-    assert np.isnan([alone.residual, alone.initial_residual, prepared.residual_at(stated, kept)]).all()
+    assert np.isnan([alone.residual, alone.initial_residual, prepared.residual_at(stated, original)]).all()
     # Pins that move are at their ends, whatever came before.
     moved = replace(stated, pin_targets=stated.pin_targets + 0.01)
     found = prepared.solve(moved, StopRule(4))
@@ -282,9 +282,9 @@ def test_the_script_that_is_printed_ends_where_the_run_did(
     listed = CliRunner().invoke(app, ["export-script", str(config)])
     (line,) = [line for line in listed.stdout.splitlines() if f"net-3-work-{name}" in line]
     point = line.split()[0]
-    told = CliRunner().invoke(app, ["export-script", str(config), point[-6:], "-o", str(tmp_path)])
-    assert told.exit_code == 0, told.output
-    assert (tmp_path / f"{point}.py").read_text() in told.stdout
+    result = CliRunner().invoke(app, ["export-script", str(config), point[-6:], "-o", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / f"{point}.py").read_text() in result.stdout
     monkeypatch.chdir(tmp_path)
     capsys.readouterr()
     runpy.run_path(f"{point}.py")
@@ -296,5 +296,5 @@ def test_the_script_that_is_printed_ends_where_the_run_did(
 def test_a_point_of_none_or_of_several_is_a_mistake(tmp_path: Path):
     (tmp_path / "net.yaml").write_text(NET)
     (tmp_path / "config.yaml").write_text(CONFIG.format(engine="mujoco"))
-    told = CliRunner().invoke(app, ["export-script", str(tmp_path / "config.yaml"), "nothing"])
-    assert told.exit_code == 2
+    result = CliRunner().invoke(app, ["export-script", str(tmp_path / "config.yaml"), "nothing"])
+    assert result.exit_code == 2

@@ -49,8 +49,8 @@ def test_and_the_table_says_who_refuses_who_is_alone_and_who_does_not_get_there(
     assert cells["net 9", "1e-3"][1] == "–"
     assert cells["stiff 9", "1e-1"] == ["30", "refused"]
     assert cells["net 9", "1e-6"] == ["alone", "–"]
-    assert any("net 9 to 1e-2, mujoco: " in told for told in describe_best_settings(works))
-    assert all(OWN_PROGRAM not in told for told in describe_best_settings(works))
+    assert any("net 9 to 1e-2, mujoco: " in message for message in describe_best_settings(works))
+    assert all(OWN_PROGRAM not in message for message in describe_best_settings(works))
 
 
 def test_a_front_holds_what_no_other_setting_of_the_program_beats(works: list[WorkPoint]) -> None:
@@ -83,7 +83,7 @@ def test_the_page_has_a_line_for_each_program_on_each_mesh(tmp_path: Path) -> No
 
 def test_and_nothing_is_told_where_no_engine_was_tried(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = list(made.build_work_rows("net", 10))
-    told = summarise_findings(read_accuracy(made.write_accuracy_rows(tmp_path, rows)))
-    assert not [title for title in told if "engine" in title]
+    findings = summarise_findings(read_accuracy(made.write_accuracy_rows(tmp_path, rows)))
+    assert not [title for title in findings if "engine" in title]
     assert not engine_panels(tmp_path)
     assert not build_engine_chart(read_accuracy(tmp_path))["items"]

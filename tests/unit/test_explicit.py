@@ -106,8 +106,8 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
     scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
     errors = [
-        truth("none").measure_error(0, run(scene, prepared(name, scene, error_tolerance=asked), 3)[-1].positions)
-        for asked in (1e-4, 1e-6, 1e-8, 1e-10)
+        truth("none").measure_error(0, run(scene, prepared(name, scene, error_tolerance=requested), 3)[-1].positions)
+        for requested in (1e-4, 1e-6, 1e-8, 1e-10)
     ]
     assert errors[0] < 1e-3
     assert errors[-1] < 1e-9

@@ -48,9 +48,9 @@ BAD = {
 @pytest.mark.parametrize("name", BAD)
 def test_a_mistake_is_answered_with_what_was_wanted(results: Path, name: str, tmp_path: Path) -> None:
     (kind, *more), *wanted = BAD[name]
-    told = CliRunner().invoke(app, ["figure", kind, str(results), *more, "-o", str(tmp_path)])
-    assert told.exit_code == 2, told.output
-    assert all(words in told.output for words in wanted), told.output
+    result = CliRunner().invoke(app, ["figure", kind, str(results), *more, "-o", str(tmp_path)])
+    assert result.exit_code == 2, result.output
+    assert all(words in result.output for words in wanted), result.output
     assert not list(tmp_path.iterdir())
 
 

@@ -70,9 +70,9 @@ def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tm
     now = tile_figures(list(figures.values()), (2100, 1080))
     now.save(tmp_path / "figures.png")
     then = Image.open(LOOKS)
-    told = f"look at {tmp_path / 'figures.png'} beside {LOOKS}, and where it is better, put it there"
-    assert now.size == then.size, told
-    assert least_similarity(now, then) > MIN_SIMILARITY, told
+    hint = f"look at {tmp_path / 'figures.png'} beside {LOOKS}, and where it is better, put it there"
+    assert now.size == then.size, hint
+    assert least_similarity(now, then) > MIN_SIMILARITY, hint
 
 
 def test_a_curve_of_another_look_is_found_out(figures: dict[str, Figure]) -> None:
@@ -111,14 +111,14 @@ def test_faults_are_found() -> None:
     figure.text(0.1, 0.5, "one name")
     figure.text(0.12, 0.5, "another")
     figure.legend(loc="center")
-    told = "\n".join(find_layout_faults(figure))
+    faults = "\n".join(find_layout_faults(figure))
     for said in ("'beyond the edge' is cut", "'tiny' is of 5.0 points", "'one name' meets 'another'", "lies over data"):
-        assert said in told
+        assert said in faults
 
 
 def test_the_legend_has_the_order_of_the_curves(results: dict[str, Path]) -> None:
-    asked = FigureOptions(selectors=(("net", "10", "gap", "time"), ("net", "10", "previous", "gap", "iterations")))
-    figure, _ = compose_kind("convergence", results["convergence"], asked)
+    requested = FigureOptions(selectors=(("net", "10", "gap", "time"), ("net", "10", "previous", "gap", "iterations")))
+    figure, _ = compose_kind("convergence", results["convergence"], requested)
     (legend,) = figure.legends
     lines = {str(line.get_label()): line for line in figure.axes[0].lines}
     names = [text.get_text() for text in legend.get_texts() if text.get_text() in lines]
@@ -160,8 +160,8 @@ def test_the_command_writes_each_format_the_data_and_a_script_that_draws_them(
     results: dict[str, Path], tmp_path: Path
 ) -> None:
     words = ["figure", "timing", str(results["timing"]), "--width", "8.5cm", "--panels", "step", "-o", str(tmp_path)]
-    told = CliRunner().invoke(app, words)
-    assert told.exit_code == 0, told.output
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
     stem = tmp_path / "timing-step"
     pdf, svg = stem.with_suffix(".pdf").read_bytes(), stem.with_suffix(".svg").read_text()
     box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+)", pdf)

@@ -32,15 +32,15 @@ def priced(folder: Path, solvers: list[str], refused: str, codes: dict[str, str]
             "solver": solver,
         }
         for name, (price, low, high) in PRICES.items():
-            told: dict[str, Any] = {
+            values: dict[str, Any] = {
                 "name": name,
                 "overhead_ratio": price,
                 "overhead_ratio_low": low,
                 "overhead_ratio_high": high,
             }
             if (solver, name) == (refused, "bending"):
-                told = {"name": name, "status": "unsupported"}
-            rows.append(same | told | {"source_fingerprint": codes.get(solver)})
+                values = {"name": name, "status": "unsupported"}
+            rows.append(same | values | {"source_fingerprint": codes.get(solver)})
     made.write_result_rows(folder / "ablation" / "cloth.parquet", rows, ABLATION_SCHEMA)
     return folder
 
@@ -49,11 +49,11 @@ def test_the_dearest_effect_stands_first_all_last_and_round_off_of_one_is_no_pri
     figure, (grid,) = compose_kind(
         "prices", priced(tmp_path, ["numba", "dense"], "dense", {"dense": "before"}), FigureOptions()
     )
-    told = {(cell.row, cell.column): (cell.outcome, cell.value_text, cell.is_stale) for cell in grid.cells}
+    values = {(cell.row, cell.column): (cell.outcome, cell.value_text, cell.is_stale) for cell in grid.cells}
     assert list(dict.fromkeys(cell.row for cell in grid.cells)) == ["gas", "bending", "wind", "all"]
-    assert told["gas", "numba"] == ("2 to 3", "2.40", False)
-    assert told["wind", "numba"] == ("cannot be told from 1", "1.05", False)
-    assert told["bending", "dense"] == ("unsupported", "–", True)
+    assert values["gas", "numba"] == ("2 to 3", "2.40", False)
+    assert values["wind", "numba"] == ("cannot be told from 1", "1.05", False)
+    assert values["bending", "dense"] == ("unsupported", "–", True)
     said = " ".join(text.get_text() for text in visible_texts(figure))
     assert "Dot: measured by other code than today's." in said
     assert sum(line.get_marker() == "o" for line in figure.axes[0].lines) == 4

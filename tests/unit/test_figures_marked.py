@@ -63,8 +63,8 @@ def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
     # The reproduction of the paper is by one solver alone.
     before = "numba" if kind == "liu2013" else "newton"
     rows = [row | {"source_fingerprint": "before" if row.get("solver") == before else None} for row in rows]
-    asked = FigureOptions(selectors=(("net", "10", "gap"),)) if kind == "convergence" else FigureOptions()
-    figure, panels = compose_kind(kind, synthetic_accuracy_rows.write_accuracy_rows(tmp_path, rows), asked)
+    requested = FigureOptions(selectors=(("net", "10", "gap"),)) if kind == "convergence" else FigureOptions()
+    figure, panels = compose_kind(kind, synthetic_accuracy_rows.write_accuracy_rows(tmp_path, rows), requested)
     said = " ".join(text.get_text() for text in visible_texts(figure)).replace("\n", " ")
     if kind in ("profiles", "liu2013"):
         assert f"Measured by other code than today's, in whole or in part: {before}." in said
@@ -75,10 +75,10 @@ def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
 
 
 def test_and_in_those_of_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = made.write_speed_results(tmp_path / "told")
-    _, (panel,) = compose_kind("speed", told, FigureOptions())
+    folder = made.write_speed_results(tmp_path / "told")
+    _, (panel,) = compose_kind("speed", folder, FigureOptions())
     assert {row["series"] for row in panel.csv_rows() if row["is_stale"]} == {"numba supernodal"}
-    found = speed_figures(base_rows.read_rows(row_store.list_units(told / "rows")))
+    found = speed_figures(base_rows.read_rows(row_store.list_units(folder / "rows")))
     pages: list[Figure] = []
     monkeypatch.setattr(size_plot, "save_page", lambda page, path: pages.append(page))
     draw_speed_plots(found, tmp_path)

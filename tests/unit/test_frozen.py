@@ -122,9 +122,9 @@ def test_a_run_goes_on_from_a_frozen_step_as_if_it_had_never_stopped(tmp_path, i
 
 def test_the_first_guess_is_chosen_at_use(tmp_path):
     (one,) = ReferenceStore(tmp_path).load_frames(SPEC, SIZE, [3]).values()
-    held = one.problem.system.pins.vertices
+    pinned = one.problem.system.pins.vertices
     guess = one.problem.inertial_target.copy()
-    guess[held] = one.problem.pin_targets
+    guess[pinned] = one.problem.pin_targets
     np.testing.assert_array_equal(one.build_problem("inertial").initial_guess, guess)
     np.testing.assert_array_equal(one.build_problem("previous").initial_guess, one.problem.current_positions)
     assert np.abs(guess - one.problem.current_positions).max() > 1e-4
@@ -142,7 +142,7 @@ def test_a_first_guess_beyond_an_obstacle_is_where_the_step_starts(tmp_path):
 
 def test_the_violent_moment_is_the_step_that_has_farthest_to_go():
     scene, length = build_exact_scene(SPEC, SIZE), 30  # it swings through its lowest point after half a second
-    kept, violence = run_reference(scene, NewtonSolver(), length)
+    saved, violence = run_reference(scene, NewtonSolver(), length)
     run = list(
         simulate_scene(
             scene, prepare(scene, NewtonSolver()), StopRule(100, 1e-12), initial_guess="previous", frames=length
@@ -154,7 +154,7 @@ def test_the_violent_moment_is_the_step_that_has_farthest_to_go():
     np.testing.assert_allclose(violence, gap, rtol=1e-9)  # differences of sums that are some hundred times as large
     violent = 2 + int(np.argmax(gap[1:]))
     assert 2 < violent < length
-    assert set(kept) == {3, 15, violent}
+    assert set(saved) == {3, 15, violent}
 
 
 @pytest.mark.parametrize(

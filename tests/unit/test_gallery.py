@@ -82,8 +82,8 @@ def test_the_sheet_has_a_tile_for_each_scene_and_says_what_drew_it(tmp_path: Pat
     sizes, blank = [], []
     for count in (4, 7):
         sheet = tmp_path / "sheet.png"
-        told = CliRunner().invoke(app, ["gallery", *map(str, paths[:count]), "-o", str(sheet)])
-        assert told.exit_code == 0, told.output
+        result = CliRunner().invoke(app, ["gallery", *map(str, paths[:count]), "-o", str(sheet)])
+        assert result.exit_code == 0, result.output
         image = Image.open(sheet).convert("L")
         sizes.append(image.size)
         blank.append(np.asarray(image)[-300:, 1250:].min() > 200)

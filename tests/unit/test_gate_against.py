@@ -37,8 +37,8 @@ ALL = (
 
 def git(folder: Path, *arguments: str) -> str:
     who = ["-c", "user.name=somebody", "-c", "user.email=somebody@example.org"]
-    told = subprocess.run(["git", *who, *arguments], cwd=folder, capture_output=True, text=True, check=True)
-    return told.stdout.strip()
+    completed = subprocess.run(["git", *who, *arguments], cwd=folder, capture_output=True, text=True, check=True)
+    return completed.stdout.strip()
 
 
 def state(folder: Path, rounds: int = 100_000, answer: float = 0.0, other: str = "old") -> None:
@@ -151,9 +151,9 @@ def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Pat
 )
 def test_a_mistake_is_one_message(repository: Path, arguments: tuple[str, ...], said: str):
     state(repository, other="new")
-    code, told = regress(*arguments)
-    assert code == 2, told
-    assert said in told
+    code, printed = regress(*arguments)
+    assert code == 2, printed
+    assert said in printed
 
 
 def test_a_folder_outside_git_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -171,7 +171,7 @@ def test_a_run_has_exact_counts_and_each_revision_its_own_file(repository: Path)
     sides = GitRevision("this", repository), GitRevision("that", other, checkout=repository, injected_slowdown=0.1)
     run_options = {"solvers": ["sparse"], "sizes": [], "max_iterations": 20}
     with start_workers(*sides) as alive:
-        held = []
+        fixed = []
         for worker in alive:
             config = str(worker.revision.resolve_file(repository / "cloth.yaml"))
             (title,) = worker.send_request("list_runs", config=config, run_options=run_options)["runs"]
@@ -183,13 +183,13 @@ def test_a_run_has_exact_counts_and_each_revision_its_own_file(repository: Path)
                 "num_frames": 9,
                 "injected_slowdown": worker.revision.injected_slowdown,
             }
-            held.append(worker.prepare_work("prepare_run", **given))
+            fixed.append(worker.prepare_work("prepare_run", **given))
             assert worker.time_calls(2, "cpu") > 0
-    assert [(h.num_frames, h.clock, h.answer.shape) for h in held] == [(2, "cpu", (16, 3))] * 2
-    assert held[0].stats == held[1].stats  # what is planted is beside the run's own work
-    assert held[0].stats["iterations"] == 40
-    assert held[0].stats["nnz_factor"] > 16
-    assert abs(held[0].answer - held[1].answer).max() > 1e-6
+    assert [(h.num_frames, h.clock, h.answer.shape) for h in fixed] == [(2, "cpu", (16, 3))] * 2
+    assert fixed[0].stats == fixed[1].stats  # what is planted is beside the run's own work
+    assert fixed[0].stats["iterations"] == 40
+    assert fixed[0].stats["nnz_factor"] > 16
+    assert abs(fixed[0].answer - fixed[1].answer).max() > 1e-6
 
 
 def test_rebuilt_work_is_prepared_again_before_it_is_timed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -202,11 +202,11 @@ def test_rebuilt_work_is_prepared_again_before_it_is_timed(tmp_path: Path, monke
     monkeypatch.setattr(
         revision_worker, "_load_gates", lambda: {"mine": SimpleNamespace(candidate=candidate, clock="cpu")}
     )
-    held = revision_worker.RevisionWorker()
-    monkeypatch.setattr(held, "_pin_threads", lambda threads: None)
-    held.prepare_gate("mine", str(tmp_path / "answer.npy"))
-    held.rebuild_work()
-    held.time_calls(2, "cpu")
+    fixed = revision_worker.RevisionWorker()
+    monkeypatch.setattr(fixed, "_pin_threads", lambda threads: None)
+    fixed.prepare_gate("mine", str(tmp_path / "answer.npy"))
+    fixed.rebuild_work()
+    fixed.time_calls(2, "cpu")
     assert (made, done) == ([0, 1], [0, 1, 1])
 
 

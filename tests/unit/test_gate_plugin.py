@@ -52,9 +52,9 @@ def session(folder: Path, test: str, *options: str) -> tuple[int, str, list[dict
     command = [sys.executable, "-m", "pytest", "-q", *plugin, f"--benchmark-json={stored}", *options]
     # Beside other workers of one session pytest-benchmark times nothing; this session is one of its own.
     alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
-    told = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=alone)
+    completed = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=alone)
     found = json.loads(stored.read_text())["benchmarks"] if stored.exists() and stored.stat().st_size else []
-    return told.returncode, told.stdout + told.stderr, found
+    return completed.returncode, completed.stdout + completed.stderr, found
 
 
 def test_a_paired_benchmark_has_three_verdicts_and_stores_its_result(tmp_path: Path):

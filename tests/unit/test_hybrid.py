@@ -79,8 +79,8 @@ def test_a_way_to_a_saddle_is_left_aside_where_curvature_is_negative_alone(size)
     given = stiff(1e4)
     flat = given.current_positions * [size, 1.0, size]
     np.testing.assert_array_equal(np.ptp(flat[:, 1]), 0.0)
-    held = flat[given.system.pins.vertices]
-    given = replace(given, inertial_target=flat, pin_targets=held, external_force=np.zeros_like(flat))
+    pinned = flat[given.system.pins.vertices]
+    given = replace(given, inertial_target=flat, pin_targets=pinned, external_force=np.zeros_like(flat))
     step = StepObjective(FixedObjective(given.system), given)
     at, hessian = DescentPoint(flat, step.gradient(flat)), step.hessian(flat)
     assert hessian.factorise(0.0)

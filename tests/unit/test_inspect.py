@@ -38,8 +38,8 @@ def chain(tmp_path: Path) -> Path:
 def printed(*paths: Path, **options: Any) -> str:
     """What an inspection prints, white space made one blank."""
     out = io.StringIO()
-    asked = {"frame": None, "export": None, "csv": None, **options}
-    inspect_recordings(list(paths), **asked, console=Console(file=out, width=200))
+    settings = {"frame": None, "export": None, "csv": None, **options}
+    inspect_recordings(list(paths), **settings, console=Console(file=out, width=200))
     return " ".join(out.getvalue().split())
 
 

@@ -49,19 +49,19 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def asked(checkout: Path, code: str, **environment: str) -> str:
+def run_code(checkout: Path, code: str, **environment: str) -> str:
     """What a new process prints."""
-    kept = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
-    told = subprocess.run(
+    saved = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    completed = subprocess.run(
         [sys.executable, "-c", code],
         cwd=checkout,
         # What is edited here may have one length, and one second: bytecode would be taken for today's.
-        env=kept | {"PYTHONPATH": str(checkout / ".src"), "PYTHONDONTWRITEBYTECODE": "1"} | environment,
+        env=saved | {"PYTHONPATH": str(checkout / ".src"), "PYTHONDONTWRITEBYTECODE": "1"} | environment,
         capture_output=True,
         text=True,
     )
-    assert told.returncode == 0, told.stderr
-    return told.stdout.strip()
+    assert completed.returncode == 0, completed.stderr
+    return completed.stdout.strip()
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -72,31 +72,31 @@ def edit(path: Path, old: str, new: str) -> None:
 
 def test_a_changed_kernel_never_runs_stale_whoever_imports_the_solvers_and_in_whatever_order(checkout: Path):
     inner, outer = (checkout / "solvers" / "kernels" / f"{name}_of_test.py" for name in ("inner", "kernel"))
-    assert asked(checkout, ASK) == "6.0 0"
-    assert asked(checkout, "import numba\n" + ASK) == "6.0 1"
+    assert run_code(checkout, ASK) == "6.0 0"
+    assert run_code(checkout, "import numba\n" + ASK) == "6.0 1"
     edit(inner, "3.0 * x", "6.0 * x")  # a function in another file
-    assert asked(checkout, ASK) == "12.0 0"
-    assert asked(checkout, "import numba, springbench.harness\n" + ASK) == "12.0 1"
+    assert run_code(checkout, ASK) == "12.0 0"
+    assert run_code(checkout, "import numba, springbench.harness\n" + ASK) == "12.0 1"
     edit(inner, "FACTOR = 2.0", "FACTOR = 4.0")  # a constant from another file
-    assert asked(checkout, "import springbench, numba\n" + ASK) == "24.0 0"
+    assert run_code(checkout, "import springbench, numba\n" + ASK) == "24.0 0"
     edit(outer, "* FACTOR", "/ FACTOR")
-    assert asked(checkout, "import numba\n" + ASK) == "1.5 0"
+    assert run_code(checkout, "import numba\n" + ASK) == "1.5 0"
     edit(outer, "/ FACTOR", "* FACTOR")  # as it was: what was compiled then serves again
-    assert asked(checkout, ASK) == "24.0 1"
+    assert run_code(checkout, ASK) == "24.0 1"
 
 
 def test_options_of_the_compiler_have_code_of_their_own(checkout: Path):
-    assert asked(checkout, ASK) == "6.0 0"
-    assert asked(checkout, ASK, NUMBA_BOUNDSCHECK="1") == "6.0 0"
+    assert run_code(checkout, ASK) == "6.0 0"
+    assert run_code(checkout, ASK, NUMBA_BOUNDSCHECK="1") == "6.0 0"
     edit(checkout / "solvers" / "jit" / "kernel_compilation.py", '"nogil": True', '"nogil": True, "fastmath": True')
-    assert asked(checkout, ASK) == "6.0 0"
+    assert run_code(checkout, ASK) == "6.0 0"
 
 
 def test_one_folder_may_serve_many_checkouts(checkout: Path, tmp_path_factory: pytest.TempPathFactory):
     shared, other = tmp_path_factory.mktemp("kernels"), tmp_path_factory.mktemp("other") / "checkout"
     shutil.copytree(checkout, other, symlinks=True)
-    assert asked(checkout, ASK, NUMBA_CACHE_DIR=str(shared)) == "6.0 0"
-    assert asked(other, ASK, NUMBA_CACHE_DIR=str(shared)) == "6.0 1"
+    assert run_code(checkout, ASK, NUMBA_CACHE_DIR=str(shared)) == "6.0 0"
+    assert run_code(other, ASK, NUMBA_CACHE_DIR=str(shared)) == "6.0 1"
     assert not [*checkout.rglob("*.nbc")]
 
 
@@ -110,7 +110,7 @@ for path in sorted(Path("solvers").rglob("*.py")):
 
 def test_editing_one_solver_recompiles_its_own_kernels_only(checkout: Path):
     def digests() -> dict[str, str]:
-        return dict(line.split() for line in asked(checkout, DIGESTS_OF_MODULES).splitlines())
+        return dict(line.split() for line in run_code(checkout, DIGESTS_OF_MODULES).splitlines())
 
     before = digests()
     own = [*(checkout / "solvers").rglob("*xpbd*.py")]  # the method, its kernels, a device's
@@ -125,15 +125,15 @@ def test_what_was_edited_since_it_was_imported_is_kept_for_nobody_else(checkout:
     editing = "from pathlib import Path\nimport springbench.solvers.kernels.inner_of_test\n"
     editing += "path = Path('solvers/kernels/inner_of_test.py')\n"
     editing += "path.write_text(path.read_text().replace('3.0', '9.0'))\n"
-    assert asked(checkout, editing + ASK) == "6.0 0"  # its own module is as it was
-    assert asked(checkout, ASK) == "18.0 0"
-    assert asked(checkout, ASK) == "18.0 1"
+    assert run_code(checkout, editing + ASK) == "6.0 0"  # its own module is as it was
+    assert run_code(checkout, ASK) == "18.0 0"
+    assert run_code(checkout, ASK) == "18.0 1"
 
 
 def test_a_source_that_is_removed_while_a_process_runs_stops_nothing(checkout: Path):
     removing = "from pathlib import Path\nimport springbench.solvers.kernels.kernel_of_test\n"
     removing += "Path('solvers/kernels/inner_of_test.py').unlink()\n"
-    assert asked(checkout, removing + ASK) == "6.0 0"
+    assert run_code(checkout, removing + ASK) == "6.0 0"
 
 
 TYPES = "TYPE_CHECKING"

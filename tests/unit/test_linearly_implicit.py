@@ -123,8 +123,8 @@ def test_the_linearised_step_is_that_of_baraff_and_witkin():
     np.testing.assert_allclose(found.ravel(), wanted, rtol=0, atol=1e-13)  # round-off of positions of about 1 m
 
 
-@pytest.mark.parametrize(("name", "kept"), [("baraff-witkin", 0.01), ("ros2", 0.01), ("rodas", 0.01), ("ros3p", 0.8)])
-def test_a_stiff_spring_does_not_ring_after_one_step(name, kept):
+@pytest.mark.parametrize(("name", "saved"), [("baraff-witkin", 0.01), ("ros2", 0.01), ("rodas", 0.01), ("ros3p", 0.8)])
+def test_a_stiff_spring_does_not_ring_after_one_step(name, saved):
     """One spring of 1e5 1/s along its own line, stretched by a thousandth: L-stable methods forget it at once, and
     ROS3P keeps 0.73 of it (Lang and Verwer 2001)."""
     integrator = "implicit-euler" if name == "baraff-witkin" else "substepping"
@@ -136,14 +136,14 @@ def test_a_stiff_spring_does_not_ring_after_one_step(name, kept):
     still = type(state)(Motion(p, np.zeros_like(p)), None, 0)
     ready = prepare(scene, load_target(SOLVERS[name])())
     after = next(simulate_scene(scene, ready, ONCE, initial_guess="previous", frames=1, initial_state=still)).positions
-    assert np.linalg.norm(after - scene.mesh.rest_positions) <= kept * 1e-3 * np.linalg.norm(along)
+    assert np.linalg.norm(after - scene.mesh.rest_positions) <= saved * 1e-3 * np.linalg.norm(along)
 
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
     scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
-    asked = (1e-2, 1e-3, 1e-4, 1e-5)
-    errors = [truth("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions) for e in asked]
+    requested = (1e-2, 1e-3, 1e-4, 1e-5)
+    errors = [truth("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions) for e in requested]
     assert errors[-1] < 1e-3
     assert all(b < a for a, b in pairwise(errors))
 

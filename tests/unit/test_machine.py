@@ -133,11 +133,11 @@ with limit_threads({threads}):
 @pytest.mark.parametrize("threads", sorted({1, CORES}))
 def test_pinned_threads_hold_for_numba_and_every_blas(threads: int):
     # A fresh process, in which neither NumPy nor SciPy was loaded before the threads were pinned.
-    told = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-c", PINNED.format(threads=threads)], capture_output=True, text=True, check=True
     ).stdout.split()
-    assert len(told) >= 2
-    assert set(told) == {str(threads)}
+    assert len(completed) >= 2
+    assert set(completed) == {str(threads)}
 
 
 def test_pinned_threads_are_restored_even_after_a_failure():

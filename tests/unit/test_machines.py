@@ -30,16 +30,16 @@ ABLE = {"machine_bandwidth": 12.0e9, "machine_flops_per_second": 40.0e9, "machin
 
 def two_machines(solvers: tuple[str, ...] = ("sparse", "dense")) -> list[dict[str, Any]]:
     """Each solver on a machine of its own, one twice as fast."""
-    told = list[dict[str, Any]]()
+    messages = list[dict[str, Any]]()
     for number, solver in enumerate(solvers):
         own = {"run_id": f"{number:012x}", "solver": solver, "scene": "cloth", "size": 8, "residual": 1e-3}
         own |= {"machine_id": f"{number}" * 12, "node_id": "e" * 12, "seconds": 1e-3 * (1 + number), **ABLE}
-        told += [row | own for row in build_dummy_rows(number)]
-    return told
+        messages += [row | own for row in build_dummy_rows(number)]
+    return messages
 
 
-def table_of(told: list[dict[str, Any]]) -> pa.Table:
-    return pa.Table.from_pylist(told, schema=RUN_SCHEMA)
+def table_of(rows: list[dict[str, Any]]) -> pa.Table:
+    return pa.Table.from_pylist(rows, schema=RUN_SCHEMA)
 
 
 def printed(table: Any) -> str:
@@ -58,8 +58,8 @@ def test_a_sweeps_table_names_the_machine_of_each_run_and_what_it_can_do():
 
 
 def test_two_computers_of_one_kind_are_told_apart():
-    told = [row | {"machine_id": "a" * 12, "node_id": str(row["seconds"] > 1e-3) * 3} for row in two_machines()]
-    assert sorted(label_runs(read_run_times(table_of(told))).values()) == [
+    given_rows = [row | {"machine_id": "a" * 12, "node_id": str(row["seconds"] > 1e-3) * 3} for row in two_machines()]
+    assert sorted(label_runs(read_run_times(table_of(given_rows))).values()) == [
         "dense, machine aaaaaa-True",
         "sparse, machine aaaaaa-Fals",
     ]
@@ -86,9 +86,9 @@ def test_medians_are_those_of_one_machine(tmp_path: Path):
 
 
 def command(*arguments: object) -> str:
-    told = CliRunner().invoke(app, list(map(str, arguments)))
-    assert told.exit_code == 0, told.output
-    return " ".join(told.output.split())
+    result = CliRunner().invoke(app, list(map(str, arguments)))
+    assert result.exit_code == 0, result.output
+    return " ".join(result.output.split())
 
 
 def test_list_query_and_merge_say_it(tmp_path: Path):
@@ -96,9 +96,9 @@ def test_list_query_and_merge_say_it(tmp_path: Path):
     assert f"states are those on this machine, {describe_machine().machine_id:.6}" in command(
         "list", tmp_path / "cloth.yaml", "--results", tmp_path / "none"
     )
-    for name, told in zip("ab", (two_machines()[:2], two_machines()[2:]), strict=True):
+    for name, rows in zip("ab", (two_machines()[:2], two_machines()[2:]), strict=True):
         (tmp_path / name / "sweep" / "rows").mkdir(parents=True)
-        parquet_rows.write_rows(tmp_path / name / "sweep" / "rows" / f"{name}.parquet", told)
+        parquet_rows.write_rows(tmp_path / name / "sweep" / "rows" / f"{name}.parquet", rows)
     question = "SELECT machine_id, median(seconds) FROM rows GROUP BY ALL"
     assert COMPARISON_NOTE in command("query", question, "--results", tmp_path / "a")
     assert COMPARISON_NOTE not in command("query", question, "--results", tmp_path / "a", "--csv"), (
@@ -123,8 +123,8 @@ def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatc
     assert 1e7 < found["machine_bandwidth"] < 1e13
     assert 1e7 < found["machine_flops_per_second"] < 1e13
     assert 1e-6 < found["machine_step_seconds"] < 10.0
-    (kept,) = user_cache_dir("machine").iterdir()
-    assert kept.stem == compute_node_id()
+    (saved,) = user_cache_dir("machine").iterdir()
+    assert saved.stem == compute_node_id()
     for name in ("measure_copy_bandwidth", "measure_flops", "measure_step_seconds"):
         monkeypatch.delattr(machine_calibration, name)  # what is kept is not found again
     monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})

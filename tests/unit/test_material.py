@@ -40,12 +40,12 @@ def pull(mesh: Mesh, k: np.ndarray, *, fixed: np.ndarray, moved: np.ndarray, axi
     stiffness = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (n, n)).tocsr()
     u = np.zeros(n)
     u[3 * moved + axis] = 1.0
-    held = np.concatenate([3 * fixed + axis, 3 * moved + axis, 3 * fixed[:1], 3 * fixed[:1] + 1, 3 * fixed[:1] + 2])
+    pinned = np.concatenate([3 * fixed + axis, 3 * moved + axis, 3 * fixed[:1], 3 * fixed[:1] + 1, 3 * fixed[:1] + 2])
     flat = np.flatnonzero(np.ptp(mesh.rest_positions, axis=0) == 0)
-    held = np.concatenate([held, *(np.arange(c, n, 3) for c in flat)])
+    pinned = np.concatenate([pinned, *(np.arange(c, n, 3) for c in flat)])
     if mesh.dimension == 3:  # the last rigid motion, a turn about the axis
-        held = np.append(held, 3 * fixed[-1] + (2 if axis == 0 else 0))
-    free = np.setdiff1d(np.arange(n), held)
+        pinned = np.append(pinned, 3 * fixed[-1] + (2 if axis == 0 else 0))
+    free = np.setdiff1d(np.arange(n), pinned)
     if len(free):
         u[free] = np.asarray(spsolve(stiffness[free][:, free].tocsc(), -(stiffness @ u)[free]))
     return float((stiffness @ u)[3 * moved + axis].sum())
@@ -69,11 +69,11 @@ def test_a_woven_cloth_resists_by_warp_weft_and_bias():
 
 def test_a_weave_needs_a_surface_along_its_warp():
     up = OrthotropicStiffness(warp=1.0, weft=1.0, bias=1.0, direction=(0.0, 1.0, 0.0))
-    for mesh, told in (
+    for mesh, message in (
         (ChainMesh().build_mesh(3), "need a mesh of triangles"),
         (GridMesh().build_mesh(3), "stands upright on the mesh"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             up.compute_stiffness(mesh, mesh.springs)
 
 

@@ -96,11 +96,11 @@ def test_dense_and_sparse_are_equal(network):
 def test_a_sparse_matrix_stores_exactly_its_entries(network):
     springs, _, mass, _, pinned, _ = network
     made = sparse_matrices(*network)
-    held = (mass > 0) | np.isin(np.arange(len(mass)), np.concatenate([springs.ravel(), pinned]))
+    diagonal = (mass > 0) | np.isin(np.arange(len(mass)), np.concatenate([springs.ravel(), pinned]))
     assert made["A"].nnz == 2 * len(springs)
     assert made["M"].nnz == np.count_nonzero(mass)
     assert made["C"].nnz == len(pinned)
-    assert made["Q"].nnz == held.sum() + 2 * len(springs)
+    assert made["Q"].nnz == diagonal.sum() + 2 * len(springs)
 
 
 @given(networks())

@@ -108,8 +108,8 @@ def test_times_hold_what_was_done_in_them(seen):
     repeats = [call for k, call in enumerate(solver.slept["global"]) if k % (PHASE_REPEATS + 2) >= 2]
     assert all(t.seconds >= slept for t, slept in zip(of(measured, "global"), repeats, strict=True))
     assert all(t.seconds >= slept for t, slept in zip(of(measured, "prepare"), solver.slept["prepare"], strict=True))
-    beside, timed = solver.slept["solve"][1 : 2 * FRAMES : 2], solver.slept["solve"][2 * FRAMES :]
-    assert all(t.seconds * t.num_calls >= slept for t, slept in zip(of(measured, ITERATION_PHASE), beside, strict=True))
+    other, timed = solver.slept["solve"][1 : 2 * FRAMES : 2], solver.slept["solve"][2 * FRAMES :]
+    assert all(t.seconds * t.num_calls >= slept for t, slept in zip(of(measured, ITERATION_PHASE), other, strict=True))
     assert all(t.seconds >= slept for t, slept in zip(of(measured, "step"), timed, strict=True))
     assert sum(t.seconds * t.num_calls for t in measured.timings) <= whole
 
@@ -127,9 +127,9 @@ def test_every_time_lies_within_what_its_watch_saw(seen):
         ("step", round) for round in range(ROUNDS)
     }
     for (phase, round), watch in measured.watches.items():
-        told = sum(t.seconds * t.num_calls for t in of(measured, phase) if round in (None, t.round))
+        total_seconds = sum(t.seconds * t.num_calls for t in of(measured, phase) if round in (None, t.round))
         # The raw clock and the one that is adjusted differ by 500 parts in a million at most.
-        assert told <= watch.wall_seconds * (1 + 5e-4)
+        assert total_seconds <= watch.wall_seconds * (1 + 5e-4)
 
 
 def test_rows_tell_both_clocks_and_that_a_solver_which_sleeps_was_interrupted(seen):
@@ -146,8 +146,8 @@ def test_rows_tell_both_clocks_and_that_a_solver_which_sleeps_was_interrupted(se
         }
         for k in (0, 1)
     ]
-    for round, told in enumerate(by_round):
-        assert told == {sum(t.seconds for t in of(measured, "step") if t.round == round)}
+    for round, times in enumerate(by_round):
+        assert times == {sum(t.seconds for t in of(measured, "step") if t.round == round)}
 
 
 @pytest.mark.parametrize("phase", ["prepare", "local", "global", ITERATION_PHASE, "step"])

@@ -71,8 +71,8 @@ def test_one_spring_ends_where_its_force_is_that_of_inertia():
     target = np.array([[0.0, 0.0, 0.0], [0.0, -y, 0.0]])
     start = build_step_start(system, target, rest)
     problem = StepProblem(system, target, np.zeros((2, 3)), rest[:1], rest, rest, start)
-    held = m / dt**2
-    wanted = (k * r + held * y) / (k + held)
+    diagonal = m / dt**2
+    wanted = (k * r + diagonal * y) / (k + diagonal)
     np.testing.assert_allclose(solved(problem, 1), [[0.0, 0.0, 0.0], [0.0, -wanted, 0.0]], rtol=0, atol=1e-15)
 
 
@@ -178,20 +178,21 @@ def test_multigrid_makes_up_for_the_length_of_a_chain(components, most):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         pytest.param(lambda s: replace(s, energies=(*s.energies, Other())), "mgpbd: .*Other", id="another energy"),
         pytest.param(without_mass, r"mgpbd: .*1 of 12 have none and are not pinned \(3\)", id="no mass"),
     ],
 )
-def test_what_it_cannot_do_is_said_before_any_work(change, told):
-    with pytest.raises(Unsupported, match=told):
+def test_what_it_cannot_do_is_said_before_any_work(change, message):
+    with pytest.raises(Unsupported, match=message):
         MultigridXpbd().prepare(change(build_random_problem(0).system))
 
 
 @pytest.mark.parametrize(
-    ("settings", "told"), [({"near_null_vectors": -1}, "near_null_vectors"), ({"setup_interval": 0}, "setup_interval")]
+    ("settings", "message"),
+    [({"near_null_vectors": -1}, "near_null_vectors"), ({"setup_interval": 0}, "setup_interval")],
 )
-def test_settings_that_mean_nothing_are_refused(settings, told):
-    with pytest.raises(ValueError, match=f"{told}: should be at least"):
+def test_settings_that_mean_nothing_are_refused(settings, message):
+    with pytest.raises(ValueError, match=f"{message}: should be at least"):
         MultigridXpbd(**settings)

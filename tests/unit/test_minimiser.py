@@ -116,8 +116,8 @@ def test_a_minimum_is_certified_by_the_oracle(problem):
         assert found.newton_step_length <= 1e-12
         assert not found.positions.flags.writeable
         exact = problem.system.pins.exact_mask
-        held = problem.system.pins.vertices[exact]
-        np.testing.assert_array_equal(found.positions[held], problem.pin_targets[exact])
+        pinned = problem.system.pins.vertices[exact]
+        np.testing.assert_array_equal(found.positions[pinned], problem.pin_targets[exact])
 
 
 @problems

@@ -67,9 +67,9 @@ def test_stiffness_over_six_decades_does_not_fill_the_levels():
 
 def test_every_vertex_is_in_one_connected_aggregate():
     of, count = aggregates(SHEET)
-    held = [0, 69]
-    assert (of[held] == -1).all()
-    others = np.delete(of, held)
+    fixed = [0, 69]
+    assert (of[fixed] == -1).all()
+    others = np.delete(of, fixed)
     np.testing.assert_array_equal(np.unique(others), np.arange(count))
     for a in range(0, count, 50):
         members = np.flatnonzero(of == a)

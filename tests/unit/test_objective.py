@@ -96,8 +96,8 @@ def exact_hessian(problem: StepProblem, p: Positions) -> csr_array:
     """(3f, 3f), from the energies' own Hessians."""
     s = problem.system
     _, vertices, weight = s.penalty_pins
-    held = np.repeat(s.inertia_diagonal + np.bincount(vertices, weight, minlength=s.num_vertices), 3)
-    H = csr_array(diags_array(held))
+    diagonal = np.repeat(s.inertia_diagonal + np.bincount(vertices, weight, minlength=s.num_vertices), 3)
+    H = csr_array(diags_array(diagonal))
     for energy in problem.energies:
         H = csr_array(H + energy.hessian(p))
     free = (3 * s.free_vertices[:, None] + np.arange(3)).ravel()

@@ -37,19 +37,19 @@ def test_the_command_line_gives_numbers_as_numbers(folder: Path) -> None:
 def test_each_option_that_a_sweep_varies_is_one_of_a_run_of_the_command_line_and_of_rows() -> None:
     assert set(RUN_OPTIONS) == set(VariedOptions.model_fields), "what it is called for short, and its column"
     assert set(RUN_OPTIONS) <= set(RunSpec.model_fields)
-    told = CliRunner().invoke(app, ["run", "--help"]).output
-    assert {name for name in RUN_OPTIONS if f"--{name.replace('_', '-')} VALUE" in told} == set(RUN_OPTIONS)
+    result = CliRunner().invoke(app, ["run", "--help"]).output
+    assert {name for name in RUN_OPTIONS if f"--{name.replace('_', '-')} VALUE" in result} == set(RUN_OPTIONS)
     assert {option.column for option in RUN_OPTIONS.values()} - {""} <= set(RUN_SCHEMA.names)
 
 
 def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
 
     def loaded(path: Path, *, solvers: Any, sizes: Any, **options: Any) -> SweepPlan:
-        asked.update(options)
-        asked["runs"] = load_config(path, sizes=[4], **options).list_runs()
+        settings.update(options)
+        settings["runs"] = load_config(path, sizes=[4], **options).list_runs()
         raise InputError("enough")
 
     monkeypatch.setattr(config_loader, "load_config", loaded)
@@ -58,8 +58,8 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
     assert set(values) == set(RUN_OPTIONS) - {"error_target"}, "which would choose most of them"
     given = [part for name, text in values.items() for part in (f"--{name.replace('_', '-')}", text)]
     assert CliRunner().invoke(app, ["run", str(folder / "cloth.yaml"), *given]).exit_code == 2
-    (run,) = asked.pop("runs")
-    assert asked == {**values, "max_iterations": 7, "rtol": 1e-3, "frames": 3, "rounds": 1}
+    (run,) = settings.pop("runs")
+    assert settings == {**values, "max_iterations": 7, "rtol": 1e-3, "frames": 3, "rounds": 1}
     assert (run.max_iterations, run.rtol, run.time_step, run.frames, run.rounds) == (7, 1e-3, 1 / 60, 3, 1)
     assert (run.integrator, run.initial_guess, run.threads) == ("bdf2", "inertial", "auto")
 

@@ -32,19 +32,19 @@ from tests.plugin_solvers import SCENE_SOURCE, SWEEP_OPTIONS, PluginSweep, write
 def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PluginSweep:
     """A sweep of two solvers that was run, and one of them changed since."""
     made = write_plugin_solver(tmp_path, monkeypatch)
-    told = ran(made)
-    assert "other code" not in told
+    result = ran(made)
+    assert "other code" not in result
     made.solver_path.write_text(made.solver_path.read_text() + "\n# changed\n")
     return made
 
 
 def ran(made: PluginSweep, *options: str) -> str:
     """What the command says, in lines without breaks."""
-    told = CliRunner().invoke(
+    result = CliRunner().invoke(
         app, ["run", str(made.sweep_path), "--in-process", "--results", str(made.sweep_path.parent / "r"), *options]
     )
-    assert told.exit_code == 0, told.output
-    return re.sub(r"\s+", " ", told.output)
+    assert result.exit_code == 0, result.output
+    return re.sub(r"\s+", " ", result.output)
 
 
 def started(made: PluginSweep) -> dict[str, int]:
@@ -58,12 +58,12 @@ def started(made: PluginSweep) -> dict[str, int]:
 
 def test_run_says_which_rows_are_of_other_code_and_the_table_marks_them(done: PluginSweep):
     before = started(done)
-    told = ran(done)
-    assert "2 of 2 runs are there already" in told
-    assert "1 of them by other code than today's: scene 4 mine --rerun-stale does these again" in told
-    assert re.search(r" 4 mine [^a-z]+ max-iter† ", told)
-    assert "† by other code than today's" in told
-    assert re.search(r" 4 sparse [^a-z]+ max-iter [^†]", told)
+    result = ran(done)
+    assert "2 of 2 runs are there already" in result
+    assert "1 of them by other code than today's: scene 4 mine --rerun-stale does these again" in result
+    assert re.search(r" 4 mine [^a-z]+ max-iter† ", result)
+    assert "† by other code than today's" in result
+    assert re.search(r" 4 sparse [^a-z]+ max-iter [^†]", result)
     assert started(done) == before
 
 
@@ -148,8 +148,8 @@ def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monke
     ran(made)
     before = started(made)
     made.sweep_path.write_text(made.sweep_path.read_text().replace("pictures: false", "pictures: true"))
-    told = ran(made)
-    assert "2 of 2 runs are there already" in told
+    result = ran(made)
+    assert "2 of 2 runs are there already" in result
     assert started(made) == before
     assert len([*(tmp_path / "r" / "sweep" / "pictures").glob("scene-4-*-????????????.png")]) == 2
 
@@ -163,10 +163,10 @@ def test_parameters_by_other_sources_are_kept_beside_each_other_for_a_while(
     for checkout in "ab":
         monkeypatch.setattr(solver_parameters, "_hash_solver_sources", lambda checkout=checkout: 16 * checkout)
         load_config(tmp_path / "sweep.yaml", imports_code=False)
-    kept = {path.stem: path for path in (tmp_path / "springbench" / "parameters").iterdir()}
-    assert set(kept) == {f"sparse-{16 * checkout}" for checkout in "ab"}
+    saved = {path.stem: path for path in (tmp_path / "springbench" / "parameters").iterdir()}
+    assert set(saved) == {f"sparse-{16 * checkout}" for checkout in "ab"}
 
-    os.utime(kept.pop(f"sparse-{16 * 'a'}"), (0, 0))
+    os.utime(saved.pop(f"sparse-{16 * 'a'}"), (0, 0))
     monkeypatch.setattr(solver_parameters, "_hash_solver_sources", lambda: 16 * "c")
     load_config(tmp_path / "sweep.yaml", imports_code=False)
     assert {path.stem[-1] for path in (tmp_path / "springbench" / "parameters").iterdir()} == {"b", "c"}

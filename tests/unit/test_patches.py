@@ -151,7 +151,12 @@ def test_a_way_that_begins_where_one_before_began_is_looked_at_from_there(made):
 
 
 def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
-    told, patches, owner, limits = 0, made.patches, made.owners(), CollisionQuery(REACH, 0.3 * REACH, MIN_GAP_FRACTION)
+    num_clear, patches, owner, limits = (
+        0,
+        made.patches,
+        made.owners(),
+        CollisionQuery(REACH, 0.3 * REACH, MIN_GAP_FRACTION),
+    )
     for seed in range(8):
         p = moved(made.rest_positions, 300 + seed)
         q = p + 1e-3 * moved(p, 400 + seed)
@@ -163,12 +168,12 @@ def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
         )
         known = {tuple(x) for x in patches.cluster_pairs.clusters[: patches.num_rest_pairs].tolist()}
         clear, apart = known - {tuple(x) for x in doubted[:count].tolist()}, compute_distances(made.pairs, q)
-        told += len(clear)
+        num_clear += len(clear)
         bad = made.met(p, q, limits) | (apart < near)
         for k in np.flatnonzero(bad):
             x, cut = made.pairs.vertices[k].tolist(), 1 if k < made.pairs.num_point_triangle else 2
             assert tuple(sorted((owner[tuple(x[:cut])], owner[tuple(x[cut:])]))) not in clear
-    assert told > 0 or made.rest_positions[:, 1].any()  # a coarse balloon has no flat patch
+    assert num_clear > 0 or made.rest_positions[:, 1].any()  # a coarse balloon has no flat patch
 
 
 def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_max_relative_displacement(made):
@@ -176,9 +181,9 @@ def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_max_relati
     for seed in range(3):
         p, q = moved(made.rest_positions, seed), moved(made.rest_positions, 50 + seed)
         way = q - p
-        beside = np.linalg.norm(way[near[:, :, None]] - way[near[:, None, :]], axis=-1).max()
+        other = np.linalg.norm(way[near[:, :, None]] - way[near[:, None, :]], axis=-1).max()
         found = made.patches.max_relative_displacement(p, q)
-        assert beside <= found <= max_relative_displacement(p, q) * (1.0 + 1e-12)
+        assert other <= found <= max_relative_displacement(p, q) * (1.0 + 1e-12)
         assert made.patches.max_relative_displacement(p, p + 3.0) <= 1e-14
 
 
@@ -246,7 +251,7 @@ def test_patches_of_a_stack_tell_nothing():
 
 
 def test_contact_that_is_idle_goes_only_ways_that_are_free_and_mostly_without_a_look(monkeypatch):
-    mesh, asked, ways = GridMesh().build_mesh(17), [], 0
+    mesh, arguments, ways = GridMesh().build_mesh(17), [], 0
     surface = CollisionMesh.from_rest_shape(
         mesh.rest_positions,
         unique_edges(mesh.triangles),
@@ -256,7 +261,9 @@ def test_contact_that_is_idle_goes_only_ways_that_are_free_and_mostly_without_a_
         0.006,
     )
     contact, clear = SelfContact(surface), ClusterCulling.compute_clearance_bounds
-    monkeypatch.setattr(ClusterCulling, "compute_clearance_bounds", lambda *given: asked.append(given) or clear(*given))
+    monkeypatch.setattr(
+        ClusterCulling, "compute_clearance_bounds", lambda *given: arguments.append(given) or clear(*given)
+    )
     rng = np.random.default_rng(0)
     p = mesh.rest_positions @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
     for k in range(14):
@@ -272,4 +279,4 @@ def test_contact_that_is_idle_goes_only_ways_that_are_free_and_mostly_without_a_
             p, ways = p + way, ways + 1
             assert (contact.value(p) == 0.0) == (len(surface.find_proximity_candidates(p, 0.012).vertices) == 0)
     assert ways > 10
-    assert len(asked) < ways
+    assert len(arguments) < ways

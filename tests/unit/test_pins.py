@@ -53,9 +53,9 @@ def test_the_assignments_weight_holds_a_cloth_to_a_billionth(backend):
     made = build_cloth(8)
     problem = build_first_problem(made)
     p = backend.prepare(made.system).solve(problem, StopRule(50)).positions
-    held = made.system.pins.vertices
+    pinned_vertices = made.system.pins.vertices
     # A cloth of 1 kg pulls at a pin with some tens of newtons, which 1e10 N/m answer at some 1e-9 m.
-    assert np.abs(p[held] - made.pin_targets).max() <= 1e-8
+    assert np.abs(p[pinned_vertices] - made.pin_targets).max() <= 1e-8
 
 
 @backends

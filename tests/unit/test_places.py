@@ -19,7 +19,7 @@ def command(*arguments: object) -> Result:
     return CliRunner().invoke(app, list(map(str, arguments)))
 
 
-def kept(place: Path) -> list[Path]:
+def list_files(place: Path) -> list[Path]:
     """The files of rows in a place; the page's tables are not among them."""
     return [path for path in place.rglob("*.parquet") if "site" not in path.parts]
 
@@ -77,22 +77,25 @@ def a_sweep_lives_at(url: str, config: Path, cache: Path) -> None:
     """Run, list, query, pack and query again, as from three machines."""
     for machine in range(3):
         os.environ["XDG_CACHE_HOME"] = str(cache / str(machine))
-        told = command("run", config, "--results", url)
-        assert told.exit_code == 0, told.output
-        assert ("1 of 1 runs are there already" in told.output) == (machine > 0)
-    asked = command("query", "SELECT DISTINCT scene, solver FROM rows", "--results", url, "--csv")
-    assert asked.output.split() == ["scene,solver", "cloth,sparse"]
+        result = command("run", config, "--results", url)
+        assert result.exit_code == 0, result.output
+        assert ("1 of 1 runs are there already" in result.output) == (machine > 0)
+    requested = command("query", "SELECT DISTINCT scene, solver FROM rows", "--results", url, "--csv")
+    assert requested.output.split() == ["scene,solver", "cloth,sparse"]
     packed = command("compact", url)
     assert packed.exit_code == 0, packed.output
     os.environ["XDG_CACHE_HOME"] = str(cache / "4")
-    assert command("query", "SELECT DISTINCT scene, solver FROM rows", "--results", url, "--csv").output == asked.output
+    assert (
+        command("query", "SELECT DISTINCT scene, solver FROM rows", "--results", url, "--csv").output
+        == requested.output
+    )
     assert "done" in command("list", config, "--results", url).output
 
 
 def test_a_sweep_lives_at_a_url(config: Path, cache: Path, tmp_path: Path):
     (tmp_path / "there").mkdir()
     a_sweep_lives_at(f"file://{tmp_path / 'there'}", config, cache)
-    assert [path.name for path in kept(tmp_path / "there")] == ["rows.parquet"]
+    assert [path.name for path in list_files(tmp_path / "there")] == ["rows.parquet"]
 
 
 @pytest.fixture
@@ -117,13 +120,13 @@ def test_a_sweep_lives_in_storage_of_the_kind_of_s3(storage: str, config: Path, 
 
 
 def test_a_place_that_cannot_be_read_or_written_is_named_and_nothing_is_lost(config: Path, cache: Path, tmp_path: Path):
-    told = command("query", "SELECT 1", "--results", "nothing://there")
-    assert (told.exit_code, "nothing://there" in told.output) == (2, True)
+    result = command("query", "SELECT 1", "--results", "nothing://there")
+    assert (result.exit_code, "nothing://there" in result.output) == (2, True)
     (tmp_path / "there").write_text("a file")
     url = f"file://{tmp_path / 'there'}"
-    told = command("run", config, "--results", url)
-    assert (told.exit_code, "all is kept in" in told.output) == (1, True), told.output
+    result = command("run", config, "--results", url)
+    assert (result.exit_code, "all is kept in" in result.output) == (1, True), result.output
     (tmp_path / "there").unlink()
-    told = command("run", config, "--results", url)
-    assert (told.exit_code, "1 of 1 runs are there already" in told.output) == (0, True), told.output
-    assert len(kept(tmp_path / "there")) == 1
+    result = command("run", config, "--results", url)
+    assert (result.exit_code, "1 of 1 runs are there already" in result.output) == (0, True), result.output
+    assert len(list_files(tmp_path / "there")) == 1

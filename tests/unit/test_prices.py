@@ -41,9 +41,9 @@ def cloth(tmp_path: Path) -> Path:
 def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tmp_path: Path):
     sweep = load_config(cloth, solvers=["newton", "dense"], rounds=4, rtol=1e-6, threads=1)
     paths = measure_all_overheads(sweep, tmp_path, create_display(get_error_console()), print_message, isolated=False)
-    told = {(row["name"], row["solver"]): row for path in paths for row in read_ablation(path)}
-    assert set(told) == {(e, s) for e in ("bending", "air-drag", "all") for s in ("newton", "dense")}
-    for (effect, solver), row in told.items():
+    values = {(row["name"], row["solver"]): row for path in paths for row in read_ablation(path)}
+    assert set(values) == {(e, s) for e in ("bending", "air-drag", "all") for s in ("newton", "dense")}
+    for (effect, solver), row in values.items():
         if solver == "dense" and effect != "air-drag":
             assert row["status"] == "unsupported"
             assert row["overhead_ratio"] is None
@@ -55,7 +55,7 @@ def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tm
         )  # some kilobytes
         assert 3 <= row["rounds"] <= 4
         assert row["seconds"] > 0.0
-    table = build_overhead_table(list(told.values()))
+    table = build_overhead_table(list(values.values()))
     assert [str(column.header) for column in table.columns] == ["effect", "newton", "dense"]
     assert next(iter(table.columns[2].cells)) == "unsupported"
 

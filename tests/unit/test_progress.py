@@ -26,7 +26,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def told(kind: Callable[[Console], ProgressDisplay], does: Callable[[ProgressDisplay], None]) -> str:
+def capture_progress(kind: Callable[[Console], ProgressDisplay], does: Callable[[ProgressDisplay], None]) -> str:
     out = io.StringIO()
     display = kind(Console(file=out, force_terminal=kind is ProgressBars, width=200))
     does(display)
@@ -56,7 +56,7 @@ def test_the_time_left_follows_from_the_latest_run_of_each_kind(
             clock[0] += seconds
             run.finish_run("ok")
 
-    lines = told(kind, does)
+    lines = capture_progress(kind, does)
     # 3 s come with any run. After the second one: fast 0 s and slow 0.2 s for each of the amount, so 3, 3 + 8 and 3 s.
     # After the third one: fast 6 s for 40, so 3 + 8 s and 3 + 15 s. After the fourth one 3 + 15 s.
     for seconds in (17, 29, 18):
@@ -80,7 +80,7 @@ def test_a_run_that_goes_on_tells_its_own_pace(clock: list[float]):
             clock[0] += 12.0
             run.report_tick("timed pass")
 
-    assert "40 %; about 72 s left" in told(ProgressLines, does)
+    assert "40 %; about 72 s left" in capture_progress(ProgressLines, does)
 
 
 def test_a_line_comes_though_no_run_ends(clock: list[float]):
@@ -92,7 +92,7 @@ def test_a_line_comes_though_no_run_ends(clock: list[float]):
             clock[0] += 1.0
             run.report_tick(POLL)
 
-    lines = told(ProgressLines, does).splitlines()
+    lines = capture_progress(ProgressLines, does).splitlines()
     assert lines == ["[0/1] one: timed pass, 10 %"] * 3
 
 
@@ -104,4 +104,4 @@ def test_what_is_compiled_is_told_while_it_is(clock: list[float]):
             clock[0] += 11.0
             run.report_tick(POLL)
 
-    assert "one: compiling (once), 0 %" in told(ProgressLines, does)
+    assert "one: compiling (once), 0 %" in capture_progress(ProgressLines, does)

@@ -52,8 +52,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("compact", home / "results"),
         ("publish", home / "results" / "sweep", "-o", home / "packed.zip"),
     ):
-        told = command(*arguments)
-        assert told.exit_code == 0, told.output
+        result = command(*arguments)
+        assert result.exit_code == 0, result.output
     return home
 
 
@@ -85,11 +85,11 @@ def test_what_was_published_comes_out_again(home: Path, name: str, tmp_path: Pat
         )
         listed = command("list", folder / "configs" / "sweep" / "sweep.yaml", "--results", folder / "results")
         assert listed.output.count("done") == 2
-    told = [*map(str, claims)]
+    arguments = [*map(str, claims)]
     for solver in ("dense", "sparse"):
-        assert f"cloth 4 {solver}, positions: holds (2 steps, to the bit)" in told
-        assert any(line.startswith(f"cloth 4 {solver}, other columns: holds (") for line in told), told
-        assert any(line.startswith(f"cloth 4 {solver}, time of a step: ") for line in told)
+        assert f"cloth 4 {solver}, positions: holds (2 steps, to the bit)" in arguments
+        assert any(line.startswith(f"cloth 4 {solver}, other columns: holds (") for line in arguments), arguments
+        assert any(line.startswith(f"cloth 4 {solver}, time of a step: ") for line in arguments)
     assert "times as long as" in claims[-1].subject
 
 
@@ -109,11 +109,11 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
         content["mine.py"] = b"raise SystemExit"
         del content["CITATION.cff"]
 
-    told = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=False))
-    assert told.exit_code == 1
+    result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=False))
+    assert result.exit_code == 1
     for line in ("sweep.yaml: does not hold (was changed)", "mine.py: does not hold (was not", "(missing)"):
-        assert line in told.output
-    assert "done again" not in told.output
+        assert line in result.output
+    assert "done again" not in result.output
 
 
 @pytest.fixture(scope="module")
@@ -199,8 +199,8 @@ def test_a_forged_column_does_not_hold(kind: str, repeated: tuple[list[Published
     assert claims_of(honest, new) == []
     change, said = FORGED[kind]
     forged = [replace(one, rows=[change(row) for row in one.rows]) for one in honest]
-    told = claims_of(forged, new)
-    assert any(re.search(said, line) for line in told), told
+    refuted = claims_of(forged, new)
+    assert any(re.search(said, line) for line in refuted), refuted
 
 
 def test_rows_that_are_missing_or_doubled_do_not_hold(repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
@@ -228,10 +228,10 @@ def test_runs_that_no_config_asks_for_cannot_be_told(home: Path, tmp_path: Path)
         made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in build_dummy_rows(1)]
         content["results/sweep/rows/cloth-4-magic.parquet"] = parquet_rows.encode_rows(made_up)
 
-    told = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
-    assert "1 of 3 runs of sweep: cannot tell (the config asks for none such)" in told.output
-    assert told.exit_code == (1 if "does not hold" in told.output else 3), told.output
-    assert "no repeat confirms these columns: " in told.output
+    result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
+    assert "1 of 3 runs of sweep: cannot tell (the config asks for none such)" in result.output
+    assert result.exit_code == (1 if "does not hold" in result.output else 3), result.output
+    assert "no repeat confirms these columns: " in result.output
 
 
 def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Path):
@@ -245,17 +245,17 @@ def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Pa
             )
             content[name] = (tmp_path / "x.parquet").read_bytes()
 
-    told = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
-    assert told.exit_code == 1, told.output
-    assert "positions: does not hold (they differ from step 1 of 2 on)" in told.output
+    result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
+    assert result.exit_code == 1, result.output
+    assert "positions: does not hold (they differ from step 1 of 2 on)" in result.output
 
 
 def test_an_archive_whose_results_lead_to_another_config_is_refused(home: Path, tmp_path: Path):
     def change(content: dict[str, bytes]) -> None:
         content["results/sweep/.config"] = str(home / "sweep.yaml").encode()
 
-    told = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
-    assert (told.exit_code, "leads out of the archive" in told.output) == (2, True)
+    result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
+    assert (result.exit_code, "leads out of the archive" in result.output) == (2, True)
 
 
 BAD: dict[str, Callable[[Path], object]] = {
@@ -268,15 +268,15 @@ BAD: dict[str, Callable[[Path], object]] = {
 @pytest.mark.parametrize("kind", BAD)
 def test_what_is_no_such_archive_is_the_users_mistake(tmp_path: Path, kind: str):
     BAD[kind](tmp_path / "x.zip")
-    told = command("verify-archive", tmp_path / "x.zip")
-    assert (told.exit_code, "springbench: " in told.output) == (2, True)
+    result = command("verify-archive", tmp_path / "x.zip")
+    assert (result.exit_code, "springbench: " in result.output) == (2, True)
 
 
 def test_damaged_rows_are_not_published(home: Path, tmp_path: Path):
     (tmp_path / "sweep" / "rows").mkdir(parents=True)
     (tmp_path / "sweep" / "rows" / "a.parquet").write_bytes(b"PAR1")
-    told = command("publish", tmp_path, "-o", tmp_path / "x.zip")
-    assert (told.exit_code, "a.parquet" in told.output) == (2, True)
+    result = command("publish", tmp_path, "-o", tmp_path / "x.zip")
+    assert (result.exit_code, "a.parquet" in result.output) == (2, True)
     assert not (tmp_path / "x.zip").exists()
     assert command("publish", home / "results", "-o", tmp_path / "x.tar").exit_code == 2
 

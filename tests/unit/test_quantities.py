@@ -68,8 +68,10 @@ def replay_of(solver: str) -> RecordingReplay:
 
 
 def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
-    told = rows_of("sparse") + rows_of("numba")
-    table = pa.table({field.name: [row.get(field.name) for row in told] for field in RUN_SCHEMA}, schema=RUN_SCHEMA)
+    given_rows = rows_of("sparse") + rows_of("numba")
+    table = pa.table(
+        {field.name: [row.get(field.name) for row in given_rows] for field in RUN_SCHEMA}, schema=RUN_SCHEMA
+    )
     (tmp_path / "made" / "rows").mkdir(parents=True)
     pq.write_table(table, tmp_path / "made" / "rows" / "all.parquet")
 

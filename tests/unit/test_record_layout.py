@@ -76,12 +76,12 @@ def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: f
 
 
 @pytest.mark.parametrize(
-    ("ends", "told"), [((-0.05, 0.39), ["to +39 %"]), ((-0.2, 0.05), ["to −20 %"]), ((-0.1, 0.1), [])]
+    ("ends", "labels"), [((-0.05, 0.39), ["to +39 %"]), ((-0.2, 0.05), ["to −20 %"]), ((-0.1, 0.1), [])]
 )
-def test_the_scale_ends_in_a_tip_with_a_figure_where_strain_lies_beyond(ends: tuple[float, float], told: list[str]):
+def test_the_scale_ends_in_a_tip_with_a_figure_where_strain_lies_beyond(ends: tuple[float, float], labels: list[str]):
     strip, words = ViewExtent(MESHES_BY_KIND["cloth"].rest_positions).build_colour_scale(0.1, ends)
-    assert listed(words.labels).tolist()[5:] == told
-    assert len(listed(strip.triangle_indices)) == 2 * (NUM_LEVELS - 1) + len(told)
+    assert listed(words.labels).tolist()[5:] == labels
+    assert len(listed(strip.triangle_indices)) == 2 * (NUM_LEVELS - 1) + len(labels)
 
 
 def test_what_is_wide_and_low_stands_in_the_middle_of_the_room_above_the_scale():

@@ -35,14 +35,14 @@ def require_last(path: Path, of: RecordingInfo, frame: int, time: float, p: np.n
 @pytest.mark.parametrize("mesh", MESHES_BY_KIND)
 def test_a_recording_that_ends_as_the_run_did_passes(mesh: str, tmp_path: Path):
     p = ends(mesh)
-    told = require_last(
+    message = require_last(
         write_recording(tmp_path / "a.rrd", build_recording_info(mesh), COUNT),
         build_recording_info(mesh),
         COUNT - 1,
         TIME,
         p,
     )
-    assert told == hashlib.sha256(p.astype(np.float32).tobytes()).hexdigest()
+    assert message == hashlib.sha256(p.astype(np.float32).tobytes()).hexdigest()
 
 
 def test_a_mesh_without_springs_passes(tmp_path: Path):

@@ -10,7 +10,7 @@ from springbench.solvers.iteration.solver_info import LIU_2013, Citation
 from springbench.solvers.registry import SOLVERS, load_target
 
 
-def told(reference: Citation) -> str:
+def build_bibtex_entry(reference: Citation) -> str:
     return json.dumps(asdict(reference))
 
 
@@ -25,7 +25,7 @@ def told(reference: Citation) -> str:
     ],
 )
 def test_a_reference_is_a_line_of_words(reference: Citation, words: str):
-    assert format_citation(told(reference)).startswith(words)
+    assert format_citation(build_bibtex_entry(reference)).startswith(words)
 
 
 def test_what_has_no_reference_has_no_words():
@@ -34,7 +34,7 @@ def test_what_has_no_reference_has_no_words():
 
 def test_each_work_has_one_entry_and_a_key_of_its_own():
     other = Citation("Liu, Tiantian", 2013, "Another of the year")
-    found = format_bibtex(map(told, (LIU_2013, other, LIU_2013)))
+    found = format_bibtex(map(build_bibtex_entry, (LIU_2013, other, LIU_2013)))
     assert [line for line in found.splitlines() if line.startswith("@")] == ["@misc{liu2013a,", "@misc{liu2013b,"]
     assert "  author = {Liu, Tiantian and Bargteil, Adam W. and O'Brien, James F. and Kavan, Ladislav},\n" in found
 

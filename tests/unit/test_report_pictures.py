@@ -112,11 +112,11 @@ def boxes(monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[PixelBox, list[
     """Where the frames of the last run were drawn."""
     found: list[tuple[PixelBox, list[PixelBox]]] = []
 
-    def kept(*given: Any) -> tuple[PixelBox, list[PixelBox]]:
+    def record_layout(*given: Any) -> tuple[PixelBox, list[PixelBox]]:
         found.append(layout_frames(*given))
         return found[-1]
 
-    monkeypatch.setattr(run_picture, "layout_frames", kept)
+    monkeypatch.setattr(run_picture, "layout_frames", record_layout)
     return lambda: found[-1]
 
 

@@ -107,8 +107,8 @@ def learned(**how: Any) -> list[str]:
     return learned_from(rows(**how).to_pylist())
 
 
-def learned_from(told: list[dict[str, Any]]) -> list[str]:
-    lines = "\n".join(summarise_sweep(read_run_times(pa.Table.from_pylist(told, schema=RUN_SCHEMA))))
+def learned_from(message: list[dict[str, Any]]) -> list[str]:
+    lines = "\n".join(summarise_sweep(read_run_times(pa.Table.from_pylist(message, schema=RUN_SCHEMA))))
     return lines.replace("\n  ", " ").splitlines()
 
 
@@ -243,10 +243,10 @@ def test_the_summary_and_the_words_after_it_fit_a_hundred_columns() -> None:
 
 def changed(solvers: Sequence[str], sizes: Sequence[int] = (20,), **by: Callable[[dict[str, Any]], Any]) -> list[str]:
     """What is learned of rows whose columns are changed where they are not null."""
-    told = rows(sizes=sizes, solvers=solvers).to_pylist()
-    for row in told:
+    given_rows = rows(sizes=sizes, solvers=solvers).to_pylist()
+    for row in given_rows:
         row |= {name: change(row) for name, change in by.items() if row[name] is not None}
-    return learned_from(told)
+    return learned_from(given_rows)
 
 
 def test_times_are_compared_at_equal_errors_by_the_median_step() -> None:
@@ -273,60 +273,60 @@ def test_times_at_unequal_or_unknown_errors_are_not_compared() -> None:
 
 
 def test_residuals_at_round_off_are_equal_and_their_runs_were_not_cut_short() -> None:
-    told = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
-    for row in told:
+    given_rows = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
+    for row in given_rows:
         if row["phase"] == "step":
             row |= {"residual": 0.0 if row["solver"] == "sparse" else 7e-16, "termination_reason": "max-iter"}
             row |= {"residual_initial": 1e-3, "energy_force": -1e-6}  # round-off of both: 1e-15
-    (speed,) = learned_from(told)
+    (speed,) = learned_from(given_rows)
     assert "fastest at equal accuracy is sparse, 0.4 ms a step; dense 400 times as long" in speed
-    for row in told:
+    for row in given_rows:
         row["residual_initial"] = 1e-6 if row["residual_initial"] else None  # the energy's square root is what is left
-    assert len(learned_from(told)) == 1
-    for row in told:
+    assert len(learned_from(given_rows)) == 1
+    for row in given_rows:
         row["energy_force"] = 0.0
-    assert learned_from(told)[1].endswith("dense (its error is 700 times as large).")
+    assert learned_from(given_rows)[1].endswith("dense (its error is 700 times as large).")
 
 
 def test_judged_runs_are_compared_by_their_distance_from_the_reference() -> None:
-    told = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
-    for row in told:
+    given_rows = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
+    for row in given_rows:
         if row["phase"] == "step":
             row["reference_distance"] = 1e-3 if (row["solver"], row["frame"]) == ("dense", 3) else 1e-5
-    assert "largest distance from the reference 1.0e-05" in learned_from(told)[0]
-    assert "dense (its error is 100 times as large)" in learned_from(told)[1]
+    assert "largest distance from the reference 1.0e-05" in learned_from(given_rows)[0]
+    assert "dense (its error is 100 times as large)" in learned_from(given_rows)[1]
 
 
 def test_steps_of_other_lengths_or_integrators_are_not_compared() -> None:
-    told = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
+    given_rows = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
     for name, other in (("time_step", 0.02), ("integrator", "bdf2"), ("error_requested", 1e-3)):
-        mixed = [row | ({name: other} if row["solver"] == "dense" else {}) for row in told]
+        mixed = [row | ({name: other} if row["solver"] == "dense" else {}) for row in given_rows]
         assert not [line for line in learned_from(mixed) if "fastest" in line or "compared" in line], name
 
 
 def test_a_limit_of_iterations_stops_only_what_has_one() -> None:
     own = changed(("sparse", "xpbd"), is_substepping=lambda row: True)
     assert own[-1].startswith("All 2 runs stopped"), "of others it is not known"
-    told = rows(sizes=(20,), solvers=("sparse", "symplectic-euler")).to_pylist()
-    for row in told:
+    given_rows = rows(sizes=(20,), solvers=("sparse", "symplectic-euler")).to_pylist()
+    for row in given_rows:
         row["is_substepping"] = row["solver"] == "symplectic-euler"
-    assert learned_from(told)[-1].startswith("1 of 2 runs stopped at the limit of iterations")
-    sparse, explicit = read_run_times(pa.Table.from_pylist(told, schema=RUN_SCHEMA))
+    assert learned_from(given_rows)[-1].startswith("1 of 2 runs stopped at the limit of iterations")
+    sparse, explicit = read_run_times(pa.Table.from_pylist(given_rows, schema=RUN_SCHEMA))
     assert (sparse.termination_reason, explicit.termination_reason) == ("max-iter", "converged")
-    for row in told:
+    for row in given_rows:
         row["num_iterations"] = row["num_iterations"] and 1  # of 10 that were allowed, as of one linear solve a step
-    assert not [line for line in learned_from(told) if "limit" in line]
+    assert not [line for line in learned_from(given_rows) if "limit" in line]
 
 
 def strains(largest: Sequence[float], below: Sequence[float], exponent: int | None, stopped: str) -> list[str]:
     """What is learned of one solver's strains at sizes 3 and 9."""
-    told = rows(sizes=(3, 9), solvers=("sparse",)).to_pylist()
-    for row in told:
+    given_rows = rows(sizes=(3, 9), solvers=("sparse",)).to_pylist()
+    for row in given_rows:
         k = int(row["size"] == 9)
         if row["phase"] == "step":
             row |= {"max_strain": largest[k], "strain_p99": below[k], "termination_reason": stopped}
             row |= {"modulus_exponent": exponent, "residual": 1.0}
-    return learned_from(told)
+    return learned_from(given_rows)
 
 
 def test_strains_of_two_sizes_are_told_with_what_happens_to_the_material() -> None:
@@ -383,12 +383,12 @@ def test_a_sweep_ends_with_three_commands_and_one_link(tmp_path: Path) -> None:
 
 
 def test_the_summary_marks_times_that_are_doubtful_and_says_why() -> None:
-    told = rows(sizes=(10,), solvers=("sparse",)).to_pylist()
-    for row in told:
+    given_rows = rows(sizes=(10,), solvers=("sparse",)).to_pylist()
+    for row in given_rows:
         row["preempted"] = row["phase"] == "step" and row["frame"] == 2
         row["phases_consistent"] = False if row["phase"] in ("local", "global") else None
     console = Console(width=200, record=True, file=StringIO())
-    console.print(build_summary_table(pa.Table.from_pylist(told, schema=RUN_SCHEMA)))
+    console.print(build_summary_table(pa.Table.from_pylist(given_rows, schema=RUN_SCHEMA)))
     text = " ".join(console.export_text().split())
     assert "10 sparse 0.8 0.3 0.1! 0.099 0.01~ 0.02~ 10" in text
     assert PREEMPTED_NOTE in text

@@ -53,8 +53,8 @@ def test_a_ball_that_comes_is_found_like_a_way_to_it():
 
 @pytest.mark.parametrize("motion", [None, ACROSS, ROUND, SMOOTH])
 def test_a_way_beside_a_ball_is_free(motion: KeyFrameMotion | None):
-    beside = SphereObstacle(center=(2.0, 5.0, 0.0), radius=0.1)
-    assert find_first_violation(beside.build_obstacle(), None, POINT, motion, LIMIT) is None
+    other = SphereObstacle(center=(2.0, 5.0, 0.0), radius=0.1)
+    assert find_first_violation(other.build_obstacle(), None, POINT, motion, LIMIT) is None
 
 
 @pytest.mark.parametrize("motion", [ACROSS, ROUND, SMOOTH])

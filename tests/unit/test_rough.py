@@ -28,11 +28,11 @@ effects: [{kind: springs, stretch: 10}, {kind: gravity}, {kind: self-contact}]
 def executed(folder: Path, timing: str) -> tuple[list[dict[str, Any]], list[str]]:
     """The rows of a run, and the passes that it told of."""
     (folder / "scene.yaml").write_text(SCENE)
-    asked: dict[str, Any] = {"solvers": ["newton"], "timing": timing, "record": False, "rtol": 1e-3}
-    (spec,) = load_config(folder / "scene.yaml", **asked).list_runs()
-    files, told = RunFiles.for_run(spec, folder), list[str]()
+    options: dict[str, Any] = {"solvers": ["newton"], "timing": timing, "record": False, "rtol": 1e-3}
+    (spec,) = load_config(folder / "scene.yaml", **options).list_runs()
+    files, messages = RunFiles.for_run(spec, folder), list[str]()
     files.rows_path.parent.mkdir(exist_ok=True)
-    return execute_run(spec, files, told.append), told
+    return execute_run(spec, files, messages.append), messages
 
 
 def test_a_rough_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_path: Path):

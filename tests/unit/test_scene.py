@@ -43,11 +43,11 @@ def test_a_woven_cloth_of_a_mass_per_area_weighs_that_and_the_reference_terms_ag
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
     assert made.system.mass.sum() == pytest.approx(0.2 * area, rel=1e-12)
     assert verify_terms(spec, made, "implicit-euler") == "agrees"
-    for mesh, more, told in (
+    for mesh, more, message in (
         (ChainMesh(), {}, "needs a surface"),
         (SkirtMesh(), {"mass": 1.0}, "is given beside `mass`"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             build_scene(SceneSpec.model_validate({"mesh": mesh, **given, **more}), 8)
 
 

@@ -36,14 +36,14 @@ def floor(y: float) -> ContactEffect:
 
 def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_again(tmp_path, monkeypatch):
     effects, velocity = (SpringsEffect(stretch=40.0), HELD), (0.5, 1.0, 2.0)
-    beside, alone = thrown(*effects, floor(-9.0), velocity=velocity), thrown(*effects, velocity=velocity)
-    found = ReferenceStore(tmp_path).load_trajectory(beside, 3, [END], error=0.1)
+    other, alone = thrown(*effects, floor(-9.0), velocity=velocity), thrown(*effects, velocity=velocity)
+    found = ReferenceStore(tmp_path).load_trajectory(other, 3, [END], error=0.1)
     truth = integrate_motion(build_exact_scene(alone, 3), [END])
     assert (found.reference_kind, truth.reference_kind) == ("self-converged", "integrated")
     # Both integrators err by about what halving their steps moved them, and that is the most that either did.
     assert truth.measure_error(0, found.positions[0]) <= 1.5 * found.disagreement[0] <= 1.5 * REFERENCE_MARGIN * 0.1
     monkeypatch.setattr(self_converged_trajectory, "compute_self_converged", None)
-    again = ReferenceStore(tmp_path).load_trajectory(beside, 3, [END], error=0.2)
+    again = ReferenceStore(tmp_path).load_trajectory(other, 3, [END], error=0.2)
     assert (again.positions == found.positions).all()
     with pytest.raises(NotConverged, match=r"halving the steps further takes more than .* ask for an error of"):
         again.require_accuracy(0.01)

@@ -32,7 +32,7 @@ def sweep(tmp_path: Path) -> Path:
     return tmp_path / "sweep"
 
 
-def told(table: pa.Table) -> list[str]:
+def format_rows(table: pa.Table) -> list[str]:
     """The rows as text, because what is not a number equals nothing."""
     return list(map(repr, table.to_pylist()))
 
@@ -43,9 +43,9 @@ def one_by_one(units: list[Path]) -> pa.Table:
 
 def test_many_units_are_read_as_one_by_one_in_the_order_asked_for(sweep: Path):
     units = row_store.list_units(sweep / "rows")
-    for asked in (units, units[::-1]):
-        assert told(parquet_rows.read_rows(asked)) == told(one_by_one(asked))
-        assert parquet_rows.read_rows(asked).schema.equals(one_by_one(asked).schema)
+    for requested in (units, units[::-1]):
+        assert format_rows(parquet_rows.read_rows(requested)) == format_rows(one_by_one(requested))
+        assert parquet_rows.read_rows(requested).schema.equals(one_by_one(requested).schema)
     heads = parquet_rows.read_first_rows(units, ["status", "positions_digest"], required_columns=("run_id",))
     assert heads == {
         u: {"status": "ok", "positions_digest": parquet_rows.read_rows([u])["positions_digest"][0].as_py()}
@@ -72,13 +72,13 @@ QUERY = "SELECT * FROM rows ORDER BY run_id, frame"
 
 def test_packed_rows_are_the_same_to_all_who_read(sweep: Path):
     units = row_store.list_units(sweep / "rows")
-    before, asked = told(parquet_rows.read_rows(units)), repr(run_query(QUERY, sweep.parent).values)
+    before, requested = format_rows(parquet_rows.read_rows(units)), repr(run_query(QUERY, sweep.parent).values)
     heads = parquet_rows.read_first_rows(units, ["source_fingerprint"])
     assert compact_results(sweep.parent, lambda line: None) == COUNT
     assert list((sweep / "rows").iterdir()) == []
     assert row_store.list_units(sweep / "rows") == units
-    assert told(parquet_rows.read_rows(units)) == before
-    assert repr(run_query(QUERY, sweep.parent).values) == asked
+    assert format_rows(parquet_rows.read_rows(units)) == before
+    assert repr(run_query(QUERY, sweep.parent).values) == requested
     assert parquet_rows.read_first_rows(units, ["source_fingerprint"]) == heads
     first = parquet_rows.read_first_row(units[2])
     assert isinstance(first, dict)
@@ -200,7 +200,7 @@ def test_packing_that_is_killed_at_any_moment_loses_and_doubles_nothing_and_goes
     units = row_store.list_units(sweep / "rows")
     for unit in (*units[:2], *units[6:]):  # four are left, of three schemas
         unit.unlink()
-    before, moments = told(parquet_rows.read_rows(units[2:6])), 0
+    before, moments = format_rows(parquet_rows.read_rows(units[2:6])), 0
     while True:
         copy = tmp_path / str(moments) / "sweep"
         shutil.copytree(sweep, copy)
@@ -209,13 +209,13 @@ def test_packing_that_is_killed_at_any_moment_loses_and_doubles_nothing_and_goes
         process.join()
         left = row_store.list_units(copy / "rows")
         assert [unit.name for unit in left] == [unit.name for unit in units[2:6]]
-        assert told(parquet_rows.read_rows(left)) == before
+        assert format_rows(parquet_rows.read_rows(left)) == before
         if process.exitcode == 0:  # it had done all before
             break
         assert process.exitcode == -signal.SIGKILL
         compact_results(copy, lambda line: None)
         assert {path.name for path in copy.iterdir()} == {"rows", "rows.parquet", ".lock"}
         assert list((copy / "rows").iterdir()) == []
-        assert told(parquet_rows.read_rows(left)) == before
+        assert format_rows(parquet_rows.read_rows(left)) == before
         moments += 1
     assert moments == 2 + 3 + 1 + 4, "two batches, to sync, rename and sync, the partial file, and each unit"

@@ -30,9 +30,9 @@ effects:
 def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     picture = tmp_path / "cloth.png"
-    told = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(picture)])
-    assert told.exit_code == 0, told.output
-    lines = " ".join(told.output.split())
+    result = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(picture)])
+    assert result.exit_code == 0, result.output
+    lines = " ".join(result.output.split())
     assert "effects[1] pins: 2 vertices (parts (top_corners)): 0, 4" in lines
     assert "effects[2] sewing: second: 3 vertices (parts (right), stride 2): 4, 14, 24" in lines
     assert "boundary loops (boundary_loops): 0: 4 m" in lines
@@ -48,5 +48,5 @@ def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
 
 def test_a_picture_that_is_none_is_refused(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
-    told = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(tmp_path / "cloth.jpg")])
-    assert told.exit_code != 0
+    result = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(tmp_path / "cloth.jpg")])
+    assert result.exit_code != 0

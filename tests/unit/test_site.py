@@ -117,11 +117,13 @@ def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
 
 
 def test_the_fastest_is_told_among_those_that_are_equally_accurate():
-    told = synthetic_site_rows.build_run_rows(0)
+    given_rows = synthetic_site_rows.build_run_rows(0)
     made = []
     for name, ms, residual in (("slow", 4.0, 1e-6), ("fair", 2.0, 5e-6), ("hasty", 1.0, 1e-2), ("blind", 0.5, None)):
         own = {"run_id": name, "parameters": json.dumps({"kind": name})}
-        made += [row | own | {"seconds": 1e-3 * ms, "residual": residual} for row in told if row["phase"] == "step"]
+        made += [
+            row | own | {"seconds": 1e-3 * ms, "residual": residual} for row in given_rows if row["phase"] == "step"
+        ]
     columns = {field.name: [row.get(field.name) for row in made] for field in RUN_SCHEMA}
     rows_of = pa.table(columns, schema=RUN_SCHEMA).append_column("file", [[row["file"] for row in made]])
     found = build_run_table(locate_folder(Path("made"), Path()), rows_of)
@@ -166,10 +168,10 @@ def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
     }
     there = synthetic_benchmarks.write_benchmark_files(tmp_path / "bench" / "Linux-CPython-3.11-64bit", gates)
     (there / "0099_damaged.json").write_text("{")
-    told: list[str] = []
-    update_page(tmp_path, print_message=told.append)
-    assert len(told) == 1
-    assert "0099_damaged.json" in told[0]
+    messages: list[str] = []
+    update_page(tmp_path, print_message=messages.append)
+    assert len(messages) == 1
+    assert "0099_damaged.json" in messages[0]
     chart = read(tmp_path, "bench/gates")
     slower = next(item for item in chart["items"] if item["label"].startswith("slower"))
     assert (slower["benchmark"], slower["commit"]) == ("solve", ["0000006"])
@@ -194,12 +196,12 @@ def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: 
     synthetic_results.write_speed_results(tmp_path / "speed")
     update_page(tmp_path)
     for name in ("study/convergence", "study/times", "study/work", "study/growth"):
-        told = {item["label"] for item in read(tmp_path, name)["items"] if np.any(item["stale"])}
-        assert told == {"newton"}, name
+        values = {item["label"] for item in read(tmp_path, name)["items"] if np.any(item["stale"])}
+        assert values == {"newton"}, name
     said = read(tmp_path, "study/profiles")["note"]
     assert "other code than that of the newest rows, in whole or in part: newton." in said
-    told = {item["label"] for item in read(tmp_path, "speed/speed")["items"] if any(item["stale"])}
-    assert told == {"numba supernodal"}
+    values = {item["label"] for item in read(tmp_path, "speed/speed")["items"] if any(item["stale"])}
+    assert values == {"numba supernodal"}
 
 
 def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -207,9 +209,9 @@ def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.M
         synthetic_site_rows.write_site_results(tmp_path, 3, name)
     update_page(tmp_path)
     seen: list[str] = []
-    told = page_build.build_overview
+    message = page_build.build_overview
     monkeypatch.setattr(
-        page_build, "build_overview", lambda folder, *a, **k: (seen.append(folder.name), told(folder, *a, **k))[1]
+        page_build, "build_overview", lambda folder, *a, **k: (seen.append(folder.name), message(folder, *a, **k))[1]
     )
     update_page(tmp_path)
     assert not seen

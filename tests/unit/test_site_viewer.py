@@ -35,9 +35,9 @@ def test_a_script_holds_its_recording_and_is_written_once(tmp_path: Path):
     recording = write_recording(tmp_path / "a.rrd", frame_count=3)
     script = rerun_viewer.write_recording(recording, tmp_path / "site" / "a.js", 'cloth "6"')
     name, value = script.read_text().removesuffix(";\n").split(" = ", 1)
-    told = json.loads(value)
-    assert (name, told["title"]) == ("springbench.taken", 'cloth "6"')
-    assert gzip.decompress(b64decode(told["rrd"])) == rerun_viewer.move_layout_first(recording.read_bytes())
+    chunk = json.loads(value)
+    assert (name, chunk["title"]) == ("springbench.taken", 'cloth "6"')
+    assert gzip.decompress(b64decode(chunk["rrd"])) == rerun_viewer.move_layout_first(recording.read_bytes())
     made = script.stat().st_mtime_ns
     rerun_viewer.write_recording(recording, script, "other")
     assert script.stat().st_mtime_ns == made
@@ -102,11 +102,13 @@ def test_a_page_replays_recordings_from_the_file_system_and_says_what_it_lacks(t
     page = site(tmp_path)
     ask = "([script, file]) => springbench.replay('id', script, {file})"
     with launch_chromium() as browser:
-        tab, said, asked = browser.new_page(viewport={"width": 1280, "height": 800}), [], []
+        tab, said, arguments = browser.new_page(viewport={"width": 1280, "height": 800}), [], []
         tab.on("console", lambda message: said.append(message.text))
-        tab.on("request", lambda request: asked.append(request.url))
+        tab.on("request", lambda request: arguments.append(request.url))
         tab.goto(page.as_uri())
-        assert asked == [page.as_uri(), (page.parent / "site" / "replay.js").as_uri()], "nothing heavy before a click"
+        assert arguments == [page.as_uri(), (page.parent / "site" / "replay.js").as_uri()], (
+            "nothing heavy before a click"
+        )
         assert not tab.evaluate(ask, ["site/a.js", "a.rrd"])
         for words in ("The viewer is not part of this report", f"springbench view {tmp_path / 'a.rrd'}"):
             assert tab.get_by_role("dialog").get_by_text(words).is_visible()
@@ -132,4 +134,4 @@ def test_a_page_replays_recordings_from_the_file_system_and_says_what_it_lacks(t
             tab.get_by_role("button", name="Close").click()
             assert not tab.get_by_role("dialog").is_visible()
         assert not said
-        assert all(url.startswith("file:") for url in asked)
+        assert all(url.startswith("file:") for url in arguments)

@@ -159,9 +159,9 @@ def test_of_a_solver_that_does_not_minimise_is_said_what_it_leaves_of_a_step(tmp
     """Springs that turn: XPBD ends elsewhere than at the minimum, however many iterations it takes."""
     (tmp_path / "scene.yaml").write_text(TURNING)
     (tmp_path / "rows").mkdir()
-    asked: dict[str, Any] = {"solvers": ["xpbd", "newton"], "rounds": 1, "record": False, "max_iterations": 2000}
+    options: dict[str, Any] = {"solvers": ["xpbd", "newton"], "rounds": 1, "record": False, "max_iterations": 2000}
     found = list[dict[str, Any]]()
-    for spec in load_config(tmp_path / "scene.yaml", **asked).list_runs():
+    for spec in load_config(tmp_path / "scene.yaml", **options).list_runs():
         found += execute_run(spec, RunFiles.for_run(spec, tmp_path), lambda phase: None)
     left = {row["solver"]: row["stationarity_audit"] for row in found if row["phase"] == "step" and row["frame"] == 3}
     assert left["newton"] < 1e-6 < SOLVED_RESIDUAL < left["xpbd"]

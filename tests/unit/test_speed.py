@@ -145,15 +145,15 @@ def test_a_power_law_is_predicted_exactly(power: float):
 
 
 def test_a_short_call_is_repeated_after_a_first_one_and_a_long_one_is_not():
-    asked: list[int] = []
+    arguments: list[int] = []
 
     def seconds(number: int) -> float:
-        asked.append(number)
+        arguments.append(number)
         return number * 1e-3
 
     assert compute_call_seconds(seconds, 0.02) == pytest.approx(1e-3, rel=1e-12)
     assert compute_call_seconds(seconds, 1e-4) == pytest.approx(1e-3, rel=1e-12)
-    assert asked == [1, 20, 1]
+    assert arguments == [1, 20, 1]
 
 
 def test_an_entry_that_is_read_is_a_multiply_and_an_add_for_each_of_three_sides():

@@ -16,7 +16,7 @@ from tests.effect_scenes import build_effect_cloth
 from tests.scene_builders import build_test_scene
 
 
-def asked(
+def suggest(
     made: Scene, kinds: set[str], positions: np.ndarray, velocities: np.ndarray | float = 0.0
 ) -> list[EffectSuggestion]:
     """What a motion calls for that passes through positions (n, 3) for 12 frames."""
@@ -35,13 +35,13 @@ def folded(made: Scene, angle: float) -> np.ndarray:
 
 def still() -> Scene:
     made = replace(build_effect_cloth(), varying_forces=(), pin_motions=())
-    assert asked(made, set(), made.mesh.rest_positions) == []
+    assert suggest(made, set(), made.mesh.rest_positions) == []
     return made
 
 
 def test_a_motion_that_asks_for_nothing_gets_no_suggestion():
     made = still()
-    assert asked(made, set(), folded(made, np.deg2rad(20.0))) == []
+    assert suggest(made, set(), folded(made, np.deg2rad(20.0))) == []
 
 
 @pytest.mark.parametrize(
@@ -60,34 +60,34 @@ def test_a_suggestion_comes_with_its_evidence_unless_the_effect_is_listed(effect
         "air-drag": made.mesh.rest_positions,
     }
     speed = 1.0 if effect == "air-drag" else 0.0
-    found = {s.effect_kind: s.evidence for s in asked(made, set(), places[effect], speed)}
+    found = {s.effect_kind: s.evidence for s in suggest(made, set(), places[effect], speed)}
     assert evidence in found[effect]
-    assert effect not in {s.effect_kind for s in asked(made, {listed}, places[effect], speed)}
+    assert effect not in {s.effect_kind for s in suggest(made, {listed}, places[effect], speed)}
 
 
 def test_a_corner_alone_asks_for_no_effect():
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), size=20)
     p, h = made.mesh.rest_positions.copy(), made.mesh.spacing
     p[0] += [-h, 2 * h, -h]  # three springs of 1482, and two edges of 1083
-    assert asked(made, set(), p) == []
+    assert suggest(made, set(), p) == []
     p[made.mesh.parts["left"]] += [0.0, 3 * h, 0.0]
-    assert {s.effect_kind for s in asked(made, set(), p)} == {"strain-limits", "bending"}
+    assert {s.effect_kind for s in suggest(made, set(), p)} == {"strain-limits", "bending"}
 
 
 def test_vertices_that_come_close_are_counted():
     made = still()
-    found = {s.effect_kind: s.evidence for s in asked(made, set(), folded(made, np.pi * 0.99))}
+    found = {s.effect_kind: s.evidence for s in suggest(made, set(), folded(made, np.pi * 0.99))}
     # Of 6 columns the inner two are joined by springs; each outer pair lies on each other in all 6 rows.
     assert found["self-contact"].startswith("12 pairs of vertices without a spring")
 
 
 def test_a_body_that_flies_as_a_whole_is_not_asked_to_rest():
     free = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), size=4)
-    assert asked(free, set(), free.mesh.rest_positions, 1.0) == []
-    swelling = asked(free, set(), free.mesh.rest_positions, free.mesh.rest_positions)
+    assert suggest(free, set(), free.mesh.rest_positions, 1.0) == []
+    swelling = suggest(free, set(), free.mesh.rest_positions, free.mesh.rest_positions)
     assert [s.effect_kind for s in swelling] == ["air-drag"]
 
 
 def test_a_driven_motion_is_not_asked_to_rest():
     made = replace(still(), varying_forces=(lambda p, v, t: p,))
-    assert asked(made, set(), made.mesh.rest_positions, 1.0) == []
+    assert suggest(made, set(), made.mesh.rest_positions, 1.0) == []

@@ -18,11 +18,11 @@ from springbench.solvers.model.step_problem import NotPositiveDefinite
 from springbench.solvers.model.system_matrix_assembly import diagonal_matrix, drop_zeros, signed_incidence_matrix_sparse
 
 
-def network(springs, stiffness, held):
+def network(springs, stiffness, fixed):
     """A'KA + diag(held) [N/m]."""
-    A = signed_incidence_matrix_sparse(np.asarray(springs, np.int64).reshape(-1, 2), len(held))
+    A = signed_incidence_matrix_sparse(np.asarray(springs, np.int64).reshape(-1, 2), len(fixed))
     return drop_zeros(
-        A.T @ diagonal_matrix(np.asarray(stiffness, float)) @ A + diagonal_matrix(np.asarray(held, float))
+        A.T @ diagonal_matrix(np.asarray(stiffness, float)) @ A + diagonal_matrix(np.asarray(fixed, float))
     )
 
 
@@ -36,9 +36,9 @@ def sheet(n, stiffness=1e5):
         (index[1:, :-1], index[:-1, 1:]),
     ]
     springs = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in ends])
-    held = np.full(n * n, 900.0 / n**2)
-    held[[0, n - 1]] += 1e10
-    return network(springs, np.full(len(springs), stiffness), held)
+    diagonal = np.full(n * n, 900.0 / n**2)
+    diagonal[[0, n - 1]] += 1e10
+    return network(springs, np.full(len(springs), stiffness), diagonal)
 
 
 def solution(Q, b, **options):
@@ -184,9 +184,9 @@ def test_columns_in_any_order_and_entries_in_parts_mean_the_same_matrix():
 
 def test_leaves_the_right_hand_sides_as_they_are():
     b = right_hand_sides(400)
-    kept = b.copy()
+    original = b.copy()
     solution(sheet(20), b)
-    np.testing.assert_array_equal(b, kept)
+    np.testing.assert_array_equal(b, original)
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32", "float16"])
@@ -258,8 +258,8 @@ def test_names_the_vertex_that_a_negative_mass_makes_indefinite():
 
 def test_names_a_vertex_of_the_component_that_nothing_holds():
     springs = [(i, i + 1) for i in range(199) if i != 99]
-    held = np.where(np.arange(200) < 100, 1.0, 0.0)
-    Q = network(springs, np.random.default_rng(3).uniform(1, 2, 198), held)
+    diagonal = np.where(np.arange(200) < 100, 1.0, 0.0)
+    Q = network(springs, np.random.default_rng(3).uniform(1, 2, 198), diagonal)
     with pytest.raises(NotPositiveDefinite, match=r"vertex \d+") as error:
         SupernodalCholesky(Q)
     named = int(re.findall(r"vertex (\d+)", str(error.value))[0])

@@ -202,7 +202,7 @@ def test_substeps_follow_from_the_stiffness(stretch):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         pytest.param(lambda s: replace(s, energies=(*s.energies, Other())), "Other", id="another energy"),
         pytest.param(lambda s: replace(s, inertia_factor=4.0), "implicit-euler", id="another integrator"),
@@ -210,8 +210,8 @@ def test_substeps_follow_from_the_stiffness(stretch):
         pytest.param(lambda s: replace(s, time_step=1e9), r"stable with 6.*e\+10 substeps", id="too many substeps"),
     ],
 )
-def test_what_it_cannot_do_is_said_before_any_work(change, told):
-    with pytest.raises(Unsupported, match=told):
+def test_what_it_cannot_do_is_said_before_any_work(change, message):
+    with pytest.raises(Unsupported, match=message):
         SymplecticEuler().prepare(change(build_random_problem(0).system))
 
 

@@ -20,11 +20,11 @@ def test_the_norm_is_the_square_root_of_the_quadratic_form_without_pins():
     problem = build_random_problem(0)
     rng = np.random.default_rng(1)
     e = rng.normal(size=problem.inertial_target.shape)
-    kept = e.copy()
+    original = e.copy()
     Q = assemble_system_matrix(problem.system, [require_only_springs(problem.system, "the test")]).toarray()
     inner = np.where(problem.system.unpinned_mask[:, None], e, 0.0)
     assert EnergyNorm(problem.system)(e) == pytest.approx(np.sqrt(np.trace(inner.T @ Q @ inner)), rel=1e-13)
-    np.testing.assert_array_equal(e, kept)
+    np.testing.assert_array_equal(e, original)
 
 
 def test_a_trace_has_the_objective_and_the_step_of_each_iterate():

@@ -163,10 +163,10 @@ CHAOS = spec(
 
 
 def test_a_horizon_beyond_which_round_off_decides_is_refused(tmp_path):
-    kept = ReferenceStore(tmp_path)
-    assert kept.load_trajectory(CHAOS, 4, [0.5], error=1e-3).growth[0] < 1e-8
+    store = ReferenceStore(tmp_path)
+    assert store.load_trajectory(CHAOS, 4, [0.5], error=1e-3).growth[0] < 1e-8
     with pytest.raises(UnpredictableMotion, match=r"after 8 s a perturbation of 1e-12 .* a --t-end of"):
-        kept.load_trajectory(CHAOS, 4, [0.5, 8.0], error=1e-3)
+        store.load_trajectory(CHAOS, 4, [0.5, 8.0], error=1e-3)
 
 
 def test_how_far_a_trajectory_is_known_depends_on_the_error_to_be_measured():
@@ -208,11 +208,11 @@ SWING = (SPRING, HELD, GravityEffect(), EtherDragEffect(decay_rate=C))
 
 
 def test_a_trajectory_is_integrated_once_for_all_time_steps(tmp_path, monkeypatch):
-    kept = ReferenceStore(tmp_path)
-    found = kept.load_trajectory(spec(ChainMesh(), *SWING), 3, TIMES, error=1e-3)
+    store = ReferenceStore(tmp_path)
+    found = store.load_trajectory(spec(ChainMesh(), *SWING), 3, TIMES, error=1e-3)
     monkeypatch.setattr(reference_store, "integrate_motion", None)
     for time_step in (1 / 30, 1 / 240):
-        again = kept.load_trajectory(spec(ChainMesh(), *SWING, time_step=time_step), 3, TIMES, error=1e-3)
+        again = store.load_trajectory(spec(ChainMesh(), *SWING, time_step=time_step), 3, TIMES, error=1e-3)
         for f in fields(ReferenceTrajectory):
             np.testing.assert_array_equal(getattr(found, f.name), getattr(again, f.name))
 
@@ -228,18 +228,18 @@ def test_a_trajectory_is_integrated_once_for_all_time_steps(tmp_path, monkeypatc
     ids=["stiffness", "speed", "size", "times"],
 )
 def test_another_question_has_another_trajectory(tmp_path, other, size, times):
-    kept = ReferenceStore(tmp_path)
-    one = kept.load_trajectory(spec(ChainMesh(), *SWING), 3, TIMES, error=1e-3).positions
-    two = kept.load_trajectory(other, size, times, error=1e-3).positions
+    store = ReferenceStore(tmp_path)
+    one = store.load_trajectory(spec(ChainMesh(), *SWING), 3, TIMES, error=1e-3).positions
+    two = store.load_trajectory(other, size, times, error=1e-3).positions
     assert one.shape != two.shape or np.abs(one - two).max() > 1e-4
 
 
 def test_a_trajectory_of_equations_that_have_changed_is_integrated_anew(tmp_path, monkeypatch):
     """As after a change of the code: the scene's digest is the same, its springs are not."""
-    kept, asked = ReferenceStore(tmp_path), spec(ChainMesh(), *SWING)
-    before = kept.load_trajectory(asked, 3, TIMES, error=1e-3)
+    store, requested = ReferenceStore(tmp_path), spec(ChainMesh(), *SWING)
+    before = store.load_trajectory(requested, 3, TIMES, error=1e-3)
     stiffer = build_exact_scene(spec(ChainMesh(), SpringsEffect(scaling_rule="fixed", stretch=K + 1.0), *SWING[1:]), 3)
     monkeypatch.setattr(equations_of_motion, "build_exact_scene", lambda *question: stiffer)
-    after = kept.load_trajectory(asked, 3, TIMES, error=1e-3)
+    after = store.load_trajectory(requested, 3, TIMES, error=1e-3)
     assert np.abs(after.positions - before.positions).max() > 1e-4
     np.testing.assert_array_equal(after.positions, integrate_motion(stiffer, TIMES).positions)

@@ -42,9 +42,9 @@ def test_a_vertex_feels_what_the_oracle_says(effect):
     problem = build_moving_problem(build_effect_cloth(*EFFECTS[effect]))
     n = problem.system.num_vertices
     p, d = problem.current_positions, 0.01 * NOISE.normal(size=(n, 3))
-    beside = VertexElements.from_system(problem.system)
-    around = beside.with_rows(np.arange(n), n).update_elements(problem)
-    energy: Any = problem.energies[beside.energy_indices[0]]
+    other = VertexElements.from_system(problem.system)
+    around = other.with_rows(np.arange(n), n).update_elements(problem)
+    energy: Any = problem.energies[other.energy_indices[0]]
     total, felt, risen = VertexFunctions.from_kinds([ElementKind(energy.element_law, 2)])
 
     def tell(around, p, d, gradient, block, rises, value):
@@ -90,13 +90,13 @@ def test_vertices_of_one_element_have_different_colours():
     """Elements that join vertices which no spring joins."""
     problem = build_moving_problem(build_effect_cloth(DASHPOT_EFFECT))
     system = problem.system
-    beside = VertexElements.from_system(system)
+    other = VertexElements.from_system(system)
     far = [
         replace(energy, edges=np.array([[0, 35], [5, 30]]), stiffness=energy.stiffness[:2], offset=energy.offset[:2],
                 direction=energy.direction[:2])
-        for energy in beside.energies
+        for energy in other.energies
     ]  # fmt: skip
-    apart = replace(system, energies=(*(e for e in system.energies if e not in beside.energies), *far))
+    apart = replace(system, energies=(*(e for e in system.energies if e not in other.energies), *far))
     made = VertexBlockDescent().prepare(apart)
     assert isinstance(made, PreparedVertexBlockDescent)
     bundle = {int(place) // 4: k // 8 for k, place in enumerate(made.colour_packets.spring_packets.row_offset)}

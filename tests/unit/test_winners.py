@@ -22,18 +22,18 @@ from tests import synthetic_results
 
 def row(solver: str, integrator: str, error: float, cpu: float, **other: Any) -> dict[str, Any]:
     """A simulation of half a second of a mesh of 81 vertices, k/m = 900 /s^2."""
-    told = {
+    values = {
         "integrator": integrator,
         "error": error,
         "cpu_seconds": cpu,
         "seconds_per_simulated_second": 9.9,
         "seconds": [9.9],
     }
-    told |= {"t_end": 0.5, "time_step": 0.01, "max_iterations": 50, "stiffness_ratio": 0.09, "vertices": 81}
+    values |= {"t_end": 0.5, "time_step": 0.01, "max_iterations": 50, "stiffness_ratio": 0.09, "vertices": 81}
     return (
         made.build_shared_columns("net", 9, solver=solver, parameters="{}", kind="work")
         | {"is_minimiser": True}
-        | told
+        | values
         | other
     )
 
@@ -69,12 +69,12 @@ def test_the_cheapest_by_processor_time_within_the_error_wins(found):
 
 
 def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Path):
-    told = build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path, ROWS)))
-    points = {(error, item["label"]) for item in told["items"] for error in item["error"]}
+    chart = build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path, ROWS)))
+    points = {(error, item["label"]) for item in chart["items"] for error in item["error"]}
     order = ("implicit, order 1", "linearly implicit", "linearly implicit", "implicit, order 2")
     assert points == {(10.0**-k, name) for k, name in enumerate(order, 1)}
-    assert {item["panel"] for item in told["items"]} == {"81 vertices"}
-    first = next(item for item in told["items"] if item["label"] == order[0])
+    assert {item["panel"] for item in chart["items"]} == {"81 vertices"}
+    first = next(item for item in chart["items"] if item["label"] == order[0])
     assert (first["runner_up_family"], first["lead_ratio"]) == (["linearly implicit"], ["3 times as much"])
     assert "numba" in first["setting"][0]
     assert not build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path / "one", ROWS[:1])))["items"], (

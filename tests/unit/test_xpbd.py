@@ -206,14 +206,14 @@ def without_mass(system: System) -> System:
 
 @methods
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         pytest.param(lambda s: replace(s, energies=(*s.energies, Other())), "Other", id="another energy"),
         pytest.param(without_mass, r"1 of 12 have none and are not pinned \(3\)", id="no mass"),
     ],
 )
-def test_what_it_cannot_do_is_said_before_any_work(method, change, told):
-    with pytest.raises(Unsupported, match=told):
+def test_what_it_cannot_do_is_said_before_any_work(method, change, message):
+    with pytest.raises(Unsupported, match=message):
         method.prepare(change(build_random_problem(0).system))
 
 
