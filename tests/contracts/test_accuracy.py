@@ -166,7 +166,7 @@ def test_a_config_that_was_stopped_goes_on_where_it_was(home: Home, tmp_path: Pa
     assert stopped.told() == home.told()
 
 
-def test_what_is_asked_otherwise_takes_the_place_of_what_was_there(tmp_path: Path) -> None:
+def test_a_changed_request_replaces_the_earlier_one(tmp_path: Path) -> None:
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, peak]", "early"))
     assert made.run() == 2
     files = set(made.written())
@@ -176,7 +176,7 @@ def test_what_is_asked_otherwise_takes_the_place_of_what_was_there(tmp_path: Pat
     assert {len(row["seconds"]) for row in made.rows("curve")} == {1}
 
 
-def test_what_is_not_asked_for_any_more_stays_and_is_not_counted(tmp_path: Path) -> None:
+def test_what_is_no_longer_requested_stays_and_is_not_counted(tmp_path: Path) -> None:
     made = Home(tmp_path, CONFIG.partition("work:")[0])
     made.run()
     before = set(made.written())
@@ -198,7 +198,7 @@ def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
     assert len(made.rows("snapshot")) == 1
 
 
-def test_a_minimum_that_is_not_certified_is_told_and_nothing_is_graded_by_it(
+def test_a_minimum_that_is_not_certified_is_reported_and_nothing_is_graded_by_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(reference_store, "find_minima", lambda problem, solver: KnownMinima((), "it ended on a saddle"))

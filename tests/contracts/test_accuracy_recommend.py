@@ -129,7 +129,7 @@ def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -
     assert not measured(scene)
 
 
-def test_an_error_that_nothing_keeps_to_is_told_with_the_nearest(scene: Path) -> None:
+def test_an_error_that_no_method_reaches_is_reported_with_the_nearest(scene: Path) -> None:
     with pytest.raises(RunFailed, match=r"nothing that was measured keeps to an error of 1e-08 .* midpoint") as raised:
         recommend(scene, 1e-8)
     assert "ask for a larger --error or a shorter --t-end" in str(raised.value)

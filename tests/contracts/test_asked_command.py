@@ -50,7 +50,7 @@ SCENES = Path(__file__).parents[2] / "configs" / "scenes"
         (("--verify",), "--verify: is of a run with --error"),
     ],
 )
-def test_what_cannot_be_asked_is_the_users_mistake(options, message, tmp_path, capsys):
+def test_an_impossible_request_is_the_users_mistake(options, message, tmp_path, capsys):
     given = ["run", str(SCENES / "chain.yaml"), "--results", str(tmp_path), *options]
     found = CliRunner().invoke(app, given)
     assert found.exit_code == 2
@@ -151,7 +151,7 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
 
 
 @pytest.mark.long
-def test_peers_have_rows_beside_it(tmp_path):
+def test_third_party_integrators_have_rows_of_their_own(tmp_path):
     other = [row for row in rows_of(tmp_path, "--compare") if row["kind"] == "third-party"]
     assert [peer["solver"] for peer in other] == list(THIRD_PARTY_INTEGRATORS)
     assert all(peer["reason"] or peer["error_estimated"] <= 1e-3 for peer in other)

@@ -155,9 +155,7 @@ def test_hermites_cubic_is_exact_for_cubics():
 
 @pytest.mark.parametrize("error", [1e-2, 1e-3, 1e-4])
 @pytest.mark.parametrize(("scene", "size", "horizon"), [("single-spring", 2, 1.0), ("chain", 5, 0.5)])
-def test_the_error_is_never_above_the_one_that_was_asked_for_whichever_way_wins(
-    scene, size, horizon, error, monkeypatch
-):
+def test_the_error_is_never_above_the_requested_one_whichever_method_wins(scene, size, horizon, error, monkeypatch):
     error_target = ErrorTarget.from_scene(load_scene(SCENES / f"{scene}.yaml"), size, horizon)
     messages = list[str]()
     seen, truth = (
@@ -352,7 +350,7 @@ def test_forces_of_the_speed_are_even_within_pieces_of_a_frame_as_short_as_the_e
     assert errors[1] < errors[0] / 7  # an eighth of what is of order 1, less of what the substeps leave
 
 
-def test_a_rosenbrock_method_keeps_to_an_error_that_is_asked_for():
+def test_a_rosenbrock_method_meets_a_requested_error():
     truth = integrate_motion(build_scene(SWINGING, 5, "substepping"), [END])
     scene = build_scene(SWINGING, 5, "substepping")
     coarse, fine = (

@@ -67,7 +67,7 @@ def refused(place: tuple[str, int], security: Security | None) -> bool:
             return True
 
 
-def test_nobody_without_the_certificate_reaches_a_cluster_of_this_machine():
+def test_no_client_without_the_certificate_reaches_a_cluster_of_this_machine():
     with open_scheduler("local:1") as found, Client(found, timeout=60.0) as client:
         assert client.submit(os.getpid).result() != os.getpid()
         me = psutil.Process()

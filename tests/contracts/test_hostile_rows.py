@@ -54,7 +54,7 @@ def test_odd_rows_that_fit_are_shown(tmp_path: Path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SHOWN)
-def test_odd_rows_are_told_at_the_end_of_a_sweep(tmp_path: Path, name: str):
+def test_odd_rows_are_reported_at_the_end_of_a_sweep(tmp_path: Path, name: str):
     table = read_rows(write_cases(tmp_path / "cases", {name: SHOWN[name]}))
     Console(file=StringIO()).print(build_summary_table(table))
     summarise_sweep(read_run_times(table))
@@ -127,7 +127,7 @@ def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path
     assert reported(tmp_path).code in (0, 2)
 
 
-def test_who_reads_without_leaving_out_is_told_of_every_file(tmp_path: Path):
+def test_a_strict_read_reports_every_file(tmp_path: Path):
     files = write_cases(tmp_path / "cases", dict(list(LEFT_OUT.items())[:2]))
     with pytest.raises(InputError) as raised:
         read_rows(files)

@@ -149,7 +149,7 @@ def test_the_accuracy_report_takes_a_new_solver_and_effect(configs: Path):
     assert "Noether 1918" in script_text
 
 
-def test_a_new_solver_has_a_look_that_nobody_else_has():
+def test_a_new_solver_has_a_style_of_its_own():
     looks = assign_solver_styles()
     assert looks["mine"] not in [look for name, look in looks.items() if name != "mine"]
     assert looks["mine"].color not in {look.color for name, look in looks.items() if name != "mine"}

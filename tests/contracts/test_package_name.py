@@ -46,12 +46,12 @@ def python(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
-def test_a_script_beside_files_of_these_names_imports_all_public_names(folder: Path):
+def test_a_script_next_to_files_of_these_names_imports_all_public_names(folder: Path):
     result = python("script.py", folder=folder)
     assert (result.returncode, result.stdout) == (0, "16 3\n"), result.stderr
 
 
-def test_a_config_beside_files_of_these_names_runs(folder: Path):
+def test_a_config_next_to_files_of_these_names_runs(folder: Path):
     result = python("-m", "springbench", "run", "scene.yaml", "--solver", "sparse", folder=folder)
     assert result.returncode == 0, result.stderr
     assert list((folder / "results").rglob("*.parquet"))

@@ -149,7 +149,7 @@ def test_every_view_is_legible_and_fits(browser: Any, studies: str, width: int):
     tab.close()
 
 
-def test_it_loads_runs_and_plots_when_they_are_asked_for(tab: Tab, page: str):
+def test_it_loads_runs_and_plots_on_demand(tab: Tab, page: str):
     shown = tab.open(page)
     assert not any("plotly.js" in url or "made/runs.js" in url for url in tab.asked), "they are not shown yet"
     shown.get_by_role("link", name="Runs", exact=True).click()
@@ -212,7 +212,7 @@ def test_every_view_says_by_which_code_and_machine(tab: Tab, studies: str, view:
     assert "1" * 10 in said or "0" * 10 in said, "the commit"
 
 
-def test_a_failure_is_told_in_words_with_the_number_of_its_runs(tab: Tab, page: str):
+def test_a_failure_is_reported_in_words_with_the_number_of_its_runs(tab: Tab, page: str):
     shown = tab.open(page)
     row = shown.get_by_role("row").filter(has_text="unsupported")
     assert row.count() == 1
@@ -242,7 +242,7 @@ def test_a_point_of_a_curve_leads_to_its_solve_by_keys(tab: Tab, page: str):
     assert not point.is_visible(), "the card goes when something else is shown"
 
 
-def test_points_of_other_code_are_hollow_and_told(tab: Tab, page: str):
+def test_points_of_other_code_are_hollow_and_reported(tab: Tab, page: str):
     shown = tab.open(page, "plots?sweep=made&plot=accuracy&scene=hanging-cloth")
     shown.wait_for_function("document.querySelector('.plot')?.data?.length")
     symbols = shown.evaluate("document.querySelector('.plot').data.flatMap(one => one.marker.symbol)")

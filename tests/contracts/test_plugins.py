@@ -220,7 +220,7 @@ def test_opened_or_not_a_run_has_one_name_and_one_code(plugin_folder: Path):
     assert not shipped.find_plugins()
 
 
-def test_two_of_one_solver_are_told_apart_by_what_only_one_of_them_says(plugin_folder: Path):
+def test_two_of_one_solver_are_distinguished_by_what_only_one_of_them_states(plugin_folder: Path):
     sweep = configs(plugin_folder, WAYS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5}", "patience: 5}, './mine.py:Mine'"))
     (group,) = group_by_scene(
@@ -229,7 +229,7 @@ def test_two_of_one_solver_are_told_apart_by_what_only_one_of_them_says(plugin_f
     assert list(group.jobs_by_label) == ["./mine.py:Mine, patience 5", "./mine.py:Mine"]
 
 
-def test_a_file_beside_the_config_travels_between_processes(plugin_folder: Path):
+def test_a_file_next_to_the_config_travels_between_processes(plugin_folder: Path):
     import pickle
 
     run = load_config(configs(plugin_folder, WAYS["beside"])).list_runs()[0]
@@ -290,7 +290,7 @@ def test_what_a_name_leads_to_is_checked_when_it_is_run(part: str, name: str, pl
     assert WRONG[part, name] in str(caught.value)
 
 
-def test_wrong_parameters_of_own_code_are_told_with_their_line(plugin_folder: Path):
+def test_wrong_parameters_of_own_code_are_reported_with_their_line(plugin_folder: Path):
     sweep = configs(plugin_folder, WAYS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5", "patience: soon"))
     with pytest.raises(InputError, match=r"sweep\.yaml:2: solvers\[0\]\.patience: came \"soon\"; should be"):

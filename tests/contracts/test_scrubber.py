@@ -45,7 +45,7 @@ def study(folder: Path) -> str:
 
 
 @pytest.mark.long
-def test_each_iterate_is_shown_beside_the_reference_by_its_distance(tmp_path: Path):
+def test_each_iterate_is_shown_with_its_distance_to_the_reference(tmp_path: Path):
     page = study(tmp_path)
     files = {solver: read_replay(tmp_path / f"study/recordings/net-6-early-{solver}.rrd") for solver in AMPLITUDES}
     with launch_chromium() as browser:

@@ -91,7 +91,7 @@ def test_a_claim_holds_against_others_and_goes_with_its_process(tmp_path: Path):
     claims.close()
 
 
-def test_what_its_claimant_has_done_is_done_though_the_claim_is_kept(tmp_path: Path):
+def test_what_its_claimant_has_done_is_done_though_the_claim_remains(tmp_path: Path):
     unit = tmp_path / "a.parquet"
     claims, other = UnitClaims(tmp_path, [unit]), claimed_elsewhere(tmp_path, unit)
     parquet_rows.write_rows(unit, [{"run_id": "x"}])
@@ -111,7 +111,7 @@ def test_what_somebody_else_has_done_since_is_left_to_that(tmp_path: Path):
     claims.close()
 
 
-def test_whoever_packs_a_folder_has_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_process_that_packs_a_folder_has_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(folder_locks, "_LOCK_TIMEOUT", 0.0)
     with (
         folder_locks.lock_folder_shared(tmp_path),

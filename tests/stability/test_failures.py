@@ -109,7 +109,7 @@ FAILURES = {
 
 
 @pytest.mark.parametrize("case", FAILURES)
-def test_what_fails_in_a_frame_is_told_and_recorded_up_to_there(
+def test_a_failure_in_a_frame_is_reported_and_recorded_up_to_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
 ):
     solver, status, reason = FAILURES[case]

@@ -148,7 +148,7 @@ def test_what_no_linear_solver_holds_is_refused_with_what_each_needs():
         build_linear_solver(grid_matrix(40, 40), memory_limit=100.0 * 2**10)
 
 
-def test_bytes_are_told_in_words():
+def test_bytes_are_printed_in_words():
     assert [memory.format_bytes(n) for n in (0, 1023, 1024, 3.5 * 2**20, 2.0**30, 3.0 * 2**50)] == [
         "0 bytes",
         "1,023 bytes",

@@ -117,7 +117,7 @@ def test_without_gravity_the_centre_of_mass_stays_where_it_was(ablation_rows):
     assert row["energy_difference"] == pytest.approx(1.0)  # a scene without gravity and at rest has no energy at all
 
 
-def test_pairs_are_told_of_under_both_names(ablation_rows):
+def test_pairs_are_reported_under_both_names(ablation_rows):
     assert {"gravity+bending", "springs+pins"} <= set(by_name(ablation_rows))
     # Without gravity nothing moves, and so bending has nothing to do.
     both, one = (by_name(ablation_rows)[name]["displacement_max"] for name in ("gravity+bending", "gravity"))

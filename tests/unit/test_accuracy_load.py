@@ -120,7 +120,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("before", "after", "line", "said"), MISTAKES, ids=[after for _, after, *_ in MISTAKES])
-def test_a_mistake_is_told_with_its_line(folder: Path, before: str, after: str, line: int, said: str) -> None:
+def test_a_mistake_is_reported_with_its_line(folder: Path, before: str, after: str, line: int, said: str) -> None:
     with pytest.raises(InputError) as refused:
         loaded(folder, CONFIG.replace(before, after))
     assert any(m.line == line and said in m.problem for m in refused.value.mistakes), refused.value

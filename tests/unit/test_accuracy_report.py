@@ -271,7 +271,7 @@ def test_the_summary_is_json_with_a_time_for_each_accuracy(tmp_path: Path) -> No
     assert entry["setup_seconds"] == pytest.approx(SETUP * 100)
 
 
-def test_every_failure_is_told_with_its_reason(tmp_path: Path) -> None:
+def test_every_failure_is_reported_with_its_reason(tmp_path: Path) -> None:
     rows = [
         *made.build_snapshot_rows("net", 10, "early"),
         made.build_failure_row("net", 10, "early", "dense", "unsupported", "knows springs"),
@@ -296,5 +296,5 @@ def test_a_folder_without_rows_is_a_mistake_that_says_what_to_do(tmp_path: Path)
 @pytest.mark.parametrize(
     ("seconds", "words"), [(0.0412, "41.2 ms"), (1.3, "1.3 s"), (2.5e-5, "25 µs"), (0.9999, "1 s"), (0.0, "0 µs")]
 )
-def test_times_are_told_in_the_unit_that_fits(seconds: float, words: str) -> None:
+def test_times_are_printed_in_the_unit_that_fits(seconds: float, words: str) -> None:
     assert format_duration(seconds) == words

@@ -89,7 +89,7 @@ def test_the_same_rows_give_the_same_vectors(tmp_path: Path) -> None:
     assert once == again
 
 
-def test_doubtful_references_and_failures_are_told_on_the_picture(drawn) -> None:
+def test_doubtful_references_and_failures_are_marked_on_the_picture(drawn) -> None:
     pages = drawn[1]
     (doubtful,) = (page for name, page in pages.items() if "peak" in name)
     said = written(doubtful)
@@ -115,11 +115,11 @@ def test_the_default_of_the_assignment_and_methods_that_do_not_minimise_are_mark
     assert "numba †" not in said
 
 
-def test_growth_is_told_at_the_ends_of_lines(drawn) -> None:
+def test_growth_is_labelled_at_the_ends_of_lines(drawn) -> None:
     assert "numba  $n^{1.00}$" in written(drawn[1]["report/growth"])
 
 
-def test_what_other_code_measured_is_hollow_in_every_picture_and_told(
+def test_what_other_code_measured_is_hollow_in_every_picture_and_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rows: list[dict] = []

@@ -303,7 +303,7 @@ def test_hard_cases_keep_their_lengths(case):
     assert np.abs(length_errors(lengths, found.positions) / lengths.max_length).max() < 1e-6
 
 
-def test_lengths_that_cannot_all_be_kept_are_missed_and_that_is_told():
+def test_lengths_that_cannot_all_be_satisfied_are_reported():
     """A chain of 1 m between pins that are 2 m apart: tensions stay bounded, all links give, a metre in all."""
     stated = build_first_problem(
         build_test_scene(ChainMesh(), EXACT, PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"}), size=5)
@@ -325,7 +325,7 @@ def test_every_other_solver_refuses_exact_lengths_by_name(name):
         prepare(chain(3, mass=1.0), solver)
 
 
-def test_whoever_prepares_a_solver_without_the_harness_is_refused_too():
+def test_a_solver_prepared_without_the_harness_is_refused_too():
     stated = build_first_problem(chain(3, mass=1.0))
     with pytest.raises(Unsupported, match="exact"):
         NewtonSolver().prepare(stated.system).solve(stated, StopRule(1))
@@ -346,7 +346,7 @@ def test_settings_that_mean_nothing_are_named(settings, said):
         Avbd(**settings)
 
 
-def test_a_length_that_is_none_cannot_be_kept():
+def test_a_length_that_is_no_length_cannot_be_exact():
     mesh = build_test_scene(ChainMesh(), GravityEffect(), size=3).mesh
     flat = replace(mesh, rest_positions=np.zeros_like(mesh.rest_positions))
     with pytest.raises(InputError, match="spring 0-1 has no length"):
@@ -364,7 +364,7 @@ def test_the_reference_terms_have_the_exact_lengths(name):
     assert "exact lengths" in verify_terms(spec, lying, "implicit-euler")
 
 
-def test_lengths_are_kept_at_a_steps_end_and_integrators_of_other_unknowns_are_refused():
+def test_lengths_are_exact_at_a_steps_end_and_integrators_of_other_unknowns_are_refused():
     bound = chain(3, mass=1.0)
     assert isinstance(bound.system.length_constraints[0], LengthConstraints)
     spec = SceneSpec(mesh=ChainMesh(), mass=1.0, time_step=0.1, frames=1, effects=(EXACT,), path=Path("scene.yaml"))

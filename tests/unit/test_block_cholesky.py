@@ -66,7 +66,7 @@ def test_a_solve_agrees_with_scipy(A):
 
 
 @matrices
-def test_an_indefinite_matrix_is_told_wherever_it_is_indefinite(A):
+def test_an_indefinite_matrix_is_detected_wherever_it_is_indefinite(A):
     factor, n = BlockCholesky(graph_of(A)), len(A.indptr) - 1
     rows = np.repeat(np.arange(n), np.diff(A.indptr))
     for vertex in np.unique(np.linspace(0, n - 1, 5).astype(int)):

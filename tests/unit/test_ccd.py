@@ -148,7 +148,7 @@ def test_no_random_pair_comes_nearer_than_it_may_on_the_way(edges):
     assert ended >= 4
 
 
-def test_what_is_kept_between_steps_bounds_them_as_well():
+def test_candidates_stored_between_steps_bound_them_as_well():
     """Two triangles, one above the other, which close at the bound of twice the largest displacement; the second look
     goes by what the first has kept."""
     rest = np.array([*TRIANGLE, *TRIANGLE], float)
@@ -167,7 +167,7 @@ def test_what_is_kept_between_steps_bounds_them_as_well():
 
 
 @pytest.mark.parametrize("way", [0.5, 1.9])
-def test_candidates_that_are_kept_bound_no_step_that_leads_beyond_their_reach(way):
+def test_stored_candidates_bound_no_step_beyond_their_range(way):
     """Of three triangles above each other, two in range, the third is no candidate and comes down on them."""
     layer, reach = np.array(TRIANGLE, float), 1 / 16
     limit = THICKNESS + reach

@@ -51,7 +51,7 @@ def test_times_that_another_clock_did_not_see_are_refused(watch: PhaseWatch, rep
 
 
 @pytest.mark.parametrize("lies", [0, 1, 2])
-def test_what_is_told_falsely_once_is_measured_again_and_twice_is_a_failure(lies: int) -> None:
+def test_a_false_report_is_measured_again_and_a_second_one_is_a_failure(lies: int) -> None:
     times = iter([1e-3] * lies + [1.0] * 3)
 
     @retry_on_mismatch
@@ -86,7 +86,7 @@ HONEST = {
 
 
 @pytest.mark.parametrize(("watch", "reported"), HONEST.values(), ids=HONEST)
-def test_times_that_another_clock_saw_are_believed_and_both_are_told(watch: PhaseWatch, reported: float) -> None:
+def test_times_that_another_clock_saw_are_believed_and_both_are_reported(watch: PhaseWatch, reported: float) -> None:
     columns = watch.build_columns("step", [reported / 2] * 2)
     assert columns == {
         "wall_seconds_check": watch.wall_seconds,

@@ -67,7 +67,7 @@ def test_a_worker_without_a_plug_in_is_named_with_it(tmp_path: Path):
     assert "./mine.py:Mine" in str(refused.value)
 
 
-def test_a_worker_that_cannot_be_asked_is_told():
+def test_a_worker_that_does_not_answer_is_reported():
     with pytest.raises(InputError, match=r"worker-0.*ModuleNotFoundError.*harness"):
         machines(Workers(ModuleNotFoundError("No module named 'harness'")))
 

@@ -73,7 +73,7 @@ def test_what_a_piece_waits_for_others_does_not_count_for_its_limit():
     workers.stop_worker()
 
 
-def test_compiling_is_told_once_whatever_is_compiled_within():
+def test_compiling_is_reported_once_whatever_is_compiled_within():
     heard: list[str] = []
     with report_compilation(heard.append), event.trigger_event("numba:compile"), event.trigger_event("numba:compile"):
         assert len(heard) == 1

@@ -96,7 +96,7 @@ def test_a_mesh_in_between_that_is_slower_moves_the_size(ratios: list[float], fi
     assert (found.vertices if found else None) == (None if first is None else sizes[first])
 
 
-def test_without_a_device_nothing_is_claimed_and_the_command_is_told() -> None:
+def test_without_a_device_nothing_is_claimed_and_the_command_is_named() -> None:
     said = describe_report([*made(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")])
     assert "nothing is said of what one saves (vbd: there is no CUDA device)" in said
     assert "`.venv/bin/springbench run configs/gpu.yaml` fills this in" in said
@@ -112,7 +112,7 @@ def test_times_of_the_simulator_are_no_devices() -> None:
     assert pair_fastest_runs(read_device_runs(table_of(some))) == {}
 
 
-def test_what_has_no_time_is_told() -> None:
+def test_what_has_no_time_is_reported() -> None:
     some = [*made(0, "vbd", 100, 0.1, on=True), refused(1, "the device has no memory left")]
     said = describe_report(some)
     assert "1 of 2 runs on a device have no time: the device has no memory left." in said

@@ -78,7 +78,7 @@ def test_a_method_of_thirty_lines_is_a_solver():
     assert problem.value(last) < problem.value(before) < problem.value(problem.current_positions)
 
 
-def test_without_a_tolerance_only_the_last_residual_is_asked_for(monkeypatch):
+def test_without_a_tolerance_only_the_last_residual_is_requested(monkeypatch):
     problem, arguments = build_first_problem(build_cloth(3)), []
     measured = Diagonal.residual
     monkeypatch.setattr(Diagonal, "residual", lambda self: arguments.append(0) or measured(self))

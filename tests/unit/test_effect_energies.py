@@ -106,7 +106,7 @@ def test_the_system_matrix_has_the_stiffness_of_the_step(case):
     assert np.abs(Q - wanted).max() <= 1e-13 * np.abs(wanted).max()  # the order of sums
 
 
-def test_a_lagged_energy_does_not_keep_what_a_step_told_it():
+def test_a_lagged_energy_stores_no_state_of_a_step():
     problem = build_moving_problem(build_effect_cloth())
     one, two = (build_moving_problem(EFFECT_SCENES["all that are projective"]()) for _ in range(2))
     assert problem.value(problem.current_positions) < one.value(one.current_positions)

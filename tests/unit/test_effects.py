@@ -171,7 +171,7 @@ def test_pins_have_their_weight(weight, wanted):
     assert pin.weight == wanted
 
 
-def test_pins_weigh_what_the_assignments_do_unless_told():
+def test_pins_weigh_what_the_assignments_do_by_default():
     (pin,) = bound(PinsEffect(parts=("top",))).pins
     assert pin.weight == 1e10
 
@@ -260,7 +260,7 @@ def test_springs_take_the_stiffness_of_their_rule():
     np.testing.assert_allclose(energy.rest_length, MESH.rest_lengths, rtol=1e-15)
 
 
-def test_springs_shear_as_they_stretch_unless_told():
+def test_springs_shear_as_they_stretch_by_default():
     (energy,) = bound(SpringsEffect(stretch=100.0, scaling_rule="fixed")).energies
     assert isinstance(energy, SpringsEnergy)
     assert set(energy.stiffness) == {100.0}

@@ -81,7 +81,7 @@ def test_the_page_has_a_line_for_each_program_on_each_mesh(tmp_path: Path) -> No
     assert all(len(item["setting"]) == len(item["seconds"]) for item in items)
 
 
-def test_and_nothing_is_told_where_no_engine_was_tried(tmp_path: Path) -> None:
+def test_nothing_is_reported_where_no_engine_was_tried(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = list(made.build_work_rows("net", 10))
     findings = summarise_findings(read_accuracy(made.write_accuracy_rows(tmp_path, rows)))
     assert not [title for title in findings if "engine" in title]

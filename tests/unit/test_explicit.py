@@ -103,7 +103,7 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 
 
 @pytest.mark.parametrize("name", ["tsitouras-5", "dormand-prince-8"])
-def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
+def test_the_requested_error_steers_the_one_that_is_found(name):
     scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
     errors = [
         truth("none").measure_error(0, run(scene, prepared(name, scene, error_tolerance=requested), 3)[-1].positions)
@@ -147,7 +147,7 @@ def test_the_energy_of_symplectic_methods_stays_near_over_a_hundred_thousand_ste
 
 
 @pytest.mark.parametrize("name", METHODS)
-def test_momentum_is_kept(name):
+def test_momentum_is_conserved(name):
     scene = made(SpringsEffect(stretch=30.0), mesh=GridMesh(), time_step=0.1)
     v = np.random.default_rng(1).normal(size=scene.mesh.rest_positions.shape)
     path = run(scene, prepared(name, scene), 10, MotionState(Motion(scene.mesh.rest_positions, v), None, 0))

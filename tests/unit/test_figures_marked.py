@@ -24,7 +24,7 @@ from tests import synthetic_results as made
 from tests.figure_images import FIGURE_SOURCES, compose_kind
 
 
-def test_what_other_code_measured_is_hollow_and_told(tmp_path: Path) -> None:
+def test_what_other_code_measured_is_hollow_and_reported(tmp_path: Path) -> None:
     swept = made.write_sweep_results(tmp_path)
     older = {f"geometry-flat-newton-{size}" for size in (8, 16, 32)}
     figure, (panel,) = compose_kind("timing", swept, FigureOptions(), older)

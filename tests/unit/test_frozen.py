@@ -186,7 +186,7 @@ def test_another_scene_is_another_problem(tmp_path, change):
     assert same(ReferenceStore(tmp_path, Refuses()).load_frames(SPEC, SIZE, [4])[4], one)
 
 
-def test_a_problem_that_the_same_scene_states_otherwise_by_now_is_taken_anew(tmp_path, monkeypatch):
+def test_a_problem_that_the_same_scene_states_differently_now_is_prepared_again(tmp_path, monkeypatch):
     """As after a change of the code: the scene's digest is the same, its springs are not."""
     store = ReferenceStore(tmp_path)
     before = store.load_frames(SPEC, SIZE, [4])[4]

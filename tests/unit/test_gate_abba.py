@@ -58,7 +58,7 @@ def test_a_steady_drift_cancels_in_each_turn():
         assert TimedBlock(order, (1.0, 1.1, 1.2, 1.3)).log_ratio == pytest.approx(0.0, abs=1e-15)
 
 
-def test_work_is_made_anew_between_turns_in_its_share_of_the_time(monkeypatch: pytest.MonkeyPatch):
+def test_work_is_rebuilt_between_turns_in_its_share_of_the_time(monkeypatch: pytest.MonkeyPatch):
     now, turns, renewed = [0.0], list[None](), list[int]()
 
     def renew() -> None:
@@ -75,7 +75,7 @@ def test_work_is_made_anew_between_turns_in_its_share_of_the_time(monkeypatch: p
     assert renewed == [1, 4, 8, 12]  # after the first turn, and then after every fourth: a fifth of the time
 
 
-def test_a_race_makes_the_work_of_both_anew_until_it_knows():
+def test_a_comparison_rebuilds_the_work_of_both_until_it_is_decided():
     renewed = list[None]()
     found = run_paired_benchmark(
         ProgramPair(clock(1.0), clock(1.0), lambda: renewed.append(None)), RULE, time_budget=60.0
@@ -129,7 +129,7 @@ def test_the_budget_is_that_of_both_races(monkeypatch: pytest.MonkeyPatch):
     assert budgets == [60.0, 15.0, 30.0, 0.0]
 
 
-def test_programs_are_started_anew_as_long_as_a_race_lasts(monkeypatch: pytest.MonkeyPatch):
+def test_programs_are_restarted_as_long_as_a_comparison_lasts(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(
         "springbench.harness.experiments.regression.abba_benchmark.RESTART_SECONDS", 0.0
     )  # a start for each turn

@@ -29,7 +29,7 @@ def test_an_event_of_the_kernels_own_is_counted_as_often_as_it_happens():
     assert nothing < 20
 
 
-def test_an_event_that_nobody_knows_is_refused_with_the_systems_reason():
+def test_an_unknown_event_is_refused_with_the_systems_reason():
     unknown = (99, 99)
     assert hardware_counters.count_events(lambda: None, unknown) is None
     assert "cannot be counted" in hardware_counters.explain_unavailable(unknown)

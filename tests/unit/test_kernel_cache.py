@@ -70,7 +70,7 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
-def test_a_changed_kernel_never_runs_stale_whoever_imports_the_solvers_and_in_whatever_order(checkout: Path):
+def test_a_changed_kernel_never_runs_stale_in_any_order_of_imports(checkout: Path):
     inner, outer = (checkout / "solvers" / "kernels" / f"{name}_of_test.py" for name in ("inner", "kernel"))
     assert run_code(checkout, ASK) == "6.0 0"
     assert run_code(checkout, "import numba\n" + ASK) == "6.0 1"
@@ -121,7 +121,7 @@ def test_editing_one_solver_recompiles_its_own_kernels_only(checkout: Path):
     assert {name for name, digest in after.items() if before[name] != digest} == names
 
 
-def test_what_was_edited_since_it_was_imported_is_kept_for_nobody_else(checkout: Path):
+def test_what_was_edited_since_its_import_is_stored_for_no_other_process(checkout: Path):
     editing = "from pathlib import Path\nimport springbench.solvers.kernels.inner_of_test\n"
     editing += "path = Path('solvers/kernels/inner_of_test.py')\n"
     editing += "path.write_text(path.read_text().replace('3.0', '9.0'))\n"
@@ -177,7 +177,7 @@ OUTSIDE = {
 }
 
 
-def test_a_source_from_outside_depends_on_what_lies_beside_it_and_on_the_solvers_that_it_imports(tmp_path: Path):
+def test_a_source_from_outside_depends_on_its_folder_and_on_the_solvers_that_it_imports(tmp_path: Path):
     for name, text in OUTSIDE.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
@@ -202,7 +202,7 @@ DAMAGES: dict[str, Damage] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
-def test_what_cannot_be_read_is_compiled_and_kept_anew(home: Path, damage: Damage):
+def test_what_cannot_be_read_is_compiled_and_stored_again(home: Path, damage: Damage):
     assert cached_njit()(twice)(1.0) == 2.0
     (path,) = home.glob("*/*.nbc")
     damage(path)
@@ -219,7 +219,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_disk_without_room_costs_the_kept_code_alone(home: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_costs_the_stored_code_alone(home: Path, monkeypatch: pytest.MonkeyPatch):
     def full(path: Path, content: bytes) -> None:
         raise OSError(28, "No space left on device")
 
@@ -228,7 +228,7 @@ def test_a_disk_without_room_costs_the_kept_code_alone(home: Path, monkeypatch: 
     assert not [*home.glob("*/*")]
 
 
-def test_code_of_other_sources_goes_when_new_comes_and_nobody_has_used_it(home: Path):
+def test_unused_code_of_other_sources_is_removed_when_new_code_is_stored(home: Path):
     for name in ("used", "unused"):
         (home / f"{__name__}-{name}").mkdir()
     (home / "another-unused").mkdir()
@@ -239,7 +239,7 @@ def test_code_of_other_sources_goes_when_new_comes_and_nobody_has_used_it(home: 
     assert not (home / f"{__name__}-unused").exists()
 
 
-def test_sources_that_cannot_be_written_beside_are_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_source_folder_without_write_access_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "__pycache__").write_text("a file, where a folder would have to be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
     monkeypatch.setattr(kernel_cache._NUMBA_CONFIG, "CACHE_DIR", "")

@@ -140,7 +140,7 @@ def test_a_stiff_spring_does_not_ring_after_one_step(name, saved):
 
 
 @pytest.mark.parametrize("name", ORDERS)
-def test_the_error_that_is_asked_for_steers_the_one_that_is_found(name):
+def test_the_requested_error_steers_the_one_that_is_found(name):
     scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
     requested = (1e-2, 1e-3, 1e-4, 1e-5)
     errors = [truth("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions) for e in requested]

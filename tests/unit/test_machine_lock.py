@@ -109,7 +109,7 @@ def test_who_gets_ready_goes_before_who_was_timed_and_two_get_ready_side_by_side
     looks.leave.set()
 
 
-def test_who_was_timed_looks_beside_others():
+def test_a_run_timed_next_to_others_is_reported():
     with TimingSession(quiet, exclusive=True) as mine:
         mine.finish_timing()
         mine.finish_timing()

@@ -57,7 +57,7 @@ def test_a_sweeps_table_names_the_machine_of_each_run_and_what_it_can_do():
     assert COMPARISON_NOTE in text
 
 
-def test_two_computers_of_one_kind_are_told_apart():
+def test_two_computers_of_one_kind_are_distinguished():
     given_rows = [row | {"machine_id": "a" * 12, "node_id": str(row["seconds"] > 1e-3) * 3} for row in two_machines()]
     assert sorted(label_runs(read_run_times(table_of(given_rows))).values()) == [
         "dense, machine aaaaaa-True",
@@ -114,7 +114,7 @@ def test_a_report_says_that_its_counts_may_be_compared():
     assert "may be compared across machines" in printed(build_score_table([]))
 
 
-def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_limits_of_a_machine_are_measured_once_and_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
     monkeypatch.setattr(machine_calibration, "_MIN_CPU_SHARE", 0.0)  # whatever else runs here
@@ -131,7 +131,7 @@ def test_what_a_machine_can_do_is_found_once_and_kept(tmp_path: Path, monkeypatc
     assert machine_calibration.calibrate_machine(lambda said: None) == found
 
 
-def test_what_a_busy_machine_can_do_is_told_and_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_limits_of_a_busy_machine_are_reported_and_not_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
     monkeypatch.setattr(machine_calibration, "_MIN_CPU_SHARE", 2.0)  # more than any thread can have

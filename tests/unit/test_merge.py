@@ -60,7 +60,7 @@ def test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name(two: P
         assert there[1].stem.startswith(f"{unit.stem}~")
 
 
-def test_positions_that_differ_are_a_conflict_on_one_machine_and_told_between_two(two: Path):
+def test_positions_that_differ_are_a_conflict_on_one_machine_and_reported_between_two(two: Path):
     (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
     rewritten(unit, positions_digest="f" * 64)
     found = merged(two, "a", "b")

@@ -86,7 +86,7 @@ def test_springs_follow_the_documented_order():
     assert [tuple(pair) for pair in mesh.springs.tolist()] == rows + columns + right + left + skip
 
 
-def test_a_chain_points_where_it_is_told():
+def test_a_chain_points_in_the_stated_direction():
     mesh = ChainMesh(length=3.0, direction=(0.0, -2.0, 0.0)).build_mesh(4)
     assert mesh.rest_positions == pytest.approx(
         np.array([[0, 0, 0], [0, -1, 0], [0, -2, 0], [0, -3, 0]]), abs=ROUND_OFF

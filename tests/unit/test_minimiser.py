@@ -121,7 +121,7 @@ def test_a_minimum_is_certified_by_the_oracle(problem):
 
 
 @problems
-def test_no_point_beside_a_minimum_is_lower(problem):
+def test_no_neighbour_of_a_minimum_is_lower(problem):
     rng, best = np.random.default_rng(0), find_minima(problem, NewtonSolver()).lowest_minimum
     for size in (1e-3, 1e-2):
         for _ in range(20):

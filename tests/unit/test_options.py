@@ -92,7 +92,7 @@ def test_what_an_error_or_auto_leaves_no_choice_of_is_refused(folder: Path, opti
     assert said in str(refused.value)
 
 
-def test_an_error_asked_beside_stated_steps_is_one_run_and_has_no_part_in_the_others_names(folder: Path) -> None:
+def test_a_requested_error_next_to_stated_steps_is_one_run_and_has_no_part_in_the_others_names(folder: Path) -> None:
     (folder / "sweep.yaml").write_text(
         SWEEP.format("newton", "error_target: [null, 1e-2], integrator: [bdf2, midpoint]")
     )

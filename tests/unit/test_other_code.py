@@ -154,9 +154,7 @@ def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monke
     assert len([*(tmp_path / "r" / "sweep" / "pictures").glob("scene-4-*-????????????.png")]) == 2
 
 
-def test_parameters_by_other_sources_are_kept_beside_each_other_for_a_while(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_parameters_by_other_sources_coexist_for_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     (tmp_path / "sweep.yaml").write_text("scenes: [scene.yaml]\nsolvers: [sparse]\n")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -176,7 +176,7 @@ def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
     assert num_clear > 0 or made.rest_positions[:, 1].any()  # a coarse balloon has no flat patch
 
 
-def test_what_is_near_at_rest_moves_beside_itself_by_no_more_than_the_max_relative_displacement(made):
+def test_what_is_near_at_rest_moves_relative_to_itself_by_at_most_the_max_relative_displacement(made):
     near = made.pairs.vertices[made.near_at_rest]
     for seed in range(3):
         p, q = moved(made.rest_positions, seed), moved(made.rest_positions, 50 + seed)

@@ -156,7 +156,7 @@ def test_what_lies_on_a_floor_is_at_a_minimum(name):
 
 
 @pytest.mark.parametrize(("method", "name"), [*(("newton-cg", name) for name in OTHERS), ("pncg", "block-jacobi")])
-def test_a_sheet_that_lies_on_a_ball_is_held_by_it(method, name):
+def test_a_sheet_on_a_ball_is_supported_by_it(method, name):
     made = draped(BALL, size=6)
     rule, ends = StopRule(2000, 1e-8), list[Positions]()
     for solver in (NewtonSolver(), METHODS[method](preconditioner=name)):
@@ -200,7 +200,7 @@ def test_energies_without_elements_are_refused_by_name(method, name):
         METHODS[method](preconditioner=name).prepare(stated.system)
 
 
-def test_nothing_is_solved_for_where_all_is_held():
+def test_nothing_is_solved_for_where_all_vertices_are_pinned():
     stated = build_first_problem(
         build_test_scene(ChainMesh(), SpringsEffect(stretch=1.0), PinsEffect(parts=("ends",), weight="exact"), size=2)
     )

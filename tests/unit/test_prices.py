@@ -67,6 +67,6 @@ def test_what_is_of_one_solver_is_refused(cloth: Path, also: list[str]):
     assert "cannot be combined with --solver or --with-pairs" in refused.output
 
 
-def test_what_has_no_effect_beside_the_plain_ones_has_no_price(cloth: Path):
+def test_a_scene_of_plain_effects_alone_has_no_price(cloth: Path):
     with pytest.raises(InputError, match="no effect that has a price"):
         list_measured_effects(select_effects(load_scene(cloth)))

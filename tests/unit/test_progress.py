@@ -96,7 +96,7 @@ def test_a_line_comes_though_no_run_ends(clock: list[float]):
     assert lines == ["[0/1] one: timed pass, 10 %"] * 3
 
 
-def test_what_is_compiled_is_told_while_it_is(clock: list[float]):
+def test_progress_names_what_is_being_compiled(clock: list[float]):
     def does(display: ProgressDisplay) -> None:
         display.start_sweep([RunCost()])
         run = display.start_run("one", 10, RunCost())

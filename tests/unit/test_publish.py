@@ -223,7 +223,7 @@ def test_elsewhere_what_differs_refutes_nothing_and_confirms_nothing(
         assert ClaimVerdict.INCONCLUSIVE in {claim.verdict for claim in archive_verification.verify_reruns(there, new)}
 
 
-def test_runs_that_no_config_asks_for_cannot_be_told(home: Path, tmp_path: Path):
+def test_runs_that_no_config_requests_cannot_be_decided(home: Path, tmp_path: Path):
     def change(content: dict[str, bytes]) -> None:
         made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in build_dummy_rows(1)]
         content["results/sweep/rows/cloth-4-magic.parquet"] = parquet_rows.encode_rows(made_up)
@@ -292,7 +292,7 @@ def claim(home: Path, factor: float, *, interrupted: bool = False, machine: str 
     return archive_verification._verify_time_ratio(there, (here[0], here[1]))
 
 
-def test_a_ratio_holds_or_not_or_cannot_be_told(home: Path):
+def test_a_ratio_is_met_or_not_or_inconclusive(home: Path):
     assert claim(home, 1.2).verdict is claim(home, 1 / 1.2).verdict is ClaimVerdict.PASS
     assert claim(home, 1.4).verdict is claim(home, 1 / 1.4).verdict is ClaimVerdict.FAIL
     assert claim(home, 1.4, interrupted=True).verdict is ClaimVerdict.INCONCLUSIVE
@@ -300,7 +300,7 @@ def test_a_ratio_holds_or_not_or_cannot_be_told(home: Path):
     assert claim(home, 2.4, machine="another").verdict is ClaimVerdict.INCONCLUSIVE
 
 
-def test_a_tenth_is_chosen_and_each_has_another_solver_beside_it(home: Path):
+def test_a_tenth_is_chosen_and_each_has_another_solver_for_comparison(home: Path):
     with archive_verification.unpack_archive(home / "x.zip") as folder:
         (a, b), _ = archive_verification.load_published_runs(folder, print, with_user_code=False)
     runs = [replace(one, run=one.run.replace_options(size=size)) for size in range(10) for one in (a, b)]

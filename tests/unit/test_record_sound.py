@@ -64,13 +64,13 @@ def test_a_recording_that_was_cut_or_changed_since_is_read_again_whatever_its_ti
             require_intact(recording, refuse)
 
 
-def test_notes_that_cannot_be_kept_are_no_failure(recording: Path, monkeypatch: pytest.MonkeyPatch):
+def test_notes_that_cannot_be_stored_are_no_failure(recording: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(recording))
     mark_verified(recording)
     require_intact(recording, refuse)
 
 
-def test_notes_begin_anew_before_they_are_many(recording: Path, monkeypatch: pytest.MonkeyPatch):
+def test_notes_are_restarted_before_they_are_many(recording: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(recording_integrity, "_MAX_NOTES_BYTES", 64)
     for _ in range(20):
         mark_verified(recording)

@@ -390,7 +390,7 @@ def test_frames_are_drawn_up_to_the_first_that_is_not_finite(value: float) -> No
 
 
 @needs_opengl
-def test_positions_that_are_not_finite_are_told_in_words(
+def test_positions_that_are_not_finite_are_reported_in_words(
     words: list[str], boxes: Callable[[], tuple[PixelBox, list[PixelBox]]], tmp_path: Path
 ) -> None:
     draw_run_picture(broken(cloth(), 5), tmp_path / "run.png")

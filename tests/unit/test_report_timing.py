@@ -329,7 +329,7 @@ def strains(largest: Sequence[float], below: Sequence[float], exponent: int | No
     return learned_from(given_rows)
 
 
-def test_strains_of_two_sizes_are_told_with_what_happens_to_the_material() -> None:
+def test_strains_of_two_sizes_are_reported_with_what_happens_to_the_material() -> None:
     (point,) = strains((0.05, 0.2), (0.04, 0.04), 0, "converged")
     assert "from 5 to 20 %, from size 3 to 9, where 99 % of the springs stay below 4 and 4 %: the material is" in point
     (unknown,) = strains((0.05, 0.2), (0.04, 0.04), None, "converged")

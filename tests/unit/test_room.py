@@ -52,7 +52,7 @@ def test_a_ball_that_comes_is_found_like_a_way_to_it():
 
 
 @pytest.mark.parametrize("motion", [None, ACROSS, ROUND, SMOOTH])
-def test_a_way_beside_a_ball_is_free(motion: KeyFrameMotion | None):
+def test_a_path_next_to_a_ball_is_free(motion: KeyFrameMotion | None):
     other = SphereObstacle(center=(2.0, 5.0, 0.0), radius=0.1)
     assert find_first_violation(other.build_obstacle(), None, POINT, motion, LIMIT) is None
 

@@ -76,7 +76,7 @@ def test_what_a_method_does_not_have_is_null_and_no_failure(tolerance: bool):
 
 
 @pytest.mark.parametrize("solver", ["xpbd", "symplectic-euler", "velocity-verlet", "ros2", "baraff-witkin"])
-def test_a_method_that_minimises_nothing_may_be_asked_for_a_tolerance(tmp_path: Path, solver: str):
+def test_a_method_that_minimises_nothing_may_be_requested_a_tolerance(tmp_path: Path, solver: str):
     (tmp_path / "scene.yaml").write_text(
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.01\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}, "
         "{kind: springs, stretch: 100}, {kind: pins, parts: [first]}]\n"

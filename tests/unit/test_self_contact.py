@@ -204,7 +204,7 @@ def test_each_contact_stands_for_all_pairs_that_have_its_closest_points():
     np.testing.assert_allclose(summed, gradient, atol=1e-13 * np.abs(gradient).max())
 
 
-def test_what_was_kept_changes_no_bit():
+def test_stored_kernels_change_no_bit():
     contact, p, _ = build_touching_sheets()
     fresh = SelfContact(contact.collision_mesh)
     contact.value(p)

@@ -41,7 +41,7 @@ def one_by_one(units: list[Path]) -> pa.Table:
     return pa.concat_tables([parquet_rows.read_rows([unit]) for unit in units], promote_options="default")
 
 
-def test_many_units_are_read_as_one_by_one_in_the_order_asked_for(sweep: Path):
+def test_many_units_are_read_as_one_by_one_in_the_requested_order(sweep: Path):
     units = row_store.list_units(sweep / "rows")
     for requested in (units, units[::-1]):
         assert format_rows(parquet_rows.read_rows(requested)) == format_rows(one_by_one(requested))

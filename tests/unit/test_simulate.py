@@ -179,7 +179,7 @@ def test_a_steps_seconds_hold_its_solve_and_nothing_between_steps():
         sleep(0.01)
 
 
-def test_steps_are_done_only_when_asked_for():
+def test_steps_are_done_only_on_request():
     prepared = Pushed()
     run = simulate_scene(MADE, prepared, StopRule(), initial_guess="previous", frames=1000)
     next(run)

@@ -52,7 +52,7 @@ def read(results: Path, name: str) -> Any:
     return json.loads(words.partition(", ")[2].removesuffix(");"))
 
 
-def test_the_overview_shows_times_beside_what_was_simulated(tmp_path: Path):
+def test_the_overview_shows_times_with_what_was_simulated(tmp_path: Path):
     for name in ("timing", "net-9-numba-0123456789ab", "net-9-solvers", "net-5-solvers", "net-3-solvers"):
         synthetic_site_rows.write_foreign_picture(tmp_path / "made" / "pictures" / f"{name}.png")
     shown = _select_pictures(locate_folder(tmp_path / "made", tmp_path))
@@ -86,7 +86,7 @@ def test_rows_of_other_code_are_marked(results: Path):
     assert [name for name, how in marked.items() if how == "stale"] == [build_run_columns(1)["run_id"]]
 
 
-def test_one_cause_is_told_once_with_the_number_of_its_runs(results: Path):
+def test_one_cause_is_reported_once_with_the_number_of_its_runs(results: Path):
     index = read(results, "index")
     made = next(sweep for sweep in index["sweeps"] if sweep["name"] == "made")
     (cause,) = made["failures"]
@@ -116,7 +116,7 @@ def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
             assert made["cpu"]
 
 
-def test_the_fastest_is_told_among_those_that_are_equally_accurate():
+def test_the_fastest_is_named_among_those_that_are_equally_accurate():
     given_rows = synthetic_site_rows.build_run_rows(0)
     made = []
     for name, ms, residual in (("slow", 4.0, 1e-6), ("fair", 2.0, 5e-6), ("hasty", 1.0, 1e-2), ("blind", 0.5, None)):
@@ -183,7 +183,7 @@ def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
     assert all(made["commit"] and made["cpu"] == "A processor" for made in sweep["provenance"])
 
 
-def test_points_of_other_code_than_the_newest_are_told_in_every_chart(tmp_path: Path):
+def test_points_of_other_code_than_the_newest_are_reported_in_every_chart(tmp_path: Path):
     rows = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + synthetic_accuracy_rows.build_snapshot_rows(
         "net", 12, "early"
     )
@@ -281,7 +281,7 @@ def test_a_folder_without_rows_is_refused(tmp_path: Path):
         update_page(tmp_path / "none")
 
 
-def test_words_are_kept_once():
+def test_words_are_stored_once():
     assert encode_column(["b", "a", "b", None]) == {"values": ["b", "a"], "indices": [0, 1, 0, -1]}
     assert encode_column([1.23456789, None, float("nan"), 2]) == [1.2346, None, None, 2]
 

@@ -93,7 +93,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
-def test_what_a_solver_does_wrong_while_it_solves_is_told(
+def test_what_a_solver_does_wrong_while_it_solves_is_reported(
     wrong: Wrong, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     made = write_plugin_solver(tmp_path, monkeypatch, solve_code=wrong.does)
@@ -105,7 +105,7 @@ def test_what_a_solver_does_wrong_while_it_solves_is_told(
         assert made.source_line(wrong.line) in row["reason"]
 
 
-def test_what_a_solver_writes_to_while_it_prepares_itself_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_a_solver_writes_to_while_it_prepares_itself_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     does = "system.mass.flags.writeable = True; system.mass[:] *= 2"
     made = write_plugin_solver(tmp_path, monkeypatch, prepare_code=does)
     (row,) = rows_of(made, tmp_path)

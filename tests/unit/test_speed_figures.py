@@ -114,7 +114,7 @@ def test_the_growth_of_a_solve_is_the_power_in_its_times():
     assert fit_exponents(found) == {("cloth", "sparse"): pytest.approx(1.25, rel=1e-9)}  # the fit's round-off
 
 
-def test_the_growth_of_a_factor_is_told_beside_that_of_its_solve():
+def test_the_growth_of_a_factor_is_shown_with_that_of_its_solve():
     found = [
         SpeedFigures(
             "cloth", size, size**2, "a", 1, "ok", None, None, global_=float(size) ** 2.6, factor_entries=size**2 * size

@@ -55,7 +55,7 @@ def test_what_the_compiler_says_is_the_reason(tmp_path: Path, monkeypatch: pytes
     assert list((tmp_path / "build").iterdir()) == []
 
 
-def test_it_is_asked_line_by_line(echo: Path, tmp_path: Path):
+def test_it_is_queried_line_by_line(echo: Path, tmp_path: Path):
     made = build_cloth(4)
     running = CppBaseline(echo, build_first_problem(made), made.all_springs, tmp_path, "")
     assert running.prepare_seconds == 0.125

@@ -81,13 +81,13 @@ def test_vertices_that_come_close_are_counted():
     assert found["self-contact"].startswith("12 pairs of vertices without a spring")
 
 
-def test_a_body_that_flies_as_a_whole_is_not_asked_to_rest():
+def test_a_body_that_flies_as_a_whole_need_not_come_to_rest():
     free = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), size=4)
     assert suggest(free, set(), free.mesh.rest_positions, 1.0) == []
     swelling = suggest(free, set(), free.mesh.rest_positions, free.mesh.rest_positions)
     assert [s.effect_kind for s in swelling] == ["air-drag"]
 
 
-def test_a_driven_motion_is_not_asked_to_rest():
+def test_a_driven_motion_need_not_come_to_rest():
     made = replace(still(), varying_forces=(lambda p, v, t: p,))
     assert suggest(made, set(), made.mesh.rest_positions, 1.0) == []

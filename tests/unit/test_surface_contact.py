@@ -233,7 +233,7 @@ def test_surfaces_of_round_obstacles_lie_inside_by_no_more_than_is_said():
         assert 1e-4 < depth.max() <= 1e-3
 
 
-def test_a_mesh_from_a_file_is_told_by_what_it_holds(tmp_path):
+def test_a_mesh_from_a_file_is_identified_by_its_contents(tmp_path):
     (tmp_path / "one.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 0 1\nf 1 3 2\n")
     context = {"folder": tmp_path}
     given = {"kind": "mesh", "mesh": {"kind": "file", "path": "one.obj"}, "scale": 2.0, "offset": (0.0, -1.0, 0.0)}

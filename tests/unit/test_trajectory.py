@@ -234,7 +234,7 @@ def test_another_question_has_another_trajectory(tmp_path, other, size, times):
     assert one.shape != two.shape or np.abs(one - two).max() > 1e-4
 
 
-def test_a_trajectory_of_equations_that_have_changed_is_integrated_anew(tmp_path, monkeypatch):
+def test_a_trajectory_of_equations_that_have_changed_is_integrated_again(tmp_path, monkeypatch):
     """As after a change of the code: the scene's digest is the same, its springs are not."""
     store, requested = ReferenceStore(tmp_path), spec(ChainMesh(), *SWING)
     before = store.load_trajectory(requested, 3, TIMES, error=1e-3)

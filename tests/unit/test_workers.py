@@ -78,7 +78,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_what_a_piece_does_to_its_process_is_told_and_the_next_one_is_done(case: Case, workers: IsolatedWorker):
+def test_what_a_task_does_to_its_process_is_reported_and_the_next_one_is_done(case: Case, workers: IsolatedWorker):
     for _ in range(2):
         with pytest.raises(TaskFailure) as lost:
             workers.run_task(case.piece, quiet, case.limits)
