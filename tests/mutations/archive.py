@@ -5,7 +5,7 @@ from __future__ import annotations
 from tests.mutations.base import Mutation
 
 _SHELF, _MERGED, _PUBLISHED, _REFUSED, _LOCKS = (
-    f"tests/unit/test_{name}.py" for name in ("shelf", "merge", "publish", "publish_refused", "machine_lock")
+    f"tests/unit/test_{name}.py" for name in ("row_store", "result_merge", "publish", "publish_refused", "machine_lock")
 )
 
 ARCHIVE = (

@@ -7,8 +7,8 @@ from tests.mutations.base import Mutation
 _SEARCH, _GROWTH = "harness/experiments/error_control/method_search.py", "harness/reference/perturbation_growth.py"
 _CONTROLLER = "solvers/model/integrators/step_size_controller.py"
 _CONTROLLERS = "tests/unit/test_step_size_controller.py"
-_FORMULAS = "tests/contracts/test_search.py"
-_ASKED = "tests/contracts/test_asked_error.py"
+_FORMULAS = "tests/contracts/test_error_search.py"
+_ASKED = "tests/contracts/test_error_control.py"
 _GROWS = f"{_ASKED}::test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known"
 
 _TABLE = (

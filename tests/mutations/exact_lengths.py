@@ -60,6 +60,6 @@ EXACT_LENGTHS = (
         "harness/reference/hessian_curvature.py",
         "here = HessianCurvature(smallest, 4.0 * (sums + moved), direction, solve)",
         "here = HessianCurvature(smallest, 0.04 * (sums + moved), direction, solve)",
-        ("tests/unit/test_judge.py",),
+        ("tests/unit/test_verification.py",),
     ),
 )

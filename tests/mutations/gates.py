@@ -42,14 +42,14 @@ GATES = (
         "harness/results/regression_verdict.py",
         "if RegressionVerdict.FAIL in found:",
         "if found == {RegressionVerdict.FAIL}:",
-        ("tests/unit/test_gate_against.py::test_a_failure_outweighs_an_inconclusive_test_and_that_a_pass",),
+        ("tests/unit/test_regress_revision.py::test_a_failure_outweighs_an_inconclusive_test_and_that_a_pass",),
     ),
     Mutation(
         "sizes-from-the-origin",
         "harness/experiments/regression/program_pair.py",
         "float(np.ptp(points, axis=0).max(initial=0.0)) if points.size",
         "float(np.abs(points).max(initial=0.0)) if points.size",
-        ("tests/unit/test_gate_plugin.py::test_answers_are_compared_in_their_own_size",),
+        ("tests/unit/test_pytest_plugin.py::test_answers_are_compared_in_their_own_size",),
     ),
     Mutation(
         "an-interval-too-narrow",

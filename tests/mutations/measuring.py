@@ -6,8 +6,8 @@ from __future__ import annotations
 from tests.mutations.base import Mutation
 
 _RERUN, _RENDER = "harness/recording/rerun_recorder.py", "harness/report/mesh_rendering.py"
-_LIES, _RECORDINGS = "tests/contracts/test_lies.py", "tests/contracts/test_recordings.py"
-_UNIT_STEP, _UNIT_MEASURE, _UNIT_CLOCK = (f"tests/unit/test_{name}.py" for name in ("simulate", "measure", "clock"))
+_LIES, _RECORDINGS = "tests/contracts/test_false_reports.py", "tests/contracts/test_recordings.py"
+_UNIT_STEP, _UNIT_MEASURE, _UNIT_CLOCK = (f"tests/unit/test_{name}.py" for name in ("simulate", "phase_times", "clock"))
 _PICTURES, _PHASES = (
     "tests/unit/test_report_pictures.py",
     "tests/contracts/test_solver_contract.py::test_each_phase_does_what_it_returns",

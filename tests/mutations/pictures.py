@@ -32,7 +32,7 @@ PICTURES = (
         "harness/simulation/instrumentation_pass.py",
         '{"external": step.problem.external_force}',
         '{"external": -step.problem.external_force}',
-        ("tests/unit/test_observe.py",),
+        ("tests/unit/test_instrumentation_pass.py",),
     ),
     Mutation(
         "origin-not-stated",

@@ -28,7 +28,7 @@ from springbench.solvers.model.step_problem import Positions, StepProblem
 
 from tests.preemption_retry import retry_if_preempted
 from tests.scene_builders import build_cloth, build_first_problem
-from tests.unit.test_minimiser import FLAT
+from tests.unit.test_certified_minimum import FLAT
 
 PROBLEM = build_first_problem(build_cloth(6, "exact"))
 

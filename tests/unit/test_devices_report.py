@@ -19,7 +19,7 @@ from springbench.harness.results import parquet_rows
 from springbench.solvers.iteration.device_interface import SIMULATOR_NAME
 from typer.testing import CliRunner
 
-from tests.unit.test_machines import table_of
+from tests.unit.test_machine_comparison import table_of
 
 ON = '{"device": "cuda", "spectral_radius": 0.999}'
 

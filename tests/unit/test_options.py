@@ -19,7 +19,7 @@ from springbench.harness.results import parquet_rows
 from springbench.harness.results.run_schema import RUN_SCHEMA
 from typer.testing import CliRunner
 
-from tests.unit.test_spec import CLOTH
+from tests.unit.test_sweep_expansion import CLOTH
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, m
     monkeypatch.setattr(run_pipeline, "measure_run", broken)
     (row,) = execute_run(spec, files, lambda phase: None)
     assert row["status"] == "failed"
-    assert "ZeroDivisionError: nothing to divide by (test_run.py:" in row["reason"]
+    assert "ZeroDivisionError: nothing to divide by (test_run_pipeline.py:" in row["reason"]
     assert not files.recording_path.exists()
     assert not files.picture_path.exists()
     assert files.rows_path.exists()
