@@ -179,7 +179,7 @@ class _AdmmState(SolverState):
             edges.min_length,
             edges.max_length,
             edges.rest_direction,
-            prepared.weight,
+            prepared.penalty_weight,
         )
         self._step = StepObjective(prepared.fixed_objective, problem)
         self._constant_term = self._local_global.constant_right_hand_side(problem)
