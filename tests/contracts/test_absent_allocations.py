@@ -47,7 +47,7 @@ IDLE: dict[str, SceneEffect] = {
     "bending": BENDING_EFFECT.model_copy(update={"stiffness": 0.0}),
     "strain limits": STRAIN_LIMIT_EFFECT.model_copy(update={"stiffness": 0.0}),
     "dashpots": DASHPOT_EFFECT.model_copy(update={"stretch": 0.0}),
-    "rayleigh": RAYLEIGH_EFFECT.model_copy(update={"mass": 0.0, "stiffness": 0.0}),
+    "rayleigh": RAYLEIGH_EFFECT.model_copy(update={"mass_coefficient": 0.0, "stiffness_coefficient": 0.0}),
     "air drag": AIR_DRAG_EFFECT.model_copy(update={"coefficient": 0.0}),
     "attachments": ATTACHMENT_EFFECT.model_copy(update={"stiffness": 0.0}),
     "wind": WindEffect(acts_on="triangle", strength=0.0),

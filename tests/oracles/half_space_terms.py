@@ -168,6 +168,6 @@ def _obstacle_scale(one: Any) -> float:
 _SIZE_FIELDS = {
     "plane": ("point",),
     "sphere": ("center", "radius"),
-    "capsule": ("ends", "radius"),
+    "capsule": ("end_points", "radius"),
     "box": ("low", "high"),
 }

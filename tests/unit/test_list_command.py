@@ -25,7 +25,7 @@ def test_runs_are_listed_with_the_settings_in_which_they_differ(tmp_path: Path):
     (tmp_path / "sweep.yaml").write_text(SWEEP.format(scene=SCENE.name))
     listed = CliRunner().invoke(app, ["list", str(tmp_path / "sweep.yaml"), "--results", str(tmp_path)])
     heading, _, *lines = listed.stdout.splitlines()[:-1]
-    columns = ["run", "scene", "size", "solver", "max_iterations", "rtol", "threads", "frames", "pairs", "state"]
+    columns = ["run", "scene", "size", "solver", "max_iterations", "rtol", "threads", "frames", "history_size", "state"]
     assert heading.split() == columns
     without_hash = {line.split(maxsplit=1)[1] for line in lines}
     assert len(without_hash) == len(lines) == 2 * 3 * 2

@@ -34,7 +34,7 @@ def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
     assert result.exit_code == 0, result.output
     lines = " ".join(result.output.split())
     assert "effects[1] pins: 2 vertices (parts (top_corners)): 0, 4" in lines
-    assert "effects[2] sewing: second: 3 vertices (parts (right), stride 2): 4, 14, 24" in lines
+    assert "effects[2] sewing: second_row: 3 vertices (parts (right), stride 2): 4, 14, 24" in lines
     assert "boundary loops (boundary_loops): 0: 4 m" in lines
     with Image.open(picture) as drawn:
         pixels = np.asarray(drawn.convert("RGB"), np.float64) / 255

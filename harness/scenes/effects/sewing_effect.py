@@ -47,8 +47,8 @@ class SewingEffect(ConfigModel):
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the threads as one energy, empty for zero stiffness; raise InputError if the rows overlap."""
         rows = (
-            self.first_row.select_vertices(mesh, f"{self.kind}: first"),
-            self.second_row.select_vertices(mesh, f"{self.kind}: second"),
+            self.first_row.select_vertices(mesh, f"{self.kind}: first_row"),
+            self.second_row.select_vertices(mesh, f"{self.kind}: second_row"),
         )
         if len(both := np.intersect1d(*rows)):
             raise InputError(
