@@ -21,6 +21,7 @@ from springbench.harness.cli.commands.export_script import export_script
 from springbench.harness.cli.commands.figure import figure
 from springbench.harness.cli.commands.gallery import gallery
 from springbench.harness.cli.commands.list_runs import list_command
+from springbench.harness.cli.commands.matrices import matrices
 from springbench.harness.cli.commands.preview import preview
 from springbench.harness.cli.commands.recommend import recommend
 from springbench.harness.cli.commands.regress import regress
@@ -258,6 +259,7 @@ app.command()(verify_archive)
 app.command()(figure)
 app.command()(gallery)
 app.command()(preview)
+app.command()(matrices)
 app.command()(regress)
 
 

@@ -1,0 +1,62 @@
+"""Command `springbench matrices`: print and export the matrices of a scene."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from springbench.harness.console import print_message
+from springbench.harness.errors import InputError
+from springbench.harness.execution.isolated_call import run_isolated
+
+if TYPE_CHECKING:
+    from springbench.harness.execution.worker_process import ProgressCallback
+    from springbench.harness.scenes.scene_spec import SceneSpec
+
+
+def matrices(
+    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
+    frame: Annotated[int, typer.Option(min=1, max=10_000, help="Number of the step that y, d and b belong to.")] = 1,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Folder for the files; SCENE-matrices by default.")
+    ] = None,
+) -> None:
+    """Print E, A, C, M, Q, y, d and b of a scene, and write them as .npz, Matrix Market and a picture."""
+    folder = output or Path(f"{scene.stem}-matrices")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--output: came {folder}, a file; wanted a folder, which is made if it is missing")
+
+    from springbench.harness.config.config_loader import load_config
+
+    run = load_config(scene, sizes=() if size is None else (size,)).list_runs()[0]
+    text, messages = run_isolated(
+        partial(_write_matrices, run.scene, run.size, run.scene_name, frame, folder), run.scene.find_plugins()
+    )
+    for line in text:
+        print(line)
+    for line in messages:
+        print_message(line)
+
+
+def _write_matrices(
+    spec: SceneSpec, size: int, name: str, frame: int, folder: Path, tick: ProgressCallback
+) -> tuple[list[str], list[str]]:
+    """Write the files, and return the printed matrices and the messages."""
+    from springbench.harness.experiments.grading.local_global_matrices import (
+        build_local_global_matrices,
+        format_matrices,
+        save_matrices,
+    )
+    from springbench.harness.experiments.grading.spring_terms import build_graded_scene
+    from springbench.harness.report.sparsity_plot import draw_sparsity
+
+    made = build_local_global_matrices(build_graded_scene(spec, size), frame, spec.initial_guess)
+    paths = save_matrices(made, folder)
+    facts = [f"{made.terms.num_vertices} vertices, {len(made.E)} springs, {len(made.terms.pinned)} pins"]
+    facts += ["dark: positive entries", "orange: negative entries"]
+    shown = {key: matrix for key, matrix in made.sparse_matrices.items() if matrix.shape[0]}
+    picture = draw_sparsity(shown, folder / "sparsity.png", f"Matrices of {name}{f' {size}' if size else ''}", facts)
+    return list(format_matrices(made)), [f"{', '.join(path.name for path in (*paths, picture))} are in {folder}"]

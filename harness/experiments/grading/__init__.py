@@ -1,0 +1,1 @@
+"""Grading (`springbench grade`, `springbench matrices`): positions and matrices of others, compared with a scene's."""
