@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.config import config_loader
 from springbench.harness.config.run_options import DEFAULT_SOLVER, DEFAULT_STOP_RULE
+from springbench.harness.config.shipped_configs import locate_config
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.typed_keys import (
     IntegratorName,
@@ -61,8 +62,8 @@ __all__ = [
 
 
 def load_scene(path: str | Path) -> SceneSpec:
-    """Load a scene from a YAML file, or from an assignment's JSON file; raise InputError."""
-    return config_loader.load_scene_in_process(Path(path))
+    """Load a scene from a YAML file, an assignment's JSON file, or by the name of a shipped scene; raise InputError."""
+    return config_loader.load_scene_in_process(locate_config(path))
 
 
 def make_scene(
@@ -196,7 +197,7 @@ def run_config(
     """Run what is missing of a sweep, as `springbench run`, and return its rows.
 
     Args:
-        config: file of a sweep or a scene, or a sweep as a mapping.
+        config: file of a sweep or a scene, name of a shipped one, or a sweep as a mapping.
         name: name of a sweep that is a mapping.
         folder: folder of the scenes and the code that a mapping names.
         results: folder that contains a results folder for each sweep.
@@ -217,7 +218,7 @@ def run_config(
         path = Path(folder) / f"{name}.yaml"
         sweep = config_loader.build_sweep_from_document(ConfigDocument(path, _to_plain_data(config)))
     else:
-        path = Path(config)
+        path = locate_config(config)
         sweep = config_loader.load_config(path)
     place = claim_folder(Path(results) / sweep.name, path)
     table = run_sweep(

@@ -37,6 +37,7 @@ from springbench.harness.cli.shared_options import (
     ResultsOption,
     RowsOption,
     VerifyOption,
+    describe_config,
 )
 from springbench.harness.config.cli_options import build_command_class
 from springbench.harness.console import get_error_console, get_output_console, split_wide_table
@@ -56,7 +57,10 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-ConfigArgument = Annotated[Path, typer.Argument(help="Sweep or scene (YAML), or scene of the assignment (JSON).")]
+ConfigArgument = Annotated[
+    Path,
+    describe_config("CONFIG", "Sweep or scene (YAML), or scene of the assignment (JSON), or name of a shipped config."),
+]
 RecordingsArgument = Annotated[list[Path], typer.Argument(help="Recordings (.rrd) or folders of them.")]
 
 
@@ -184,7 +188,7 @@ def _report_sweep(sweep: SweepPlan, table: pa.Table, config: Path, results: Path
 
 @app.command()
 def accuracy(
-    config: Annotated[Path, typer.Argument(help="Accuracy config (YAML).")],
+    config: Annotated[Path, describe_config("CONFIG", "Accuracy config (YAML), or name of a shipped one.")],
     results: ResultsOption = Path("results"),
     rerun: RerunOption = False,
     rerun_stale: RerunStaleOption = False,

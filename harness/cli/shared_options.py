@@ -9,10 +9,19 @@ from typing import Annotated, Any
 
 import typer
 from springbench.harness.atomic_files import USER_ERRNOS, describe_os_error
+from springbench.harness.config.shipped_configs import locate_config
 from springbench.harness.console import enable_logging, print_message
 from springbench.harness.errors import SpringbenchError
 from springbench.harness.results import remote_storage
 from typer.core import TyperGroup
+
+SCENE_HELP = "Scene (YAML), or scene of the assignment (JSON), or name of a shipped scene."
+
+
+def describe_config(metavar: str, help_text: str) -> Any:
+    """Describe an argument that is a config: a file, or the name of a shipped one."""
+    return typer.Argument(parser=locate_config, metavar=metavar, help=help_text)
+
 
 _RESULTS_SETTINGS: Any = {
     "parser": remote_storage.parse_location,

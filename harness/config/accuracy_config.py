@@ -72,7 +72,7 @@ class AccuracyConfig(ConfigModel):
     description: str = Field(default="", max_length=1000)
     """One sentence about the question that the config answers."""
     scenes: tuple[str, ...] = Field(min_length=1)
-    """Scene files (*.yaml, or *.json of the assignment), relative to the config."""
+    """Scene files (*.yaml, or *.json of the assignment), relative to the config, or names of shipped scenes."""
     solvers: tuple[str | dict[str, Any], ...] = Field(min_length=1)
     """Solvers: a name, or a mapping of `name` and the solver's parameters."""
     curves: tuple[CurveStudyConfig, ...] = ()

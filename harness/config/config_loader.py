@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 from springbench.harness.config.expand_grid import GridExpansion
 from springbench.harness.config.run_options import AUTO, DEFAULT_SOLVER, DEFAULT_STOP_RULE
+from springbench.harness.config.shipped_configs import resolve_scene_path, suggest_shipped_scene
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import RunSpec, SweepConfig, SweepOptions
 from springbench.harness.config.user_code import (
@@ -370,9 +371,9 @@ def read_scenes(document: ConfigDocument) -> dict[str, SceneSpec]:
     for i, entry in enumerate(listed if is_list(listed) else []):
         if not isinstance(entry, str):
             continue  # the check of the whole sweep reports it
-        at, path = ("scenes", i), document.path.parent / entry
+        at, path = ("scenes", i), resolve_scene_path(entry, document.path.parent)
         if not os.path.isfile(path):
-            document.add_mistake(f"there is no file {quote_value(str(path))}", at)
+            document.add_mistake(f"there is no file {quote_value(str(path))}{suggest_shipped_scene(entry)}", at)
         elif path.stem in scenes and not os.path.samefile(scenes[path.stem].path, path):
             document.add_mistake(f"two scenes are named {path.stem}; rename one of the files", at)
         else:

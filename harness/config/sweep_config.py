@@ -108,7 +108,7 @@ class SweepConfig(ConfigModel):
     description: str = Field(default="", max_length=1000)
     """One sentence about the question that the sweep answers."""
     scenes: tuple[str, ...] = Field(min_length=1)
-    """Scene files (*.yaml, or *.json of the assignment), relative to the sweep file."""
+    """Scene files (*.yaml, or *.json of the assignment), relative to the sweep file, or names of shipped scenes."""
     sizes: tuple[MeshSize, ...] = ()
     """Mesh sizes; may be left out if every scene has a default size or a mesh from a file."""
     solvers: tuple[str | dict[str, Any], ...] = Field(min_length=1)

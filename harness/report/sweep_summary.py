@@ -10,6 +10,7 @@ from pathlib import Path
 from textwrap import wrap
 
 import pyarrow as pa
+from springbench.harness.config.shipped_configs import get_config_name
 from springbench.harness.report import equal_accuracy
 from springbench.harness.report.equal_accuracy import compare_runs
 from springbench.harness.report.timing_table import TABLE_WIDTH, RunTimes, label_runs, read_run_times
@@ -67,7 +68,9 @@ def suggest_commands(timed_runs: Sequence[RunTimes], config: Path, results: Path
         suggestions.append(("springbench view", best, "replay a run of the largest mesh"))
     scenes = {run.scene: None for run in timed_runs}
     if scene := next(filter(None, (_find_scene_file(config, name) for name in scenes)), None):
-        suggestions.append(("springbench recommend --error 1e-2", scene, "the cheapest way to an error of 1 %"))
+        suggestions.append(
+            ("springbench recommend --error 1e-2", get_config_name(scene), "the cheapest way to an error of 1 %")
+        )
     suggestions.append(("springbench report", results, "bring the page up to date, with recordings that it replays"))
     return [line for words, path, why in suggestions for line in (f"  # {why}", f"  {words} {shlex.quote(str(path))}")]
 

@@ -74,3 +74,5 @@ def test_the_wheel_has_one_package(tmp_path: Path):
     assert {name.split("/")[0] for name in names} == {"springbench", f"{wheel.name.split('-py3')[0]}.dist-info"}
     for module in ("__init__.py", "py.typed", "harness/__main__.py", "solvers/registry.py"):
         assert f"springbench/{module}" in names
+    configs = [path for path in (ROOT / "configs").rglob("*.*") if "__pycache__" not in path.parts]
+    assert {f"springbench/{path.relative_to(ROOT).as_posix()}" for path in configs} <= set(names)

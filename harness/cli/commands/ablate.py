@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from springbench.harness.cli.shared_options import InProcessOption, RerunOption, RerunStaleOption, ResultsOption
+from springbench.harness.cli.shared_options import (
+    SCENE_HELP,
+    InProcessOption,
+    RerunOption,
+    RerunStaleOption,
+    ResultsOption,
+    describe_config,
+)
 from springbench.harness.console import get_error_console, get_output_console, print_message, split_wide_table
 
 DEFAULT_ABLATION_SOLVER, DEFAULT_ABLATION_TOLERANCE = "hybrid", 1e-4
@@ -24,7 +31,7 @@ DEFAULT_NUM_ROUNDS = 5
 
 def ablate(
     context: typer.Context,
-    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
+    scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
     results: ResultsOption = Path("results"),
     solver: Annotated[
         str | None,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from springbench.harness.cli.shared_options import describe_config
 from springbench.harness.console import format_plain_table, print_message
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution.isolated_call import run_isolated
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def export_script(
-    config: Annotated[Path, typer.Argument(help="Accuracy config (YAML).")],
+    config: Annotated[Path, describe_config("CONFIG", "Accuracy config (YAML), or name of a shipped one.")],
     point: Annotated[str, typer.Argument(help="Name of a point, or its last characters; lists all by default.")] = "",
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the script and its data.")] = Path(),
 ) -> None:

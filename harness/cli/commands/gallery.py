@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from springbench.harness.cli.shared_options import describe_config
 from springbench.harness.console import print_message
 from springbench.harness.errors import InputError
 from springbench.harness.execution.isolated_call import run_isolated
@@ -19,7 +20,9 @@ _SOLVER, _TOLERANCE = "hybrid", "1e-4"
 
 
 def gallery(
-    scenes: Annotated[list[Path], typer.Argument(help="Scenes (YAML) in the order of the sheet.")],
+    scenes: Annotated[
+        list[Path], describe_config("SCENES...", "Scenes (YAML) in the order of the sheet, or names of shipped ones.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write (.png).")] = Path("scenes.png"),
 ) -> None:
     """Draw a sheet of scenes, each at its default size and last frame."""

@@ -9,11 +9,13 @@ from functools import partial
 from importlib.util import find_spec
 from operator import attrgetter
 from pathlib import Path
+from textwrap import fill, shorten
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from springbench.harness.cli.shared_options import ResultsOption
-from springbench.harness.console import format_plain_table
+from springbench.harness.cli.shared_options import ResultsOption, describe_config
+from springbench.harness.console import CONSOLE_WIDTH, format_plain_table
+from springbench.harness.errors import InputError
 
 if TYPE_CHECKING:
     from springbench.harness.config.sweep_config import RunSpec
@@ -25,18 +27,57 @@ _FIXED_COLUMNS = ("max_iterations", "frames", "threads")
 def list_command(
     config: Annotated[
         Path | None,
-        typer.Argument(help="Sweep or scene (YAML), or scene of the assignment (JSON); lists names by default."),
+        describe_config(
+            "[CONFIG]",
+            "Sweep or scene (YAML), or scene of the assignment (JSON), or name of a shipped config; lists names by "
+            "default.",
+        ),
     ] = None,
     results: ResultsOption = Path("results"),
+    shipped: Annotated[bool, typer.Option("--shipped", help="List the shipped configs and scenes by name.")] = False,
 ) -> None:
     """Check a config and list its runs with their status.
 
     Without a config, list all solvers, effects and meshes.
     """
-    if config is None:
+    if shipped:
+        if config is not None:
+            raise InputError("--shipped: lists all shipped configs; leave the config out")
+        _print_shipped_configs()
+    elif config is None:
         _print_names()
     else:
         _print_runs(config, results)
+
+
+def _print_shipped_configs() -> None:
+    """Print the shipped configs and scenes with descriptions, then the names of those in other folders."""
+    from springbench.harness.config.config_loader import ACCURACY, SCENE, find_config_kind
+    from springbench.harness.config.shipped_configs import SCENE_FOLDER, list_shipped_configs
+    from springbench.harness.schema.yaml_loader import read_yaml
+
+    described: dict[str, dict[str, str]] = {"sweeps": {}, "accuracy configs": {}, "scenes": {}}
+    others: dict[str, list[str]] = {}
+    for name, path in list_shipped_configs().items():
+        folder, _, stem = name.rpartition("/")
+        if folder not in ("", SCENE_FOLDER):
+            others.setdefault(f"scenes of {folder}", []).append(name)
+            continue
+        data = read_yaml(path).data
+        kind = find_config_kind(data)
+        heading = "scenes" if kind == SCENE else "accuracy configs" if kind == ACCURACY else "sweeps"
+        described[heading][stem] = " ".join(str(data.get("description", "")).split())
+    for heading, entries in described.items():
+        print(f"\n{heading}, {len(entries)}")
+        width = max(map(len, entries))
+        for name, description in entries.items():
+            print(f"  {name:{width}}  {shorten(description, CONSOLE_WIDTH - width - 4, placeholder=' ...')}".rstrip())
+    for heading, names in others.items():
+        print(f"\n{heading}, {len(names)}")
+        print(
+            fill(", ".join(names), CONSOLE_WIDTH, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
+        )
+    print("\neach is run by its name: `springbench run quickstart`, or in a sweep `scenes: [hanging-cloth]`")
 
 
 def _print_runs(config: Path, results: Path) -> None:

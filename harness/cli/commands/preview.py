@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from springbench.harness.cli.shared_options import SCENE_HELP, describe_config
 from springbench.harness.console import print_message
 from springbench.harness.errors import InputError
 from springbench.harness.execution.isolated_call import run_isolated
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def preview(
-    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
+    scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Picture to write (.png); SCENE.png by default.")

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from springbench.harness.cli.shared_options import ResultsOption
+from springbench.harness.cli.shared_options import SCENE_HELP, ResultsOption, describe_config
 from springbench.harness.console import get_error_console, get_output_console, print_message, split_wide_table
 
 
 def recommend(
-    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
+    scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
     error: Annotated[float, typer.Option(help="Target error, relative to the displacement from the start.")],
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
     t_end: Annotated[

@@ -7,13 +7,19 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from springbench.harness.cli.shared_options import InProcessOption, RerunOption, RerunStaleOption, ResultsOption
+from springbench.harness.cli.shared_options import (
+    InProcessOption,
+    RerunOption,
+    RerunStaleOption,
+    ResultsOption,
+    describe_config,
+)
 from springbench.harness.console import get_error_console, get_output_console, print_message, split_wide_table
 from springbench.harness.errors import InputError, InputMistake
 
 
 def roofline(
-    config: Annotated[Path, typer.Argument(help="Sweep (YAML).")],
+    config: Annotated[Path, describe_config("CONFIG", "Sweep (YAML), or name of a shipped one.")],
     results: ResultsOption = Path("results"),
     budget: Annotated[float, typer.Option(help="Time budget of a candidate at one size [s].")] = 210.0,
     rerun: RerunOption = False,

@@ -16,6 +16,7 @@ from typing import Any
 from pydantic import Field
 from springbench.harness.config.config_loader import GATES, read_config
 from springbench.harness.config.run_options import IterationLimit, RelativeTolerance
+from springbench.harness.config.shipped_configs import resolve_scene_path, suggest_shipped_scene
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.machine_info import limit_threads
 from springbench.harness.experiments.regression.abba_benchmark import (
@@ -45,7 +46,7 @@ class RegressionTest(ConfigModel):
     """
 
     scene: str
-    """The scene's file (*.yaml, or *.json of the assignment), relative to the gates file."""
+    """The scene's file (*.yaml, or *.json of the assignment), relative to the gates file, or a shipped scene's name."""
     solver: str | dict[str, Any]
     """The tested solver: a name, or a mapping of `name` and the solver's parameters."""
     baseline: str | dict[str, Any]
@@ -104,8 +105,9 @@ def run_gates_file(
     if gates_file is None:
         raise document.build_error()
     for i, gate in enumerate(gates_file.gates):
-        if not (path.parent / gate.scene).is_file():
-            document.add_mistake(f"there is no file {path.parent / gate.scene}", ("gates", i, "scene"))
+        if not resolve_scene_path(gate.scene, path.parent).is_file():
+            problem = f"there is no file {path.parent / gate.scene}{suggest_shipped_scene(gate.scene)}"
+            document.add_mistake(problem, ("gates", i, "scene"))
     if document.mistakes:
         raise document.build_error()
     found: list[tuple[RegressionTest, BenchmarkResult]] = []
@@ -125,9 +127,8 @@ def _start_solvers(document: ConfigDocument, index: int, test: RegressionTest) -
     options = {key: getattr(test, key) for key in ("max_iterations", "rtol", "integrator", "frames")}
     with limit_threads(1):
         try:
-            candidate, baseline = prepare_solver_pair(
-                document.path.parent / test.scene, test.solver, test.baseline, size=test.size, **options
-            )
+            scene = resolve_scene_path(test.scene, document.path.parent)
+            candidate, baseline = prepare_solver_pair(scene, test.solver, test.baseline, size=test.size, **options)
             require_agreement(candidate(), baseline(), test.agreement_rtol)
         except (AnswersDiffer, Unsupported, NotPositiveDefinite) as error:
             document.add_mistake(str(error), ("gates", index))
