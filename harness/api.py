@@ -62,7 +62,13 @@ __all__ = [
 
 
 def load_scene(path: str | Path) -> SceneSpec:
-    """Load a scene from a YAML file, an assignment's JSON file, or by the name of a shipped scene; raise InputError."""
+    """Load a scene from a YAML file, an assignment's JSON file, or by the name of a shipped scene; raise InputError.
+
+    Example:
+        >>> scene = springbench.load_scene("configs/scenes/chain.yaml")
+        >>> scene.frames
+        90
+    """
     return config_loader.load_scene_in_process(locate_config(path))
 
 
@@ -85,6 +91,14 @@ def make_scene(
     Returns: the validated scene.
     Raises:
         InputError: for any mistake in the scene.
+
+    Example:
+        >>> effects = [{"kind": "springs", "stretch": 300.0}, {"kind": "gravity"}, {"kind": "pins", "parts": ["ends"]}]
+        >>> scene = springbench.make_scene(
+        ...     mesh={"kind": "chain"}, mass=1.0, time_step=1 / 30, frames=30, default_size=5, effects=effects
+        ... )
+        >>> scene.mesh.kind
+        'chain'
     """
     listed = [dict(effect) if isinstance(effect, Mapping) else {"kind": "gravity"} for effect in effects]
     given = dict(mesh) if isinstance(mesh, Mapping) else {"kind": "grid"}
@@ -104,11 +118,16 @@ def make_scene(
 class Simulation:
     """A simulation of a scene that advances step by step.
 
-    mesh: mesh at rest.
-    time: simulated time [s].
-    positions: (n, 3) [m].
-    velocity: (n, 3) [m/s].
-    last_step: last step, with its problem and its solution; None at the start.
+    Attributes:
+        mesh: mesh at rest.
+        last_step: last step, with its problem and its solution; None at the start.
+
+    Example:
+        >>> scene = springbench.load_scene("configs/scenes/chain.yaml")
+        >>> simulation = springbench.Simulation(scene, "newton", size=5)
+        >>> positions = simulation.step()
+        >>> positions.shape, simulation.last_step.solution.termination_reason
+        ((5, 3), 'converged')
     """
 
     def __init__(
@@ -205,6 +224,11 @@ def run_config(
     Returns: the rows, in the type that `load_rows` returns.
     Raises:
         InputError: for any mistake in the config.
+
+    Example:
+        >>> options = {"frames": 2, "rounds": 1, "pictures": False}
+        >>> sweep = {"scenes": ["chain.yaml"], "sizes": [5], "solvers": ["sparse", "newton"], "options": options}
+        >>> rows = springbench.run_config(sweep, name="small", folder="configs/scenes")
     """
     from springbench.harness.console import get_error_console
     from springbench.harness.execution.progress_display import ProgressLines
@@ -255,6 +279,11 @@ def load_rows(folder: str | Path) -> Any:
     """Load the rows of a sweep's results folder, such as "results/quickstart"; raise InputError.
 
     Returns: a polars DataFrame if polars is installed, else a pandas DataFrame, else a pyarrow table.
+
+    Example:
+        >>> rows = springbench.load_rows("results/small")
+        >>> sorted(set(rows["solver"].to_pylist()))
+        ['newton', 'sparse']
     """
     from springbench.harness.results.parquet_rows import read_rows
     from springbench.harness.results.row_store import list_units
@@ -273,6 +302,11 @@ def open_recording(path: str | Path) -> RecordingReplay:
 
     Returns: times (k,) [s], positions (k, n, 3) [m] relative to `origin` (3,), springs and scalars. Its method
     `absolute_positions(k)` adds the origin in double precision.
+
+    Example:
+        >>> path = sorted(Path("results/small/recordings").glob("chain-5-newton-*.rrd"))[0]
+        >>> springbench.open_recording(path).positions.shape
+        (3, 5, 3)
     """
     from springbench.harness.recording.recording_reader import read_replay
 
@@ -302,6 +336,11 @@ def draw_picture(source: str | Path | RecordingReplay | Mapping[str, str | Path 
     Raises:
         InputError: if a recording cannot be read.
         RunFailed: if the system cannot draw.
+
+    Example:
+        >>> picture = springbench.draw_picture(path)
+        >>> picture.save("chain.png").name
+        'chain.png'
     """
     from springbench.harness.report.comparison_picture import draw_comparison_picture
     from springbench.harness.report.run_picture import draw_run_picture

@@ -298,6 +298,21 @@ def schema() -> None:
 
 
 @app.command()
+def reference(
+    folder: Annotated[Path, typer.Argument(help="Folder of the pages.")] = Path("configs/reference"),
+    check: Annotated[bool, typer.Option("--check", help="Write nothing; exit with 1 if a page is stale.")] = False,
+) -> None:
+    """Write the reference pages: commands, config keys, columns, Python API and solvers."""
+    from springbench.harness.cli.reference_pages import build_reference_pages, find_stale_pages, write_stale_pages
+
+    pages = build_reference_pages(typer.main.get_command(app))
+    paths = find_stale_pages(pages, folder) if check else write_stale_pages(pages, folder)
+    for path in paths:
+        _say(f"{path}: stale" if check else f"{path}: written")
+    raise typer.Exit(1 if check and paths else 0)
+
+
+@app.command()
 def inspect(
     recordings: RecordingsArgument,
     frame: Annotated[int | None, typer.Option(help="Frame to export; the last one by default.")] = None,

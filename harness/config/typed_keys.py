@@ -16,10 +16,12 @@ SolverName = Literal[
     "tsitouras-5", "dormand-prince-8", "baraff-witkin", "ros2", "ros3p", "rodas", "pncg", "admm", "a-jacobi", "mgpbd",
     "jgs2", "avbd", "eigen", "cholmod", "mujoco", "pypbd", "taichi", "newton-physics",
 ]  # fmt: skip
+"""Names of the shipped solvers."""
 IntegratorName = Literal[
     "implicit-euler", "bdf2", "midpoint", "generalised-alpha", "hht", "newmark", "sdirk-2", "tr-bdf2", "sdirk-3",
     "esdirk-3", "sdirk-4", "esdirk-4", "substepping",
 ]  # fmt: skip
+"""Names of the shipped integrators."""
 ReportName = Literal["certificates", "medians", "timing"]
 UserCodeName = NewType("UserCodeName", str)
 """Name of user code: `UserCodeName("./mine.py:Mine")`."""

@@ -1,6 +1,6 @@
 """Columns of the rows of a run: `RUN_COLUMNS` is both their schema and their documentation.
 
-`results/README.md` shows the same table.
+`springbench reference` writes the same table to `configs/reference/columns.md`.
 """
 
 from __future__ import annotations

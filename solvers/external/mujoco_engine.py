@@ -62,6 +62,8 @@ class MujocoEngine(ExternalEngine):
         ),
         is_substepping=True,
         package_name="mujoco",
+        formula="MuJoCo: spatial tendons between slide joints",
+        cost="1 engine substep",
     )
 
     mujoco_integrator: MujocoIntegrator = "implicitfast"

@@ -81,6 +81,8 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
         Citation("{Newton Contributors}", 2025, "Newton: an open-source, GPU-accelerated physics simulation engine"),
         is_substepping=True,
         package_name="newton",
+        formula="Newton on Warp: VBD, XPBD or semi-implicit Euler",
+        cost="1 engine substep",
     )
 
     newton_solver: NewtonSolverName = "vbd"

@@ -64,6 +64,8 @@ class PyPbdEngine(ExternalEngine):
         ),
         is_substepping=True,
         package_name="pyPBD",
+        formula="PositionBasedDynamics: XPBD distance constraints",
+        cost="1 engine substep",
     )
 
     iterations_per_substep: int = 1

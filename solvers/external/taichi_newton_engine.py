@@ -66,6 +66,8 @@ class TaichiNewtonEngine(ExternalEngine):
         ),
         is_substepping=True,
         package_name="taichi",
+        formula="implicit Euler by Newton-CG, written in Taichi",
+        cost="1 engine substep",
     )
 
     iterations_per_substep: int = 1

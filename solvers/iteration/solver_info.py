@@ -1,4 +1,4 @@
-"""The metadata of a solver, given as its class variable `about`, for tables and figures."""
+"""The metadata of a solver, given as its class variable `solver_info`, for tables and figures."""
 
 from __future__ import annotations
 
@@ -42,6 +42,8 @@ class SolverInfo:
             estimate.
         has_fixed_step: whether the substeps have a fixed size, which can be reduced (`with_refined_substeps`).
         package_name: the distribution that the method is an interface to, whose version is part of its rows.
+        formula: the update of an iteration in one line, in the symbols of configs/explanation/notation.md.
+        cost: the work of an iteration: solves with the factor of Q, passes over the springs, factorisations.
     """
 
     family: str
@@ -51,6 +53,8 @@ class SolverInfo:
     supports_error_control: bool = False
     has_fixed_step: bool = False
     package_name: str = ""
+    formula: str = ""
+    cost: str = ""
 
 
 LIU_2013 = Citation(

@@ -60,6 +60,8 @@ class Admm:
             "ADMM ⊇ Projective Dynamics: Fast Simulation of Hyperelastic Models with Dynamic Constraints",
             "10.1109/TVCG.2017.2730875",
         ),
+        formula="local-global on A p + u, u⁺ = u + A p − z",
+        cost="2 solves, 1 pass, 1 gradient",
     )
 
     penalty_weight: float = 1.0

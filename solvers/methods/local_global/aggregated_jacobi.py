@@ -69,6 +69,8 @@ class AggregatedJacobi:
             "Penetration-free projective dynamics on the GPU",
             "10.1145/3528223.3530069",
         ),
+        formula="p⁺ = p − S ∇g, S from Jacobi sweeps on Q",
+        cost="1 sparse product, 1 pass, no factor",
     )
 
     jacobi_sweeps: int = 2

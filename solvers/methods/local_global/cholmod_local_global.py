@@ -27,7 +27,12 @@ class CholmodLocalGlobal:
 
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = True
-    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        LOCAL_GLOBAL_FAMILY,
+        LIU_2013,
+        formula="Q p⁺ = AᵀK d(p) + y, CHOLMOD in C++",
+        cost="1 solve, 1 pass",
+    )
 
     def prepare(self, system: System) -> PreparedCholmod:
         """Prepare the method for a system.

@@ -38,7 +38,13 @@ class CompiledLocalGlobal:
 
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = True
-    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013, is_family_default=True)
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        LOCAL_GLOBAL_FAMILY,
+        LIU_2013,
+        is_family_default=True,
+        formula="Q p⁺ = AᵀK d(p) + y, compiled supernodal Cholesky",
+        cost="1 solve, 1 pass",
+    )
 
     linear_solver: LinearSolverName = "auto"
     precision: Precision = "float64"

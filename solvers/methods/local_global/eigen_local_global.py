@@ -19,7 +19,12 @@ class EigenLocalGlobal:
 
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = True
-    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        LOCAL_GLOBAL_FAMILY,
+        LIU_2013,
+        formula="Q p⁺ = AᵀK d(p) + y, Eigen in C++",
+        cost="1 solve, 1 pass",
+    )
 
     def prepare(self, system: System) -> PreparedLocalGlobal:
         """Prepare the method for a system.

@@ -61,7 +61,12 @@ class DenseLocalGlobal:
 
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = True
-    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        LOCAL_GLOBAL_FAMILY,
+        LIU_2013,
+        formula="Q p⁺ = AᵀK d(p) + y, dense Cholesky",
+        cost="1 dense solve, 1 pass",
+    )
 
     def prepare(self, system: System) -> PreparedLocalGlobal:
         """Prepare the method for a system.
@@ -116,7 +121,12 @@ class SparseLocalGlobal:
 
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = True
-    solver_info: ClassVar[SolverInfo] = SolverInfo(LOCAL_GLOBAL_FAMILY, LIU_2013)
+    solver_info: ClassVar[SolverInfo] = SolverInfo(
+        LOCAL_GLOBAL_FAMILY,
+        LIU_2013,
+        formula="Q p⁺ = AᵀK d(p) + y, SuperLU",
+        cost="1 solve, 1 pass",
+    )
 
     def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.

@@ -93,6 +93,8 @@ class HybridNewton:
             "10.1145/2766969",
         ),
         is_family_default=True,
+        formula="L-BFGS, then Newton with predicted tensions",
+        cost="1 L-BFGS iteration or 1 Newton step",
     )
 
     def prepare(self, system: System) -> PreparedDescent:

@@ -73,6 +73,8 @@ class NewtonCG(PrecisionOptions):
             "Truncated-Newton algorithms for large-scale unconstrained optimization",
             "10.1007/BF02592055",
         ),
+        formula="p⁺ = p − t H⁻¹ ∇g by preconditioned CG",
+        cost="several solves and products with H",
     )
 
     preconditioner: PreconditionerName = "cholesky"

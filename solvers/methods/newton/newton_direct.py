@@ -67,6 +67,8 @@ class NewtonSolver:
         Citation("Nocedal, Jorge and Wright, Stephen J.", 2006, "Numerical Optimization", "10.1007/978-0-387-40065-5"),
         is_family_default=True,
         supports_error_control=True,
+        formula="p⁺ = p − t (H + E)⁻¹ ∇g",
+        cost="1 factorisation of 3 × 3 blocks",
     )
 
     indefinite_strategy: IndefiniteStrategy = "shift-schedule"

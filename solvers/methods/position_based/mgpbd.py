@@ -80,6 +80,8 @@ class MultigridXpbd:
             "MGPBD: A Multigrid Accelerated Global XPBD Solver",
             "10.1145/3721238.3730720",
         ),
+        formula="(J W Jᵀ + K⁻¹) Δt = C − K⁻¹ t, multigrid CG",
+        cost="tens of V-cycles",
     )
 
     near_null_vectors: int = 6

@@ -49,6 +49,8 @@ class Xpbd(PrecisionOptions):
             "XPBD: position-based simulation of compliant constrained dynamics",
             "10.1145/2994258.2994272",
         ),
+        formula="Δλ = −(C + α λ)/(w₁ + w₂ + α), α = 1/(k dt²)",
+        cost="1 pass, no factor",
     )
 
     def prepare(self, system: System) -> PreparedSolver:
@@ -85,6 +87,8 @@ class XpbdSmallSteps(PrecisionOptions):
         ),
         is_substepping=True,
         is_family_default=True,
+        formula="one XPBD iteration in each substep",
+        cost="1 pass per substep, no factor",
     )
 
     def prepare(self, system: System) -> PreparedSolver:

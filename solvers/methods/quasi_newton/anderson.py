@@ -44,6 +44,8 @@ class Anderson(WindowedAcceleration):
             "Anderson acceleration for geometry optimization and physics simulation",
             "10.1145/3197517.3201290",
         ),
+        formula="p⁺ = LG(p) − Σ θⱼ ΔLGⱼ, θ by least squares",
+        cost="1 solve, 1 pass, dot products",
     )
 
     def prepare(self, system: System) -> PreparedAccelerated:

@@ -49,6 +49,8 @@ class Chebyshev:
             "A Chebyshev semi-iterative approach for accelerating projective and position-based dynamics",
             "10.1145/2816795.2818063",
         ),
+        formula="p⁺ = ω (LG(p) − p⁻) + p⁻",
+        cost="1 solve, 1 pass",
     )
 
     linear_solver: LinearSolverName = "auto"

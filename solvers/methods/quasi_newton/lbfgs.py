@@ -70,6 +70,8 @@ class Lbfgs(WindowedAcceleration):
         ),
         is_family_default=True,
         supports_error_control=True,
+        formula="d = −H ∇g, H from γ Q⁻¹ and recent pairs",
+        cost="1 solve, 1 or 2 passes",
     )
 
     preconditioner: Literal["cholesky", "a-jacobi"] = "cholesky"

@@ -60,6 +60,8 @@ class NonlinearCG:
             "Preconditioned nonlinear conjugate gradient method for real-time interior-point hyperelasticity",
             "10.1145/3641519.3657490",
         ),
+        formula="d⁺ = −Q⁻¹ ∇g + β d",
+        cost="1 solve, 1 pass, 1 product with H",
     )
 
     preconditioner: PreconditionerName = "cholesky"

@@ -48,6 +48,8 @@ class BaraffWitkin:
         "linearly implicit",
         Citation("Baraff, David and Witkin, Andrew", 1998, "Large steps in cloth simulation", "10.1145/280814.280821"),
         is_family_default=True,
+        formula="p⁺ = p − H⁻¹ ∇g, once per step",
+        cost="1 factorisation, 1 solve",
     )
 
     def prepare(self, system: System) -> PreparedBaraffWitkin:

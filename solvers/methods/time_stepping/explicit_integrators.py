@@ -155,13 +155,24 @@ class _AdaptiveStepSolver(ExplicitSolver):
         return self._prepare_explicit(system, 1, self.error_tolerance)
 
 
-def _explicit_info(authors: str, year: int, title: str, doi: str = "", *, has_fixed_step: bool = False) -> SolverInfo:
+def _explicit_info(
+    authors: str,
+    year: int,
+    title: str,
+    doi: str = "",
+    *,
+    has_fixed_step: bool = False,
+    formula: str = "",
+    cost: str = "",
+) -> SolverInfo:
     return SolverInfo(
         "explicit",
         Citation(authors, year, title, doi),
         is_substepping=True,
         supports_error_control=True,
         has_fixed_step=has_fixed_step,
+        formula=formula,
+        cost=cost,
     )
 
 
@@ -191,6 +202,8 @@ class VelocityVerlet(_FixedStepSolver):
         "A computer simulation method for the calculation of equilibrium constants",
         "10.1063/1.442716",
         has_fixed_step=True,
+        formula="kick h/2, drift h, kick h/2",
+        cost="1 pass per substep",
     )
     coefficients: ClassVar[SplittingMethod | ExplicitTableau] = VELOCITY_VERLET
 
@@ -200,7 +213,11 @@ class BlanesMoan4(_FixedStepSolver):
     """Symplectic composition of Blanes and Moan, order 4, six force evaluations per substep."""
 
     solver_name: ClassVar[str] = "blanes-moan-4"
-    solver_info: ClassVar[SolverInfo] = _BLANES_MOAN_INFO
+    solver_info: ClassVar[SolverInfo] = replace(
+        _BLANES_MOAN_INFO,
+        formula="symplectic kicks and drifts, order 4",
+        cost="6 passes per substep",
+    )
     coefficients: ClassVar[SplittingMethod | ExplicitTableau] = BLANES_MOAN_4
 
 
@@ -209,7 +226,11 @@ class BlanesMoan6(_FixedStepSolver):
     """Symplectic composition of Blanes and Moan, order 6, ten force evaluations per substep."""
 
     solver_name: ClassVar[str] = "blanes-moan-6"
-    solver_info: ClassVar[SolverInfo] = _BLANES_MOAN_INFO
+    solver_info: ClassVar[SolverInfo] = replace(
+        _BLANES_MOAN_INFO,
+        formula="symplectic kicks and drifts, order 6",
+        cost="10 passes per substep",
+    )
     coefficients: ClassVar[SplittingMethod | ExplicitTableau] = BLANES_MOAN_6
 
 
@@ -218,7 +239,13 @@ class RungeKutta4(_FixedStepSolver):
     """Kutta's Runge-Kutta method of order 4, four force evaluations per substep."""
 
     solver_name: ClassVar[str] = "runge-kutta-4"
-    solver_info: ClassVar[SolverInfo] = replace(_HAIRER_INFO, supports_error_control=False, has_fixed_step=True)
+    solver_info: ClassVar[SolverInfo] = replace(
+        _HAIRER_INFO,
+        supports_error_control=False,
+        has_fixed_step=True,
+        formula="classical Runge-Kutta method, order 4",
+        cost="4 passes per substep",
+    )
     coefficients: ClassVar[SplittingMethod | ExplicitTableau] = RUNGE_KUTTA_4
 
 
@@ -232,6 +259,8 @@ class Tsitouras5(_AdaptiveStepSolver):
         2011,
         "Runge-Kutta pairs of order 5(4) satisfying only the first column simplifying assumption",
         "10.1016/j.camwa.2011.06.002",
+        formula="Runge-Kutta pair of orders 5(4)",
+        cost="6 passes per substep",
     )
     coefficients: ClassVar[SplittingMethod | ExplicitTableau] = TSITOURAS_5
 
@@ -241,7 +270,11 @@ class DormandPrince8(_AdaptiveStepSolver):
     """Dormand and Prince's method of order 8, error orders 5 and 3, twelve force evaluations per substep."""
 
     solver_name: ClassVar[str] = "dormand-prince-8"
-    solver_info: ClassVar[SolverInfo] = _HAIRER_INFO
+    solver_info: ClassVar[SolverInfo] = replace(
+        _HAIRER_INFO,
+        formula="Runge-Kutta method of orders 8(5,3)",
+        cost="12 passes per substep",
+    )
 
     def build_coefficients(self) -> SplittingMethod | ExplicitTableau:
         """Return the coefficients, taken from SciPy."""

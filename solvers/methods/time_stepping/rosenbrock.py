@@ -117,8 +117,9 @@ class _RosenbrockSolver:
         )
 
 
-def _rosenbrock_info(authors: str, year: int, title: str, doi: str) -> SolverInfo:
-    return SolverInfo("linearly implicit", Citation(authors, year, title, doi), is_substepping=True)
+def _rosenbrock_info(authors: str, year: int, title: str, doi: str, *, formula: str = "", cost: str = "") -> SolverInfo:
+    citation = Citation(authors, year, title, doi)
+    return SolverInfo("linearly implicit", citation, is_substepping=True, formula=formula, cost=cost)
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,8 @@ class Ros2(_RosenbrockSolver):
         1999,
         "A second-order Rosenbrock method applied to photochemical dispersion problems",
         "10.1137/S1064827597326651",
+        formula="Rosenbrock method of orders 2(1)",
+        cost="1 factorisation, 2 solves and passes per step",
     )
 
 
@@ -146,6 +149,8 @@ class Ros3P(_RosenbrockSolver):
         2001,
         "ROS3P: an accurate third-order Rosenbrock solver designed for parabolic problems",
         "10.1023/A:1021900219772",
+        formula="Rosenbrock method of orders 3(2)",
+        cost="1 factorisation, 3 solves and passes per step",
     )
 
 
@@ -163,6 +168,8 @@ class Rodas(_RosenbrockSolver):
             "10.1007/978-3-642-05221-7",
         ),
         supports_error_control=True,
+        formula="Rosenbrock method of orders 4(3)",
+        cost="1 factorisation, 6 solves and passes per step",
     )
 
 

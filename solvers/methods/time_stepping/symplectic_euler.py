@@ -63,6 +63,8 @@ class SymplecticEuler:
         ),
         is_substepping=True,
         is_family_default=True,
+        formula="v⁺ = v + h M⁻¹(f − ∇E), p⁺ = p + h v⁺",
+        cost="1 pass per substep",
     )
 
     def prepare(self, system: System) -> PreparedSolver:

@@ -85,6 +85,8 @@ class AugmentedVertexBlockDescent:
             "Augmented vertex block descent",
             "10.1145/3731195",
         ),
+        formula="VBD sweep, then t⁺ = t + k (l − r) and larger k",
+        cost="1 pass, no factor",
     )
 
     stiffness_ramp: float = 1e3

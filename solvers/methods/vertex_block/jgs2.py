@@ -73,6 +73,8 @@ class Jgs2:
             "JGS2: Near second-order converging Jacobi/Gauss-Seidel for GPU elastodynamics",
             "10.48550/arXiv.2506.06494",
         ),
+        formula="dᵢ = (UᵢᵀHUᵢ)⁻¹ Uᵢᵀ∇g, all vertices at once",
+        cost="products with H on one patch per vertex",
     )
 
     neighbour_rings: int = 4

@@ -74,6 +74,8 @@ class VertexBlockDescent(PrecisionOptions):
             "Vertex block descent",
             "10.1145/3658179",
         ),
+        formula="pᵢ⁺ = pᵢ − Hᵢᵢ⁻¹ ∇ᵢg, one colour after another",
+        cost="1 pass, no factor",
     )
 
     spectral_radius: float = 0.999
