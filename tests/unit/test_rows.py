@@ -1,20 +1,10 @@
-"""Rows: the schema is documented, files are whole or absent, and reading joins them."""
+"""Rows: files are whole or absent, and reading joins them."""
 
 from pathlib import Path
 
 import pyarrow as pa
 import pytest
 from springbench.harness.results import parquet_rows, run_schema
-
-ROOT = Path(__file__).resolve().parents[2]
-
-
-def test_results_readme_documents_every_column_with_its_unit():
-    text = (ROOT / "results" / "README.md").read_text()
-    table = [line for line in text.splitlines() if line.startswith("| `")]
-    for column in run_schema.RUN_COLUMNS:
-        meaning = column.description.replace("|", "\\|")
-        assert f"| `{column.name}` | {column.unit} | {meaning} |" in table
 
 
 def test_rows_come_back_in_the_order_of_the_files(tmp_path: Path):
