@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from springbench.harness.cli.main import app
+from springbench.harness.config import user_code
 from typer.testing import CliRunner
 
 USER_CODE = """
@@ -46,7 +47,7 @@ class Hum(ConfigModel):
         with (Path(__file__).parent / "count").open("a") as count:
             count.write(".")
             if count.tell() >= {exits_at}:
-                os._exit(0)
+                {ends}
         force = 0.0 * mesh.rest_positions
         force[:, 0] = 0.1
         return EffectContribution(forces=build_constant_force(force))
@@ -94,9 +95,11 @@ DRAWING = ("accuracy", "roofline", "gallery")
 """Commands that draw pictures even so, or that import what draws them."""
 
 
-def command(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, exits_at: float) -> tuple[int, str]:
+def command(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, exits_at: float, ends: str = "os._exit(0)"
+) -> tuple[int, str]:
     """Exit code and output of a command, whose effect ends its process in one of its bindings."""
-    (folder / "mine.py").write_text(USER_CODE.format(command=os.getpid(), exits_at=exits_at))
+    (folder / "mine.py").write_text(USER_CODE.format(command=os.getpid(), exits_at=exits_at, ends=ends))
     for file, text in FILES.items():
         (folder / file).write_text(text)
     monkeypatch.chdir(folder)
@@ -122,6 +125,13 @@ def test_user_code_that_exits_after_its_trial_ends_no_command(name: str, tmp_pat
 def test_user_code_that_works_never_runs_in_the_command(name: str, tmp_path: Path, monkeypatch):
     code, said = command(tmp_path, monkeypatch, name, exits_at=1e9)
     assert code == 0, said
+
+
+def test_user_code_that_hangs_after_its_trial_is_stopped_at_the_time_limit(tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(user_code, "DEFAULT_LOAD_LIMITS", user_code.LoadLimits(3.0, 2.0))
+    code, said = command(tmp_path, monkeypatch, "preview", exits_at=2, ends="while True: pass")
+    assert code == 1
+    assert "did not end within 3 s" in said
 
 
 STOPPED_WHILE_IMPORTING = """

@@ -91,7 +91,9 @@ def build_scene_terms(spec: SceneSpec, scene: Scene) -> SceneTerms:
     indices = [[i for i, owner in enumerate(owners) if owner == k] for k in range(len(contributions))]
     external = {k for k, effect in enumerate(declared.effects) if not _is_shipped(effect)}
     if any(indices[k] for k in external):  # damping by stiffness is derived from their energies
-        external |= {k for k, one in enumerate(declared.effects) if one.kind == "rayleigh" and one.stiffness_coefficient}
+        external |= {
+            k for k, one in enumerate(declared.effects) if one.kind == "rayleigh" and one.stiffness_coefficient
+        }
     effect_terms = list[EffectTerms]()
     resists: Array = mass / dt**2
     for k, (effect, part) in enumerate(zip(declared.effects, contributions, strict=True)):

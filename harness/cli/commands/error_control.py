@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from springbench.harness.config.config_loader import load_scene
+from springbench.harness.config.sweep_config import FixedOptions
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.isolated_call import run_isolated
+from springbench.harness.execution.worker_process import TaskLimits
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, format_method_name
@@ -99,7 +101,12 @@ def run_error_control(
         positions,
         rerun,
     )
-    return run_isolated(partial(_execute_error_control, *given), scene.find_plugins(), print_message)
+    return run_isolated(
+        partial(_execute_error_control, *given),
+        scene.find_plugins(),
+        TaskLimits(FixedOptions().time_limit),
+        print_message,
+    )
 
 
 def _execute_error_control(

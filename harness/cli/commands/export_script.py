@@ -28,6 +28,8 @@ def export_script(
 ) -> None:
     """Export a script that repeats one simulation with an external engine alone."""
     from springbench.harness.config.accuracy_loader import load_accuracy
+    from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
+    from springbench.harness.execution.worker_process import TaskLimits
     from springbench.solvers.registry import SOLVERS, load_target
 
     engines = {spec.build_file_stem(): spec for spec in load_accuracy(config).work}
@@ -54,7 +56,9 @@ def export_script(
             InputMistake(f"{output} is a file; expected a folder, which is made if it is missing", key="--output")
         )
     spec = engines[found[0]]
-    texts = run_isolated(partial(_write_script, found[0], spec, output), spec.find_plugins())
+    texts = run_isolated(
+        partial(_write_script, found[0], spec, output), spec.find_plugins(), TaskLimits(*DEFAULT_LOAD_LIMITS)
+    )
     print(texts[f"{found[0]}.py"], end="")
     print_message(f"{', '.join(texts)} and {found[0]}.npz are in {output.resolve()}: run `python {found[0]}.py` there")
 

@@ -49,9 +49,10 @@ def _format_strain_range(tiles: list[Any]) -> list[str]:
 def _build_tile(path: Path) -> Any:
     """Simulate a scene and build its tile."""
     from springbench.harness.config.config_loader import load_config
+    from springbench.harness.execution.worker_process import TaskLimits
 
     run = load_config(path, solvers=[_SOLVER]).list_runs()[0]
-    return run_isolated(partial(_simulate_tile, run), run.find_plugins())
+    return run_isolated(partial(_simulate_tile, run), run.find_plugins(), TaskLimits(run.time_limit, run.memory_limit))
 
 
 def _simulate_tile(run: RunSpec, tick: ProgressCallback) -> Any:

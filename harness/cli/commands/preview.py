@@ -30,9 +30,11 @@ def preview(
         raise InputError(f"--output: came {path}; wanted a file that ends in .png, in a folder that exists")
 
     from springbench.harness.config.config_loader import load_config
+    from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
+    from springbench.harness.execution.worker_process import TaskLimits
 
     run = load_config(scene, sizes=() if size is None else (size,)).list_runs()[0]
-    for line in run_isolated(partial(_draw_preview, run, path), run.find_plugins()):
+    for line in run_isolated(partial(_draw_preview, run, path), run.find_plugins(), TaskLimits(*DEFAULT_LOAD_LIMITS)):
         print_message(line)
 
 

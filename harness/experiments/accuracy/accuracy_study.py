@@ -88,7 +88,7 @@ def run_accuracy_study(
     home = AccuracyResults(accuracy.name, folder)
     cases = {spec.case.scene_name: spec.case for spec in reversed(accuracy.work)}
     plugins = [plugin for case in cases.values() for plugin in case.scene.find_plugins()] if isolated else []
-    run_isolated(partial(_report_contact, cases), plugins, print_message, TaskLimits(*DEFAULT_LOAD_LIMITS))
+    run_isolated(partial(_report_contact, cases), plugins, TaskLimits(*DEFAULT_LOAD_LIMITS), print_message)
     require_threads({spec.measurement.threads for spec in (*accuracy.curves, *accuracy.work)})
     (folder / "accuracy").mkdir(parents=True, exist_ok=True)
     with folder_locks.lock_folder_exclusive(folder):
