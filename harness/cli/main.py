@@ -22,7 +22,9 @@ from springbench.harness.cli.commands.figure import figure
 from springbench.harness.cli.commands.gallery import gallery
 from springbench.harness.cli.commands.list_runs import list_command
 from springbench.harness.cli.commands.matrices import matrices
+from springbench.harness.cli.commands.pages import pages
 from springbench.harness.cli.commands.preview import preview
+from springbench.harness.cli.commands.published import compare, publish_study, reproduce
 from springbench.harness.cli.commands.recommend import recommend
 from springbench.harness.cli.commands.regress import regress
 from springbench.harness.cli.commands.roofline import roofline
@@ -260,6 +262,10 @@ app.command()(compact)
 app.command()(merge)
 app.command()(publish)
 app.command()(verify_archive)
+app.command()(publish_study)
+app.command()(reproduce)
+app.command()(compare)
+app.command()(pages)
 app.command()(figure)
 app.command()(gallery)
 app.command()(preview)

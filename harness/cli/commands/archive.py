@@ -83,6 +83,11 @@ def verify_archive(
 
     Exit code 1: a claim fails; 3: a claim is inconclusive.
     """
+    raise typer.Exit(verify_one_archive(archive, seed, with_user_code=with_user_code))
+
+
+def verify_one_archive(archive: Path, seed: int | None, *, with_user_code: bool) -> int:
+    """Verify an archive, print what holds, and return the exit code of `verify-archive`."""
     from secrets import randbelow
     from tempfile import TemporaryDirectory
 
@@ -95,7 +100,7 @@ def verify_archive(
             for claim in wrong:
                 print_message(str(claim))
             print_message(f"{archive} is not what was published; nothing of it was run")
-            raise typer.Exit(1)
+            return 1
         print_message("all checksums hold")
         found, claims = checks.load_published_runs(folder, print_message, with_user_code=with_user_code)
         runs = checks.select_runnable(found, print_message)
@@ -113,4 +118,4 @@ def verify_archive(
     print_message(
         "something does not hold" if bad else "not all can be told here" if unknown else "all that was done again holds"
     )
-    raise typer.Exit(1 if bad else 3 if unknown else 0)
+    return 1 if bad else 3 if unknown else 0

@@ -1,0 +1,132 @@
+"""Commands on the published set of results: publish-study, reproduce, compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from springbench.harness.cli.shared_options import ResultsOption
+from springbench.harness.console import get_error_console, get_output_console, print_message, split_wide_table
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.results import published_set
+from springbench.harness.results.study_comparison import MAX_DIFFERING_SHARE, AgreementLevel, RunAgreement
+
+PublishedOption = Annotated[Path, typer.Option(help="Folder of the published set.")]
+
+ALL_STUDIES, ENTRIES = "all", "entries"
+"""Names that stand for every study, and for the archives that others have contributed."""
+
+
+def publish_study(
+    results: Annotated[Path, typer.Argument(help="Results of one config, such as results/hard.")],
+    config: Annotated[Path | None, typer.Option(help="Config of these results; the owner of the folder.")] = None,
+    published: PublishedOption = published_set.PUBLISHED_FOLDER,
+) -> None:
+    """Write the results of a study to the published set of this checkout.
+
+    The pages under results/ are made of it, by `springbench pages`.
+    """
+    from springbench.harness.experiments.archive.study_publication import write_study
+    from springbench.harness.results.folder_ownership import read_owner
+
+    owner = config or read_owner(results)
+    if owner is None:
+        raise InputError(InputMistake("does not state its config; give --config", results))
+    write_study(results, owner, published, print_message)
+
+
+def compare(
+    results: Annotated[Path, typer.Argument(help="Folder of results, or of one sweep.")],
+    published: PublishedOption = published_set.PUBLISHED_FOLDER,
+) -> None:
+    """Compare runs with the published ones, by ratios to a reference solver."""
+    from springbench.harness.report.published_comparison import build_comparison_table, compare_with_published
+
+    if not results.is_dir():
+        raise InputError(InputMistake("is no folder; wanted results of `springbench run`", results))
+    lines = compare_with_published(results, published_set.list_studies(published))
+    get_output_console().print(split_wide_table(build_comparison_table(lines), key_columns=3))
+
+
+def reproduce(
+    study: Annotated[str, typer.Argument(help="Name of a published study; all; or entries.")],
+    quick: Annotated[bool, typer.Option("--quick", help="Repeat a tenth of the runs, drawn at random.")] = False,
+    seed: Annotated[int | None, typer.Option(help="Seed that draws the runs; random by default.")] = None,
+    results: ResultsOption = Path("results/reproduced"),
+    published: PublishedOption = published_set.PUBLISHED_FOLDER,
+    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Number of worker processes.")] = None,
+) -> None:
+    """Repeat a published study here, and compare outcomes, iterations, residuals and ratios of times.
+
+    The same command resumes an interrupted repetition. Exit code 1: more runs differ than between processors.
+    """
+    from secrets import randbelow
+
+    from springbench.harness.experiments.archive.study_reproduction import QUICK_SHARE
+
+    if seed is not None and not quick and study != ENTRIES:
+        raise InputError(InputMistake("draws the runs of --quick; give both", key="--seed"))
+    if study == ENTRIES:
+        raise typer.Exit(_verify_entries(published / ENTRIES, seed))
+    found = published_set.list_studies(published) if study == ALL_STUDIES else ()
+    studies = [one for one in found if one.is_repeatable] or [published_set.find_study(published, study)]
+    chance = (randbelow(10**6) if seed is None else seed) if quick else None
+    durations = [(QUICK_SHARE if quick else 1.0) * one.metadata["duration_seconds"] for one in studies]
+    if len(studies) > 1:
+        print_message(f"{len(studies)} studies, which took {_format_duration(sum(durations))} when they were published")
+    agrees = [_reproduce_one(one, took, results, chance, workers) for one, took in zip(studies, durations, strict=True)]
+    raise typer.Exit(0 if all(agrees) else 1)
+
+
+def _reproduce_one(
+    study: published_set.PublishedStudy, duration: float, results: Path, seed: int | None, workers: int | None
+) -> bool:
+    """Repeat one study, print what agrees, and return whether all of it does."""
+    from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.archive.study_reproduction import reproduce_study
+
+    if changed := published_set.find_changed_tables(study):
+        raise InputError(InputMistake("differs from its checksum in study.json; restore it", changed[0]))
+    machine, count = study.metadata["machines"][0], study.metadata["runs"]
+    drawn = f"{count} runs" if seed is None else f"a tenth of {count} runs, drawn by --seed {seed}"
+    took = f"{_format_duration(duration)} on {machine['cpu']}, {machine['cores']} cores"
+    print_message(f"{study.study_name}: {drawn}; when it was published this took {took}")
+    display = create_display(get_error_console())
+    found = reproduce_study(study, results / study.study_name, display, print_message, seed=seed, num_workers=workers)
+    return _report_agreement(study.study_name, found.runs, found.ratios)
+
+
+def _report_agreement(name: str, runs: Sequence[RunAgreement], ratios: Sequence[RunAgreement]) -> bool:
+    """Print the counts and all differences, and return whether the repetition agrees."""
+    agrees = True
+    for what, found in (("runs", runs), ("ratios of times", ratios)):
+        different = [one for one in found if one.level is AgreementLevel.DIFFERENT]
+        for one in different:
+            print_message(f"  {one.title}: {one.explanation}")
+        if found:
+            counts = ", ".join(f"{sum(one.level is level for one in found)} {level.value}" for level in AgreementLevel)
+            print_message(f"{name}: {len(found)} {what}: {counts}")
+        agrees = agrees and len(different) <= MAX_DIFFERING_SHARE * len(found)
+    agrees = agrees and bool(runs)
+    limit = f"at most {100 * MAX_DIFFERING_SHARE:g} % may differ between processors"
+    print_message(f"{name} {'agrees' if agrees else 'does not agree'} with the published results ({limit})")
+    return agrees
+
+
+def _format_duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.0f} min"
+
+
+def _verify_entries(folder: Path, seed: int | None) -> int:
+    """Verify all contributed archives; return the least favourable exit code."""
+    from springbench.harness.cli.commands.archive import verify_one_archive
+
+    archives = sorted(folder.glob("*.zip"))
+    print_message(f"{len(archives)} entries in {folder}")
+    codes: list[int] = []
+    for path in archives:
+        print_message(f"{path.name}:")
+        codes.append(verify_one_archive(path, seed, with_user_code=True))
+    return 1 if 1 in codes else 3 if 3 in codes else 0

@@ -1,0 +1,189 @@
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyarrow's stubs are incomplete for columns.
+"""Write the results of a study to the published set (`springbench.harness.results.published_set`).
+
+Columns that no page uses and no repeat confirms are left out, and so are all times of studies that time nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
+
+DROPPED_COLUMNS = frozenset(
+    (
+        *("positions_digest", "recording_digest", "recording_path", "node_id", "source_fingerprint", "sweep"),
+        *("wall_seconds_check", "wall_seconds_sum", "phases_consistent", "energy_springs", "energy_inertia"),
+        *("energy_force", "energy_pins", "energy_effects", "energy_gain", "energy_available", "max_strain"),
+        *("strain_p99", "flops_per_solve", "factor_bytes", "nnz_system", "nnz_factor", "nnz_hessian_factor"),
+    )
+)
+"""Columns that are left out: digests of files that are not published, checks that a run has passed, and provenance.
+
+`study.json` states the provenance once.
+"""
+
+_TIME_COLUMNS = frozenset(("seconds", "cpu_seconds", "preempted", "load_average", "cold_seconds", "search_seconds"))
+"""Columns that mean nothing where the steps were not timed."""
+
+_TABLES = ("rows", "accuracy", "ablation")
+
+MAX_PAUSE = 600.0
+"""Longest time between the starts of two runs that counts as work [s]; one run of a study takes less."""
+
+MAX_PUBLISHED_BYTES = 8 * 2**20
+"""Largest total size of the published set: it is part of every clone."""
+
+
+def write_study(
+    results: Path, config: Path, published: Path, print_message: Callable[[str], None]
+) -> published_set.PublishedStudy:
+    """Write the study of a folder of results to the published set, and return it.
+
+    Args:
+        results: results of one config.
+        config: the config; its stem is the name of the study.
+        published: folder of the published set.
+        print_message: prints a remark.
+
+    Raises:
+        InputError: there are no rows, runs of several configs, or the published set would become too large.
+    """
+    if not config.is_file():
+        raise InputError(InputMistake("is not there; wanted the config of these results", config, key="--config"))
+    tables = {table: _read_table(results / table) for table in _TABLES}
+    tables = {table: _drop_missing_software(rows) for table, rows in tables.items() if rows is not None}
+    if not tables:
+        raise InputError(InputMistake("holds no rows; wanted the folder of one sweep, such as results/hard", results))
+    is_timed = any(_is_timed(rows) for rows in tables.values())
+    folder = published / config.stem
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in folder.glob("*.parquet"):
+        path.unlink()
+    for table, rows in tables.items():
+        left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed else _TIME_COLUMNS)
+        write_published_table(folder / published_set.TABLE_FILES[table], _drop_columns(rows, left_out))
+    metadata = {
+        "config": os.path.relpath(config.resolve(), folder.resolve()),
+        "config_digest": published_set.compute_file_digest(config),
+        "command": _describe_command(tables, config),
+        "is_timed": is_timed,
+        **describe_provenance([row for rows in tables.values() for row in _select_provenance(rows)]),
+    }
+    study = write_study_file(folder, metadata)
+    size = sum(path.stat().st_size for path in published.rglob("*.parquet"))
+    if size > MAX_PUBLISHED_BYTES:
+        why = f"takes {size:,} bytes with this study, and at most {MAX_PUBLISHED_BYTES:,} are part of a clone"
+        raise InputError(InputMistake(f"{why}; publish fewer runs", published))
+    print_message(f"{folder}: {sum(map(len, tables.values())):,} rows; the published set takes {size / 2**20:.1f} MiB")
+    return study
+
+
+def write_study_file(folder: Path, metadata: Mapping[str, Any]) -> published_set.PublishedStudy:
+    """Write `study.json` with the checksums of the tables in a folder, and return the study."""
+    files = {path.name: published_set.compute_file_digest(path) for path in sorted(folder.glob("*.parquet"))}
+    with atomic_write(folder / published_set.STUDY_FILE) as partial:
+        partial.write_text(json.dumps({**metadata, "files": files}, indent=2) + "\n", encoding="utf-8")
+    return published_set.read_study(folder)
+
+
+def write_published_table(path: Path, table: pa.Table) -> None:
+    """Write a table with the strongest compression: it is read rarely and cloned often."""
+    with atomic_write(path) as partial:
+        pq.write_table(table, partial, compression="zstd", compression_level=19, store_schema=False)
+
+
+def describe_provenance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Describe commits, machines, versions, dates and load of rows; each value is listed once.
+
+    Args:
+        rows: mappings with the columns of provenance; missing ones are omitted.
+    """
+
+    def list_values(name: str) -> list[Any]:
+        return sorted({row[name] for row in rows if row.get(name) is not None})
+
+    machines = {(row.get("cpu"), row.get("cores"), row.get("memory_gib"), row.get("operating_system")) for row in rows}
+    versions: dict[str, str] = {}
+    for text in list_values("versions"):
+        versions |= json.loads(text)
+    started, loads = list_values("started_at"), list_values("load_average")
+    return {
+        "runs": len({row.get("run_id") or row.get("unit_id") for row in rows}),
+        "commits": list_values("commit"),
+        "machines": [
+            {"cpu": cpu, "cores": cores, "memory_gib": memory, "operating_system": system}
+            for cpu, cores, memory, system in sorted(machines, key=str)
+        ],
+        "versions": dict(sorted(versions.items())),
+        "started": [started[0], started[-1]] if started else [],
+        "load_average": [round(loads[0], 2), round(loads[-1], 2)] if loads else [],
+        "duration_seconds": round(_measure_duration(rows)),
+    }
+
+
+def _read_table(folder: Path) -> pa.Table | None:
+    """Read the rows of a folder with the names of their units, or None if there are none."""
+    units = row_store.list_units(folder)
+    if not units:
+        return None
+    schema = run_schema.RUN_SCHEMA if folder.name == "rows" else pa.schema([])
+    return parquet_rows.read_rows(units, schema, with_unit_names=True)
+
+
+def _drop_missing_software(rows: pa.Table) -> pa.Table:
+    """Drop solvers that no run supports: they need software that is not installed here."""
+    if "status" not in rows.column_names or "solver" not in rows.column_names:
+        return rows
+    supported = pc.unique(rows.filter(pc.field("status") != "unsupported")["solver"])
+    return rows.filter(pc.is_in(rows["solver"], supported))
+
+
+def _is_timed(rows: pa.Table) -> bool:
+    return "timing" not in rows.column_names or "none" not in pc.unique(rows["timing"]).to_pylist()
+
+
+def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:
+    """Return the table without columns of these names and without empty columns."""
+    selected = [name for name in rows.column_names if name not in names and rows[name].null_count < len(rows)]
+    return rows.select(selected)
+
+
+_PROVENANCE_COLUMNS = (
+    *("run_id", "unit_id", "commit", "cpu", "cores", "memory_gib", "operating_system", "versions", "started_at"),
+    "load_average",
+)
+
+
+def _select_provenance(rows: pa.Table) -> list[dict[str, Any]]:
+    return rows.select([name for name in _PROVENANCE_COLUMNS if name in rows.column_names]).to_pylist()
+
+
+def _describe_command(tables: Mapping[str, pa.Table], config: Path) -> str:
+    command = next(name for table, name in _COMMANDS.items() if table in tables)
+    return f"springbench {command} {config.parent.name}/{config.name}"
+
+
+_COMMANDS = {"accuracy": "accuracy", "ablation": "ablate", "rows": "run"}
+
+
+def _measure_duration(rows: Sequence[Mapping[str, Any]]) -> float:
+    """Return the wall time of the study [s], from which the time of a repetition is predicted.
+
+    It is the sum of the times between successive starts of runs. Longer pauses than MAX_PAUSE count as interruptions.
+    """
+    starts = sorted({datetime.fromisoformat(row["started_at"]) for row in rows if row.get("started_at")})
+    pauses = ((later - earlier).total_seconds() for earlier, later in pairwise(starts))
+    return sum(min(pause, MAX_PAUSE) for pause in pauses)

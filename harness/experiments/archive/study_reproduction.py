@@ -1,0 +1,207 @@
+"""Repeat a published study on this machine (`springbench reproduce`).
+
+All of its runs, or a tenth that is drawn at random, are executed in a folder of their own, without recordings and
+pictures. Steps of studies that publish no times are not timed. Runs that are complete there are not executed again.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from springbench.harness.config.accuracy_loader import load_accuracy
+from springbench.harness.config.config_loader import load_config
+from springbench.harness.config.sweep_config import RunSpec
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution import folder_locks, machine_info
+from springbench.harness.execution.progress_display import ProgressDisplay
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.experiments.accuracy.accuracy_study import run_accuracy_study
+from springbench.harness.experiments.completion_status import select_missing_units
+from springbench.harness.experiments.experiment_units import choose_num_workers, execute_units
+from springbench.harness.experiments.provenance import build_specification_columns
+from springbench.harness.experiments.run_unit import RunUnit
+from springbench.harness.experiments.sweep_plan import plan_runs
+from springbench.harness.report.robustness import classify_run
+from springbench.harness.results import parquet_rows, row_store
+from springbench.harness.results.published_set import RUN_KEYS, PublishedStudy, open_study_folder
+from springbench.harness.results.study_comparison import (
+    AgreementLevel,
+    RunAgreement,
+    RunRows,
+    compare_runs,
+    compare_time_ratios,
+    group_runs,
+)
+from springbench.harness.results.time_ratios import compute_time_ratios
+
+QUICK_SHARE = 0.1
+"""Share of the runs that `--quick` repeats."""
+
+
+class StudyRepetition(NamedTuple):
+    """What a repetition found.
+
+    Attributes:
+        runs: agreement of each repeated run.
+        ratios: agreement of the ratios of times; empty if the study publishes none.
+    """
+
+    runs: list[RunAgreement]
+    ratios: list[RunAgreement]
+
+
+def reproduce_study(
+    study: PublishedStudy,
+    folder: Path,
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
+    *,
+    seed: int | None = None,
+    num_workers: int | None = None,
+) -> StudyRepetition:
+    """Repeat a study, or a tenth of it, and compare.
+
+    Args:
+        study: published study.
+        folder: folder of the repeated results.
+        display: shows progress.
+        print_message: prints a remark.
+        seed: seed that draws a tenth of the runs; None repeats all.
+        num_workers: number of worker processes; chosen by cores and memory if left out.
+
+    Raises:
+        InputError: the config of the study is missing, or requests none of its runs.
+    """
+    if study.find_table("rows"):
+        return _reproduce_sweep(study, folder, display, print_message, seed, num_workers)
+    if study.find_table("accuracy"):
+        return _reproduce_accuracy(study, folder, display, print_message, seed)
+    why = f"cannot be repeated run by run; its command does all of it: {study.metadata['command']}"
+    raise InputError(InputMistake(why, study.folder))
+
+
+def draw_sample(items: Sequence[Any], seed: int | None) -> list[Any]:
+    """Draw a tenth of the items, at least one; all of them without a seed."""
+    if seed is None or not items:
+        return list(items)
+    count = max(1, math.ceil(QUICK_SHARE * len(items)))
+    chosen = sorted(random.Random(seed).sample(range(len(items)), count))
+    return [items[k] for k in chosen]
+
+
+def classify_outcome(run: RunRows) -> str:
+    """Classify a run in words: its outcome if it was verified, else its status."""
+    rows = [dict(row) for row in run]
+    if rows[0]["status"] == "ok" and all(
+        row["stationarity"] is None and row["reference_distance"] is None for row in rows
+    ):
+        return "ok"
+    return classify_run(rows)[0].label
+
+
+def _reproduce_sweep(
+    study: PublishedStudy,
+    folder: Path,
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
+    seed: int | None,
+    num_workers: int | None,
+) -> StudyRepetition:
+    published_rows = read_study_rows(study)
+    published = group_runs(published_rows)
+    runs = _select_published_runs(load_config(study.config_path).list_runs(), published)
+    if not runs:
+        raise InputError(
+            InputMistake("requests none of the published runs; publish the study again", study.config_path)
+        )
+    chosen = dict(draw_sample(list(runs.items()), seed))
+    timing = {} if study.is_timed else {"timing": "none"}
+    specs = [run.replace_options(record=False, pictures=False, **timing) for run in chosen.values()]
+    for part in ("rows", "recordings", "pictures"):
+        (folder / part).mkdir(parents=True, exist_ok=True)
+    with folder_locks.lock_folder_exclusive(folder):
+        planned = plan_runs(specs, folder)
+        todo = select_missing_units(planned, "runs", print_message, rerun_stale=True)
+        many = min(num_workers or choose_num_workers(), max(1, len(todo)))
+        units = [RunUnit(p.run, p.files, None, 1 if study.is_timed else many) for p in todo]
+        execute_units(units, display, num_workers=many)
+    rows = parquet_rows.read_rows([p.files.rows_path for p in planned]).to_pylist()
+    repeated: dict[str, list[Any]] = {run[0]["run_id"]: run for run in group_runs(rows).values()}
+    machine = machine_info.describe_machine().machine_id
+    found = [
+        compare_runs(published[key], repeated[spec.compute_run_id(machine)], classify_outcome)
+        for key, spec in zip(chosen, specs, strict=True)
+    ]
+    ratios = (
+        compare_time_ratios(compute_time_ratios(published_rows), compute_time_ratios(rows)) if study.is_timed else []
+    )
+    return StudyRepetition(found, ratios)
+
+
+def read_study_rows(study: PublishedStudy) -> list[dict[str, Any]]:
+    """Read the rows of a published sweep, with nulls in columns that are not published."""
+    with open_study_folder(study) as folder:
+        return parquet_rows.read_rows(row_store.list_units(folder / "rows")).to_pylist()
+
+
+def _select_published_runs(
+    runs: Sequence[RunSpec], published: dict[tuple[Any, ...], list[Any]]
+) -> dict[tuple[Any, ...], RunSpec]:
+    """Return the runs of a config that are published, by their key there."""
+    found: dict[tuple[Any, ...], RunSpec] = {}
+    for run in runs:
+        columns = build_specification_columns(run)
+        key = tuple(columns[name] for name in RUN_KEYS)
+        for whole in ((*key, run.frames), (*key, 0)):
+            if whole in published:
+                found[whole] = run
+                break
+    return found
+
+
+def _reproduce_accuracy(
+    study: PublishedStudy,
+    folder: Path,
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
+    seed: int | None,
+) -> StudyRepetition:
+    """Repeat an accuracy study: errors within their tolerance, and ratios of times."""
+    plan = load_accuracy(study.config_path)
+    curves, work = draw_sample(plan.curves, seed), draw_sample(plan.work, seed)
+    files = run_accuracy_study(
+        replace(plan, curves=tuple(curves), work=tuple(work)), folder, display, print_message, rerun_stale=True
+    )
+    rows = parquet_rows.read_rows(files, ACCURACY_SCHEMA).to_pylist()
+    published = [row for row in study.read_table("accuracy").to_pylist() if row["kind"] == "work"]
+    repeated = [row for row in rows if row["kind"] == "work"]
+    known = {_build_work_key(row): row for row in published}
+    found = [_compare_work(known[key], row) for row in repeated if (key := _build_work_key(row)) in known]
+    ratios = compare_time_ratios(compute_time_ratios(published), compute_time_ratios(repeated))
+    return StudyRepetition(found, ratios)
+
+
+ERROR_TOLERANCE = 0.05
+"""Relative difference of the error of a whole simulation: round-off changes where adaptive steps end."""
+
+
+def _build_work_key(row: dict[str, Any]) -> tuple[Any, ...]:
+    return (*(row.get(name) for name in RUN_KEYS), row["t_end"])
+
+
+def _compare_work(old: dict[str, Any], new: dict[str, Any]) -> RunAgreement:
+    title = f"{old['scene']} {old['size']} {old['solver']} {old['integrator']} {old['time_step']:.3g} s"
+    if old["status"] != new["status"]:
+        why = f"published as {old['status']!r}, here {new['status']!r}"
+        return RunAgreement(title, AgreementLevel.DIFFERENT, why)
+    was, now = old["error"], new["error"]
+    if was == now:
+        return RunAgreement(title, AgreementLevel.IDENTICAL)
+    if was is None or now is None or abs(now - was) > ERROR_TOLERANCE * was:
+        return RunAgreement(title, AgreementLevel.DIFFERENT, f"error {was}, here {now}")
+    return RunAgreement(title, AgreementLevel.CLOSE)

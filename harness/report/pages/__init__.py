@@ -1,0 +1,1 @@
+"""Pages that show published results: templates, the queries that fill them, and their pictures."""

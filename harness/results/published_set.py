@@ -1,0 +1,164 @@
+"""Published set of results: compact tables of each study, and what made them.
+
+`results/published/<study>/` holds one Parquet file for each table of a results folder (`TABLE_FILES`) and
+`study.json`: config, command, commits, machines, versions, dates, load and checksums. `springbench publish-study`
+writes all of it. The tables are packed rows (`springbench.harness.results.row_store`) without the columns that nobody
+else can confirm, so `open_study_folder` presents a study as an ordinary folder of results to every report.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from springbench.harness.errors import InputError, InputMistake, suggest_name
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+STUDY_FILE = "study.json"
+PUBLISHED_FOLDER = Path("results/published")
+"""The published set of a checkout, relative to its root."""
+
+TABLE_FILES = {
+    "rows": "runs.parquet",
+    "accuracy": "units.parquet",
+    "ablation": "effects.parquet",
+    "blocks": "blocks.parquet",
+    "rates": "rates.parquet",
+}
+"""File of each table.
+
+The names differ from those of packed rows: reports and queries over `results/` do not find them.
+"""
+
+RUN_KEYS = (
+    "scene",
+    "size",
+    "solver",
+    "parameters",
+    "integrator",
+    "time_step",
+    "initial_guess",
+    "max_iterations",
+    "residual_rtol",
+)
+"""Columns that identify a run on any machine and in any results folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedStudy:
+    """One study of the published set.
+
+    Attributes:
+        folder: its folder.
+        metadata: content of `study.json`.
+    """
+
+    folder: Path
+    metadata: dict[str, Any]
+
+    @property
+    def study_name(self) -> str:
+        """Name of the study, which is that of its folder."""
+        return self.folder.name
+
+    @property
+    def config_path(self) -> Path:
+        """Config that the study was made from."""
+        return (self.folder / str(self.metadata["config"])).resolve()
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether times are among the published results."""
+        return bool(self.metadata["is_timed"])
+
+    @property
+    def is_repeatable(self) -> bool:
+        """Whether single runs of the study can be repeated and compared."""
+        return bool(self.find_table("rows") or self.find_table("accuracy"))
+
+    def find_table(self, table: str) -> Path | None:
+        """Return the file of a table, or None if the study has no such table."""
+        path = self.folder / TABLE_FILES[table]
+        return path if path.is_file() else None
+
+    def read_table(self, table: str) -> pa.Table:
+        """Read a table. Raises InputError if the study has no such table."""
+        import pyarrow.parquet as pq  # a study may be listed without it
+
+        path = self.find_table(table)
+        if path is None:
+            raise InputError(InputMistake(f"has no table {TABLE_FILES[table]}; publish the study again", self.folder))
+        return pq.read_table(path, partitioning=None)
+
+
+def list_studies(published: Path) -> list[PublishedStudy]:
+    """List the studies of a published set, sorted by name.
+
+    Raises:
+        InputError: there is no published set, or a `study.json` is damaged.
+    """
+    found = [read_study(path.parent) for path in sorted(published.glob(f"*/{STUDY_FILE}"))]
+    if not found:
+        raise InputError(
+            InputMistake(
+                "holds no published studies; run this in a checkout of springbench, or give its path", published
+            )
+        )
+    return found
+
+
+def find_study(published: Path, name: str) -> PublishedStudy:
+    """Find a study by its name. Raises InputError if there is none."""
+    studies = {study.study_name: study for study in list_studies(published)}
+    if name not in studies:
+        raise InputError(InputMistake(f"came {name!r}; wanted {suggest_name(name, studies)}", key="STUDY"))
+    return studies[name]
+
+
+def read_study(folder: Path) -> PublishedStudy:
+    """Read `study.json` of a folder. Raises InputError if it is damaged."""
+    path = folder / STUDY_FILE
+    try:
+        metadata = json.loads(path.read_text(encoding="utf-8"))
+        study = PublishedStudy(folder, metadata)
+        if not isinstance(metadata["files"], dict) or not study.config_path.name or study.is_timed is None:
+            raise ValueError("its keys are not those of a study")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        why = f"describes no study ({error!r}); restore it, or write it again by `springbench publish-study`"
+        raise InputError(InputMistake(why, path)) from error
+    return study
+
+
+def compute_file_digest(path: Path) -> str:
+    """Compute the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def find_changed_tables(study: PublishedStudy) -> list[Path]:
+    """Return the tables that are missing or differ from the checksums in `study.json`."""
+    stated = {study.folder / name: digest for name, digest in study.metadata["files"].items()}
+    there = {path for path in study.folder.iterdir() if path.suffix == ".parquet"}
+    return sorted(
+        path for path in there | stated.keys() if not path.is_file() or stated.get(path) != compute_file_digest(path)
+    )
+
+
+@contextmanager
+def open_study_folder(study: PublishedStudy) -> Generator[Path]:
+    """Yield a temporary folder of results with the packed rows of a study."""
+    with TemporaryDirectory() as scratch:
+        folder = Path(scratch) / study.study_name
+        folder.mkdir()
+        for table in ("rows", "accuracy", "ablation"):
+            if path := study.find_table(table):
+                (folder / f"{table}.parquet").symlink_to(path.resolve())
+        yield folder

@@ -1,0 +1,127 @@
+"""Comparison of repeated runs with published ones: outcome, iterations, residuals, and ratios of times.
+
+Bitwise equal columns are `identical`. A run is `close` if its outcome is the same and its iterations and residuals are
+within the tolerances below. Anything else `differs`. Milliseconds are never compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from enum import Enum
+from typing import Any, NamedTuple
+
+from springbench.harness.results.published_set import RUN_KEYS
+from springbench.harness.results.time_ratios import TimeRatio
+
+ITERATION_TOLERANCE, ITERATION_SLACK = 0.1, 3
+"""Relative and absolute difference of a step's iterations: where the descent left is round-off, single ones change."""
+RESIDUAL_FACTOR = 2.0
+"""Factor between two residuals that have not met the tolerance, for the same reason."""
+MAX_DIFFERING_SHARE = 0.02
+"""Largest share of runs that may differ between processors.
+
+Where a step may go either way, the last bit decides. Between an EPYC and a Xeon that is one run in a thousand of the
+hard cases; a tenth of them has few runs, so that two per cent are allowed.
+"""
+
+RunRows = Sequence[Mapping[str, Any]]
+
+
+class AgreementLevel(Enum):
+    """How well a repeated run agrees with the published one."""
+
+    IDENTICAL = "identical"
+    CLOSE = "within tolerance"
+    DIFFERENT = "differs"
+
+
+class RunAgreement(NamedTuple):
+    """A repeated run, how well it agrees, and where it differs."""
+
+    title: str
+    level: AgreementLevel
+    explanation: str = ""
+
+
+def group_runs(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Group the rows that state the results of runs, by `RUN_KEYS` and the number of frames.
+
+    These are the rows of the first round of each step, or the single row of a failed run.
+    """
+    runs: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
+            runs.setdefault(row["run_id"], []).append(row)
+    return {build_run_key(run): sorted(run, key=lambda row: row["frame"] or 0) for run in runs.values()}
+
+
+def build_run_key(run: RunRows) -> tuple[Any, ...]:
+    """Build the key of a run on any machine: `RUN_KEYS`, and the number of frames of a completed run."""
+    frames = max(row["frame"] or 0 for row in run) if run[0]["status"] == "ok" else 0
+    return (*(run[0][name] for name in RUN_KEYS), frames)
+
+
+def compare_runs(published: RunRows, repeated: RunRows, classify_outcome: Callable[[RunRows], str]) -> RunAgreement:
+    """Compare a repeated run with the published one.
+
+    Args:
+        published, repeated: rows of the first round, sorted by frame.
+        classify_outcome: returns the outcome of a run in words.
+    """
+    first = published[0]
+    title = " ".join(str(part) for part in (first["scene"], first["size"] or "", first["solver"]) if part)
+    was, now = classify_outcome(published), classify_outcome(repeated)
+    if was != now:
+        return RunAgreement(title, AgreementLevel.DIFFERENT, f"published as {was!r}, here {now!r}")
+    if len(published) != len(repeated):
+        return RunAgreement(title, AgreementLevel.DIFFERENT, f"{len(published)} steps, here {len(repeated)}")
+    if all(_is_identical(old, new) for old, new in zip(published, repeated, strict=True)):
+        return RunAgreement(title, AgreementLevel.IDENTICAL)
+    for old, new in zip(published, repeated, strict=True):
+        if why := _describe_difference(old, new):
+            return RunAgreement(title, AgreementLevel.DIFFERENT, why)
+    return RunAgreement(title, AgreementLevel.CLOSE)
+
+
+_COMPARED_COLUMNS = ("num_iterations", "termination_reason", "residual", "residual_initial", "stationarity")
+
+
+def _is_identical(old: Mapping[str, Any], new: Mapping[str, Any]) -> bool:
+    return all(_is_same_value(old.get(name), new.get(name)) for name in _COMPARED_COLUMNS)
+
+
+def _is_same_value(old: Any, new: Any) -> bool:
+    return old == new or (isinstance(old, float) and isinstance(new, float) and math.isnan(old) and math.isnan(new))
+
+
+def _describe_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
+    """Describe the difference of two steps beyond the tolerances; empty if there is none."""
+    was, now = old["num_iterations"], new["num_iterations"]
+    if was is not None and now is not None and abs(now - was) > max(ITERATION_SLACK, ITERATION_TOLERANCE * was):
+        return f"step {old['frame']} took {was} iterations, here {now}"
+    was, now = old["residual"], new["residual"]
+    if was is None or now is None or _meets_tolerance(old) or _meets_tolerance(new):
+        return ""
+    if not was / RESIDUAL_FACTOR <= now <= was * RESIDUAL_FACTOR:
+        return f"step {old['frame']} left a residual of {was:.2g}, here {now:.2g}"
+    return ""
+
+
+def _meets_tolerance(row: Mapping[str, Any]) -> bool:
+    return row["termination_reason"] in ("converged", "roundoff")
+
+
+def compare_time_ratios(published: Sequence[TimeRatio], repeated: Sequence[TimeRatio]) -> list[RunAgreement]:
+    """Compare ratios of times; those that one side lacks are omitted.
+
+    A ratio is close within the published interval.
+    """
+    known = {(one.scene, one.size, one.method, one.reference): one for one in published}
+    found: list[RunAgreement] = []
+    for new in repeated:
+        if old := known.get((new.scene, new.size, new.method, new.reference)):
+            level = AgreementLevel.CLOSE if old.low <= new.ratio <= old.high else AgreementLevel.DIFFERENT
+            why = f"{old.ratio:.3g} published, in [{old.low:.3g}, {old.high:.3g}]; here {new.ratio:.3g}"
+            found.append(RunAgreement(new.title, level, why))
+    return found
