@@ -17,7 +17,7 @@ from rich.table import Table
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.published_set import RUN_KEYS, PublishedStudy, open_study_folder
-from springbench.harness.results.time_ratios import TimeRatio, compute_time_ratios
+from springbench.harness.results.time_ratios import MethodTimeRatio, compute_time_ratios
 
 _IterationMeans = dict[tuple[Any, ...], float]
 
@@ -74,7 +74,7 @@ def _compare_with_study(own: Sequence[Mapping[str, Any]], study: PublishedStudy)
         published = _read_rows(folder / "rows")
     places = {(row["scene"], row["size"]) for row in published}
     mine = [row for row in own if (row["scene"], row["size"]) in places and row["phase"] == "step"]
-    ratios: dict[tuple[Any, ...], TimeRatio] = {}
+    ratios: dict[tuple[Any, ...], MethodTimeRatio] = {}
     if study.is_timed:
         ratios = {_build_key(one): one for one in compute_time_ratios(published)}
     own_ratios = {_build_key(one): one for one in compute_time_ratios(row for row in mine if row["timing"] != "none")}
@@ -106,7 +106,7 @@ def _compare_with_study(own: Sequence[Mapping[str, Any]], study: PublishedStudy)
     return lines
 
 
-def _build_key(one: TimeRatio) -> tuple[Any, ...]:
+def _build_key(one: MethodTimeRatio) -> tuple[Any, ...]:
     return one.scene, one.size, *one.method
 
 

@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from springbench.harness.results.published_set import RUN_KEYS
-from springbench.harness.results.time_ratios import TimeRatio
+from springbench.harness.results.time_ratios import MethodTimeRatio
 
 ITERATION_TOLERANCE, ITERATION_SLACK = 0.1, 3
 """Relative and absolute difference of a step's iterations: where the descent left is round-off, single ones change."""
@@ -62,7 +62,9 @@ def build_run_key(run: RunRows) -> tuple[Any, ...]:
     return (*(run[0][name] for name in RUN_KEYS), frames)
 
 
-def compare_runs(published: RunRows, repeated: RunRows, classify_outcome: Callable[[RunRows], str]) -> RunAgreement:
+def compare_repeated_run(
+    published: RunRows, repeated: RunRows, classify_outcome: Callable[[RunRows], str]
+) -> RunAgreement:
     """Compare a repeated run with the published one.
 
     Args:
@@ -112,7 +114,9 @@ def _meets_tolerance(row: Mapping[str, Any]) -> bool:
     return row["termination_reason"] in ("converged", "roundoff")
 
 
-def compare_time_ratios(published: Sequence[TimeRatio], repeated: Sequence[TimeRatio]) -> list[RunAgreement]:
+def compare_time_ratios(
+    published: Sequence[MethodTimeRatio], repeated: Sequence[MethodTimeRatio]
+) -> list[RunAgreement]:
     """Compare ratios of times; those that one side lacks are omitted.
 
     A ratio is close within the published interval.

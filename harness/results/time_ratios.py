@@ -24,7 +24,7 @@ REFERENCE_SOLVERS = ("numba", "sparse", "hybrid", "newton")
 MethodKey = tuple[Any, ...]
 
 
-class TimeRatio(NamedTuple):
+class MethodTimeRatio(NamedTuple):
     """Time of a method over that of the reference method, with the interval in which a repetition must lie.
 
     Attributes:
@@ -47,7 +47,7 @@ class TimeRatio(NamedTuple):
         return f"{self.scene} {self.size or ''}: {self.method[0]} over {self.reference[0]}"
 
 
-def compute_time_ratios(rows: Iterable[Mapping[str, Any]]) -> list[TimeRatio]:
+def compute_time_ratios(rows: Iterable[Mapping[str, Any]]) -> list[MethodTimeRatio]:
     """Compute the ratio of each method of a scene and size to the reference method there.
 
     Args:
@@ -59,7 +59,7 @@ def compute_time_ratios(rows: Iterable[Mapping[str, Any]]) -> list[TimeRatio]:
         steps = times.setdefault((row["scene"], row["size"]), {}).setdefault(method, {})
         for key, seconds in _list_times(row):
             steps[key] = min(seconds, steps.get(key, seconds))
-    found: list[TimeRatio] = []
+    found: list[MethodTimeRatio] = []
     for (scene, size), methods in times.items():
         timed = {method: steps for method, steps in methods.items() if steps}
         reference = _choose_reference(list(timed))
@@ -90,10 +90,10 @@ def _choose_reference(methods: Sequence[MethodKey]) -> MethodKey | None:
 
 def _build_ratio(
     scene: str, size: int, ours: tuple[MethodKey, dict[int, float]], theirs: tuple[MethodKey, dict[int, float]]
-) -> TimeRatio:
+) -> MethodTimeRatio:
     found = bootstrap_statistics.estimate_slowdown(ours[1], theirs[1])
     if len(ours[1].keys() & theirs[1].keys()) < 2:
         middle = median(ours[1].values()) / median(theirs[1].values())
         found = bootstrap_statistics.ConfidenceInterval(middle, middle, middle)
     low, high = found.low / OTHER_MACHINE_FACTOR, found.high * OTHER_MACHINE_FACTOR
-    return TimeRatio(scene, size, ours[0], theirs[0], found.estimate, low, high)
+    return MethodTimeRatio(scene, size, ours[0], theirs[0], found.estimate, low, high)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from springbench.harness.cli.shared_options import ResultsOption
 from springbench.harness.console import get_error_console, get_output_console, print_message, split_wide_table
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results import published_set
-from springbench.harness.results.study_comparison import MAX_DIFFERING_SHARE, AgreementLevel, RunAgreement
+
+if TYPE_CHECKING:
+    from springbench.harness.results.study_comparison import RunAgreement
 
 PublishedOption = Annotated[Path, typer.Option(help="Folder of the published set.")]
 
@@ -100,6 +102,8 @@ def _reproduce_one(
 
 def _report_agreement(name: str, runs: Sequence[RunAgreement], ratios: Sequence[RunAgreement]) -> bool:
     """Print the counts and all differences, and return whether the repetition agrees."""
+    from springbench.harness.results.study_comparison import MAX_DIFFERING_SHARE, AgreementLevel
+
     agrees = True
     for what, found in (("runs", runs), ("ratios of times", ratios)):
         different = [one for one in found if one.level is AgreementLevel.DIFFERENT]

@@ -80,7 +80,7 @@ def write_study(
         "config_digest": published_set.compute_file_digest(config),
         "command": _describe_command(tables, config),
         "is_timed": is_timed,
-        **describe_provenance([row for rows in tables.values() for row in _select_provenance(rows)]),
+        **summarise_provenance([row for rows in tables.values() for row in _select_provenance(rows)]),
     }
     study = write_study_file(folder, metadata)
     size = sum(path.stat().st_size for path in published.rglob("*.parquet"))
@@ -105,7 +105,7 @@ def write_published_table(path: Path, table: pa.Table) -> None:
         pq.write_table(table, partial, compression="zstd", compression_level=19, store_schema=False)
 
 
-def describe_provenance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def summarise_provenance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Describe commits, machines, versions, dates and load of rows; each value is listed once.
 
     Args:

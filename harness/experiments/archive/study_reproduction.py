@@ -33,7 +33,7 @@ from springbench.harness.results.study_comparison import (
     AgreementLevel,
     RunAgreement,
     RunRows,
-    compare_runs,
+    compare_repeated_run,
     compare_time_ratios,
     group_runs,
 )
@@ -134,7 +134,7 @@ def _reproduce_sweep(
     repeated: dict[str, list[Any]] = {run[0]["run_id"]: run for run in group_runs(rows).values()}
     machine = machine_info.describe_machine().machine_id
     found = [
-        compare_runs(published[key], repeated[spec.compute_run_id(machine)], classify_outcome)
+        compare_repeated_run(published[key], repeated[spec.compute_run_id(machine)], classify_outcome)
         for key, spec in zip(chosen, specs, strict=True)
     ]
     ratios = (

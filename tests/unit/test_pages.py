@@ -1,0 +1,113 @@
+"""Pages are made from the published set: equal data give equal bytes, and anything stale is found."""
+
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.report.pages.page_files import check_pages, write_pages
+from springbench.harness.results.published_set import read_study
+from typer.testing import CliRunner
+
+from tests.synthetic_run_rows import write_dummy_runs
+
+TEMPLATE = """# Runs
+
+{{ value("SELECT count(DISTINCT run_id) FROM dummy") }} runs, of which {{ (0.25) | percent }} are slow.
+
+{{ table("SELECT solver, sum(num_iterations) AS iterations FROM dummy GROUP BY ALL ORDER BY ALL") }}
+
+{{ bars("iterations", "All take 50",
+"SELECT solver AS series, avg(num_iterations) AS y FROM dummy GROUP BY ALL ORDER BY 1", "Iterations by solver") }}
+
+{{ provenance("dummy") }} {{ typed("2026-01-02", "abc") }}
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A checkout with one published study and one template."""
+    write_dummy_runs(tmp_path / "runs", 10)
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "dummy.yaml").write_text("scenes: []\n")
+    publish_dummy_study(tmp_path)
+    (tmp_path / "results" / "findings").mkdir()
+    (tmp_path / "results" / "findings" / "runs.md.j2").write_text(TEMPLATE)
+    return tmp_path
+
+
+def publish_dummy_study(root: Path) -> None:
+    config, published = root / "configs" / "dummy.yaml", root / "results" / "published"
+    arguments = ["publish-study", str(root / "runs"), "--config", str(config), "--published", str(published)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, result.output
+
+
+def test_a_study_states_what_made_it(checkout: Path) -> None:
+    study = read_study(checkout / "results" / "published" / "dummy")
+    assert study.config_path == (checkout / "configs" / "dummy.yaml").resolve()
+    assert study.metadata["command"] == "springbench run configs/dummy.yaml"
+    assert study.metadata["runs"] == 10
+    assert study.metadata["machines"][0]["cpu"] == "a processor"
+    assert study.metadata["versions"] == {"numpy": "2.4"}
+    table = study.read_table("rows")
+    assert table.num_rows == 20
+    assert "positions_digest" not in table.column_names
+
+
+def test_equal_data_give_equal_bytes(checkout: Path) -> None:
+    page, picture = (checkout / "results" / "findings" / name for name in ("runs.md", "pictures/iterations.png"))
+    assert set(write_pages(checkout)) == {page, picture}
+    text, pixels = page.read_bytes(), picture.read_bytes()
+    assert "10 runs, of which 25 % are slow." in page.read_text()
+    assert "| hybrid | 200 |" in page.read_text()
+    assert "`springbench run configs/dummy.yaml`, 10 runs, a processor, 2 cores, 2026-01-01" in page.read_text()
+    assert check_pages(checkout, draws_pictures=True) == []
+    assert write_pages(checkout) == []
+    page.unlink()
+    picture.unlink()
+    write_pages(checkout)
+    assert (page.read_bytes(), picture.read_bytes()) == (text, pixels)
+
+
+def test_a_changed_figure_in_the_data_makes_page_and_picture_stale(checkout: Path) -> None:
+    write_pages(checkout)
+    write_dummy_runs(checkout / "runs", 3, frames=3, first_number=10)
+    publish_dummy_study(checkout)
+    assert [line.rpartition("/")[2].split()[0] for line in check_pages(checkout)] == ["runs.md"]
+    (checkout / "results" / "findings" / "runs.md.j2").write_text(TEMPLATE.replace("avg(", "sum("))
+    assert "iterations.png shows other data than the published set has" in " ".join(check_pages(checkout))
+    result = CliRunner().invoke(app, ["pages", str(checkout), "--check"])
+    assert result.exit_code == 1
+
+
+def test_a_replaced_picture_is_stale(checkout: Path) -> None:
+    write_pages(checkout)
+    picture = checkout / "results" / "findings" / "pictures" / "iterations.png"
+    picture.write_bytes(picture.read_bytes() + b" ")
+    assert check_pages(checkout) == [f"{picture} is not the file that `springbench pages` wrote"]
+
+
+def test_a_table_that_was_edited_is_refused(checkout: Path) -> None:
+    path = checkout / "results" / "published" / "dummy" / "runs.parquet"
+    pq.write_table(pq.read_table(path).slice(1), path)
+    result = CliRunner().invoke(app, ["pages", str(checkout)])
+    assert result.exit_code == 2
+    assert "differs from its checksum" in result.output
+
+
+@pytest.mark.parametrize(
+    ("template", "message"),
+    [
+        ("{{ value('SELECT count(*) FROM nothing') }}", "nothing"),
+        ("{{ value('SELECT size FROM dummy') }}", "wants one value"),
+        ("{{ unknown }}", "'unknown' is undefined"),
+        ("text\n{% if %}", "runs.md.j2:2: "),
+    ],
+)
+def test_a_mistake_in_a_template_is_named(checkout: Path, template: str, message: str) -> None:
+    (checkout / "results" / "findings" / "runs.md.j2").write_text(template)
+    result = CliRunner().invoke(app, ["pages", str(checkout)])
+    assert result.exit_code == 2
+    assert "runs.md.j2" in result.output
+    assert message in " ".join(result.output.split())

@@ -1,0 +1,154 @@
+"""A published study is repeated: equal runs agree, and a changed result is found."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from springbench.harness.cli.main import app
+from springbench.harness.experiments.archive.study_publication import write_published_table, write_study_file
+from springbench.harness.experiments.archive.study_reproduction import draw_sample
+from springbench.harness.results.published_set import read_study
+from springbench.harness.results.study_comparison import AgreementLevel, compare_repeated_run
+from typer.testing import CliRunner, Result
+
+from tests.contracts.hostile import scene
+
+SWEEP = """
+scenes: [cloth.yaml]
+sizes: [4]
+solvers: [sparse, dense]
+options: {rounds: 1, frames: 3, record: false, pictures: false, max_iterations: 3, timing: TIMING}
+"""
+
+
+def command(*arguments: object) -> Result:
+    return CliRunner().invoke(app, list(map(str, arguments)))
+
+
+def publish_sweep(home: Path, timing: str) -> Path:
+    """Run a sweep and publish it; return the published set."""
+    (home / "cloth.yaml").write_text(scene())
+    (home / "sweep.yaml").write_text(SWEEP.replace("TIMING", timing))
+    published = home / "published"
+    for arguments in (
+        ("run", home / "sweep.yaml", "--results", home / "results"),
+        ("publish-study", home / "results" / "sweep", "--published", published),
+    ):
+        result = command(*arguments)
+        assert result.exit_code == 0, result.output
+    return published
+
+
+@pytest.fixture(scope="module")
+def untimed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return publish_sweep(tmp_path_factory.mktemp("untimed"), "none")
+
+
+@pytest.mark.slow
+def test_a_study_agrees_with_itself(untimed: Path, tmp_path: Path) -> None:
+    again = ("reproduce", "sweep", "--published", untimed, "--results", tmp_path)
+    result = command(*again)
+    assert result.exit_code == 0, result.output
+    assert "sweep: 2 runs; when it was published this took" in result.output
+    assert "2 runs: 2 identical, 0 within tolerance, 0 differs" in result.output
+    assert "2 of 2 runs are there already" in command(*again).output
+    quick = command(*again, "--quick", "--seed", 3)
+    assert "a tenth of 2 runs, drawn by --seed 3" in quick.output
+    assert "1 runs: 1 identical" in quick.output
+
+
+@pytest.mark.slow
+def test_another_number_of_iterations_does_not_agree(untimed: Path, tmp_path: Path) -> None:
+    study = read_study(untimed / "sweep")
+    table = study.read_table("rows")
+    changed = [9 * count if count else count for count in table["num_iterations"].to_pylist()]
+    at = table.column_names.index("num_iterations")
+    forged = tmp_path / "published" / "sweep"
+    forged.mkdir(parents=True)
+    write_published_table(forged / "runs.parquet", table.set_column(at, "num_iterations", pa.array(changed)))
+    write_study_file(forged, study.metadata | {"config": str(study.config_path)})
+    result = command("reproduce", "all", "--published", forged.parent, "--results", tmp_path)
+    assert result.exit_code == 1, result.output
+    assert "took 27 iterations, here 3" in result.output
+    assert "does not agree" in result.output
+
+
+@pytest.mark.slow
+def test_own_runs_stand_next_to_the_published_ones(tmp_path: Path) -> None:
+    published = publish_sweep(tmp_path, "exclusive")
+    result = command("compare", tmp_path / "results", "--published", published)
+    assert result.exit_code == 0, result.output
+    (line,) = (line for line in result.output.splitlines() if "dense" in line)
+    ratio, reference = line.split()[5], line.split()[4]
+    assert reference == "sparse"
+    assert ratio == line.split()[6], "the same rows have the same ratio"
+
+
+def test_a_changed_table_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "published" / "study"
+    folder.mkdir(parents=True)
+    write_published_table(folder / "runs.parquet", pa.table({"run_id": ["a"]}))
+    metadata = {"config": "sweep.yaml", "is_timed": False, "runs": 1, "duration_seconds": 1, "machines": [{}]}
+    write_study_file(folder, metadata | {"machines": [{"cpu": "a", "cores": 1}]})
+    pq.write_table(pa.table({"run_id": ["b"]}), folder / "runs.parquet")
+    result = command("reproduce", "study", "--published", folder.parent)
+    assert result.exit_code == 2
+    assert "differs from its checksum in study.json" in result.output
+
+
+def test_an_unknown_study_is_answered_by_the_known_ones(tmp_path: Path) -> None:
+    folder = tmp_path / "hard"
+    folder.mkdir()
+    (folder / "study.json").write_text(json.dumps({"config": "hard.yaml", "is_timed": False, "files": {}}))
+    result = command("reproduce", "hart", "--published", tmp_path)
+    assert result.exit_code == 2
+    assert "did you mean 'hard'?" in result.output
+    (folder / "study.json").write_text("{}")
+    assert command("reproduce", "hard", "--published", tmp_path).exit_code == 2
+    assert command("compare", tmp_path, "--published", tmp_path / "nothing").exit_code == 2
+
+
+def test_a_tenth_is_drawn_by_its_seed() -> None:
+    items = list(range(95))
+    assert draw_sample(items, None) == items
+    assert len(draw_sample(items, 1)) == 10
+    assert draw_sample(items, 1) == draw_sample(items, 1)
+    assert draw_sample(items, 1) != draw_sample(items, 2)
+
+
+ROW: dict[str, Any] = {
+    "scene": "cloth",
+    "size": 8,
+    "solver": "newton",
+    "frame": 1,
+    "num_iterations": 40,
+    "termination_reason": "max-iter",
+    "residual": 1e-3,
+    "residual_initial": 1.0,
+    "stationarity": None,
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "level"),
+    [
+        ({}, AgreementLevel.IDENTICAL),
+        ({"num_iterations": 43}, AgreementLevel.CLOSE),
+        ({"num_iterations": 46}, AgreementLevel.DIFFERENT),
+        ({"residual": 1.5e-3}, AgreementLevel.CLOSE),
+        ({"residual": 2.5e-3}, AgreementLevel.DIFFERENT),
+        ({"residual": 1e-7, "termination_reason": "converged"}, AgreementLevel.CLOSE),
+    ],
+)
+def test_a_step_agrees_within_the_tolerances(change: dict[str, Any], level: AgreementLevel) -> None:
+    assert compare_repeated_run([ROW], [ROW | change], lambda run: "ok").level is level
+
+
+def test_another_outcome_differs() -> None:
+    outcomes = iter(("right", "not converged"))
+    found = compare_repeated_run([ROW], [ROW], lambda run: next(outcomes))
+    assert found.level is AgreementLevel.DIFFERENT
+    assert found.explanation == "published as 'right', here 'not converged'"
