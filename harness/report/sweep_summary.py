@@ -22,6 +22,10 @@ STRAIN_GROWTH_FACTOR = 1.5
 """Factor by which the largest strain has to grow to be reported, and to exceed the growth of the 99th percentile."""
 
 
+NOTABLE_SHARE, MAX_DISSIPATION_SENTENCES = 0.01, 3
+"""Share of the provided energy above which dissipation is reported, and the largest number of scenes that are."""
+
+
 def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
     """Build the last lines of a sweep: findings, commands, and the page's address.
 
@@ -41,13 +45,14 @@ def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Pa
 
 
 def summarise_sweep(timed_runs: Sequence[RunTimes]) -> list[str]:
-    """Summarise the fastest solvers, the termination reasons and the strains of runs, in lines."""
+    """Summarise the fastest solvers, the termination reasons, the strains and the dissipation of runs, in lines."""
     fine, names = [run for run in timed_runs if run.status == "ok"], label_runs(timed_runs)
     sentences = [
         *_describe_fastest(fine, names),
         *_describe_iteration_limits(fine),
         *_describe_unsolved(fine, names),
         *_describe_strain_growth(fine, names),
+        *_describe_dissipation(fine, names),
     ]
     return [line for sentence in sentences for line in wrap(sentence, TABLE_WIDTH - 2, subsequent_indent="  ")]
 
@@ -153,6 +158,51 @@ def _compare_strains(coarse_run: RunTimes, ok_runs: RunTimes) -> str:
     return (
         f"the largest strain grows with the mesh, {change}, {bound}: {same}strains have not converged by these sizes."
     )
+
+
+def _describe_dissipation(ok_runs: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
+    """Describe the energy that integrators and unconverged solves took, for the scenes where they took most.
+
+    Of each scene and integrator it is the run of the largest mesh whose solves changed the energy least.
+    """
+    chosen: dict[tuple[str, str, float], RunTimes] = {}
+    for run in sorted(ok_runs, key=lambda run: (run.size, -abs(run.solve_share or 0.0))):
+        if run.dissipation_shares and run.integrator and run.time_step:
+            chosen[run.scene, run.integrator, run.time_step] = run
+    notable = [run for run in chosen.values() if abs(run.integrator_share or 0.0) >= NOTABLE_SHARE]
+    notable.sort(key=lambda run: -abs(run.integrator_share or 0.0))
+    for run in notable[:MAX_DISSIPATION_SENTENCES]:
+        yield f"{run.scene}: {_describe_losses(run)}"
+    if (more := len(notable) - MAX_DISSIPATION_SENTENCES) > 0:
+        yield f"Integrators took less in {more} other cases (column `dissipation_integrator`)."
+    unsolved = [run for run in ok_runs if abs(run.solve_share or 0.0) >= NOTABLE_SHARE]
+    if unsolved:
+        run = max(unsolved, key=lambda run: abs(run.solve_share or 0.0))
+        share = run.solve_share or 0.0
+        yield (
+            f"Unconverged solves {'took' if share > 0 else 'added'} up to {_format_share(share)} of the energy "
+            f"({names[run.run_id]} on {run.scene}{f' {run.size}' if run.size else ''}, column `dissipation_solve`): "
+            "more iterations change the motion."
+        )
+
+
+def _describe_losses(run: RunTimes) -> str:
+    """Describe where the energy of a run went, in words."""
+    damping, friction, integrator, _ = run.dissipation_shares or (0.0,) * 4
+    seconds = (run.frames or 0) * (run.time_step or 0.0)
+    others = [(damping, "damping effects"), (friction, "friction")]
+    effects = " and ".join(f"{what} {_format_share(share)}" for share, what in others if share >= NOTABLE_SHARE / 2)
+    words = (
+        f"{run.integrator} {'took' if integrator > 0 else 'added'} {_format_share(integrator)} of the energy in "
+        f"{seconds:.3g} s{', ' if effects else ''}{effects}"
+    )
+    if run.integrator == "implicit-euler":
+        return f"{words}; half the time step takes about half of that, and midpoint none of a linear motion."
+    return f"{words}."
+
+
+def _format_share(share: float) -> str:
+    return f"{100 * abs(share):.2g} %" if abs(share) < 1 else f"{100 * abs(share):.0f} %"
 
 
 def _choose_recording(timed_runs: Sequence[RunTimes], recordings: Path) -> Path | None:

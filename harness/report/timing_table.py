@@ -23,7 +23,7 @@ from springbench.harness.report.machine_footer import assign_machine_names as ma
 from springbench.harness.report.machine_footer import machine_footer
 from springbench.harness.report.page_layout import format_quantity, format_time_step
 from springbench.harness.report.table_queries import query_table
-from springbench.harness.results.quantities import SQL_EXPRESSIONS
+from springbench.harness.results.quantities import DISSIPATION_CAUSES, SQL_EXPRESSIONS
 from springbench.harness.results.run_schema import RUN_SCHEMA
 
 
@@ -45,6 +45,8 @@ class RunTimes(NamedTuple):
         modulus_exponent: value of the rows.
         max_stationarity_audit: largest stationarity that the reference evaluator measured, for a solver that does not
             minimise.
+        provided_energy: energy provided in all frames [J].
+        damping_share, friction_share, integrator_share, solve_share: energy dissipated by each cause, relative to it.
     """
 
     run_id: str
@@ -83,6 +85,17 @@ class RunTimes(NamedTuple):
     reference_distance: float | None
     modulus_exponent: int | None
     max_stationarity_audit: float | None
+    provided_energy: float | None
+    damping_share: float | None
+    friction_share: float | None
+    integrator_share: float | None
+    solve_share: float | None
+
+    @property
+    def dissipation_shares(self) -> tuple[float, ...] | None:
+        """Shares of the causes `DISSIPATION_CAUSES`; None where they are unknown or no energy was provided."""
+        shares = tuple(getattr(self, f"{cause}_share") for cause in DISSIPATION_CAUSES)
+        return None if self.provided_energy is None or shares[2] is None else tuple(one or 0.0 for one in shares)
 
 
 ROUNDOFF_RATIO = 1e-12
@@ -118,7 +131,8 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     {SQL_EXPRESSIONS["worst_residual"]},
     {ROUNDOFF_RATIO} * max(greatest({_ENERGY_COLUMNS})),
     case when bool_and(reference_distance is not null) filter (phase = 'step') then max(reference_distance) end,
-    any_value(modulus_exponent), max(stationarity_audit) filter (not is_minimiser)
+    any_value(modulus_exponent), max(stationarity_audit) filter (not is_minimiser),
+    {SQL_EXPRESSIONS["provided_energy"]}, {", ".join(SQL_EXPRESSIONS[f"{cause}_share"] for cause in DISSIPATION_CAUSES)}
 from rows_of group by run_id order by min(place)
 """
 
@@ -188,6 +202,7 @@ _NUMBER_HEADINGS = (
     "largest\nstrain",
     "99 %\nbelow",
 )
+_DISSIPATION_HEADING = "lost, %\nd/f/i/s"
 
 TABLE_WIDTH = 100
 """Maximum width of a line [characters], unless its numbers need more."""
@@ -198,6 +213,7 @@ _MIN_NAME_WIDTH = 12
 PREEMPTED_NOTE = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
 INCONSISTENT_NOTE = "~ local and global, timed alone, do not add up to an iteration within 15 %"
 STALE_MARK_NOTE = "† by other code than today's"
+DISSIPATION_NOTE = "d/f/i/s: energy lost to damping, friction, integrator and unconverged solves, of that provided"
 """Meanings of the marks in the table."""
 SHARED_TIMING_NOTE = (
     "timed beside others, up to {} at once, each on cores of its own: slower than alone by what they share"
@@ -228,7 +244,8 @@ def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Tab
     out.add_column(
         "\nsolver", overflow="fold", min_width=min(_MIN_NAME_WIDTH, max(map(len, names.values()), default=0))
     )
-    for name in _NUMBER_HEADINGS:
+    has_dissipation = any(run.dissipation_shares for run in found)
+    for name in (*_NUMBER_HEADINGS, *((_DISSIPATION_HEADING,) if has_dissipation else ())):
         out.add_column(name, justify="left" if name == "\nstopped" else "right", no_wrap=True)
     for run in found:
         if not what and (not above or above[-1] != run.scene):
@@ -252,8 +269,10 @@ def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Tab
                 _format_number(strain, lambda strain: f"{100 * strain:.3g} %")
                 for strain in (run.max_strain, run.strain_p99)
             ),
+            *([_format_number(run.dissipation_shares, _format_shares)] if has_dissipation else []),
         )
     marks = {
+        DISSIPATION_NOTE: has_dissipation,
         PREEMPTED_NOTE: any(run.preempted for run in found),
         INCONSISTENT_NOTE: any(_inconsistency_mark(run, run.local) for run in found),
     }
@@ -294,6 +313,11 @@ def _describe_methods(table: pa.Table) -> list[str]:
         if reference:
             solvers[reference].append(solver)
     return [f"{', '.join(names)}: {format_citation(reference)}" for reference, names in solvers.items()]
+
+
+def _format_shares(shares: Sequence[float]) -> str:
+    """Format shares in whole percent, separated by slashes."""
+    return "/".join(f"{round(100 * share)}" if abs(share) < 10 else f"{100 * share:.0e}" for share in shares)
 
 
 def _format_number(value: Any, words: Callable[[Any], str]) -> str:

@@ -10,6 +10,7 @@ Each has one definition and one name.
     largest residual  maximum over all frames, where each has one
     largest strain    maximum of |length / rest length - 1| over all springs and all frames after the start
     99 % below        maximum over these frames of the 99 % quantile over the springs
+    share of a cause  energy that it dissipated in all frames, relative to the energy that was provided in them
 
 `SQL_EXPRESSIONS` computes them from the rows of one run. A recording stores the strain of each frame, and the run's ms
 a step as a property computed by `compute_ms_per_step`.
@@ -22,6 +23,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+DISSIPATION_CAUSES = ("damping", "friction", "integrator", "solve")
+"""Causes of dissipation: damping effects, friction, the time integrator, and unconverged solves."""
+
 SQL_EXPRESSIONS = {
     "step": "1e3 * median(seconds) filter (phase = 'step')",
     "lower": "1e3 * quantile_cont(seconds, 0.25) filter (phase = 'step')",
@@ -32,6 +36,12 @@ SQL_EXPRESSIONS = {
     "worst_residual": "case when bool_and(residual is not null) filter (phase = 'step') then max(residual) end",
     "max_strain": "max(max_strain)",
     "strain_p99": "max(strain_p99)",
+    "provided_energy": "max(provided_energy)",
+    **{
+        f"{cause}_share": f"sum(dissipation_{cause}) filter (phase = 'step' and \"round\" = 0) "
+        "/ nullif(max(provided_energy), 0)"
+        for cause in DISSIPATION_CAUSES
+    },
 }
 """Aggregates over the rows of a run, by the names of the fields of
 `springbench.harness.report.timing_table.RunTimes`."""

@@ -264,6 +264,52 @@ RUN_COLUMNS = (
         "energy of the start, released potentials, work of sources, and what the load gives in one step; a "
         "larger gain is energy growth",
     ),
+    ColumnSpec("kinetic_energy", _REAL, "J", "kinetic energy after the step of all vertices without an exact pin"),
+    ColumnSpec(
+        "potential_energy",
+        _REAL,
+        "J",
+        "springs, loads, penalty pins and all other potentials after the step, loads relative to the start; null "
+        "where the solver integrates a frame itself and more than potentials acts",
+    ),
+    ColumnSpec(
+        "provided_energy",
+        _REAL,
+        "J",
+        "energy of the start, released by loads, and positive work of sources, up to the end of the step",
+    ),
+    ColumnSpec(
+        "source_work",
+        _REAL,
+        "J",
+        "work in the step of changing forces, moving pins and obstacles, and energies whose parameters change",
+    ),
+    ColumnSpec(
+        "dissipation_damping",
+        _REAL,
+        "J",
+        "energy that damping effects dissipated in the step; null, like the next three, where the solver integrates a "
+        "frame itself and more than potentials acts",
+    ),
+    ColumnSpec("dissipation_friction", _REAL, "J", "energy that friction dissipated in the step"),
+    ColumnSpec(
+        "dissipation_integrator",
+        _REAL,
+        "J",
+        "energy that the time integrator dissipated in the step beyond what the scene does; negative: it added energy",
+    ),
+    ColumnSpec(
+        "dissipation_solve",
+        _REAL,
+        "J",
+        "energy dissipated by the unconverged solve: minus the work of the residual force; negative: it added energy",
+    ),
+    ColumnSpec(
+        "balance_error",
+        _REAL,
+        "J",
+        "change of the energy in the step that these terms do not explain: round-off",
+    ),
     ColumnSpec("max_strain", _REAL, "", "maximum over the springs of |length / rest length - 1| after the step"),
     ColumnSpec(
         "strain_p99",

@@ -17,6 +17,7 @@ from springbench.harness.recording.recorder_interface import RecordedFrame, RunR
 from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
+from springbench.harness.simulation.dissipation import DissipationBudget, StepDissipation
 from springbench.harness.simulation.energy_balance import BLOW_UP_FACTOR, EnergyBalance, EnergyGain
 from springbench.harness.simulation.time_loop import SimulationStep, build_initial_state
 from springbench.harness.simulation.timing_pass import (
@@ -69,14 +70,14 @@ def observe_run(
       StepError: a step failed, or, caused by DivergenceError, the energy diverges.
     """
     found: dict[int, dict[str, Any]] = {}
-    energy = EnergyBalance(scene)
+    energy, budget = EnergyBalance(scene), DissipationBudget(scene)
 
-    def look(step: SimulationStep, residual: float, balance: EnergyGain) -> None:
+    def look(step: SimulationStep, residual: float, balance: EnergyGain, dissipation: StepDissipation) -> None:
         terms = step.problem.evaluate_terms(step.solution.positions)
         found[step.index] = columns = build_solution_columns(scene, step, terms, residual) | (
             verify_step(step) if verify_step else {}
         )
-        columns |= balance.columns
+        columns |= balance.columns | dissipation.columns
         if positions_out is not None:
             positions_out[step.index - 1] = step.positions
         if sample_frame:
@@ -99,7 +100,8 @@ def observe_run(
             balance = energy.add_step(step)
             if balance.is_above(BLOW_UP_FACTOR):
                 raise StepError(step.index) from DivergenceError(f"from frame {step.index} on the motion has {balance}")
-            looked = executor.submit(look, step, compute_returned_residual(prepared, step), balance)
+            dissipation = budget.add_step(step)
+            looked = executor.submit(look, step, compute_returned_residual(prepared, step), balance, dissipation)
             if recorder and step.index in convergence_frames:
                 norm = EnergyNorm(step.problem.system)
                 # A further round of friction starts where the previous one ended; only the first one is drawn.

@@ -138,18 +138,22 @@ class StageSequence:
         v[self._pinned] = self.scene.pin_velocities_at(time)[self._exact]
         return Motion(p, v)
 
-    def _compute_acceleration(self) -> Positions:
-        """Compute the initial acceleration (n, 3) [m/s^2], zero at exact pins; raises Unsupported."""
+    def build_start_problem(self) -> StepProblem:
+        """Build the problem whose gradient at the start of the step is that of all forces but inertia [N]."""
         (p, v), system = self.now, self.scene.system
-        require_masses(self.scene)
         begun = StepStart(p, v, self.time, p - v / system.velocity_rate, system.velocity_rate, self.time)
         force = reduce(
             lambda total, effect: total + effect(p, v, self.time), self.scene.varying_forces, self.scene.constant_force
         )
         pin_targets = self.scene.pin_targets_at(self.time)
-        pull = StepProblem(system, p, force, pin_targets, p, p, begun).gradient(p)
-        mass = system.mass[:, None]
-        return np.divide(pull, -mass, out=np.zeros_like(p), where=mass > 0.0)
+        return StepProblem(system, p, force, pin_targets, p, p, begun)
+
+    def _compute_acceleration(self) -> Positions:
+        """Compute the initial acceleration (n, 3) [m/s^2], zero at exact pins; raises Unsupported."""
+        require_masses(self.scene)
+        pull = self.build_start_problem().gradient(self.now.positions)
+        mass = self.scene.system.mass[:, None]
+        return np.divide(pull, -mass, out=np.zeros_like(pull), where=mass > 0.0)
 
 
 def require_masses(scene: Scene) -> None:

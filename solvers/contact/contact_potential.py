@@ -21,6 +21,7 @@ from springbench.solvers.contact import collisions
 from springbench.solvers.contact.broad_phase import candidate_cache
 from springbench.solvers.contact.broad_phase.candidate_cache import CachedCandidates, CandidateSource
 from springbench.solvers.contact.collisions import Candidates, Collisions, pad_positions
+from springbench.solvers.contact.contact_work import ObstacleWork
 from springbench.solvers.contact.lagged_friction import MAX_FRICTION_ITERATIONS
 from springbench.solvers.contact.potentials import barrier
 from springbench.solvers.contact.potentials.barrier_hessian import (
@@ -150,6 +151,16 @@ class BarrierContact:
         out = np.zeros_like(p)
         self.tangential_collisions.add_gradient(p, out)
         return out[:n]
+
+    def friction_potential(self, p: Positions) -> float:
+        """Return the part of friction in the energy [J] at p (n, 3)."""
+        if not len(self.tangential_collisions.vertices):
+            return 0.0
+        return float(self.tangential_collisions.value(self.append_obstacle_positions(p)))
+
+    def obstacle_work(self, p: Positions, start: Positions) -> ObstacleWork:
+        """Return the work of the obstacles in the step, by their forces at p (n, 3) [m]."""
+        return ObstacleWork()
 
     def hessian_blocks(self, p: Positions, negative_fraction: float = 1.0) -> PackedBlocks:
         """Return the Hessian blocks [N/m] of all active collisions.
@@ -379,3 +390,13 @@ class ObstacleContact(BarrierContact):
     def comoving_positions(self, p: Positions) -> list[Positions]:
         """Return the end positions that p (n, 3) would have if it moved with each of the moving obstacles."""
         return self.comoving_map(*self.step_times, p)
+
+    def obstacle_work(self, p: Positions, start: Positions) -> ObstacleWork:
+        """Return the work of the obstacles in the step, by their forces at p (n, 3) [m]."""
+        if self.start_positions is self.end_positions:
+            return ObstacleWork()
+        n, p, moved = len(p), self.append_obstacle_positions(p), self.end_positions - self.start_positions
+        pressed, friction = self._state_at(p).gradient[n:], np.zeros_like(p)
+        self.tangential_collisions.add_gradient(p, friction)
+        normal_work = np.einsum("ij,ij->", pressed, moved) if len(self._state_at(p).collisions.vertices) else 0.0
+        return ObstacleWork(float(normal_work), float(np.einsum("ij,ij->", friction[n:], moved)))

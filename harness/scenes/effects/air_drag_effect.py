@@ -8,13 +8,14 @@ their stages treat it as a force, limited to what stops a vertex in one step, an
 includes drag as well, by their area and their angle to the flow.
 """
 
+from dataclasses import dataclass
 from math import inf
 from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
-from springbench.harness.scenes.effects.effect_interface import EffectContribution, ForceFunction, ObservedMotion
+from springbench.harness.scenes.effects.effect_interface import EffectContribution, ObservedMotion
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.schema.base_model import ConfigModel
 from springbench.solvers.model.energies.quadratic_energy import AirDrag as Energy
@@ -47,7 +48,7 @@ class AirDragEffect(ConfigModel):
             return EffectContribution(energies=(Energy.from_vertices(c),))
 
         def force() -> EffectContribution:
-            return EffectContribution(forces=(_quadratic_drag_force(c, mass / time_step),))
+            return EffectContribution(forces=(QuadraticDragForce(c, mass / time_step),))
 
         return EffectContribution(velocity_filters=(QuadraticDrag(mass, c * time_step),), continuous_forms=(force,))
 
@@ -71,13 +72,18 @@ class AirDragEffect(ConfigModel):
         )
 
 
-def _quadratic_drag_force(c: NDArray[np.float64], limit: NDArray[np.float64]) -> ForceFunction:
-    """Build the force for c (n,) [kg/m], limited to `limit` (n,) [kg/s] times the velocity."""
+@dataclass(frozen=True, eq=False)
+class QuadraticDragForce:
+    """The force for c (n,) [kg/m], limited to `limit` (n,) [kg/s] times the velocity."""
 
-    def drag(p: Positions, v: Positions, t: float) -> Positions:
-        return -np.minimum(c * np.linalg.norm(v, axis=1), limit)[:, None] * v
+    c: NDArray[np.float64]
+    limit: NDArray[np.float64]
 
-    return drag
+    is_dissipative: ClassVar[bool] = True
+
+    def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
+        """Return the force (n, 3) [N] at the velocities v (n, 3) [m/s]."""
+        return -np.minimum(self.c * np.linalg.norm(v, axis=1), self.limit)[:, None] * v
 
 
 def _compute_kinetic_energy(mass: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -24,6 +24,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from springbench.solvers.contact.contact_work import ObstacleWork
 from springbench.solvers.contact.half_space import separating_planes as contact_planes
 from springbench.solvers.contact.half_space.half_space_element import HALF_SPACE_LAW
 from springbench.solvers.contact.half_space.separating_planes import RoundedBox, SeparatingPlanes
@@ -216,6 +217,30 @@ class HalfSpaceContact:
         out = np.zeros_like(p)
         self._add_friction_gradient(p, out)
         return out
+
+    def friction_potential(self, p: Positions) -> float:
+        """Return the part of friction in the energy [J] at p (n, 3)."""
+        if self.has_no_active_collisions():
+            return 0.0
+        friction = self._evaluate_friction(p)
+        return float(self.active_planes.friction_limit[friction.planes] @ friction.smoothed)
+
+    def obstacle_work(self, p: Positions, start: Positions) -> ObstacleWork:
+        """Return the work of the obstacles from the step's start to its stage.
+
+        Each vertex is pushed by the point of the obstacle that it would move with.
+
+        Args:
+            p: positions (n, 3) [m] of the stage, whose forces act.
+            start: positions (n, 3) [m] at the step's start.
+        """
+        if self.has_no_active_collisions() or self._static_frames is not None:
+            return ObstacleWork()
+        planes, friction = self.active_planes, self._evaluate_friction(p)
+        moved = planes.friction_anchor - start[planes.vertices]
+        pushed = planes.stiffness * np.minimum(0.0, self.compute_gaps(p)) * _row_dots(planes.normal, moved)
+        dragged = friction.stiffness * _row_dots(friction.u, moved[friction.planes])
+        return ObstacleWork(-float(pushed.sum()), -float(dragged.sum()))
 
     def compute_gaps(self, p: Positions) -> FloatArray:
         """Return the gaps n.x - d [m], (k,)."""

@@ -66,6 +66,8 @@ class Dashpots(EdgeEnergy):
     offset: NDArray[np.float64]
 
     is_lag_extrapolated: ClassVar[bool] = True
+    is_dissipative: ClassVar[bool] = True
+    """Whether the gradient is a damping force, which stores no energy."""
     element_law: ClassVar[ElementLaw] = ElementLaw.from_functions(
         _value, _gradient, _hessian, _energy_change, has_constant_hessian=True
     )

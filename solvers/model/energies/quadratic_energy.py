@@ -9,6 +9,7 @@ force -A'C A v is the gradient for W = C velocity_rate and d = A velocity_origin
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import scipy
@@ -70,6 +71,9 @@ class ViscousDamping(Quadratic):
 
     The weight is c (m,) [N s/m] initially, i.e. c velocity_rate [N/m] at a rate of 1/s, and c velocity_rate in a step.
     """
+
+    is_dissipative: ClassVar[bool] = True
+    """Whether the gradient is a damping force, which stores no energy."""
 
     @classmethod
     def from_operator(cls, A: scipy.sparse.csr_array, damping: NDArray[np.float64]) -> ViscousDamping:

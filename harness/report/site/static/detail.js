@@ -42,6 +42,12 @@ Object.assign(springbench, (() => {
     ]);
   }
 
+  function losses(row) {
+    if (row.integrator_share === undefined || row.integrator_share === null) return null;
+    const parts = [["damping", row.damping_share], ["friction", row.friction_share], ["the integrator", row.integrator_share], ["unconverged solves", row.solve_share]];
+    return parts.map(([cause, share]) => `${percent(share || 0)} by ${cause}`).join(", ") + `, of ${number(row.provided_energy)} J`;
+  }
+
   function figures(row) {
     if (row.step === null) return null;
     return list([
@@ -50,6 +56,7 @@ Object.assign(springbench, (() => {
       ["iterations", `${number(row.num_iterations)}, stopped by ${row.termination_reason || "their number"}`],
       ["last residual", row.residual === null ? "none: it minimises nothing" : `${fixed(row.residual)} J^½`],
       ["largest strain", percent(row.max_strain)], ["99 % of springs below", row.strain_p99 === undefined || row.strain_p99 === null ? null : percent(row.strain_p99)],
+      ["energy dissipated", losses(row)],
       ["deepest inside an obstacle", row.penetration_depth ? `${number(row.penetration_depth)} m` : null],
     ]);
   }

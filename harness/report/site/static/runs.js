@@ -29,6 +29,7 @@
     { id: "warm", width: "92px", spare: 8, title: "Prepare ms", meaning: "warm", numeric: true, show: row => number(row.warm) },
     { id: "max_strain", width: "78px", spare: 1, title: "Strain", meaning: "the largest of all springs and frames", numeric: true, show: row => percent(row.max_strain) },
     { id: "strain_p99", width: "78px", spare: 2, title: "99 %", meaning: "strain that 99 % of the springs stay below", numeric: true, show: row => percent(row.strain_p99) },
+    { id: "integrator_share", width: "84px", spare: 9, title: "Integrator", meaning: "energy that the time integrator dissipated, of that provided; damping, friction and unconverged solves are in the details", numeric: true, show: row => percent(row.integrator_share) },
   ];
   const FACETS = [["sweep", "Results"], ["scene", "Scene"], ["size", "Size"], ["solver", "Solver"], ["status", "Status"], ["outcome", "Judged"], ["termination_reason", "Stopped by"], ["staleness", "Code"]];
   const LIMITS = [["residual", "Residual at most"], ["step", "ms a step at most"], ["max_strain", "Strain at most (%)"]];
@@ -71,7 +72,7 @@
     const all = await springbench.rows();
     const known = key => all.some(row => row[key] !== null && row[key] !== undefined && row[key] !== "");
     const several = key => new Set(all.map(row => row[key])).size > 1;
-    const hidden = new Set([...["outcome", "strain_p99", "picture"].filter(key => !known(key)), ...(several("sweep") ? [] : ["sweep"])]);
+    const hidden = new Set([...["outcome", "strain_p99", "integrator_share", "picture"].filter(key => !known(key)), ...(several("sweep") ? [] : ["sweep"])]);
     if (hidden.has("picture")) hidden.add("shot");
     const columns = COLUMNS.filter(column => !hidden.has(column.id));
     let shown = all, selected = new Set(), now = query;
