@@ -22,6 +22,7 @@ from springbench.harness.cli.commands.figure import figure
 from springbench.harness.cli.commands.gallery import gallery
 from springbench.harness.cli.commands.list_runs import list_command
 from springbench.harness.cli.commands.matrices import matrices
+from springbench.harness.cli.commands.new_study import new_study
 from springbench.harness.cli.commands.pages import pages
 from springbench.harness.cli.commands.preview import preview
 from springbench.harness.cli.commands.published import compare, publish_study, reproduce
@@ -255,6 +256,7 @@ def report(
 
 app.command(cls=build_command_class("frames", "max_iterations", "rtol", "rounds"))(ablate)
 app.command("list")(list_command)
+app.command("new")(new_study)
 app.command()(roofline)
 app.command()(recommend)
 app.command()(export_script)

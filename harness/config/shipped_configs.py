@@ -16,7 +16,7 @@ SHIPPED_FOLDER = Path(__file__).parents[2] / "configs"
 """Folder of the shipped configs, in a checkout and in a wheel."""
 SCENE_FOLDER = "scenes"
 """Subfolder of the scenes that have a name without a folder."""
-_TEMPLATE_FOLDER = "new-study"
+_TEMPLATE_FOLDER = "templates"
 
 
 @cache
@@ -25,6 +25,11 @@ def list_shipped_configs() -> dict[str, Path]:
     files = sorted(SHIPPED_FOLDER.rglob("*.yaml"))
     names = {path.relative_to(SHIPPED_FOLDER).with_suffix("").as_posix(): path for path in files}
     return {name: path for name, path in names.items() if not name.startswith(f"{_TEMPLATE_FOLDER}/")}
+
+
+def list_template_files() -> list[Path]:
+    """List the files of a new study."""
+    return sorted(path for path in (SHIPPED_FOLDER / _TEMPLATE_FOLDER / "new-study").iterdir() if path.is_file())
 
 
 def find_shipped_scene(name: str) -> Path | None:

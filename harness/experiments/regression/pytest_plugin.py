@@ -17,7 +17,6 @@ from __future__ import annotations
 import os
 from collections.abc import Generator
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import pytest
@@ -132,7 +131,7 @@ class PairedBenchmark:
         """Compare two solvers on a scene.
 
         Args:
-            scene: file of the scene, relative to the test's file.
+            scene: file of the scene, relative to the test's file; or name of a shipped scene.
             solver: the candidate: a name, a mapping of name and parameters, or a solver object.
             baseline: solver to compare with, in the same form.
             max_ratio: limit of the ratio of times.
@@ -143,11 +142,13 @@ class PairedBenchmark:
             options: options of a run: max_iterations, rtol, frames, integrator, time_step, initial_guess.
         Returns: the result, or None if nothing is timed.
         """
+        from springbench.harness.config.shipped_configs import resolve_scene_path
         from springbench.harness.execution.machine_info import limit_threads
         from springbench.harness.experiments.regression.solver_pair import prepare_solver_pair
 
         with limit_threads(1):
-            both = prepare_solver_pair(self._item.path.parent / Path(scene), solver, baseline, size=size, **options)
+            path = resolve_scene_path(os.fspath(scene), self._item.path.parent)
+            both = prepare_solver_pair(path, solver, baseline, size=size, **options)
             return self(*both, max_ratio=max_ratio, clock=clock, agreement_rtol=agreement_rtol, budget=budget)
 
 
