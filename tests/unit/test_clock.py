@@ -102,6 +102,13 @@ def test_both_of_two_threads_that_were_stopped_for_half_the_time_are_found_out()
     )["preempted"]
 
 
+def test_a_background_thread_does_not_hide_a_preemption() -> None:
+    watch = PhaseWatch(wall_seconds=1.0, num_entries=1, process_seconds=1.0, thread_seconds=0.9)
+    assert watch.build_columns("step", [0.9])["preempted"]
+    elsewhere = PhaseWatch(wall_seconds=1.0, num_entries=1, process_seconds=1.0, thread_seconds=0.01)
+    assert not elsewhere.build_columns("step", [1.0])["preempted"], "an engine may compute in a thread of its own"
+
+
 def test_a_watch_adds_up_what_is_done_within_it_and_nothing_in_between() -> None:
     watch = PhaseWatch()
     for _ in range(2):
