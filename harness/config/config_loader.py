@@ -286,7 +286,12 @@ def build_scene_from_document(document: ConfigDocument) -> SceneSpec:
     effects = tuple(_build_part(document, "effect", effect, ("effects", i), own) for i, effect in enumerate(listed))
     if fields is None or document.mistakes:
         raise document.build_error()
-    parts: dict[str, Any] = {"mesh": mesh, "mesh_digest": _hash_mesh(mesh), "effects": effects}
+    try:
+        digest = _hash_mesh(mesh)
+    except InputError as error:
+        document.add_errors(error)
+        raise document.build_error() from None
+    parts: dict[str, Any] = {"mesh": mesh, "mesh_digest": digest, "effects": effects}
     return SceneSpec(
         **vars(fields) | parts,
         path=document.path,
@@ -307,6 +312,8 @@ def _hash_mesh(source: Any) -> str:
         "triangles": mesh.triangles,
         "shares": mesh.mass_fractions,
     }
+    if own := mesh.spring_properties:
+        arrays |= {"stiffness": own.stiffness, "rest length": own.rest_length, "only pulls": own.only_pulls}
     for name, array in {**arrays, "mass": mesh.mass, **mesh.spring_families}.items():
         digest.update(f"{name} {None if array is None else array.shape} ".encode())
         digest.update(b"" if array is None else array.tobytes())

@@ -62,7 +62,7 @@ class OdeField:
             raise NotIntegrable("lengths that are exact make it no differential equation; give them a stiffness")
         if without_vertex_contact(system) is not system:
             raise NotIntegrable("contact is stiff, and its friction begins anew each step; leave it out")
-        x = scene.all_springs
+        x = Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
         arrays = x.edges, x.stiffness, x.rest_length, x.rest_direction
         self._springs = arrays if compiled else None
         self._others = tuple(energy for energy in system.energies if not (compiled and isinstance(energy, Springs)))

@@ -27,6 +27,7 @@ from springbench.harness.scenes.start_positions import RestStart
 from springbench.harness.scenes.vertex_selectors import VertexSelection
 from springbench.solvers.model import integrators
 from springbench.solvers.model.energies.spring_energy import Springs
+from springbench.solvers.model.energies.tension_only_energy import TensionOnlySprings
 from springbench.solvers.model.integrators import IMPLICIT_EULER, find_integrator
 from springbench.solvers.model.step_problem import (
     DirichletPins,
@@ -116,11 +117,15 @@ class Scene:
 
     @cached_property
     def all_springs(self) -> Springs:
-        """All springs with stiffness, by effect and in mesh order; then length constraints with infinite stiffness."""
+        """All springs with stiffness, by effect and in mesh order, those that only pull last.
+
+        Length constraints follow, with infinite stiffness.
+        """
         exact = [x for x in self.system.length_constraints if (x.min_length == x.max_length).all()]
         return Springs.from_parts(
             [
                 *(energy for energy in self.system.energies if isinstance(energy, Springs)),
+                *(energy.to_springs() for energy in self.system.energies if isinstance(energy, TensionOnlySprings)),
                 *(Springs(x.edges, np.full(len(x.min_length), np.inf), x.max_length, x.rest_direction) for x in exact),
             ]
         )

@@ -135,11 +135,13 @@ def _continuum_scale(mesh: Mesh, family: str, reference: int | None) -> NDArray[
         return 16 / mesh.spacing**2
     if mesh.dimension > 1:
         return 1.0 if mesh.dimension == 2 else mesh.spacing
-    lengths = mesh.rest_lengths[mesh.spring_families[family]]
-    if not lengths.all():
+    of, own = mesh.spring_families[family], mesh.spring_properties
+    lengths = mesh.rest_lengths[of]
+    needed = np.ones(len(of), np.bool_) if own is None else np.isnan(own.stiffness[of])
+    if not lengths[needed].all():
         problem = "continuum divides by rest lengths, and a spring joins two vertices in one place; use fixed"
         raise InputError(InputMistake(problem, key="scaling_rule"))
-    return 1 / lengths
+    return np.divide(1.0, lengths, out=np.zeros_like(lengths), where=needed)
 
 
 def _liu2013_scale(mesh: Mesh, family: str, reference: int | None) -> float:

@@ -70,6 +70,14 @@ class ConfigDocument:
         line = next((self.lines[at[:k]] for k in range(len(at), -1, -1) if at[:k] in self.lines), None)
         self.mistakes.append(InputMistake(problem, self.path, line, format_key(at)))
 
+    def add_errors(self, error: InputError) -> None:
+        """Add the mistakes of an error; those that name no file are at their key in this one."""
+        for mistake in error.mistakes:
+            if mistake.file is None:
+                self.add_mistake(mistake.problem, tuple(mistake.key.split(".")) if mistake.key else ())
+            else:
+                self.mistakes.append(mistake)
+
     def validate_data(self, model: type[M], data: Any, at: ConfigKey = ()) -> M | None:
         """Validate data with a model and add its mistakes to the document.
 
@@ -98,7 +106,8 @@ class ConfigDocument:
 
     def resolve_paths(self, model: type[BaseModel], data: dict[str, Any], at: ConfigKey) -> dict[str, Any]:
         """Resolve file names relative to the config's folder; a missing file is a mistake."""
-        names = [k for k, f in model.model_fields.items() if f.annotation is Path and isinstance(data.get(k), str)]
+        paths = [k for k, f in model.model_fields.items() if f.annotation in (Path, Path | None)]
+        names = [k for k in paths if isinstance(data.get(k), str)]
         for key in names:
             data = data | {key: str(self.path.parent / data[key])}
             if not os.path.isfile(data[key]):

@@ -51,7 +51,8 @@ def compute_edge_stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, be
                 k[e] = 16 * constant / h**2
             elif mesh.dimension == 1:
                 i, j = mesh.springs[e]
-                k[e] = constant / np.linalg.norm(mesh.rest_positions[i] - mesh.rest_positions[j])
+                own, distance = mesh.spring_properties, np.linalg.norm(mesh.rest_positions[i] - mesh.rest_positions[j])
+                k[e] = constant / (distance if own is None else own.rest_length[e])
             else:
                 k[e] = constant * {2: 1.0, 3: h}[mesh.dimension]
     if effect.scaling_rule == "continuum" and bend:
@@ -92,20 +93,28 @@ def build_springs_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build springs along all edges that have stiffness."""
     k = compute_reference_stiffness(effect, declared)
     exact, k = _select_exact_lengths(declared, k, 1.0, 1.0), select_finite(k)
-    edges, n = declared.mesh.springs, len(declared.mass)
-    r = _edge_lengths(declared.rest, edges)
+    edges, n, own = declared.mesh.springs, len(declared.mass), declared.mesh.spring_properties
+    r = _rest_lengths(declared)
+    only_pulls = np.zeros(len(edges), np.bool_) if own is None else own.only_pulls
 
     def begin(moment: StepMoment) -> ValueFunction:
-        return lambda x: to_extended(k) / 2 * (_edge_lengths(x, edges) - r) ** 2
+        def value(x: ExtendedArray) -> ExtendedArray:
+            excess = _edge_lengths(x, edges) - r
+            return to_extended(k) / 2 * np.where(only_pulls & (excess.real < 0.0), 0.0, excess) ** 2
+
+        return value
 
     return EffectTerms(begin, sum_edge_weights(edges, k, n), exact_lengths=exact)
 
 
 def compute_reference_stiffness(effect: Any, declared: SceneDeclaration) -> Array:
     """Compute the stiffness (m,) [N/m] of an effect `springs`."""
-    given = effect.stretch, effect.stretch if effect.shear is None else effect.shear
+    along = 0.0 if effect.stretch is None else effect.stretch
+    given = along, along if effect.shear is None else effect.shear
     stretch, shear = (np.inf if x == "exact" else x for x in given)
-    return compute_edge_stiffness(declared.mesh, effect, stretch, shear, effect.bend)
+    k = compute_edge_stiffness(declared.mesh, effect, stretch, shear, effect.bend)
+    own = declared.mesh.spring_properties
+    return k if own is None else np.where(np.isnan(own.stiffness), k, own.stiffness)
 
 
 def select_finite(k: Array) -> Array:
@@ -120,8 +129,7 @@ def _select_exact_lengths(
 
     These are `low` and `high` times the rest length.
     """
-    edges = declared.mesh.springs
-    r = _edge_lengths(declared.rest, edges)
+    edges, r = declared.mesh.springs, _rest_lengths(declared)
     return {(*edges[e].tolist(),): (low * float(r[e]), high * float(r[e])) for e in np.flatnonzero(np.isinf(k))}
 
 
@@ -130,7 +138,7 @@ def build_strain_limits_terms(effect: Any, declared: SceneDeclaration) -> Effect
     given = np.inf if effect.stiffness == "exact" else effect.stiffness
     k = compute_edge_stiffness(declared.mesh, effect, given, given, 0.0)
     exact, k = _select_exact_lengths(declared, k, effect.min_stretch, effect.max_stretch), select_finite(k)
-    edges, r = declared.mesh.springs, _edge_lengths(declared.rest, declared.mesh.springs)
+    edges, r = declared.mesh.springs, _rest_lengths(declared)
     low, high = effect.min_stretch * r, effect.max_stretch * r
 
     def values(x: ExtendedArray) -> ExtendedArray:
@@ -194,6 +202,12 @@ def _unit_direction(v: ExtendedArray, otherwise: ExtendedArray) -> ExtendedArray
         if u.any():
             return u / np.sqrt(u @ u)
     return to_extended([1.0, 0.0, 0.0])
+
+
+def _rest_lengths(declared: SceneDeclaration) -> ExtendedArray:
+    """Return the rest lengths (m,) [m]: those that the mesh states, else the distances of the ends."""
+    own = declared.mesh.spring_properties
+    return _edge_lengths(declared.rest, declared.mesh.springs) if own is None else to_extended(own.rest_length)
 
 
 def _edge_lengths(x: ExtendedArray, edges: Any) -> ExtendedArray:

@@ -6,7 +6,7 @@ An absent effect is an empty tuple: no flag, no branch, no allocation.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -209,16 +209,29 @@ def build_length_constraints(
     """
     if not len(springs):
         return EffectContribution()
-    rest = Springs.from_rest_shape(mesh.rest_positions, springs, np.ones(len(springs)))
+    rest = build_rest_springs(mesh, springs, np.ones(len(springs)))
     r = rest.rest_length
     if len(none := np.flatnonzero(r == 0.0)):
-        i, j = springs[none[0]]
+        i, j = rest.edges[none[0]]
         problem = f"the spring {i}-{j} has no length at rest, and none that could be kept; give a stiffness in figures"
         raise InputError(problem)
     lengths = LengthConstraints(rest.edges, min_ratio * r, max_ratio * r, rest.rest_direction)
     return EffectContribution(
         length_constraints=(lengths,), end_of_step_reasons=("keeps lengths as they are at the end of a step",)
     )
+
+
+def build_rest_springs(mesh: Mesh, indices: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:
+    """Build springs of a mesh with its rest lengths.
+
+    Args:
+        mesh: the mesh.
+        indices: (m,) indices of its springs.
+        stiffness: (m,) [N/m].
+    """
+    springs = Springs.from_rest_shape(mesh.rest_positions, mesh.springs[indices], stiffness)
+    own = mesh.spring_properties
+    return springs if own is None else replace(springs, rest_length=own.rest_length[indices])
 
 
 def build_constant_force(force: Positions) -> tuple[ConstantForceField, ...]:

@@ -11,18 +11,24 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, PositiveInt
-from springbench.harness.scenes.effects.effect_interface import EffectContribution, build_length_constraints
-from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.scenes.effects.effect_interface import (
+    EffectContribution,
+    build_length_constraints,
+    build_rest_springs,
+)
+from springbench.harness.scenes.mesh.mesh import STRETCH, Mesh
 from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.spring_stiffness import compute_spring_stiffness
 from springbench.harness.schema.base_model import ConfigModel
-from springbench.solvers.model.energies import spring_energy
+from springbench.solvers.model.energies import tension_only_energy
 
 
 class SpringsEffect(ConfigModel):
     """Springs k/2 (length - rest length)^2 along the mesh's edges.
 
-    Springs of zero stiffness are omitted; springs of infinite stiffness are length constraints.
+    Springs of zero stiffness are omitted; springs of infinite stiffness are length constraints. Springs whose mesh
+    states a stiffness have that one, and those that only pull exert no force while they are slack.
     """
 
     max_convergence_order: ClassVar[float] = inf
@@ -33,9 +39,10 @@ class SpringsEffect(ConfigModel):
     """Scaling rule of the values below with the mesh size. `continuum`: the material is independent of the mesh;
     `fixed`: each spring has the given stiffness [N/m]; `liu2013`: stiffness proportional to the resolution,
     given at the size `reference_size`."""
-    stretch: NonNegativeFloat | Literal["exact"] | OrthotropicStiffness
+    stretch: NonNegativeFloat | Literal["exact"] | OrthotropicStiffness | None = None
     """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids; or one value
-    each for warp, weft and bias of a woven cloth; or `exact`: length constraints, supported by `avbd` only."""
+    each for warp, weft and bias of a woven cloth; or `exact`: length constraints, supported by `avbd` only. Left out if
+    the mesh states the stiffness of each spring itself."""
     shear: NonNegativeFloat | Literal["exact"] | None = None
     """Across the mesh's cells, in the same unit; equal to `stretch` by default."""
     bend: NonNegativeFloat = 0.0
@@ -45,8 +52,8 @@ class SpringsEffect(ConfigModel):
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the springs as one energy, empty without stiffness, and the length constraints."""
-        given = self.stretch if self.shear is None else self.shear
-        stretch, shear = (inf if x == "exact" else x for x in (self.stretch, given))
+        given = _require_stretch(self.stretch, mesh)
+        stretch, shear = (inf if x == "exact" else x for x in (given, given if self.shear is None else self.shear))
         k = compute_spring_stiffness(
             mesh,
             scaling_rule=self.scaling_rule,
@@ -55,10 +62,33 @@ class SpringsEffect(ConfigModel):
             bend=self.bend,
             reference_size=self.reference_size,
         )
-        stiff, exact = np.flatnonzero((k > 0.0) & (k < inf)), mesh.springs[k == inf]
-        found = build_length_constraints(mesh, exact, 1.0, 1.0)
-        if not len(stiff):
-            return found
-        return replace(
-            found, energies=(spring_energy.Springs.from_rest_shape(mesh.rest_positions, mesh.springs[stiff], k[stiff]),)
-        )
+        own = mesh.spring_properties
+        if own is not None:
+            k = np.where(np.isnan(own.stiffness), k, own.stiffness)
+        found = build_length_constraints(mesh, np.flatnonzero(k == inf), 1.0, 1.0)
+        stiff = np.flatnonzero((k > 0.0) & (k < inf))
+        if own is None:
+            parts = (build_rest_springs(mesh, stiff, k[stiff]),)
+        else:
+            # A spring without any rest length is never slack.
+            pulls = own.only_pulls[stiff] & (own.rest_length[stiff] > 0.0)
+            springs, cables = (build_rest_springs(mesh, some, k[some]) for some in (stiff[~pulls], stiff[pulls]))
+            parts = springs, tension_only_energy.TensionOnlySprings.from_springs(cables)
+        return replace(found, energies=tuple(one for one in parts if len(one.edges)))
+
+
+def _require_stretch(
+    stretch: float | Literal["exact"] | OrthotropicStiffness | None, mesh: Mesh
+) -> float | Literal["exact"] | OrthotropicStiffness:
+    """Return the constant of the springs along the lines; raise InputError if it is missing or has no effect."""
+    along, own = mesh.spring_families[STRETCH], mesh.spring_properties
+    stated = np.zeros(len(along), np.bool_) if own is None else ~np.isnan(own.stiffness[along])
+    if stretch is not None:
+        if len(along) and stated.all():
+            problem = "`stretch` has no effect, because the mesh states the stiffness of each spring; leave it out"
+            raise InputError(InputMistake(problem, key="stretch"))
+        return stretch
+    if not stated.all() or own is None:
+        many = f"{(~stated).sum():,} of {len(along):,} springs along the lines have no stiffness"
+        raise InputError(InputMistake(f"`stretch` is missing: {many} from the mesh", key="stretch"))
+    return 0.0

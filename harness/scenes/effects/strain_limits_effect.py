@@ -51,12 +51,15 @@ class StrainLimitsEffect(ConfigModel):
         k = compute_spring_stiffness(
             mesh, scaling_rule=self.scaling_rule, stretch=s, shear=s, bend=0.0, reference_size=self.reference_size
         )
-        edges = mesh.springs[k > 0.0]
-        if not len(edges):
+        limited = np.flatnonzero(k > 0.0)
+        if not len(limited):
             return EffectContribution()
         if self.stiffness == "exact":
-            return build_length_constraints(mesh, edges, self.min_stretch, self.max_stretch)
+            return build_length_constraints(mesh, limited, self.min_stretch, self.max_stretch)
+        edges = mesh.springs[limited]
         rest, direction = rest_directions(mesh.rest_positions, edges)
+        if mesh.spring_properties is not None:
+            rest = mesh.spring_properties.rest_length[limited]
         limits = self.min_stretch * rest, self.max_stretch * rest
         return EffectContribution(energies=(strain_limit_energy.StrainLimits(edges, k[k > 0.0], *limits, direction),))
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import sandbox
 from springbench.harness.scenes.mesh.assignment_json import read_assignment_json
@@ -22,7 +24,13 @@ from springbench.harness.scenes.mesh.spring_network import (
     build_spring_network,
     check_mesh_file,
 )
-from springbench.harness.schema.base_model import ConfigModel
+from springbench.harness.scenes.mesh.spring_values import (
+    SpringValueKeys,
+    find_springs,
+    match_table_rows,
+    spread_columns,
+)
+from springbench.harness.scenes.mesh.table_reader import read_table
 
 _CELL_KINDS = ("line", *FACE_KINDS, "tetra")
 """Kinds of cells that yield springs; the kind `vertex` is ignored."""
@@ -36,7 +44,7 @@ MIN_READ_MEMORY, READ_MEMORY_PER_BYTE = 2**29, 20
 """Memory limit of reading [bytes]: Python lists, with numbers of two characters in the worst case."""
 
 
-class FileMesh(ConfigModel):
+class FileMesh(SpringValueKeys):
     """A mesh from a file, of fixed size.
 
     Parts: the sides of its bounding box, and the groups named in the file. Attributes: point data of the file.
@@ -48,6 +56,9 @@ class FileMesh(ConfigModel):
     spring_rule: SpringRule | None = None
     """Springs along `edges` of faces only, or between all corners of a face (`face-pairs`); by default face-pairs for
     JSON scenes, and edges for all other files."""
+    spring_table: Path | None = None
+    """CSV or Parquet table with values of springs: columns `i` and `j`, zero-based vertices, and columns of values.
+    Without it the columns are the cell data of the file's lines."""
 
     def build_mesh(self, size: int = 0) -> Mesh:
         """Build the file's mesh, ignoring the size; `mesh.spring_network` defines springs and masses.
@@ -60,7 +71,24 @@ class FileMesh(ConfigModel):
         if suffix == ".json":
             path = path.parent / read_assignment_json(path).obj
             suffix = path.suffix.lower()
-        return build_spring_network(read_obj(path) if suffix == ".obj" else _read_cells(path), rule, path)
+        cells = read_obj(path) if suffix == ".obj" else _read_cells(path)
+        return self._add_spring_properties(build_spring_network(cells, rule, path), cells)
+
+    def _add_spring_properties(self, mesh: Mesh, cells: MeshCells) -> Mesh:
+        """Add the values of springs, by the table or by the cell data of the file's lines that the keys name."""
+        columns, has_table = dict[str, NDArray[np.float64]](), self.spring_table is not None
+        if self.spring_table is not None:
+            table = read_table(self.spring_table)
+            rows = match_table_rows(table, mesh.springs, len(mesh.rest_positions))
+            columns = spread_columns(table.numeric_columns(), rows, len(mesh.springs))
+        elif self.states_values:
+            rows = find_springs(cells.segments, mesh.springs)
+            named = {name: values[rows >= 0] for name, values in cells.segment_attributes.items()}
+            columns = spread_columns(named, rows[rows >= 0], len(mesh.springs))
+        else:
+            return mesh
+        properties = self.build_spring_properties(mesh.spring_distances, columns, reads_unnamed=has_table)
+        return replace(mesh, spring_properties=properties)
 
 
 def _read_cells(path: Path) -> MeshCells:
@@ -92,6 +120,7 @@ def _read_cells(path: Path) -> MeshCells:
         tetrahedra=np.concatenate([np.empty((0, 4), np.int64), *(data for kind, data in blocks if kind == "tetra")]),
         vertex_groups=found.vertex_groups,
         attributes=found.attributes,
+        segment_attributes=found.line_attributes,
     )
 
 

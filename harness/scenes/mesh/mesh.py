@@ -13,6 +13,21 @@ STRETCH, SHEAR, BEND = "stretch", "shear", "bend"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SpringProperties:
+    """Properties of springs that a mesh states itself.
+
+    Attributes:
+        stiffness: (m,) [N/m], NaN for springs whose stiffness an effect determines.
+        rest_length: (m,) [m].
+        only_pulls: (m,), springs without any force while they are shorter than their rest length.
+    """
+
+    stiffness: NDArray[np.float64]
+    rest_length: NDArray[np.float64]
+    only_pulls: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
     """A spring network at rest. All arrays are read-only.
 
@@ -30,6 +45,7 @@ class Mesh:
         attributes: vertex attributes from a file, each (n,).
         vertex_areas: (n,) [m^2] at rest if they are not thirds of the triangles, else None.
         first_vertex: number of the first vertex in the mesh's file.
+        spring_properties: stiffness, rest lengths and kinds of the springs if the mesh states them, else None.
     """
 
     rest_positions: NDArray[np.float64]
@@ -45,9 +61,12 @@ class Mesh:
     attributes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
     vertex_areas: NDArray[np.float64] | None = None
     first_vertex: int = 0
+    spring_properties: SpringProperties | None = None
 
     def __post_init__(self) -> None:
         arrays = [self.rest_positions, self.springs, self.triangles, self.mass_fractions, self.mass, self.vertex_areas]
+        if own := self.spring_properties:
+            arrays += [own.stiffness, own.rest_length]
         for array in [*arrays, *self.spring_families.values(), *self.parts.values(), *self.attributes.values()]:
             if array is not None:
                 array.flags.writeable = False
@@ -65,6 +84,13 @@ class Mesh:
     @property
     def rest_lengths(self) -> NDArray[np.float64]:
         """Rest length of each spring [m], shape (m,)."""
+        if self.spring_properties is not None:
+            return self.spring_properties.rest_length
+        return self.spring_distances
+
+    @property
+    def spring_distances(self) -> NDArray[np.float64]:
+        """Distance of the ends of each spring at rest [m], shape (m,)."""
         i, j = self.springs.T
         return np.linalg.norm(self.rest_positions[i] - self.rest_positions[j], axis=1)
 

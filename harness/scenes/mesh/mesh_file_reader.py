@@ -14,10 +14,11 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Protocol, cast
 
 import meshio
@@ -44,6 +45,7 @@ class MeshFileContent(NamedTuple):
         attributes: point data (n,); components of vectors have a number in their name, `normal.0`.
         face_locations: line or number of each cell of a block.
         unused_points: points that no cell uses, of formats that store others besides the mesh, (k, 3).
+        line_attributes: cell data of the cells `line`, in their order, each (lines,).
     """
 
     points: NDArray[np.float64]
@@ -53,6 +55,7 @@ class MeshFileContent(NamedTuple):
     face_locations: list[NDArray[np.int64]]
     location_unit: Literal["line", "face"] = "face"
     unused_points: NDArray[np.float64] = np.empty((0, 3))
+    line_attributes: Mapping[str, NDArray[np.float64]] = MappingProxyType({})
 
 
 class _MeshioCells(Protocol):
@@ -106,6 +109,7 @@ def _read_by_suffix(path: Path) -> MeshFileContent:
         _collect_groups(raw),
         _split_columns(raw.point_data, len(points)),
         _number_faces(cell_blocks),
+        line_attributes=_collect_line_attributes(raw),
     )
     return _drop_unused_points(found) if suffix == ".msh" else found
 
@@ -218,9 +222,26 @@ def _convert_vtp(read: vtp_reader.VtpContent) -> MeshFileContent:
     pairs = [np.column_stack([line[:-1], line[1:]]) for line in read.lines]
     if pairs:
         blocks.append(("line", np.concatenate(pairs)))
+    pieces = [len(line) - 1 for line in read.lines]
     return MeshFileContent(
-        read.points, blocks, {}, _split_columns(read.point_attributes, len(read.points)), _number_faces(blocks)
+        read.points,
+        blocks,
+        {},
+        _split_columns(read.point_attributes, len(read.points)),
+        _number_faces(blocks),
+        line_attributes={name: np.repeat(values, pieces) for name, values in read.line_attributes.items()},
     )
+
+
+def _collect_line_attributes(raw: _MeshioMesh) -> dict[str, NDArray[np.float64]]:
+    """Collect the cell data of the cells `line`: one number for each."""
+    lines = [k for k, block in enumerate(raw.cells) if block.type == "line" and len(block.data)]
+    found: dict[str, NDArray[np.float64]] = {}
+    for name, blocks in raw.cell_data.items():
+        values = [np.asarray(blocks[k]) for k in lines]
+        if values and all(one.ndim == 1 and one.dtype.kind in "iufb" for one in values):
+            found[name] = np.concatenate(values).astype(np.float64)
+    return found
 
 
 def _collect_groups(raw: _MeshioMesh) -> dict[str, NDArray[np.int64]]:

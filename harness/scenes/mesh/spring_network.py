@@ -62,6 +62,7 @@ class MeshCells:
         vertex_groups: points of the groups named in the file.
         attributes: point attributes, each (n,).
         first_vertex: number of the first point in the file.
+        segment_attributes: cell data of the segments, each (s,).
     """
 
     points: PointArray
@@ -73,6 +74,7 @@ class MeshCells:
     attributes: Mapping[str, PointArray] = field(default_factory=dict[str, PointArray])
     location_unit: Literal["line", "face"] = "face"
     first_vertex: int = 0
+    segment_attributes: Mapping[str, PointArray] = field(default_factory=dict[str, PointArray])
 
     @property
     def has_only_segments(self) -> bool:

@@ -35,12 +35,20 @@ _NUMPY_TYPES = {
 
 
 class VtpContent(NamedTuple):
-    """Points (n, 3), polygons and lines by their points, and point attributes by name, (n,) or (n, k)."""
+    """Contents of a .vtp file.
+
+    Attributes:
+        points: (n, 3).
+        polygons, lines: cells by their points.
+        point_attributes: by name, (n,) or (n, k).
+        line_attributes: cell data of the lines by name, each (lines,).
+    """
 
     points: FloatArray
     polygons: list[IndexArray]
     lines: list[IndexArray]
     point_attributes: dict[str, FloatArray]
+    line_attributes: dict[str, FloatArray]
 
 
 def read_vtp(content: bytes) -> VtpContent:
@@ -63,11 +71,13 @@ def read_vtp(content: bytes) -> VtpContent:
     first = np.cumsum([0, *(len(piece.points) for piece in pieces)]).tolist()
     moved = list(zip(first, pieces, strict=False))
     shared = set[str].intersection(*(set(piece.point_attributes) for piece in pieces)) if pieces else set[str]()
+    of_lines = set[str].intersection(*(set(piece.line_attributes) for piece in pieces)) if pieces else set[str]()
     return VtpContent(
         np.concatenate([np.empty((0, 3)), *(piece.points for piece in pieces)]),
         [k + polygon for k, piece in moved for polygon in piece.polygons],
         [k + line for k, piece in moved for line in piece.lines],
         {name: np.concatenate([piece.point_attributes[name] for piece in pieces]) for name in sorted(shared)},
+        {name: np.concatenate([piece.line_attributes[name] for piece in pieces]) for name in sorted(of_lines)},
     )
 
 
@@ -82,9 +92,19 @@ def _read_piece(piece: Element, arrays: _DataArrays) -> VtpContent:
         values = arrays.decode_array(array).astype(np.float64)
         if len(points) and len(values) % len(points) == 0:
             numbers[array.get("Name", "")] = values.reshape(len(points), -1)
-    return VtpContent(
-        points, _read_cells(piece, "Polys", arrays) + strips, _read_cells(piece, "Lines", arrays), numbers
-    )
+    polygons, lines = _read_cells(piece, "Polys", arrays), _read_cells(piece, "Lines", arrays)
+    return VtpContent(points, polygons + strips, lines, numbers, _read_line_attributes(piece, len(lines), arrays))
+
+
+def _read_line_attributes(piece: Element, num_lines: int, arrays: _DataArrays) -> dict[str, FloatArray]:
+    """Read the cell data of lines; cells are numbered vertices first, then lines, then polygons and strips."""
+    counts = [int(piece.get(f"NumberOf{kind}", "0")) for kind in ("Verts", "Lines", "Polys", "Strips")]
+    found: dict[str, FloatArray] = {}
+    for array in piece.iterfind("CellData/DataArray"):
+        values = arrays.decode_array(array).astype(np.float64) if num_lines == counts[1] else np.empty(0)
+        if num_lines and len(values) == sum(counts):
+            found[array.get("Name", "")] = values[counts[0] : counts[0] + num_lines]
+    return found
 
 
 def _read_cells(piece: Element, kind: str, arrays: _DataArrays) -> list[IndexArray]:
