@@ -100,7 +100,7 @@ def build_springs_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     def begin(moment: StepMoment) -> ValueFunction:
         def value(x: ExtendedArray) -> ExtendedArray:
             excess = _edge_lengths(x, edges) - r
-            return to_extended(k) / 2 * np.where(only_pulls & (excess.real < 0.0), 0.0, excess) ** 2
+            return to_extended(k) / 2 * np.where(only_pulls & (np.real(excess) < 0.0), 0.0, excess) ** 2
 
         return value
 

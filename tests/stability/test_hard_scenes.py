@@ -109,7 +109,7 @@ def test_a_hard_scene_is_refused_by_name_or_stays_finite_descends_and_repeats_it
         with pytest.raises(Unsupported, match=REFUSED[case, method]):
             prepare(made, solver)
         return
-    may_refuse = case.startswith(("contact", "effects")) and method not in TAKE_ALL
+    may_refuse = case.startswith(("contact", "effects", "network")) and method not in TAKE_ALL
     prepared = prepared_or_refused(made, solver) if may_refuse else prepare(made, solver)
     if prepared is None:
         return

@@ -18,7 +18,6 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, Protocol, cast
 
 import meshio
@@ -55,7 +54,7 @@ class MeshFileContent(NamedTuple):
     face_locations: list[NDArray[np.int64]]
     location_unit: Literal["line", "face"] = "face"
     unused_points: NDArray[np.float64] = np.empty((0, 3))
-    line_attributes: Mapping[str, NDArray[np.float64]] = MappingProxyType({})
+    line_attributes: Mapping[str, NDArray[np.float64]] = {}
 
 
 class _MeshioCells(Protocol):

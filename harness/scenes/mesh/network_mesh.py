@@ -36,7 +36,7 @@ class NetworkMesh(SpringValueKeys):
     springs: VertexPairs = ()
     """Springs along the lines (stretch), as pairs of zero-based vertices."""
     spring_table: Path | None = None
-    """CSV or Parquet table of the springs instead of `springs`: columns `i` and `j`, zero-based vertices, and values."""
+    """CSV or Parquet table of the springs instead of `springs`: columns `i` and `j`, zero-based vertices, and values"""
     shear: VertexPairs = ()
     """Springs across cells."""
     bend: VertexPairs = ()
