@@ -275,6 +275,7 @@ def test_values_of_springs_are_a_part_of_a_runs_identity(tmp_path: Path):
 def test_a_slack_spring_pushes_nothing():
     scene = build_scene(load_scene(SCENES / "elastic-catenary.yaml"), 0)
     (cables,) = scene.system.energies
+    assert isinstance(cables, TensionOnlySprings)
     p = scene.mesh.rest_positions
     assert cables.value(p) == 0.0
     assert not cables.hessian(p).nnz

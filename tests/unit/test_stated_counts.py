@@ -50,4 +50,4 @@ def test_the_table_of_hard_cases_adds_up():
     )
     assert found
     total, *parts = map(int, found.groups())
-    assert sum(parts) == total == 111 * 26
+    assert sum(parts) == total == 115 * 26

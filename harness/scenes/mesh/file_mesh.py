@@ -30,7 +30,7 @@ from springbench.harness.scenes.mesh.spring_values import (
     match_table_rows,
     spread_columns,
 )
-from springbench.harness.scenes.mesh.table_reader import read_table
+from springbench.harness.scenes.mesh.table_reader import read_data_table
 
 _CELL_KINDS = ("line", *FACE_KINDS, "tetra")
 """Kinds of cells that yield springs; the kind `vertex` is ignored."""
@@ -78,7 +78,7 @@ class FileMesh(SpringValueKeys):
         """Add the values of springs, by the table or by the cell data of the file's lines that the keys name."""
         columns, has_table = dict[str, NDArray[np.float64]](), self.spring_table is not None
         if self.spring_table is not None:
-            table = read_table(self.spring_table)
+            table = read_data_table(self.spring_table)
             rows = match_table_rows(table, mesh.springs, len(mesh.rest_positions))
             columns = spread_columns(table.numeric_columns(), rows, len(mesh.springs))
         elif self.states_values:

@@ -15,7 +15,7 @@ from springbench.harness.scenes.mesh.mesh_generator import MAX_VERTICES
 from springbench.harness.scenes.mesh.mesh_topology import NO_TRIANGLES, find_box_parts
 from springbench.harness.scenes.mesh.spring_network import MAX_COORDINATE
 from springbench.harness.scenes.mesh.spring_values import SpringValueKeys, read_vertex_pairs, spread_columns
-from springbench.harness.scenes.mesh.table_reader import DataTable, read_table
+from springbench.harness.scenes.mesh.table_reader import DataTable, read_data_table
 
 CoordinateValue = Annotated[float, Field(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 VertexPairs = tuple[tuple[NonNegativeInt, NonNegativeInt], ...]
@@ -82,7 +82,7 @@ class NetworkMesh(SpringValueKeys):
         rest, mass, attributes = self._read_vertices()
         along, columns = _to_pairs(self.springs), dict[str, NDArray[np.float64]]()
         if self.spring_table is not None:
-            table = read_table(self.spring_table)
+            table = read_data_table(self.spring_table)
             along, columns = read_vertex_pairs(table, len(rest)), table.numeric_columns()
         families = {STRETCH: along, SHEAR: _to_pairs(self.shear), BEND: _to_pairs(self.bend)}
         springs = np.concatenate(list(families.values()))
@@ -114,7 +114,7 @@ class NetworkMesh(SpringValueKeys):
         mass = None if self.mass is None else np.array(self.mass, float)
         if self.vertex_table is None:
             return np.array(self.positions, float), mass, {}
-        table = read_table(self.vertex_table)
+        table = read_data_table(self.vertex_table)
         if table.num_rows > MAX_VERTICES:
             raise InputError(InputMistake(f"has {table.num_rows:,} vertices of at most {MAX_VERTICES:,}", table.path))
         rest = np.column_stack([_require_all(table, axis) for axis in "xyz"])

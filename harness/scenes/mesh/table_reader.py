@@ -83,7 +83,7 @@ class DataTable:
         return out
 
 
-def read_table(path: Path) -> DataTable:
+def read_data_table(path: Path) -> DataTable:
     """Read a table from a `.parquet` file, or from a CSV file with a header line.
 
     Raises:
