@@ -33,7 +33,18 @@ settings.load_profile("suite")
 
 _COMPILING_FILE = "solver_contract.py"
 """It calls nearly all kernels, and has them compiled where they are not there yet."""
-_KERNEL_FREE_PREFIXES = ("worker", "bare_", "other_code", "damaged", "full_disk", "plugins", "hostile", "gate_")
+_KERNEL_FREE_PREFIXES = (
+    "worker",
+    "bare_",
+    "stale",
+    "damaged",
+    "full_disk",
+    "plugins",
+    "hostile",
+    "regress",
+    "pytest_plugin",
+    "abba",
+)
 """Files that need few of them: what runs beside it, so that no kernel is compiled twice at once. The first ones run
 sweeps, whose workers are forks as long as no thread of Numba runs."""
 

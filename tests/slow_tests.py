@@ -39,7 +39,7 @@ SLOW_NAME_PARTS = (
 """Parts of names of slow tests that are not in the list."""
 
 LONG_NAME_PARTS = (
-    *("test_nobody_without_the_certificate", "test_each_run_is_done_by_one_of_two_commands"),
+    *("test_no_client_without_the_certificate", "test_each_run_is_done_by_one_of_two_commands"),
     *("goes_on_where_it_was[without pictures]", "says_whose_it_is[entry-point]"),
     *("[100000 brackets]", "[10001 keys]", "is_said_to_be[topology-degree-1000]", "never_passes_it[0.0-pncg]"),
     "serves_all_steps_of_a_system[cloth large enough for threads",

@@ -17,7 +17,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from tests.contracts.test_readme import PAGES
+from tests.contracts.test_page_language import PAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 
