@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.mesh.assignment_json import find_key_line, read_assignment_json
 from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.mesh_cleaning import CleaningOptions, clean_cells
 from springbench.harness.scenes.mesh.mesh_topology import NO_PAIRS, NO_TRIANGLES, IndexArray, PointArray, fan_triangles
 from springbench.harness.scenes.mesh.obj_reader import read_obj
 from springbench.harness.scenes.mesh.spring_network import build_spring_network
@@ -62,7 +63,7 @@ def read_assignment_scene(path: Path) -> AssignmentScene:
     """
     scene = read_assignment_json(path)
     obj = path.parent / scene.obj
-    cells = replace(read_obj(obj), segments=NO_PAIRS)
+    cells = clean_cells(replace(read_obj(obj), segments=NO_PAIRS), CleaningOptions(), obj)
     if not cells.polygons:
         raise InputError(InputMistake("has no faces (f lines), so there are no springs", obj))
     mesh = build_spring_network(cells, "face-pairs", obj)

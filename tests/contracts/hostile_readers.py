@@ -156,7 +156,7 @@ MESHES: dict[str, tuple[bytes | str, str]] = {
     "elements-before-nodes.msh": (MSH41 + CELLS41 + NODES41, "msh"),
     "only-points.msh": (MSH41 + NODES41 + "$Elements\n1 1 1 1\n0 1 15 1\n1 1\n$EndElements\n", "no cells"),
     # VTK
-    "cells-beyond.vtk": (VTK + "CELLS 1 4\n3 0 1 9\nCELL_TYPES 1\n5\n", "different ones from 0 to 3"),
+    "cells-beyond.vtk": (VTK + "CELLS 1 4\n3 0 1 9\nCELL_TYPES 1\n5\n", "numbers from 0 to 3"),
     "cells-of-1e9.vtk": (VTK + "CELLS 1000000000 4\n3 0 1 2\nCELL_TYPES 1\n5\n", "nothing determines"),
     "negative-size.vtk": (VTK + "CELLS 1 -4\n3 0 1 2\nCELL_TYPES 1\n5\n", "vtk"),
     "type-99.vtk": (VTK + "CELLS 1 4\n3 0 1 2\nCELL_TYPES 1\n99\n", "vtk"),
@@ -166,7 +166,7 @@ MESHES: dict[str, tuple[bytes | str, str]] = {
     "offsets-that-fall.vtp": (vtp("0 1 2 3", "4 1"), "offsets"),
     "offsets-beyond.vtp": (vtp("0 1 2", "99"), "offsets"),
     "points-beyond.vtp": (vtp("0 1 9"), "vtp"),
-    "negative-points.vtp": (vtp("0 1 -1", "3"), "different ones"),
+    "negative-points.vtp": (vtp("0 1 -1", "3"), "numbers from 0"),
     "coordinates-of-two.vtp": (vtp(points=array("0 0 0 1 0 0 1")), "vtp"),
     "unknown-type.vtp": (vtp(points=array(SQUARE, type="Quaternion")), "type 'Quaternion'"),
     "unknown-format.vtp": (vtp(points=array("!!!", form="binary")), "vtp"),
@@ -179,7 +179,7 @@ MESHES: dict[str, tuple[bytes | str, str]] = {
     "face-of-1e9.off": (off(SQUARE, "1000000000 0 1 2\n"), "off"),
     "face-of-minus-3.off": (off(SQUARE, "-3 0 1 2\n"), "off"),
     "a-fraction.off": (off(SQUARE, "3 0 1 1.5\n"), "off"),
-    "face-twice-a-corner.off": (off(SQUARE, "3 0 1 1\n"), "different ones"),
+    "face-twice-a-corner.off": (off(SQUARE, "3 0 1 1\n"), "names a vertex twice"),
     # Files that name others
     "includes-what-lies-outside.inp": (b"*INCLUDE, INPUT=../outside.inp\n", "outside of its folder"),
     "includes-a-device.inp": (b"*INCLUDE, INPUT=/dev/zero\n", "outside of its folder"),

@@ -103,7 +103,7 @@ def test_messages_name_vertices_by_the_numbers_of_an_obj_too(tmp_path):
     assert mesh.format_file_numbers(0, 3) == " (1, 4 in the file)"
     with pytest.raises(InputError, match=r"from vertex 0 to 1 \(1, 2 in the file\)"):
         GasEffect(pressure=1.0).build_contribution(mesh, np.ones(4), 0.1)
-    assert replace(mesh, first_vertex=0).format_file_numbers(0, 3) == ""
+    assert replace(mesh, file_numbers=None).format_file_numbers(0, 3) == ""
 
 
 def test_parts_are_the_sides_of_the_bounding_box(tmp_path):
@@ -245,8 +245,8 @@ def test_a_broken_file_is_refused_in_silence(tmp_path, capfd, suffix, content):
     ("points", "triangle", "words"),
     [
         ([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [0, 1, 2], "point 2"),
-        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [0, 1, 3], "different ones from 0 to 2"),
-        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [0, 1, 1], "different ones from 0 to 2"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [0, 1, 3], "numbers from 0 to 2"),
+        ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [0, 1, 1], "names a vertex twice"),
     ],
 )
 def test_impossible_cells_of_meshio_are_refused(tmp_path, points, triangle, words):

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, model_validator
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import sandbox
 from springbench.harness.scenes.mesh.assignment_json import read_assignment_json
 from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.mesh_cleaning import (
+    METRES_PER_UNIT,
+    CleaningOptions,
+    FaceRule,
+    LengthUnit,
+    UnusedRule,
+    UpAxis,
+    clean_cells,
+)
 from springbench.harness.scenes.mesh.mesh_file_reader import FACE_KINDS, MeshFileContent, read_mesh_file
 from springbench.harness.scenes.mesh.mesh_topology import NO_PAIRS, IndexArray
 from springbench.harness.scenes.mesh.obj_reader import read_obj
@@ -35,9 +44,6 @@ from springbench.harness.scenes.mesh.table_reader import read_data_table
 _CELL_KINDS = ("line", *FACE_KINDS, "tetra")
 """Kinds of cells that yield springs; the kind `vertex` is ignored."""
 
-_MAX_NAMED_POINTS = 3
-_LOG = logging.getLogger("springbench")
-
 MIN_READ_SECONDS, READ_BYTES_PER_SECOND = 5.0, 1e6
 """Time limit of reading: meshio reads text at 1 MB/s or more, and does not terminate on some broken files."""
 MIN_READ_MEMORY, READ_MEMORY_PER_BYTE = 2**29, 20
@@ -53,6 +59,21 @@ class FileMesh(SpringValueKeys):
     kind: Literal["file"] = "file"
     path: Path
     """Path of an OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, a VTP, or a meshio format (VTK, ...)."""
+    scale: Annotated[float, Field(ge=1e-9, le=1e9)] = 1.0
+    """Metres per unit of the file's coordinates, 0.001 for millimetres."""
+    units: LengthUnit | None = None
+    """Unit of the file's coordinates, instead of `scale`; metres by default."""
+    up: UpAxis = "y"
+    """Axis of the file that points up; the mesh is rotated so that this axis becomes y."""
+    weld: NonNegativeFloat | None = None
+    """Distance [m], after scaling, up to which vertices become one, the first of them; 0 joins those in one place. By
+    default none are joined."""
+    unused: UnusedRule | None = None
+    """Vertices without a face, line or tetrahedron; by default dropped from Gmsh files, which contain points of the
+    geometry, and kept in others."""
+    faces: FaceRule = "strict"
+    """Faces that name a vertex twice or have no area. `strict`: the former are errors, and the latter stay;
+    `drop-degenerate`: repeated corners are joined, and faces without area are dropped."""
     spring_rule: SpringRule | None = None
     """Springs along `edges` of faces only, or between all corners of a face (`face-pairs`); by default face-pairs for
     JSON scenes, and edges for all other files."""
@@ -66,12 +87,9 @@ class FileMesh(SpringValueKeys):
         Raises:
             InputError: for a file that is missing, malformed, empty or too large.
         """
-        path, suffix = self.path, self.path.suffix.lower()
-        rule = self.spring_rule or ("face-pairs" if suffix == ".json" else "edges")
-        if suffix == ".json":
-            path = path.parent / read_assignment_json(path).obj
-            suffix = path.suffix.lower()
-        cells = read_obj(path) if suffix == ".obj" else _read_cells(path)
+        path = self.find_geometry_path()
+        rule = self.spring_rule or ("face-pairs" if path is not self.path else "edges")
+        cells = clean_cells(read_cells(path), self.cleaning_options(), path)
         return self._add_spring_properties(build_spring_network(cells, rule, path), cells)
 
     def _add_spring_properties(self, mesh: Mesh, cells: MeshCells) -> Mesh:
@@ -90,8 +108,31 @@ class FileMesh(SpringValueKeys):
         properties = self.build_spring_properties(mesh.spring_distances, columns, reads_unnamed=has_table)
         return replace(mesh, spring_properties=properties)
 
+    def find_geometry_path(self) -> Path:
+        """Return the path of the file with the geometry: that of the OBJ for a JSON scene."""
+        if self.path.suffix.lower() != ".json":
+            return self.path
+        return self.path.parent / read_assignment_json(self.path).obj
 
-def _read_cells(path: Path) -> MeshCells:
+    def cleaning_options(self) -> CleaningOptions:
+        """Return the requested changes of the file's cells."""
+        by_default = "drop" if self.path.suffix.lower() == ".msh" else "keep"
+        scale = METRES_PER_UNIT[self.units] if self.units else self.scale
+        return CleaningOptions(scale, self.up, self.weld, self.unused or by_default, self.faces)
+
+    @model_validator(mode="after")
+    def _check_scale(self) -> FileMesh:
+        if self.units and "scale" in self.model_fields_set:
+            raise ValueError("`units` and `scale` say the same; leave out one of them")
+        return self
+
+
+def read_cells(path: Path) -> MeshCells:
+    """Read the cells of a mesh file of any format as they are; raise InputError on failure."""
+    return read_obj(path) if path.suffix.lower() == ".obj" else _read_other_cells(path)
+
+
+def _read_other_cells(path: Path) -> MeshCells:
     """Read cells with meshio in a subprocess; raise InputError on any failure."""
     check_mesh_file(path)
     state = path.stat()
@@ -100,11 +141,6 @@ def _read_cells(path: Path) -> MeshCells:
     problem = _find_cell_problem(points, blocks) or _find_group_problem(found)
     if problem:
         raise InputError(InputMistake(problem, path))
-    if len(found.unused_points):
-        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in found.unused_points[:_MAX_NAMED_POINTS].tolist())
-        more = ", ..." if len(found.unused_points) > _MAX_NAMED_POINTS else ""
-        problem = f"{len(found.unused_points):,} points belong to no cell and are left out: at {where}{more} m"
-        _LOG.warning("%s", InputMistake(problem, path))
     polygons: dict[int, list[IndexArray]] = {}
     places: dict[int, list[IndexArray]] = {}
     for (kind, data), numbers in zip(blocks, found.face_locations, strict=True):
@@ -120,6 +156,7 @@ def _read_cells(path: Path) -> MeshCells:
         tetrahedra=np.concatenate([np.empty((0, 4), np.int64), *(data for kind, data in blocks if kind == "tetra")]),
         vertex_groups=found.vertex_groups,
         attributes=found.attributes,
+        file_numbers=None if path.suffix.lower() == ".msh" else np.arange(len(points)),  # Gmsh numbers by tags
         segment_attributes=found.line_attributes,
     )
 
@@ -158,8 +195,7 @@ def _find_cell_problem(points: np.ndarray, blocks: list[tuple[str, IndexArray]])
             return f"has a {kind} of fewer than 2 points"
         ordered = np.sort(data, axis=1)
         wrong = (ordered[:, 0] < 0) | (ordered[:, -1] >= len(points))
-        wrong |= np.any(ordered[:, 1:] == ordered[:, :-1], axis=1)
         if wrong.any():
             cell = data[np.flatnonzero(wrong)[0]].tolist()
-            return f"a {kind} names the points {cell}; wanted different ones from 0 to {len(points) - 1}"
+            return f"a {kind} names the points {cell}; wanted numbers from 0 to {len(points) - 1}"
     return ""

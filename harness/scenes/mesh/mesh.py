@@ -44,7 +44,7 @@ class Mesh:
         mass: (n,) [kg] if a file gives absolute masses, else None.
         attributes: vertex attributes from a file, each (n,).
         vertex_areas: (n,) [m^2] at rest if they are not thirds of the triangles, else None.
-        first_vertex: number of the first vertex in the mesh's file.
+        file_numbers: number of each vertex in the mesh's file, (n,); None if there is none.
         spring_properties: stiffness, rest lengths and kinds of the springs if the mesh states them, else None.
     """
 
@@ -60,11 +60,12 @@ class Mesh:
     mass: NDArray[np.float64] | None = None
     attributes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
     vertex_areas: NDArray[np.float64] | None = None
-    first_vertex: int = 0
+    file_numbers: NDArray[np.int64] | None = None
     spring_properties: SpringProperties | None = None
 
     def __post_init__(self) -> None:
-        arrays = [self.rest_positions, self.springs, self.triangles, self.mass_fractions, self.mass, self.vertex_areas]
+        arrays = [self.rest_positions, self.springs, self.triangles, self.mass_fractions]
+        arrays += [self.mass, self.vertex_areas, self.file_numbers]
         if own := self.spring_properties:
             arrays += [own.stiffness, own.rest_length]
         for array in [*arrays, *self.spring_families.values(), *self.parts.values(), *self.attributes.values()]:
@@ -78,8 +79,9 @@ class Mesh:
 
     def format_file_numbers(self, *vertices: int) -> str:
         """Format the file numbers of zero-based vertices for a message; empty if they are equal."""
-        numbers = ", ".join(str(vertex + self.first_vertex) for vertex in vertices)
-        return f" ({numbers} in the file)" if self.first_vertex else ""
+        if self.file_numbers is None or (numbers := self.file_numbers[list(vertices)].tolist()) == list(vertices):
+            return ""
+        return f" ({', '.join(map(str, numbers))} in the file)"
 
     @property
     def rest_lengths(self) -> NDArray[np.float64]:

@@ -43,7 +43,6 @@ class MeshFileContent(NamedTuple):
         vertex_groups: points by group name.
         attributes: point data (n,); components of vectors have a number in their name, `normal.0`.
         face_locations: line or number of each cell of a block.
-        unused_points: points that no cell uses, of formats that store others besides the mesh, (k, 3).
         line_attributes: cell data of the cells `line`, in their order, each (lines,).
     """
 
@@ -53,7 +52,6 @@ class MeshFileContent(NamedTuple):
     attributes: dict[str, NDArray[np.float64]]
     face_locations: list[NDArray[np.int64]]
     location_unit: Literal["line", "face"] = "face"
-    unused_points: NDArray[np.float64] = np.empty((0, 3))
     line_attributes: Mapping[str, NDArray[np.float64]] = {}
 
 
@@ -102,7 +100,7 @@ def _read_by_suffix(path: Path) -> MeshFileContent:
     blocks = [(block.type, np.array(block.data, np.int64)) for block in raw.cells if len(block.data)]
     cell_blocks = [(kind, data) for kind, data in blocks if kind != "vertex"]
     points = np.array(raw.points, np.float64)
-    found = MeshFileContent(
+    return MeshFileContent(
         points,
         cell_blocks,
         _collect_groups(raw),
@@ -110,7 +108,6 @@ def _read_by_suffix(path: Path) -> MeshFileContent:
         _number_faces(cell_blocks),
         line_attributes=_collect_line_attributes(raw),
     )
-    return _drop_unused_points(found) if suffix == ".msh" else found
 
 
 class _FileAccessGuard:
@@ -183,26 +180,6 @@ def _number_faces(blocks: list[CellBlock]) -> list[NDArray[np.int64]]:
     """Number each face among all faces, from 0; the numbers of other cells are unused."""
     faces = [0, *np.cumsum([len(data) if kind in FACE_KINDS else 0 for kind, data in blocks]).tolist()]
     return [first + np.arange(len(data)) for first, (_, data) in zip(faces, blocks, strict=False)]
-
-
-def _drop_unused_points(found: MeshFileContent) -> MeshFileContent:
-    """Remove points without cells: Gmsh saves the points of a geometry, such as the centres of circles."""
-    used = np.zeros(len(found.points), np.bool_)
-    for _, data in found.cell_blocks:
-        if len(data) and (data.min() < 0 or data.max() >= len(used)):
-            return found  # the caller names the cell
-        used[data.ravel()] = True
-    if used.all():
-        return found
-    number = np.cumsum(used) - 1
-    groups = {name: number[group[used[group]]] for name, group in found.vertex_groups.items()}
-    return found._replace(
-        points=found.points[used],
-        cell_blocks=[(kind, number[data]) for kind, data in found.cell_blocks],
-        vertex_groups={name: group for name, group in groups.items() if len(group)},
-        attributes={name: column[used] for name, column in found.attributes.items()},
-        unused_points=found.points[~used],
-    )
 
 
 def _convert_ply(read: ply_reader.PlyContent) -> MeshFileContent:

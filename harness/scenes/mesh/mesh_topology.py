@@ -137,7 +137,7 @@ def assemble_mesh(
     resolution: int = 0,
     parts: Mapping[str, ArrayLike] | None = None,
     vertex_areas: PointArray | None = None,
-    first_vertex: int = 0,
+    file_numbers: IndexArray | None = None,
     attributes: Mapping[str, PointArray] | None = None,
 ) -> Mesh:
     """Assemble a mesh from springs by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
@@ -168,6 +168,6 @@ def assemble_mesh(
             for name, part in (parts or {}).items()
         },
         vertex_areas=vertex_areas,
-        first_vertex=first_vertex,
+        file_numbers=file_numbers,
         attributes=dict(attributes or {}),
     )

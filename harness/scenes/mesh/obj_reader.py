@@ -18,7 +18,12 @@ import numpy as np
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.mesh.mesh_generator import MAX_VERTICES
 from springbench.harness.scenes.mesh.mesh_topology import NO_PAIRS
-from springbench.harness.scenes.mesh.spring_network import MAX_COORDINATE, MeshCells, check_mesh_file
+from springbench.harness.scenes.mesh.spring_network import (
+    MAX_COORDINATE,
+    MeshCells,
+    check_mesh_file,
+    describe_repeated_corner,
+)
 
 _RENDERING_KEYWORDS = {
     "bevel",
@@ -42,7 +47,7 @@ def read_obj(path: Path) -> MeshCells:
 
     Raises:
         InputError: with the lines, for unreadable statements, numbers that are not finite, indices out of range,
-            repeated vertices of a face, and empty or oversized files.
+            and empty or oversized files.
     """
     check_mesh_file(path)
     reader = _ObjReader(path)
@@ -75,7 +80,10 @@ def _split_statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
 
 
 class _ObjReader:
-    """Collects statements; all mistakes are reported together at the end."""
+    """Collects statements; all mistakes are reported together at the end.
+
+    Repeated corners are mistakes only in addition to others: the cleaning of the cells may join them.
+    """
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -88,6 +96,7 @@ class _ObjReader:
         self.groups: dict[str, set[int]] = defaultdict(set)
         self.current_groups: list[str] = []
         self.mistakes: list[InputMistake] = []
+        self.repetitions: list[InputMistake] = []
 
     def read_statement(self, number: int, text: str) -> None:
         """Read one statement that starts in line `number`."""
@@ -101,7 +110,7 @@ class _ObjReader:
             elif keyword == "f":
                 corners = self._parse_corners(words)
                 if len(set(corners)) < len(corners):
-                    raise ValueError("a face names a vertex twice; each corner must be another vertex")
+                    self.repetitions.append(InputMistake(describe_repeated_corner(len(corners)), self.path, number))
                 self.polygons[len(corners)].append(corners)
                 self.lines[len(corners)].append(number)
                 self._add_to_groups(corners)
@@ -109,7 +118,7 @@ class _ObjReader:
                 corners = self._parse_corners(words)
                 segments = [[a, b] for a, b in pairwise(corners)]
                 if any(a == b for a, b in segments):
-                    raise ValueError("a line joins a vertex to itself; its ends must differ")
+                    self.repetitions.append(InputMistake(describe_repeated_corner(2), self.path, number))
                 self.segments += segments
                 self.segment_lines += [number] * len(segments)
                 self._add_to_groups(corners)
@@ -146,7 +155,7 @@ class _ObjReader:
                 self._check_range(polygons, self.lines[corners])
             self._check_range(self.segments, self.segment_lines)
         if self.mistakes:
-            raise InputError(sorted(self.mistakes, key=lambda m: m.line or 0)[:_MAX_MISTAKES])
+            raise InputError(sorted(self.mistakes + self.repetitions, key=lambda m: m.line or 0)[:_MAX_MISTAKES])
         colours = self.colours if len(self.colours) == len(self.points) else []
         return MeshCells(
             vertex_groups={name: np.array(sorted(group), np.int64) for name, group in self.groups.items()},
@@ -155,8 +164,9 @@ class _ObjReader:
             polygons={k: np.array(self.polygons[k], np.int64) for k in sorted(self.polygons)},
             polygon_locations={k: np.array(lines, np.int64) for k, lines in self.lines.items()},
             location_unit="line",
-            first_vertex=1,
+            file_numbers=np.arange(1, len(self.points) + 1),
             segments=np.array(self.segments, np.int64) if self.segments else NO_PAIRS,
+            segment_locations=np.array(self.segment_lines, np.int64),
         )
 
     def _check_range(self, groups: list[list[int]], lines: list[int]) -> None:

@@ -58,10 +58,11 @@ class MeshCells:
         polygon_locations: k -> line of each polygon, (f,), or its number in the file.
         location_unit: which of the two.
         segments: (s, 2).
+        segment_locations: line of each segment, (s,), or empty.
         tetrahedra: (t, 4).
         vertex_groups: points of the groups named in the file.
         attributes: point attributes, each (n,).
-        first_vertex: number of the first point in the file.
+        file_numbers: number of each point in the file, (n,); None if it has none.
         segment_attributes: cell data of the segments, each (s,).
     """
 
@@ -69,17 +70,26 @@ class MeshCells:
     polygons: Mapping[int, IndexArray] = field(default_factory=dict[int, IndexArray])
     polygon_locations: Mapping[int, IndexArray] = field(default_factory=dict[int, IndexArray])
     segments: IndexArray = field(default_factory=lambda: NO_PAIRS)
+    segment_locations: IndexArray = field(default_factory=lambda: np.empty(0, np.int64))
     tetrahedra: IndexArray = field(default_factory=lambda: np.empty((0, 4), np.int64))
     vertex_groups: Mapping[str, IndexArray] = field(default_factory=dict[str, IndexArray])
     attributes: Mapping[str, PointArray] = field(default_factory=dict[str, PointArray])
     location_unit: Literal["line", "face"] = "face"
-    first_vertex: int = 0
+    file_numbers: IndexArray | None = None
     segment_attributes: Mapping[str, PointArray] = field(default_factory=dict[str, PointArray])
 
     @property
     def has_only_segments(self) -> bool:
         """Whether every cell has two vertices."""
         return not len(self.tetrahedra) and set(self.polygons) <= {2}
+
+
+def describe_repeated_corner(num_corners: int) -> str:
+    """Describe the mistake of a face or line that names a vertex twice."""
+    fix = "`faces: drop-degenerate` of the mesh repairs this"
+    if num_corners == 2:
+        return f"a line joins a vertex to itself; its ends must differ ({fix})"
+    return f"a face names a vertex twice; each corner must be another vertex ({fix})"
 
 
 def check_mesh_file(path: Path, *, max_bytes: int = MAX_FILE_BYTES) -> None:
@@ -168,7 +178,7 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
         parts=find_box_parts(rest) | dict(cells.vertex_groups),
         attributes=cells.attributes,
         vertex_areas=areas,
-        first_vertex=cells.first_vertex,
+        file_numbers=cells.file_numbers,
     )
 
 
