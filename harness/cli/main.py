@@ -22,6 +22,7 @@ from springbench.harness.cli.commands.figure import figure
 from springbench.harness.cli.commands.gallery import gallery
 from springbench.harness.cli.commands.list_runs import list_command
 from springbench.harness.cli.commands.matrices import matrices
+from springbench.harness.cli.commands.mesh import mesh
 from springbench.harness.cli.commands.new_study import new_study
 from springbench.harness.cli.commands.pages import pages
 from springbench.harness.cli.commands.preview import preview
@@ -270,6 +271,7 @@ app.command()(compare)
 app.command()(pages)
 app.command()(figure)
 app.command()(gallery)
+app.command()(mesh)
 app.command()(preview)
 app.command()(matrices)
 app.command()(regress)

@@ -447,7 +447,11 @@ def find_scene_mistakes(scene: SceneSpec, sizes: Sequence[int]) -> list[InputMis
     """
     try:
         if sizes:
-            build_scene(scene, min(sizes))
+            built = build_scene(scene, min(sizes))
+            if getattr(scene.mesh, "kind", "") == "file":
+                from springbench.harness.scenes.mesh_support import log_mesh_remarks  # for meshes from files only
+
+                log_mesh_remarks(scene, built.mesh)
     except InputError as error:
         return [
             replace(m, file=m.file or scene.path, line=m.line or scene.key_lines.get(m.key)) for m in error.mistakes

@@ -43,17 +43,17 @@ _PIXELS_PER_VERTEX = 120
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SelectedVertices:
-    """Vertices (q,) that an effect selects, and their description."""
+class MarkedPoints:
+    """Points (q, 3) [m] that a preview marks in one colour, with a label and a description."""
 
-    name: str
+    label: str
     description: str
-    vertices: NDArray[np.int64]
+    points: NDArray[np.float64]
 
 
 def draw_scene_preview(
     replay: RecordingReplay,
-    selections: Sequence[SelectedVertices],
+    marks: Sequence[MarkedPoints],
     facts: Sequence[str],
     notes: Sequence[tuple[str, str]],
     path: Path,
@@ -64,7 +64,7 @@ def draw_scene_preview(
 
     Args:
         replay: recording of one frame.
-        selections: vertices selected by effects.
+        marks: points to mark, relative to the origin of the recording.
         facts: phrases below the title.
         notes: further possible selections, as pairs of kind and description.
         path: target file.
@@ -74,18 +74,16 @@ def draw_scene_preview(
     """
     wide, p = PAGE_WIDTH - 2 * _VIEW_LEFT - _COLUMN_GAP - _LEGEND_WIDTH, replay.positions[0]
     angles = camera or choose_view_angles(p, compute_area_vectors(replay, 0))
-    dots = [(p[one.vertices], indexed_style(k).color) for k, one in enumerate(selections)]
+    dots = [(one.points, indexed_style(k).color) for k, one in enumerate(marks)]
     with matplotlib.rc_context(PAGE_RC), OffscreenRenderer(wide, _VIEW_HEIGHT, mesh_lines=_PIXELS_PER_VERTEX) as studio:
         page = new_page()
         draw_header(page, replay.title, facts)
         view = fit_camera(points_to_frame(replay, [0]), aspect=wide / _VIEW_HEIGHT, angles=angles)
         paste_picture(page, studio.render_frame(replay, 0, view, coloured_points=dots), _VIEW_LEFT, _VIEW_TOP)
         x, y = PAGE_WIDTH - _VIEW_LEFT - _LEGEND_WIDTH, _VIEW_TOP + _LEGEND_ROW_HEIGHT
-        for k, one in enumerate(selections):
+        for k, one in enumerate(marks):
             draw_text(page, x, y, "●", size=13, color=indexed_style(k).color)
-            draw_text(
-                page, x + 24, y, f"{one.name}: {_format_vertex_count(len(one.vertices))}", size=12, color=TEXT_COLOUR
-            )
+            draw_text(page, x + 24, y, one.label, size=12, color=TEXT_COLOUR)
             y = _draw_paragraph(page, one.description, x + 24, y + 19) + 12
         y += _LEGEND_ROW_HEIGHT
         for kind, words in notes:
@@ -93,10 +91,6 @@ def draw_scene_preview(
             y = _draw_paragraph(page, words, x, y + 19) + 12
         draw_provenance(page, [replay], PAGE_HEIGHT - 12)
         save_page(page, path)
-
-
-def _format_vertex_count(count: int) -> str:
-    return f"{count:,} {'vertex' if count == 1 else 'vertices'}"
 
 
 def _draw_paragraph(page: Figure, words: str, x: float, y: float) -> float:

@@ -13,6 +13,7 @@ from springbench.harness.errors import InputError
 from springbench.harness.execution.isolated_call import run_isolated
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from springbench.harness.config.sweep_config import RunSpec
     from springbench.harness.execution.worker_process import ProgressCallback
 
@@ -46,24 +47,22 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     from springbench.harness.recording.obstacle_shapes import build_obstacles_property, list_obstacles
     from springbench.harness.recording.recorder_interface import RecordingReplay
     from springbench.harness.recording.strain_shading import DEFAULT_STRAIN_RANGE
-    from springbench.harness.report.scene_preview import SelectedVertices, draw_scene_preview
+    from springbench.harness.report.scene_preview import MarkedPoints, draw_scene_preview
     from springbench.harness.scenes.scene_builder import build_scene
     from springbench.harness.scenes.vertex_selectors import find_selections
     from springbench.harness.simulation.time_loop import build_initial_state
 
     scene, lines = run.scene.load_plugins(), list[str]()
     made = build_scene(scene, run.size)
-    mesh, choices = made.mesh, list[SelectedVertices]()
+    mesh, choices = made.mesh, list[tuple[str, str, NDArray[np.int64]]]()
     for k, effect in enumerate(scene.effects):
         for key, selection in find_selections(effect):
             name = f"effects[{k}] {effect.kind}{f': {key}' if key else ''}"
-            choices.append(
-                SelectedVertices(name, selection.describe_selection(), selection.select_vertices(mesh, name))
-            )
+            choices.append((name, selection.describe_selection(), selection.select_vertices(mesh, name)))
     notes = _list_selectors(mesh)
-    for one in choices:
-        some = ", ".join(map(str, one.vertices[:8].tolist())) + (", ..." if len(one.vertices) > 8 else "")
-        lines.append(f"{one.name}: {len(one.vertices)} vertices ({one.description}): {some}")
+    for name, description, vertices in choices:
+        some = ", ".join(map(str, vertices[:8].tolist())) + (", ..." if len(vertices) > 8 else "")
+        lines.append(f"{name}: {len(vertices)} vertices ({description}): {some}")
     for kind, words in notes:
         lines.append(f"{kind}: {words}")
     origin = compute_local_origin(mesh.rest_positions)
@@ -92,13 +91,21 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
         f"{made.system.mass.sum():.4g} kg",
         "at the start",
     ]
-    named = [i for one in choices for i in one.vertices.tolist()]
+    named = [i for _, _, vertices in choices for i in vertices.tolist()]
     facts += ["what is chosen twice has the later colour"] if len(set(named)) < len(named) else []
-    camera = scene.camera
-    draw_scene_preview(
-        replay, choices, facts, notes, path, camera=(camera.azimuth, camera.elevation) if camera else None
-    )
+    camera, positions = scene.camera, replay.positions[0].astype(np.float64)
+    marks = [
+        MarkedPoints(
+            f"{name}: {len(vertices):,} {'vertex' if len(vertices) == 1 else 'vertices'}", words, positions[vertices]
+        )
+        for name, words, vertices in choices
+    ]
+    draw_scene_preview(replay, marks, facts, notes, path, camera=(camera.azimuth, camera.elevation) if camera else None)
     return [*lines, f"the picture is {path}"]
+
+
+def _format_vertex_count(count: int) -> str:
+    return f"{count:,} {'vertex' if count == 1 else 'vertices'}"
 
 
 def _list_selectors(mesh: Any) -> list[tuple[str, str]]:

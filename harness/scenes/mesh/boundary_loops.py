@@ -31,13 +31,18 @@ class BoundaryLoop(NamedTuple):
 
 def find_boundary_loops(mesh: Mesh) -> list[BoundaryLoop]:
     """Find the boundary loops of a mesh at rest, longest first; ties by the lowest vertex."""
-    if not len(mesh.triangles):
+    return trace_boundary_loops(mesh.rest_positions, mesh.triangles)
+
+
+def trace_boundary_loops(points: NDArray[np.float64], triangles: IndexArray) -> list[BoundaryLoop]:
+    """Trace the boundary loops of triangles (f, 3) at points (n, 3) [m], longest first."""
+    if not len(triangles):
         return []
     from scipy.sparse import coo_array  # imported only when loops are needed
     from scipy.sparse.csgraph import connected_components
 
-    n = len(mesh.rest_positions)
-    sides = np.sort(np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+    n = len(points)
+    sides = np.sort(np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
     edges, count = np.unique(sides, axis=0, return_counts=True)
     open_ = edges[count == 1]
 
@@ -46,7 +51,7 @@ def find_boundary_loops(mesh: Mesh) -> list[BoundaryLoop]:
         return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
     surface, of = pieces(edges), pieces(open_)
-    long = np.linalg.norm(mesh.rest_positions[open_[:, 0]] - mesh.rest_positions[open_[:, 1]], axis=1)
+    long = np.linalg.norm(points[open_[:, 0]] - points[open_[:, 1]], axis=1)
     length = np.bincount(of[open_[:, 0]], long, minlength=n)
     found = [np.flatnonzero(of == k) for k in np.unique(of[open_[:, 0]]).tolist()]
     rounded = {int(x[0]): float(f"{length[of[x[0]]]:.{_COMPARED_DIGITS}g}") for x in found}

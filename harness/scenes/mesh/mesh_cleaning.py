@@ -76,13 +76,16 @@ class CleaningOptions(NamedTuple):
     faces: FaceRule = "strict"
 
 
-def clean_cells(cells: MeshCells, options: CleaningOptions, path: Path) -> MeshCells:
+def clean_cells(
+    cells: MeshCells, options: CleaningOptions, path: Path, *, accepts_repeated_corners: bool = False
+) -> MeshCells:
     """Apply the requested changes to the cells of a file, and log what they changed.
 
     Args:
         cells: contents of the file.
         options: requested changes.
         path: the file, for messages.
+        accepts_repeated_corners: whether cells that name a vertex twice may remain.
 
     Raises:
         InputError: for coordinates that become too large, a weld that joins almost everything, and cells that name
@@ -92,9 +95,19 @@ def clean_cells(cells: MeshCells, options: CleaningOptions, path: Path) -> MeshC
     if options.weld is not None:
         cells = _weld_vertices(cells, options.weld, path)
     if options.faces == "drop-degenerate":
-        cells = _drop_degenerate_cells(cells, path)
-    _require_distinct_corners(cells, path, is_welded=options.weld is not None)
-    return _drop_unused_vertices(cells, path) if options.unused == "drop" else cells
+        cells, counts = drop_degenerate_cells(cells)
+        for what, count in counts.items():
+            if count:
+                _LOG.info("%s: %s %s", path, f"{count:,}", what)
+    if not accepts_repeated_corners:
+        _require_distinct_corners(cells, path, is_welded=options.weld is not None)
+    if options.unused == "drop" and len(unused := find_unused_vertices(cells)):
+        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in cells.points[unused[:_MAX_NAMED_POINTS]].tolist())
+        more = ", ..." if len(unused) > _MAX_NAMED_POINTS else ""
+        problem = f"{len(unused):,} points belong to no cell and are left out: at {where}{more} m"
+        _LOG.warning("%s", InputMistake(problem, path))
+        cells = drop_unused_vertices(cells)
+    return cells
 
 
 def _transform_points(cells: MeshCells, options: CleaningOptions, path: Path) -> MeshCells:
@@ -180,8 +193,11 @@ def find_flat_faces(points: PointArray, polygons: IndexArray) -> NDArray[np.bool
     return doubled <= FLAT_RATIO * squared
 
 
-def _drop_degenerate_cells(cells: MeshCells, path: Path) -> MeshCells:
-    """Join repeated corners of faces, and drop all cells without length, area or volume."""
+def drop_degenerate_cells(cells: MeshCells) -> tuple[MeshCells, dict[str, int]]:
+    """Join repeated corners of faces, and drop faces without area and other cells that name a vertex twice.
+
+    Returns: the other cells, and the numbers of changes with their descriptions.
+    """
     faces: dict[int, list[tuple[IndexArray, IndexArray]]] = {}
     joined = dropped = 0
     for k, polygons in cells.polygons.items():
@@ -211,10 +227,7 @@ def _drop_degenerate_cells(cells: MeshCells, path: Path) -> MeshCells:
         "lines without length were dropped": int((~has_length).sum()),
         "tetrahedra with a repeated corner were dropped": len(cells.tetrahedra) - len(tetrahedra),
     }
-    for what, count in counts.items():
-        if count:
-            _LOG.info("%s: %s %s", path, f"{count:,}", what)
-    return replace(
+    cleaned = replace(
         cells,
         polygons=polygons,
         polygon_locations=locations,
@@ -224,6 +237,7 @@ def _drop_degenerate_cells(cells: MeshCells, path: Path) -> MeshCells:
         else cells.segment_locations,
         tetrahedra=tetrahedra,
     )
+    return cleaned, counts
 
 
 def _join_repeated_corners(corners: list[int]) -> list[int]:
@@ -277,14 +291,8 @@ def find_unused_vertices(cells: MeshCells) -> IndexArray:
     return np.flatnonzero(~used)
 
 
-def _drop_unused_vertices(cells: MeshCells, path: Path) -> MeshCells:
-    unused = find_unused_vertices(cells)
-    if not len(unused):
-        return cells
-    where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in cells.points[unused[:_MAX_NAMED_POINTS]].tolist())
-    more = ", ..." if len(unused) > _MAX_NAMED_POINTS else ""
-    problem = f"{len(unused):,} points belong to no cell and are left out: at {where}{more} m"
-    _LOG.warning("%s", InputMistake(problem, path))
+def drop_unused_vertices(cells: MeshCells) -> MeshCells:
+    """Drop the vertices that no cell uses."""
     remains = np.ones(len(cells.points), np.bool_)
-    remains[unused] = False
+    remains[find_unused_vertices(cells)] = False
     return _renumber_vertices(cells, remains, np.where(remains, np.cumsum(remains) - 1, -1))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from springbench.harness.atomic_files import HEAD_BYTES, describe_misnamed_file
@@ -143,21 +143,23 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
             )
         )
 
-    along = np.concatenate(
-        [NO_PAIRS, *map(polygon_sides, groups), cells.segments, _tetrahedron_edges(cells.tetrahedra)]
-    )
     if cells.has_only_segments:
         springs = {STRETCH: np.concatenate([NO_PAIRS, *groups, cells.segments])}
     else:
-        springs = {STRETCH: sort_unique_pairs(along)}
+        springs = {STRETCH: list_cell_edges(cells)}
         if spring_rule == "face-pairs":
             springs[SHEAR] = _exclude_pairs(
                 sort_unique_pairs(np.concatenate([NO_PAIRS, *map(polygon_corner_pairs, groups)])), springs[STRETCH]
             )
-    triangles, areas = _triangulate_faces(cells, path)
+    surface = triangulate_cells(cells)
+    if surface.crossed:
+        raise InputError([_make_crossed_face_error(cells, path, *one) for one in surface.crossed[:_MAX_MISTAKES]])
+    if surface.repeats:
+        _warn_repeated_faces(cells, path, surface.repeats)
+    triangles, areas = surface.triangles, surface.areas
     if len(cells.tetrahedra):
         tetrahedra = _drop_repeated_tetrahedra(cells.tetrahedra, path)
-        triangles, areas = _find_boundary_triangles(rest, tetrahedra), None
+        triangles, areas = find_boundary_triangles(rest, tetrahedra), None
         dimension, weights = 3, lump_volumes(rest, tetrahedra)
     elif len(triangles):
         dimension, weights = 2, lump_areas(rest, triangles) if areas is None else areas
@@ -182,39 +184,49 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
     )
 
 
-def _triangulate_faces(cells: MeshCells, path: Path) -> tuple[IndexArray, PointArray | None]:
-    """Triangulate the faces (f, 3), each part of the surface once.
+class FaceTriangulation(NamedTuple):
+    """Triangles of all faces of a file, each part of the surface once.
 
-    Returns:
-        The triangles, and the vertex areas (n,) [m^2], None if they are thirds of the triangles.
+    Attributes:
+        triangles: (f, 3).
+        areas: vertex areas (n,) [m^2]; None if they are thirds of the triangles.
+        crossed: place and number of corners of faces whose sides cross; these have no triangles.
+        repeats: places of faces that repeat another, or a part of it, and of that one.
     """
+
+    triangles: IndexArray
+    areas: PointArray | None
+    crossed: list[tuple[int, int]]
+    repeats: list[tuple[int, int]]
+
+
+def triangulate_cells(cells: MeshCells) -> FaceTriangulation:
+    """Triangulate the faces of a file."""
     faces = {k: polygons for k, polygons in cells.polygons.items() if k >= 3}
     places = {k: cells.polygon_locations.get(k, np.arange(len(polygons))) for k, polygons in faces.items()}
     surfaces = {k: triangulate_polygons(cells.points, polygons) for k, polygons in faces.items()}
     crossed = [
         (int(places[k][i]), k) for k, made in surfaces.items() for i in np.flatnonzero(made.is_self_crossing).tolist()
     ]
-    if crossed:
-        raise InputError([_make_crossed_face_error(cells, path, *one) for one in sorted(crossed)[:_MAX_MISTAKES]])
     first = {k: find_repeated_rows(polygons) for k, polygons in faces.items()}
-    new = {k: first[k] == np.arange(len(first[k])) for k in faces}
+    new = {k: (first[k] == np.arange(len(first[k]))) & ~surfaces[k].is_self_crossing for k in faces}
     repeats = [
-        (int(places[k][i]), int(places[k][first[k][i]])) for k in faces for i in np.flatnonzero(~new[k]).tolist()
+        (int(places[k][i]), int(places[k][first[k][i]]))
+        for k in faces
+        for i in np.flatnonzero(first[k] != np.arange(len(first[k]))).tolist()
     ]
-    for cover in find_face_covers(cells.points, faces, surfaces):
+    for cover in [] if crossed else find_face_covers(cells.points, faces, surfaces):
         larger = places[cover.larger_corners][cover.larger_rows].tolist()
         fresh = new[cover.corners][cover.rows]
         mine = places[cover.corners][cover.rows]
         repeats += [(int(a), int(b)) for a, b in zip(mine[fresh], np.array(larger)[fresh], strict=True)]
         new[cover.corners][cover.rows] = False
-    if repeats:
-        _warn_repeated_faces(cells, path, sorted(repeats))
     selected = {k: surfaces[k].select_rows(new[k]) for k in faces}
     triangles = np.concatenate([NO_TRIANGLES, *(made.triangles.reshape(-1, 3) for made in selected.values())])
     if set(faces) <= {3}:
-        return triangles, None
+        return FaceTriangulation(triangles, None, sorted(crossed), sorted(repeats))
     areas = [compute_vertex_areas(cells.points, faces[k][new[k]], selected[k]) for k in faces]
-    return triangles, np.sum(areas, axis=0)
+    return FaceTriangulation(triangles, np.sum(areas, axis=0), sorted(crossed), sorted(repeats))
 
 
 def _make_crossed_face_error(cells: MeshCells, path: Path, place: int, corners: int) -> InputMistake:
@@ -247,6 +259,12 @@ def _drop_repeated_tetrahedra(tetrahedra: IndexArray, path: Path) -> IndexArray:
     return tetrahedra[new]
 
 
+def list_cell_edges(cells: MeshCells) -> IndexArray:
+    """List the sides of polygons, the segments and the edges of tetrahedra, each once, sorted, (m, 2)."""
+    sides = map(polygon_sides, cells.polygons.values())
+    return sort_unique_pairs(np.concatenate([NO_PAIRS, *sides, cells.segments, _tetrahedron_edges(cells.tetrahedra)]))
+
+
 def _tetrahedron_edges(tetrahedra: IndexArray) -> IndexArray:
     """Return the six edges of each tetrahedron, (6 t, 2), with repetitions."""
     return np.concatenate([tetrahedra[:, [i, j]] for i, j in combinations(range(4), 2)])
@@ -258,7 +276,7 @@ def _exclude_pairs(pairs: IndexArray, others: IndexArray) -> IndexArray:
     return pairs[~np.isin(pairs @ [base, 1], others @ [base, 1])]
 
 
-def _find_boundary_triangles(rest: PointArray, tetrahedra: IndexArray) -> IndexArray:
+def find_boundary_triangles(rest: PointArray, tetrahedra: IndexArray) -> IndexArray:
     """Return the faces of exactly one tetrahedron, facing outwards, (f, 3)."""
     inverted = compute_signed_volumes(rest, tetrahedra) < 0
     tetrahedra = np.where(inverted[:, None], tetrahedra[:, [1, 0, 2, 3]], tetrahedra)
