@@ -27,7 +27,7 @@ from springbench.harness.scenes.collision_primitives import collision_primitives
 from springbench.harness.simulation.time_loop import build_initial_state, build_problem
 from springbench.solvers.contact import collisions
 from springbench.solvers.contact.collision_mesh import CollisionMesh
-from springbench.solvers.kernels import accelerated_descent, accelerated_step, spring_local_step, spring_objective
+from springbench.solvers.kernels import accelerated_descent, spring_local_step, spring_objective
 from springbench.solvers.linalg.cholesky import (
     block_cholesky,
     block_multifrontal,
@@ -37,6 +37,7 @@ from springbench.solvers.linalg.cholesky import (
 from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
 from springbench.solvers.linalg.multigrid import multigrid_kernels
 from springbench.solvers.linalg.multigrid.multigrid_pcg import ConjugateGradients
+from springbench.solvers.methods.quasi_newton import accelerated_step
 from springbench.solvers.methods.vertex_block import vbd_sweeps
 from springbench.solvers.model.step_problem import Positions
 

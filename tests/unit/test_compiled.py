@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from numba import types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic
-from springbench.solvers.kernels import elimination_schedule
 from springbench.solvers.kernels.spring_local_step import SpringPackets, allocate_aligned, run_local_step
 from springbench.solvers.linalg.solver_selection import LinearSolverName, Precision
+from springbench.solvers.methods.local_global import elimination_schedule
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal

@@ -22,17 +22,17 @@ from springbench.solvers.iteration.iterative_solver import IterativeSolver, Solv
 from springbench.solvers.kernels import local_global_iteration, step_setup
 from springbench.solvers.kernels import spring_local_step as kernels
 from springbench.solvers.kernels.edge_elements import EdgeElements
-from springbench.solvers.kernels.elimination_schedule import (
-    EliminationSchedule,
-    allocate_vectors,
-    schedule_inverse,
-    schedule_supernodal,
-)
 from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, LoopLimits, iteration_limit
 from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
 from springbench.solvers.linalg.cholesky.thread_team import ThreadTeam
 from springbench.solvers.linalg.dense_inverse import DenseInverse
 from springbench.solvers.linalg.memory import allocate_aligned
+from springbench.solvers.methods.local_global.elimination_schedule import (
+    EliminationSchedule,
+    allocate_vectors,
+    schedule_inverse,
+    schedule_supernodal,
+)
 from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.rounding_bound import EPS

@@ -19,7 +19,7 @@ from typing import ClassVar
 import numpy as np
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, compute_max_coordinate
-from springbench.solvers.kernels import accelerated_step, step_setup
+from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.acceleration_coefficients import require_history_size
 from springbench.solvers.kernels.edge_elements import EdgeElements
@@ -44,6 +44,7 @@ from springbench.solvers.methods.local_global.prefactored import (
     prepare_local_global,
     require_projective,
 )
+from springbench.solvers.methods.quasi_newton import accelerated_step
 from springbench.solvers.model.barrier_energy import without_barriers
 from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from springbench.solvers.kernels.greedy_colouring import first_fit
+from springbench.solvers.jit.kernel_compilation import jit_kernel
 from springbench.solvers.model.system_matrix_assembly import signed_incidence_matrix_sparse
 
 
@@ -50,6 +50,28 @@ def _colour_rows(groups: csr_array, items: csr_array) -> Colouring:
     pointers, columns, back, rows = (
         np.asarray(x, np.int64) for x in (groups.indptr, groups.indices, items.indptr, items.indices)
     )
-    first_fit(pointers, columns, back, rows, colour, taken)
+    _assign_first_free_colours(pointers, columns, back, rows, colour, taken)
     start = np.concatenate([[0], np.cumsum(np.bincount(colour))]) if count else np.zeros(1, np.int64)
     return Colouring(np.argsort(colour, kind="stable"), start)
+
+
+@jit_kernel
+def _assign_first_free_colours(pointers, groups, back, items, colour, taken):
+    """Write to `colour`, for each item in order, the first colour that no earlier item of its groups has.
+
+    Args:
+        pointers, groups: groups[pointers[a]:pointers[a + 1]] are the groups of item a.
+        back, items: items[back[g]:back[g + 1]] are the items of group g, ascending.
+        colour: output, one number per item.
+        taken: scratch, one number per item, all -1.
+    """
+    for a in range(len(colour)):
+        for k in range(pointers[a], pointers[a + 1]):
+            for other in items[back[groups[k]] : back[groups[k] + 1]]:
+                if other >= a:
+                    break
+                taken[colour[other]] = a
+        c = 0
+        while taken[c] == a:
+            c += 1
+        colour[a] = c

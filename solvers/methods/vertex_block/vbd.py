@@ -40,12 +40,12 @@ from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.vertex_block import vbd_sweeps as kernels
 from springbench.solvers.methods.vertex_block.colour_blocks import VertexBlocks
+from springbench.solvers.methods.vertex_block.vbd_packets import SPRING_SCRATCH_SIZE
 from springbench.solvers.methods.vertex_block.vertex_elements import VertexElements
 from springbench.solvers.model.barrier_energy import is_barrier_energy, without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
 from springbench.solvers.objective.spring_form import SpringForm, decompose_energies
 from springbench.solvers.simd.spring_packets import LANES
-from springbench.solvers.simd.vbd_packets import SPRING_SCRATCH_SIZE
 
 if TYPE_CHECKING:
     from springbench.solvers.contact.half_space.half_space_potential import ContactPlanes

@@ -13,9 +13,9 @@ from springbench.solvers.contact.half_space.half_space_steps import build_vertex
 from springbench.solvers.jit.kernel_compilation import jit_closure
 from springbench.solvers.kernels.spring_objective import value_and_descent as objective
 from springbench.solvers.methods.vertex_block.incident_elements import ElementKind, VertexFunctions
+from springbench.solvers.methods.vertex_block.vbd_packets import vbd_model_step, vbd_vertex_model
 from springbench.solvers.methods.vertex_block.vbd_sweeps import build_iteration, write_degenerate_descent
 from springbench.solvers.simd.spring_packets import LANES
-from springbench.solvers.simd.vbd_packets import vbd_model_step, vbd_vertex_model
 
 _INFINITE = float("inf")
 _STEP_SLOT, _CHANGE_SLOT = 3, 6

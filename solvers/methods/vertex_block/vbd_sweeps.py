@@ -11,8 +11,8 @@ from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.spring_local_step import SpringPackets, add_degenerate_packet
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.kernels.spring_objective import value_and_descent as objective
+from springbench.solvers.methods.vertex_block.vbd_packets import vbd_newton_step
 from springbench.solvers.simd.spring_packets import LANES
-from springbench.solvers.simd.vbd_packets import vbd_newton_step
 
 
 class ColourPackets(NamedTuple):

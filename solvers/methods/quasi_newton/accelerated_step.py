@@ -1,8 +1,7 @@
 """A whole accelerated step over a factor's own rows, without Python, for springs and spring-like energies.
 
 The plan is that of `springbench.solvers.kernels.local_global_iteration`, which corrects positions within the solve.
-Here a solve is
-separate, because the acceptance of a trial depends on its objective.
+Here a solve is separate, because the acceptance of a trial depends on its objective.
 """
 
 from __future__ import annotations
