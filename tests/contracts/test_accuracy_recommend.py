@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.cli.commands.recommend import parse_duration
 from springbench.harness.cli.main import main
 from springbench.harness.config.config_loader import load_config, load_scene
 from springbench.harness.config.sweep_config import SolverSpec
@@ -19,7 +21,12 @@ from springbench.harness.experiments.accuracy import method_recommendation as mo
 from springbench.harness.experiments.accuracy import work_precision
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
-from springbench.harness.experiments.accuracy.method_recommendation import MethodRecommendation, recommend_method
+from springbench.harness.experiments.accuracy.method_recommendation import (
+    MethodRecommendation,
+    RecommendationGoal,
+    StudyCandidates,
+    recommend_method,
+)
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.folder_ownership import claim_folder
@@ -61,7 +68,8 @@ def recommend(scene: Path, error: float, **more: Any) -> tuple[MethodRecommendat
     display, results = SilentDisplay(), scene.parent / "results"
     options: dict[str, Any] = {"size": None, "t_end": 0.2, "time_limit": 60.0} | more
     options = {"print_message": lambda line: None} | options
-    found = recommend_method(scene, error, results=results, display=display, **options)
+    goal = options.pop("goal", RecommendationGoal(max_error=error))
+    found = recommend_method(scene, goal, results=results, display=display, **options)
     return found, display.finished_units
 
 
@@ -135,15 +143,15 @@ def test_an_error_that_no_method_reaches_is_reported_with_the_nearest(scene: Pat
     assert "ask for a larger --error or a shorter --t-end" in str(raised.value)
 
 
-def test_a_budget_that_is_used_up_is_stated_and_the_search_goes_on_from_there(scene: Path) -> None:
-    with pytest.raises(RunFailed, match=rf"settings remain \(0 of {COUNT} settings measured; 6 not: the budget"):
-        recommend(scene, 0.1, budget=1e-9)
+def test_a_search_time_that_is_used_up_is_stated_and_the_search_goes_on_from_there(scene: Path) -> None:
+    with pytest.raises(RunFailed, match=rf"settings remain \(0 of {COUNT} settings measured; 6 not: the time"):
+        recommend(scene, 0.1, search_time=1e-9)
     found, count = recommend(scene, 0.1)
     assert count > 0
     assert found.best_method.error <= 0.1
 
 
-@pytest.mark.parametrize("option", ["error", "t_end", "time_limit", "budget"])
+@pytest.mark.parametrize("option", ["error", "t_end", "time_limit", "search_time"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
 def test_what_is_no_number_above_zero_is_a_mistake(scene: Path, option: str, value: float) -> None:
     with pytest.raises(InputError, match="wanted a number above 0"):
@@ -194,7 +202,9 @@ def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scen
 
 
 def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = module._build_study(scene, load_scene(scene), 4, 0.2, 60.0).work[0]
+    spec = module._build_study(
+        scene, load_scene(scene), 4, StudyCandidates.from_goal(RecommendationGoal(max_error=0.1), None), 0.2, 60.0
+    ).work[0]
     first, slow = [True], work_precision.simulate_scene
 
     def simulate(*given: Any, **more: Any) -> Any:
@@ -214,7 +224,9 @@ def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest
 
 def test_steps_that_a_solver_takes_within_a_frame_are_printed() -> None:
     path = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
-    spec = module._build_study(path, load_scene(path), 4, 0.2, 60.0).work[0]
+    spec = module._build_study(
+        path, load_scene(path), 4, StudyCandidates.from_goal(RecommendationGoal(max_error=0.1), None), 0.2, 60.0
+    ).work[0]
     spec = replace(spec, solver=SolverSpec("velocity-verlet", {}))
     way = module.MeasuredMethod(spec, 1e-3, 1.0, "integrated", "1140 substeps of 2.9e-05 s")
     assert str(way).startswith(f"solver {spec.solver.name}, 1140 substeps of 2.9e-05 s, in each frame of ")
@@ -232,3 +244,54 @@ def test_without_a_horizon_it_is_the_longest_at_which_the_error_can_be_measured(
     )
     with pytest.raises(RunFailed, match="cannot be reached or measured"):
         module._find_longest_t_end(path, spec, 12, 1e-14, ReferenceStore(tmp_path), said.append)
+
+
+def test_a_budget_gets_the_least_error_within_it_and_what_half_and_twice_would_buy(scene: Path) -> None:
+    """With a budget that nothing exceeds, the most accurate setting wins; the others follow from the same rows."""
+    found, count = recommend(scene, 0.0, goal=RecommendationGoal(frame_seconds=1.0))
+    assert count == len(measured(scene))
+    least = min(found.measured_methods, key=lambda method: method.error)
+    assert found.best_method == least
+    assert found.checked_method.error == least.error
+    runner_up = found.find_runner_up()
+    assert runner_up is not None
+    assert runner_up.work_spec.case.integrator != least.work_spec.case.integrator
+    costs = sorted(method.seconds_per_simulated_second for method in found.measured_methods)
+    tight = replace(found, goal=RecommendationGoal(frame_seconds=found.frame * costs[2]))
+    for factor in (0.5, 1.0, 2.0):
+        within = [one for one in found.measured_methods if one.seconds_per_simulated_second <= factor * costs[2]]
+        assert tight.select_best(factor) == min(within, key=lambda method: method.error, default=None)
+
+
+@pytest.mark.long
+def test_a_budget_that_nothing_meets_names_the_cheapest(scene: Path) -> None:
+    with pytest.raises(RunFailed, match=r"takes at most 1e-06 ms for a frame of 0.0333333 s; the cheapest is"):
+        recommend(scene, 0.0, goal=RecommendationGoal(frame_seconds=1e-9))
+
+
+@pytest.mark.long
+def test_the_search_can_be_of_one_solver(scene: Path) -> None:
+    found, _ = recommend(scene, 0.5, engine="numba")
+    assert {method.work_spec.solver.name for method in found.measured_methods} == {"numba"}
+    with pytest.raises(InputError, match=r"--engine: came 'mujocko'; expected .*mujoco"):
+        recommend(scene, 0.5, engine="mujocko")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed: pip install 'springbench[mujoco]'")
+def test_an_engine_is_searched_over_its_substeps(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "ENGINE_SUBSTEPS", [16])
+    found, _ = recommend(scene, 0.0, goal=RecommendationGoal(frame_seconds=0.02), engine="mujoco")
+    assert {method.work_spec.solver.parameters["mujoco_integrator"] for method in found.measured_methods} >= {"RK4"}
+    assert "substeps of 0.0333333 s" in str(found.best_method)
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("4ms", 4e-3), ("250us", 250e-6), ("0.1s", 0.1)])
+def test_a_budget_has_a_unit(text: str, seconds: float) -> None:
+    assert parse_duration(text, "--budget") == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize("text", ["4", "ms", "-1ms", "0s", "nan s", "infs", "4 min"])
+def test_a_budget_without_a_unit_is_a_mistake(text: str) -> None:
+    with pytest.raises(InputError, match=r"--budget: came .*; expected a number above 0 with its unit"):
+        parse_duration(text, "--budget")

@@ -83,7 +83,7 @@ options: {frames: 2, rounds: 2}
 }
 COMMANDS = {
     "accuracy": "accuracy accuracy.yaml",
-    "recommend": "recommend odd.yaml --error 0.9 --t-end 0.1 --budget 10",
+    "recommend": "recommend odd.yaml --error 0.9 --t-end 0.1 --search-time 10",
     "roofline": "roofline sweep.yaml --budget 0.1",
     "ablate": "ablate odd.yaml --rtol 0.1",
     "gallery": "gallery odd.yaml -o sheet.png",

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from springbench.harness.config.accuracy_config import BenchmarkCase, MeasurementSettings, WorkSpec
 from springbench.harness.config.sweep_config import SolverSpec
-from springbench.harness.experiments.accuracy.best_first import LEAST_LIMIT, OVER_BUDGET, SLOWER, search
+from springbench.harness.experiments.accuracy.best_first import LEAST_LIMIT, OUT_OF_TIME, SLOWER, search
 
 STEPS, TOLERANCES, SOLVERS = (0.4, 0.2, 0.1, 0.05, 0.025), (1e-1, 1e-2, 1e-3), ("a", "b", "c", "d", "e")
 
@@ -108,7 +108,7 @@ def test_a_simulation_may_take_little_more_than_the_best(best: float, limit: flo
     assert omitted.reasons == {"the solver does not support it": len(specs()) - len(SOLVERS)}
 
 
-def test_after_its_budget_nothing_begins():
+def test_after_its_search_time_nothing_begins():
     omitted = search(specs(), 1e-2, inf, Measured(table(0)), -1.0)
     assert (omitted.measured, omitted.is_complete) == (0, False)
-    assert omitted.reasons == {OVER_BUDGET: len(specs())}
+    assert omitted.reasons == {OUT_OF_TIME: len(specs())}

@@ -265,7 +265,7 @@ def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_num
 @engines
 def test_rows_tell_the_version_of_the_engine(name: str):
     prepared = ready(name, made(*HANGING).system)
-    package = load_target(OPTIONAL_SOLVERS[name]).solver_info.engine_package
+    package = load_target(OPTIONAL_SOLVERS[name]).solver_info.package_name
     version = json.loads(build_provenance_columns(SolverSpec(name, {}))["versions"])[package]
     assert f"{package} {version}," in prepared.description
     assert package not in json.loads(build_provenance_columns(SolverSpec("newton", {}))["versions"])

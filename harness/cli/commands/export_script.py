@@ -36,7 +36,8 @@ def export_script(
     engines = {
         label: spec
         for label, spec in engines.items()
-        if spec.solver.name in OPTIONAL_SOLVERS and hasattr(load_target(OPTIONAL_SOLVERS[spec.solver.name]), "write_script")
+        if spec.solver.name in OPTIONAL_SOLVERS
+        and hasattr(load_target(OPTIONAL_SOLVERS[spec.solver.name]), "write_script")
     }
     if not point:
         for line in format_plain_table(

@@ -2,17 +2,34 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from math import inf
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from springbench.harness.cli.shared_options import SCENE_HELP, ResultsOption, describe_config
 from springbench.harness.console import get_error_console, get_output_console, print_message, split_wide_table
+from springbench.harness.errors import InputError, InputMistake
+
+if TYPE_CHECKING:
+    from springbench.harness.experiments.accuracy.method_recommendation import MeasuredMethod
+
+
+_UNITS = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 
 def recommend(
     scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
-    error: Annotated[float, typer.Option(help="Target error, relative to the displacement from the start.")],
+    error: Annotated[
+        float | None, typer.Option(help="Target error, relative to the displacement from the start.")
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(help="Wall time of a frame, which is a time step of the scene: 4ms, 250us or 0.1s.")
+    ] = None,
+    engine: Annotated[
+        str | None, typer.Option(help="Only this solver or outside engine, such as mujoco; all by default.")
+    ] = None,
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
     t_end: Annotated[
         float | None,
@@ -22,47 +39,83 @@ def recommend(
         ),
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Limit of a simulation's wall time [s].")] = 5.0,
-    budget: Annotated[float, typer.Option(help="Limit of the wall time of all simulations [s].")] = 60.0,
+    search_time: Annotated[float, typer.Option(help="Limit of the wall time of all simulations [s].")] = 60.0,
     results: ResultsOption = Path("results"),
 ) -> None:
-    """Find and check the cheapest integrator, time step, tolerance and solver for an error."""
+    """Find and check the cheapest method for an error, or the most accurate one for a wall time a frame."""
     from rich.table import Table
     from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.accuracy.method_recommendation import RecommendationGoal
     from springbench.harness.experiments.accuracy.method_recommendation import recommend_method as find
     from springbench.harness.report.accuracy.recommendation_plot import CandidatePoint, draw_recommendation
 
+    if (error is None) == (budget is None):
+        raise InputError("recommend: give one of --error and --budget")
+    goal = RecommendationGoal(error, None if budget is None else parse_duration(budget, "--budget"))
     found = find(
         scene,
-        error,
+        goal,
         size=size,
         t_end=t_end,
         time_limit=time_limit,
-        budget=budget,
+        engine=engine,
+        search_time=search_time,
         results=results,
         display=create_display(get_error_console()),
         print_message=print_message,
     )
     integrated = found.checked_method.reference_kind == "integrated"
-    table = Table(
-        "", "error" if integrated else f"error ({found.checked_method.reference_kind})", "wall s per simulated s", "way"
-    )
-    for name, way in (("predicted", found.best_method), ("measured", found.checked_method)):
-        table.add_row(name, f"{way.error:.3g}", f"{way.seconds_per_simulated_second:.4g}", str(way))
+    rows: list[tuple[str, MeasuredMethod | None]] = [
+        ("predicted", found.best_method),
+        ("measured", found.checked_method),
+    ]
+    if budget is not None:
+        rows += [("runner-up", found.find_runner_up())]
+        rows += [("half the time", found.select_best(0.5)), ("twice the time", found.select_best(2.0))]
+    heading = "error" if integrated else f"error ({found.checked_method.reference_kind})"
+    table = Table("", heading, "wall s per simulated s" if budget is None else "ms a frame", "way")
+    for name, method in rows:
+        if method is None:
+            table.add_row(name, "–", "–", "nothing that was measured")
+            continue
+        cost = method.seconds_per_simulated_second
+        seconds = f"{cost:.4g}" if budget is None else f"{1e3 * found.frame * cost:.3g}"
+        table.add_row(name, f"{method.error:.3g}", seconds, str(method))
     get_output_console().print(split_wide_table(table))
     print_message(found.verdict)
     points = [
         CandidatePoint(way.work_spec.solver.name, way.error, way.seconds_per_simulated_second, str(way))
         for way in found.measured_methods
     ]
-    title = (
-        f"Ways to an error of {100 * error:g} %: {scene.stem} {found.best_method.work_spec.case.size or ''}".rstrip()
-    )
+    aim = f"Ways to an error of {100 * error:g} %" if error else f"Ways to spend {budget} a frame"
+    title = f"{aim}: {scene.stem} {found.best_method.work_spec.case.size or ''}".rstrip()
     folder = results / f"recommend-{scene.stem}" / "pictures"
     t_end = found.best_method.work_spec.t_end
-    name = f"ways-{scene.stem}-{found.best_method.work_spec.case.size}-{error:g}-{t_end:g}".replace(".", "_")
+    requested = f"{error:g}" if error else f"{budget}"
+    name = f"ways-{scene.stem}-{found.best_method.work_spec.case.size}-{requested}-{t_end:g}".replace(".", "_")
     facts = [f"{t_end:g} s simulated", "time stepping and solver together"]
     facts += [] if integrated else [f"by a {found.checked_method.reference_kind} reference"]
-    picture, *_ = draw_recommendation(folder / name, title, facts, points, error)
+    picture, *_ = draw_recommendation(folder / name, title, facts, points, error, found.cost_limit)
     print_message(f"the runners-up are in {picture}")
     if command := found.best_method.format_command(scene):
         print_message(f"to run it:\n  {command}")
+
+
+def parse_duration(text: str, option: str) -> float:
+    """Return the seconds of a duration with a unit, such as 4ms.
+
+    Args:
+        text: number and unit: us, ms or s.
+        option: option that it comes from, for the message.
+
+    Raises:
+        InputError: it is no number above 0 with such a unit.
+    """
+    number = text.strip().rstrip("mus")
+    unit = text.strip()[len(number) :]
+    with suppress(ValueError):
+        if unit in _UNITS and 0.0 < float(number) < inf:
+            return float(number) * _UNITS[unit]
+    raise InputError(
+        InputMistake(f"came {text!r}; expected a number above 0 with its unit: 4ms, 250us or 0.1s", key=option)
+    )

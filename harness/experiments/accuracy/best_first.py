@@ -1,4 +1,4 @@
-"""Best-first search for the cheapest setting of a study that meets an error.
+"""Best-first search for the cheapest setting of a study that meets an error, or the most accurate one within a cost.
 
 A method is a solver with an integrator; its settings are time steps and tolerances. Shorter steps and smaller
 tolerances are assumed to cost more. A method's last cost is therefore a lower bound of those that follow. The method
@@ -6,7 +6,9 @@ with the smallest bound is measured next. The search omits
 
     smaller tolerances at a time step    once one meets the error, or smaller ones no longer change it
     the rest of a method                 once it costs more than SLOWER times the best that meets the error
-    everything                           once the budget of wall seconds is used up
+    everything                           once the time for the search is used up
+
+With an error of zero, all settings up to SLOWER times the best cost are candidates.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ LEAST_LIMIT = 0.2
 UNCHANGED = 0.1
 """Relative change of the excess error between two tolerances, below which smaller tolerances are omitted."""
 
-OVER_BUDGET = "the budget was used up"
+OUT_OF_TIME = "the time for the search was used up"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +52,8 @@ class SearchSummary:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the search ended within its budget."""
-        return OVER_BUDGET not in self.reasons
+        """Whether the search ended within its time."""
+        return OUT_OF_TIME not in self.reasons
 
     def __str__(self) -> str:
         reasons = "".join(f"; {count} not: {reason}" for reason, count in self.reasons.items())
@@ -96,23 +98,23 @@ def search(
     error: float,
     best: float,
     measure: Callable[[WorkSpec], Mapping[str, Any]],
-    budget: float,
+    search_time: float,
 ) -> SearchSummary:
     """Measure settings until no remaining one can be the cheapest that meets an error.
 
     Args:
         work: the settings.
-        error: relative error to meet.
+        error: relative error to meet; 0 for the least within SLOWER times `best`.
         best: wall seconds per simulated second of the best known setting, infinite without one.
         measure: measures a setting within the time limit of its specification, and returns the row.
-        budget: wall time after which no simulation starts [s].
+        search_time: wall time after which no simulation starts [s].
     """
     methods = _methods(work)
     settings, measured, reasons, end = (
         sum(one.num_remaining for one in methods),
         0,
         Counter[str](),
-        monotonic() + budget,
+        monotonic() + search_time,
     )
     heap = [(0.0, number) for number in range(len(methods))]
     heapify(heap)
@@ -123,7 +125,7 @@ def search(
             reasons[_slow(error)] += one.skip_all()
             continue
         if monotonic() > end:
-            reasons[OVER_BUDGET] += one.skip_all()
+            reasons[OUT_OF_TIME] += one.skip_all()
             continue
         spec = one.grid[0].pop(0)
         row = measure(_limited(spec, best))
@@ -155,6 +157,8 @@ def search(
 
 
 def _slow(error: float) -> str:
+    if not error:
+        return "they or their faster neighbours take longer than the budget allows"
     return f"they or their faster neighbours take {SLOWER:g} times as long as the best within {error:g}, or too long"
 
 

@@ -1,11 +1,11 @@
-"""Find the cheapest method to simulate a scene up to an error.
+"""Find the cheapest method for an error, or the most accurate one for a wall time.
 
-It is selected from stored rows or new measurements.
+It is selected from stored rows or new measurements, by one search: for a wall time no error is small enough, and only
+the cost ends it.
 
 An error is that of a whole simulation up to a horizon (`springbench.harness.experiments.accuracy.work_precision`). A
-cost is the
-wall time per simulated second. The result is the cheapest measured method that meets the error; one more simulation
-checks it.
+cost is the wall time per simulated second. The result is the cheapest measured method that meets the error, or the
+one with the least error within the time; one more simulation checks it.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from springbench.harness.config.accuracy_config import AccuracyConfig, BenchmarkCase, MeasurementSettings, WorkSpec
 from springbench.harness.config.accuracy_loader import AccuracyPlan, expand_studies
@@ -26,7 +27,7 @@ from springbench.harness.config.config_loader import find_scene_mistakes, load_s
 from springbench.harness.config.run_options import RUN_OPTIONS, STEP_OPTIONS
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
-from springbench.harness.errors import InputError, InputMistake, RunFailed
+from springbench.harness.errors import InputError, InputMistake, RunFailed, suggest_name
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.progress_display import ProgressDisplay
@@ -49,15 +50,32 @@ from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.schema.config_document import ConfigDocument
 from springbench.solvers.iteration.solver_info import LOCAL_GLOBAL_FAMILY
-from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_minimiser, load_target
+from springbench.solvers.registry import (
+    OPTIONAL_SOLVERS,
+    SOLVER_TABLE,
+    SOLVERS,
+    find_solver_info,
+    is_minimiser,
+    load_target,
+)
 
 TIME_STEP_REFINEMENTS = (0.5, 1, 2, 4, 8)
 """Numbers of steps up to the horizon, relative to those at the scene's own time step."""
 
 DEFAULT_T_END = 1.0
 """Default simulated time at which the error counts [s]."""
-BUDGET = 60.0
+SEARCH_TIME = 60.0
 """Default limit for the wall time of all measurements together [s]."""
+BUDGET_REFERENCE_ERROR = 1e-3
+"""Relative error that the reference must resolve where a wall time is given: people who have one accept a percent."""
+BUDGET_RANGE = 2.0
+"""Multiple of a given wall time up to which methods are measured, to tell what more time would buy."""
+FIXED_ITERATIONS, FEWER_ITERATIONS = 50, [2, 5, 10, 20]
+"""Iterations of methods without a tolerance; those that are tried too where a wall time is given."""
+ENGINE_SUBSTEPS = [1, 2, 4, 8, 16, 32, 64, 128]
+"""Substeps of outside engines in a frame."""
+ENGINE_ITERATIONS = [1, 4, 16]
+"""Iterations of outside engines in a substep, of those that iterate."""
 _MESSAGE_INTERVAL = 2.0
 """Interval between two messages about the reference [s]."""
 _ERROR_RTOL, _MAX_TIME_RATIO = 1e-6, 1.3
@@ -84,9 +102,94 @@ def build_candidate_grid() -> list[dict[str, Any]]:
     ]
     return [
         {"solver": implicit, "rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
-        {"solver": fixed, "max_iterations": 50},
+        {"solver": fixed, "max_iterations": FIXED_ITERATIONS},
         {"solver": own, "max_iterations": 1, "integrator": ["substepping"]},
     ]
+
+
+def build_solver_grid(name: str) -> list[dict[str, Any]]:
+    """Return the grid of one solver or outside engine.
+
+    Args:
+        name: its name.
+
+    Raises:
+        InputError: there is no solver of this name.
+    """
+    solver = _load_solver(name)
+    info = find_solver_info(solver, name)
+    if is_engine(solver):
+        return [{"solver": [name], "max_iterations": ENGINE_SUBSTEPS, "integrator": [find_engine_integrator(solver)]}]
+    if info.is_substepping and info.supports_error_control:
+        return [{"solver": [name], "max_iterations": 1, "integrator": ["substepping"]}]
+    fixed = {"solver": [name], "max_iterations": [*FEWER_ITERATIONS, FIXED_ITERATIONS]}
+    if not is_minimiser(solver):
+        return [fixed]
+    solved = {"rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500}
+    return [{"solver": [name], "integrator": CANDIDATE_INTEGRATORS, **solved}, fixed]
+
+
+def list_solver_variants(name: str) -> list[dict[str, Any]]:
+    """Return the parameters of a solver that are tried: those of outside engines vary, others have their defaults."""
+    solver = _load_solver(name)
+    values: dict[str, Sequence[Any]] = {}
+    for parameter in fields(solver) if is_engine(solver) else ():
+        if parameter.name == "iterations_per_substep":
+            values[parameter.name] = sorted({*ENGINE_ITERATIONS, parameter.default})
+        elif parameter.name in ("mujoco_integrator", "newton_solver"):
+            values[parameter.name] = get_args(get_type_hints(solver)[parameter.name])
+    return [{"name": name, **dict(zip(values, chosen, strict=True))} for chosen in product(*values.values())]
+
+
+def is_engine(solver: Any) -> bool:
+    """Return whether a solver is an outside engine, whose iterations are its substeps."""
+    return hasattr(solver, "write_script")
+
+
+def find_engine_integrator(solver: Any) -> str:
+    """Return the integrator by which an engine steps frames: with damping of its own, or done before each frame."""
+    return "substepping" if solver.supports_damping else "implicit-euler"
+
+
+def _load_solver(name: str) -> Any:
+    known = [*SOLVERS, *OPTIONAL_SOLVERS]
+    if name not in known:
+        raise InputError(InputMistake(f"came {name!r}; expected {suggest_name(name, known)}", key="--engine"))
+    return load_target(SOLVER_TABLE[name])
+
+
+@dataclass(frozen=True, slots=True)
+class RecommendationGoal:
+    """What a method must keep to; one of the two is given.
+
+    Attributes:
+        max_error: relative error at the end.
+        frame_seconds: wall time [s] of a frame, which is a time step of the scene.
+    """
+
+    max_error: float | None = None
+    frame_seconds: float | None = None
+
+    @property
+    def reference_error(self) -> float:
+        """Relative error that the reference must resolve."""
+        return BUDGET_REFERENCE_ERROR if self.max_error is None else self.max_error
+
+    def select_methods(
+        self, methods: Sequence[MeasuredMethod], frame: float, factor: float = 1.0
+    ) -> list[MeasuredMethod]:
+        """Return the methods that keep to the goal, the best one first.
+
+        Args:
+            methods: measured methods, the cheapest first.
+            frame: time step of the scene [s].
+            factor: multiple of the wall time.
+        """
+        if self.frame_seconds is None:
+            return [method for method in methods if method.error <= self.reference_error]
+        limit = factor * self.frame_seconds / frame
+        within = [method for method in methods if method.seconds_per_simulated_second <= limit]
+        return sorted(within, key=lambda method: method.error)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +214,11 @@ class MeasuredMethod:
 
     def __str__(self) -> str:
         u = self.work_spec
-        if find_solver_info(load_target(SOLVER_TABLE[u.solver.name]), u.solver.name).is_substepping:
+        solver = load_target(SOLVER_TABLE[u.solver.name])
+        if is_engine(solver):
+            chosen = "".join(f", {key} {value}" for key, value in u.solver.parameters.items() if key != "device")
+            return f"{u.solver.name}{chosen}, {u.options['max_iterations']} substeps of {u.case.scene.time_step:.6g} s"
+        if find_solver_info(solver, u.solver.name).is_substepping:
             return f"solver {u.solver.name}, {self.solver_description}, in each frame of {u.case.scene.time_step:.6g} s"
         tolerance = u.options["rtol"]
         stop = f"{u.options['max_iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
@@ -135,14 +242,38 @@ class MethodRecommendation:
     """Result of a recommendation.
 
     Attributes:
+        goal: what the method must keep to.
+        frame: time step of the scene [s].
         measured_methods: all measured methods, cheapest first.
-        best_method: cheapest of those that meet the error.
+        best_method: the best of those that keep to the goal.
         checked_method: a repeated measurement of it.
     """
 
+    goal: RecommendationGoal
+    frame: float
     measured_methods: tuple[MeasuredMethod, ...]
     best_method: MeasuredMethod
     checked_method: MeasuredMethod
+
+    @property
+    def cost_limit(self) -> float | None:
+        """Largest wall time per simulated second that the goal allows; None where it is an error."""
+        return None if self.goal.frame_seconds is None else self.goal.frame_seconds / self.frame
+
+    def find_runner_up(self) -> MeasuredMethod | None:
+        """Return the best method within the goal by another solver or integrator."""
+        best = self.best_method.work_spec
+        others = (
+            method
+            for method in self.goal.select_methods(self.measured_methods, self.frame)
+            if (method.work_spec.solver.name, method.work_spec.case.integrator)
+            != (best.solver.name, best.case.integrator)
+        )
+        return next(others, None)
+
+    def select_best(self, factor: float) -> MeasuredMethod | None:
+        """Return the most accurate method within a multiple of the given wall time; None if none is as cheap."""
+        return next(iter(self.goal.select_methods(self.measured_methods, self.frame, factor)), None)
 
     @property
     def verdict(self) -> str:
@@ -164,7 +295,7 @@ class MethodRecommendation:
 
 def recommend_method(
     path: Path,
-    max_error: float,
+    goal: RecommendationGoal,
     *,
     size: int | None,
     t_end: float | None,
@@ -172,29 +303,36 @@ def recommend_method(
     results: Path,
     display: ProgressDisplay,
     print_message: Callable[[str], None],
-    budget: float = BUDGET,
+    engine: str | None = None,
+    search_time: float = SEARCH_TIME,
 ) -> MethodRecommendation:
-    """Return the cheapest method for a relative error at `t_end`.
+    """Return the cheapest method for a relative error at `t_end`, or the most accurate one for a wall time.
 
     Args:
         path: file of the scene.
-        max_error: relative error to reach.
+        goal: error, or wall time of a frame.
         size: mesh size; the scene's default if None.
         t_end: simulated time [s]. If None, DEFAULT_T_END, or the longest time at which the error can be measured, if
-            that
-            is shorter.
+            that is shorter.
         time_limit: wall-time limit of a simulation [s].
         results: folder that contains a folder for each config.
         display: shows progress.
         print_message: prints a remark.
-        budget: limit for the wall time of all measurements together [s].
+        engine: name of the only solver or engine to consider; None for all.
+        search_time: limit for the wall time of all measurements together [s].
 
     Raises:
         InputError: an option is invalid.
-        RunFailed: no method meets the error.
+        RunFailed: no method keeps to the goal.
     """
-    asked_for = {"--error": max_error, "--t-end": t_end, "--time-limit": time_limit, "--budget": budget}
-    for key, value in asked_for.items():
+    options = {
+        "--error": goal.max_error,
+        "--budget": goal.frame_seconds,
+        "--t-end": t_end,
+        "--time-limit": time_limit,
+        "--search-time": search_time,
+    }
+    for key, value in options.items():
         if value is not None and not 0 < value < math.inf:
             raise InputError(InputMistake(f"came {value:g}; wanted a number above 0", key=key))
     scene = load_scene(path)
@@ -207,38 +345,71 @@ def recommend_method(
         limits=TaskLimits(EXTRA_WALL_SECONDS),
     )
     store = open_reference_store(results)
-    study: AccuracyPlan = isolated(partial(_plan_study, path, scene, size, max_error, t_end, time_limit, store))
-    t_end = study.work[0].t_end
-    ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
-    omitted: SearchSummary | None = None
-    if not any(way.error <= max_error and way.sweep != study.name for way in ways):
-        omitted = _measured(
-            study, ways, reasons, max_error, claim_folder(results / study.name, path), display, print_message, budget
-        )
-        print_message(f"{path.stem} {size or ''}: {omitted}")
-        ways, reasons = _read_measured_methods(path.stem, scene, size, t_end, results)
-    within = [way for way in ways if way.error <= max_error]
+    candidates = StudyCandidates.from_goal(goal, engine)
+    study: AccuracyPlan = isolated(partial(_plan_study, path, scene, size, goal, candidates, t_end, time_limit, store))
+    t_end, frame = study.work[0].t_end, scene.time_step
+
+    def read_methods() -> tuple[list[MeasuredMethod], list[dict[str, Any]]]:
+        methods, failed_rows = _read_measured_methods(path.stem, scene, size, t_end, results)
+        return [one for one in methods if engine in (None, one.work_spec.solver.name)], failed_rows
+
+    methods, failed_rows = read_methods()
+    summary: SearchSummary | None = None
+    if goal.max_error is None or not any(one.sweep != study.name for one in goal.select_methods(methods, frame)):
+        folder = claim_folder(results / study.name, path)
+        summary = _measure_study(study, methods, failed_rows, goal, frame, folder, display, print_message, search_time)
+        print_message(f"{path.stem} {size or ''}: {summary}")
+        methods, failed_rows = read_methods()
+    within = goal.select_methods(methods, frame)
     if not within:
-        raise RunFailed(_explain_no_method(ways, reasons, max_error, t_end, omitted))
-    best = within[0]
-    return MethodRecommendation(tuple(ways), best, isolated(partial(_check_method, best, store)))
+        raise RunFailed(_explain_no_method(methods, failed_rows, goal, frame, t_end, summary))
+    return MethodRecommendation(
+        goal, frame, tuple(methods), within[0], isolated(partial(_check_method, within[0], store))
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class StudyCandidates:
+    """Solvers of a study with their parameters, its grid, and its refinements of the time step."""
+
+    solvers: Sequence[dict[str, Any]]
+    grid: Sequence[dict[str, Any]]
+    refinements: Sequence[float]
+
+    @classmethod
+    def from_goal(cls, goal: RecommendationGoal, engine: str | None) -> StudyCandidates:
+        """Return the candidates for a goal, of one engine if it is named. Raises InputError."""
+        refinements = [
+            one for one in TIME_STEP_REFINEMENTS if one >= 1 or goal.max_error is not None
+        ]  # a frame at most
+        if engine:
+            refinements = [1] if is_engine(_load_solver(engine)) else refinements
+            return cls(list_solver_variants(engine), build_solver_grid(engine), refinements)
+        grid = build_candidate_grid()
+        if goal.max_error is None:
+            fixed = [entry for entry in grid if entry["max_iterations"] == FIXED_ITERATIONS]
+            grid += [{**entry, "max_iterations": FEWER_ITERATIONS} for entry in fixed]
+        names = dict.fromkeys(name for entry in grid for name in entry["solver"])
+        return cls([{"name": name} for name in names], grid, refinements)
 
 
 def _plan_study(
     path: Path,
     scene: SceneSpec,
     size: int,
-    max_error: float,
+    goal: RecommendationGoal,
+    candidates: StudyCandidates,
     t_end: float | None,
     time_limit: float,
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
 ) -> AccuracyPlan:
     """Return the study that may be measured, and compute its reference. Raises InputError, RunFailed."""
+    max_error = goal.reference_error
     if t_end is None:
         t_end = _find_longest_t_end(path, scene, size, max_error, reference_store, print_message)
     try:
-        study = _build_study(path, scene, size, t_end, time_limit)
+        study = _build_study(path, scene, size, candidates, t_end, time_limit)
     except InputError as refused:  # the studies are ours; what is wrong came with an option
         raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
     _compute_reference(scene, size, max_error, t_end, reference_store, print_message)
@@ -294,53 +465,59 @@ def _compute_reference(
     reference_store.load_trajectory(scene, size, [t_end], error=max_error, report_progress=told)
 
 
-def _measured(
+def _measure_study(
     study: AccuracyPlan,
-    ways: list[MeasuredMethod],
-    without: list[dict[str, Any]],
-    error: float,
+    methods: list[MeasuredMethod],
+    failed_rows: list[dict[str, Any]],
+    goal: RecommendationGoal,
+    frame: float,
     folder: Path,
     display: ProgressDisplay,
-    say: Callable[[str], None],
-    budget: float,
+    print_message: Callable[[str], None],
+    search_time: float,
 ) -> SearchSummary:
-    """Measure the methods that may be the cheapest and have no rows. Raises InputError, WriteError."""
+    """Measure the methods that may be the best and have no rows. Raises InputError, WriteError."""
     known: dict[str, dict[str, Any]] = {
-        way.work_spec.build_file_stem(): {
+        method.work_spec.build_file_stem(): {
             "status": "ok",
-            "error": way.error,
-            "seconds_per_simulated_second": way.seconds_per_simulated_second,
+            "error": method.error,
+            "seconds_per_simulated_second": method.seconds_per_simulated_second,
         }
-        for way in ways
+        for method in methods
     }
-    failed, here = {row["unit_id"]: row for row in without}, machine_info.describe_machine().machine_id
-    say(
-        f"measuring up to {len(study.work)} settings, cheap ones first, for at most {budget:g} s (--budget); a "
-        f"simulation ends once it is {SLOWER:g} times as slow as the best that keeps to the error"
+    failed, here = {row["unit_id"]: row for row in failed_rows}, machine_info.describe_machine().machine_id
+    within = [method.seconds_per_simulated_second for method in goal.select_methods(methods, frame)]
+    best, error, end = min(within, default=math.inf), goal.reference_error, f"{SLOWER:g} times as slow as the best"
+    if goal.frame_seconds is not None:  # no error is small enough, so that only the cost ends the search
+        best, error = BUDGET_RANGE * goal.frame_seconds / frame / SLOWER, 0.0
+        end = f"{BUDGET_RANGE:g} times as slow as the budget"
+    print_message(
+        f"measuring up to {len(study.work)} settings, cheap ones first, for at most {search_time:g} s (--search-time); "
+        f"a simulation ends once it is {end}"
     )
     with open_measurement(study.work, folder, display) as measure:
 
         def look_up(spec: WorkSpec) -> dict[str, Any]:
             return known.get(spec.build_file_stem()) or failed.get(spec.compute_unit_id(here)) or measure(spec)
 
-        best = min((way.seconds_per_simulated_second for way in ways if way.error <= error), default=math.inf)
-        return search(study.work, error, best, look_up, budget)
+        return search(study.work, error, best, look_up, search_time)
 
 
-def _build_study(path: Path, scene: SceneSpec, size: int, t_end: float, time_limit: float) -> AccuracyPlan:
+def _build_study(
+    path: Path, scene: SceneSpec, size: int, candidates: StudyCandidates, t_end: float, time_limit: float
+) -> AccuracyPlan:
     """Build the study that is measured where no rows exist."""
     steps = max(1, round(t_end / scene.time_step))
-    time_steps = [t_end / round(steps * factor) for factor in TIME_STEP_REFINEMENTS if round(steps * factor)]
+    time_steps = [t_end / round(steps * factor) for factor in candidates.refinements if round(steps * factor)]
     shared = {"t_end": t_end, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})
-    work: list[dict[str, Any]] = [shared | way for way in build_candidate_grid()]
-    solvers = list(dict.fromkeys(name for way in work for name in way["solver"]))
-    data = {"scenes": [path.name], "solvers": solvers, "work": work}
+    work: list[dict[str, Any]] = [shared | entry for entry in candidates.grid]
+    data = {"scenes": [path.name], "solvers": list(candidates.solvers), "work": work}
     document = ConfigDocument(path, data)
-    fields = document.validate_data(AccuracyConfig, data)
+    validated = document.validate_data(AccuracyConfig, data)
     solvers = read_solvers(document)
-    if fields is None or document.mistakes:
+    if validated is None or document.mistakes:
         raise document.build_error()
-    return replace(expand_studies(document, fields, {path.stem: scene}, solvers), name=f"recommend-{path.stem}")
+    return replace(expand_studies(document, validated, {path.stem: scene}, solvers), name=f"recommend-{path.stem}")
 
 
 def _convert_to_option(mistake: InputMistake) -> InputMistake:
@@ -406,20 +583,31 @@ def _build_measured_method(spec: WorkSpec, row: dict[str, Any]) -> MeasuredMetho
 def _explain_no_method(
     methods: list[MeasuredMethod],
     failed_rows: list[dict[str, Any]],
-    max_error: float,
+    goal: RecommendationGoal,
+    frame: float,
     t_end: float,
-    omitted: SearchSummary | None,
+    summary: SearchSummary | None,
 ) -> str:
-    """Explain why no method meets the error, and suggest what to change."""
-    if omitted and not omitted.is_complete:
+    """Explain why no method keeps to the goal, and suggest what to change."""
+    wanted = f"keeps to an error of {goal.reference_error:g} over {t_end:g} s"
+    if goal.frame_seconds is not None:
+        wanted = f"takes at most {1e3 * goal.frame_seconds:g} ms for a frame of {frame:.6g} s"
+    if summary and not summary.is_complete:
         return (
-            f"nothing that was measured keeps to an error of {max_error:g} over {t_end:g} s, and settings remain "
-            f"({omitted}): the same command with a larger --budget goes on where this one ended"
+            f"nothing that was measured {wanted}, and settings remain "
+            f"({summary}): the same command with a larger --search-time goes on where this one ended"
+        )
+    if methods and goal.frame_seconds is not None:
+        cheapest = methods[0]
+        return (
+            f"nothing that was measured {wanted}; the cheapest is {cheapest}, "
+            f"{1e3 * frame * cheapest.seconds_per_simulated_second:.3g} ms: ask for a larger --budget or a smaller "
+            "--size"
         )
     if methods:
-        nearest = min(methods, key=lambda way: way.error)
+        nearest = min(methods, key=lambda method: method.error)
         return (
-            f"nothing that was measured keeps to an error of {max_error:g} over {t_end:g} s; the nearest is {nearest}, "
+            f"nothing that was measured {wanted}; the nearest is {nearest}, "
             f"which errs by {nearest.error:.2g}: ask for a larger --error or a shorter --t-end"
         )
     reasons = {row["reason"] for row in failed_rows}

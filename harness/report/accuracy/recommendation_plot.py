@@ -41,23 +41,37 @@ class CandidatePoint(NamedTuple):
 
 
 def draw_recommendation(
-    stem: Path, title: str, facts: Sequence[str], points: Sequence[CandidatePoint], error_requested: float
+    stem: Path,
+    title: str,
+    facts: Sequence[str],
+    points: Sequence[CandidatePoint],
+    error_requested: float | None,
+    cost_limit: float | None = None,
 ) -> list[Path]:
     """Draw the candidates of a recommendation, and return the files.
 
-    The recommended candidate is the first one within the requested error.
+    The recommended candidate is the cheapest one within the requested error, or the most accurate one within the cost.
 
     Args:
         stem: path of the files without suffix.
         title: title of the picture.
         facts: phrases below the title.
         points: candidates, the cheapest first.
-        error_requested: relative error.
+        error_requested: relative error; None where a cost is given.
+        cost_limit: wall seconds per simulated second; None where an error is given.
     """
-    within = [point for point in points if point.error <= error_requested]
+
+    def is_within(point: CandidatePoint) -> bool:
+        return (error_requested is None or point.error <= error_requested) and (
+            cost_limit is None or point.seconds_per_simulated_second <= cost_limit
+        )
+
+    within = list(filter(is_within, points))
+    if error_requested is None:
+        within.sort(key=lambda point: point.error)
     words = [f"recommended: {_describe_candidate(within[0])}"] if within else []
     words += [
-        f"{k}. runner-up: {_describe_candidate(point, within[0])}"
+        f"{k}. runner-up: {_describe_candidate(point, within[0] if error_requested else None)}"
         for k, point in enumerate(within[1 : MAX_RUNNERS_UP + 1], 1)
     ]
     looks = assign_solver_styles(point.solver for point in points)
@@ -70,12 +84,18 @@ def draw_recommendation(
             notes_top(words) - PANEL_TOP - 96,
             "error of the positions, relative to the way from the start",
         )
-        down = log_limits([*(point.error for point in points), error_requested], margin=1.8)
-        ax.axhspan(down[0], error_requested, color=RULE_COLOUR, alpha=0.45, zorder=0, lw=0)
+        errors, costs = zip(*((point.error, point.seconds_per_simulated_second) for point in points), strict=True)
+        down = log_limits([*errors, *filter(None, [error_requested])], margin=1.8)
+        along = log_limits([*costs, *filter(None, [cost_limit])], margin=1.8)
+        shade: dict[str, Any] = {"color": RULE_COLOUR, "alpha": 0.45, "zorder": 0, "lw": 0}
+        if error_requested is not None:
+            ax.axhspan(down[0], error_requested, **shade)
+        if cost_limit is not None:
+            ax.axvspan(along[0], cost_limit, **shade)
         for point in points:
             look = looks[point.solver]
             style: dict[str, Any] = sheet_marker_style(look, is_stale=False) | {
-                "alpha": 1.0 if point.error <= error_requested else 0.35
+                "alpha": 1.0 if is_within(point) else 0.35
             }
             style |= {"marker": look.marker, "ls": "", "color": look.color, "ms": 6.5 * sized(look)}
             ax.plot(point.seconds_per_simulated_second, point.error, zorder=3, **style)
@@ -89,15 +109,20 @@ def draw_recommendation(
                 (point.seconds_per_simulated_second, point.error), (0, 10 if k else -22),
                 textcoords="offset points", ha="center", fontsize=9, color=TEXT_COLOUR if not k else MUTED_COLOUR,
             )  # fmt: skip
-        format_log_axis(
-            ax.xaxis, *log_limits([point.seconds_per_simulated_second for point in points], margin=1.8), unit="time"
-        )
+        format_log_axis(ax.xaxis, *along, unit="time")
         format_log_axis(ax.yaxis, *down, unit="percent")
         ax.set_xlabel("wall time a simulated second", fontsize=9, loc="left")
-        ax.annotate(
-            f"asked: {100 * error_requested:.3g} %", (1.0, error_requested), (-6, 4),
-            xycoords=("axes fraction", "data"), textcoords="offset points", ha="right", fontsize=9, color=MUTED_COLOUR,
-        )  # fmt: skip
+        note: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "fontsize": 9, "color": MUTED_COLOUR}
+        if error_requested is not None:
+            ax.annotate(
+                f"asked: {100 * error_requested:.3g} %", (1.0, error_requested), (-6, 4),
+                xycoords=("axes fraction", "data"), **note,
+            )  # fmt: skip
+        if cost_limit is not None:
+            ax.annotate(
+                f"budget: {format_duration(cost_limit)}", (cost_limit, 1.0), (-4, -14),
+                xycoords=("data", "axes fraction"), **note,
+            )  # fmt: skip
         draw_legend(
             page, {solver: looks[solver]._replace(dash="") for solver in dict.fromkeys(p.solver for p in points)}
         )
