@@ -217,12 +217,19 @@ class MeasuredMethod:
         solver = load_target(SOLVER_TABLE[u.solver.name])
         if is_engine(solver):
             chosen = "".join(f", {key} {value}" for key, value in u.solver.parameters.items() if key != "device")
-            return f"{u.solver.name}{chosen}, {u.options['max_iterations']} substeps of {u.case.scene.time_step:.6g} s"
+            substeps = f"{u.options['max_iterations']} substeps a frame"
+            return f"{u.solver.name}{chosen}, {substeps} of {u.case.scene.time_step:.6g} s"
         if find_solver_info(solver, u.solver.name).is_substepping:
             return f"solver {u.solver.name}, {self.solver_description}, in each frame of {u.case.scene.time_step:.6g} s"
         tolerance = u.options["rtol"]
         stop = f"{u.options['max_iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
         return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
+
+    @property
+    def kind(self) -> tuple[object, ...]:
+        """What distinguishes methods, without time step, iterations and tolerance."""
+        spec = self.work_spec
+        return spec.solver.name, spec.case.integrator, *sorted(spec.solver.parameters.items())
 
     def format_command(self, scene: Path) -> str:
         """Return the command line for this method; empty where the solver's parameters need a sweep."""
@@ -261,15 +268,9 @@ class MethodRecommendation:
         return None if self.goal.frame_seconds is None else self.goal.frame_seconds / self.frame
 
     def find_runner_up(self) -> MeasuredMethod | None:
-        """Return the best method within the goal by another solver or integrator."""
-        best = self.best_method.work_spec
-        others = (
-            method
-            for method in self.goal.select_methods(self.measured_methods, self.frame)
-            if (method.work_spec.solver.name, method.work_spec.case.integrator)
-            != (best.solver.name, best.case.integrator)
-        )
-        return next(others, None)
+        """Return the best method within the goal by another solver, integrator or method of an engine."""
+        within = self.goal.select_methods(self.measured_methods, self.frame)
+        return next((method for method in within if method.kind != self.best_method.kind), None)
 
     def select_best(self, factor: float) -> MeasuredMethod | None:
         """Return the most accurate method within a multiple of the given wall time; None if none is as cheap."""

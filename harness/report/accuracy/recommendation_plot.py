@@ -30,6 +30,9 @@ from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEX
 MAX_RUNNERS_UP = 4
 """Number of runners-up that are described in words."""
 
+MAX_SHOWN_ERROR = 10.0
+"""Relative error above which a candidate is not drawn: its motion is unstable, and would compress all others."""
+
 
 class CandidatePoint(NamedTuple):
     """A candidate: solver, relative error, wall seconds per simulated second, and its description."""
@@ -66,7 +69,10 @@ def draw_recommendation(
             cost_limit is None or point.seconds_per_simulated_second <= cost_limit
         )
 
-    within = list(filter(is_within, points))
+    shown = [point for point in points if point.error <= MAX_SHOWN_ERROR] or list(points)
+    if len(shown) < len(points):
+        facts = [*facts, f"{len(points) - len(shown)} unstable settings not shown"]
+    points, within = shown, list(filter(is_within, shown))
     if error_requested is None:
         within.sort(key=lambda point: point.error)
     words = [f"recommended: {_describe_candidate(within[0])}"] if within else []
