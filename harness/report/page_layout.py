@@ -20,9 +20,11 @@ from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.recording.strain_shading import PIN_COLOUR, format_percent
+from springbench.harness.report.picture_sources import SOURCES_KEY
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     MUTED_COLOUR,
@@ -79,22 +81,25 @@ def paste_picture(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) 
     page.figimage(pixels, xo=left, yo=PAGE_HEIGHT - top - pixels.shape[0], origin="upper")
 
 
-def save_page(page: Figure, path: Path, *, used_height: float = PAGE_HEIGHT) -> None:
+def save_page(page: Figure, path: Path, *, used_height: float = PAGE_HEIGHT, sources: str = "") -> None:
     """Write the page as PNG atomically: an interrupted run leaves the whole file or none.
 
     Args:
         page: figure to write.
         path: target file.
         used_height: height that is drawn on [pixels from the top]; the empty part below is cropped.
+        sources: digest of what is drawn, stored in the file (`springbench.harness.report.picture_sources`).
     Raises:
         WriteError: if the file cannot be written.
     """
     with atomic_write(path) as partial:
-        page.savefig(partial, format="png", dpi=PAGE_DPI)
+        page.savefig(partial, format="png", dpi=PAGE_DPI, metadata={SOURCES_KEY: sources})
         if used_height < PAGE_HEIGHT:
             with Image.open(partial) as whole:
                 part = whole.crop((0, 0, PAGE_WIDTH, ceil(used_height)))
-            part.save(partial, format="png")
+            text = PngInfo()
+            text.add_text(SOURCES_KEY, sources)
+            part.save(partial, format="png", pnginfo=text)
 
 
 def draw_header(page: Figure, headline: str, facts: Sequence[str], *, max_letters: int = 56) -> None:

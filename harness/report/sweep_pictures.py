@@ -20,6 +20,7 @@ from springbench.harness.execution.progress_display import ThrottledMessages
 from springbench.harness.execution.timing_lock import lock_timing_shared
 from springbench.harness.execution.worker_pool import PoolTask, run_tasks
 from springbench.harness.report.citations import write_bibtex
+from springbench.harness.report.picture_sources import digest_runs, read_sources
 
 
 class PictureJob(NamedTuple):
@@ -57,11 +58,12 @@ def draw_sweep_pictures(
     groups = [group for group in group_by_scene(drawn, folder) if group.needs_recording or group.needs_picture]
 
     def times() -> None:
-        if any(p.run.pictures for p in jobs):
+        path, sources = folder / "pictures" / "timing.png", digest_runs(name, table, stale_ids)
+        if any(p.run.pictures for p in jobs) and sources != read_sources(path):
             from springbench.harness.report.timing_plot import draw_timing_plot
 
             with lock_timing_shared(_ignore_progress):
-                draw_timing_plot(table, folder / "pictures" / "timing.png", name, stale_ids)
+                draw_timing_plot(table, path, name, stale_ids, sources)
 
     missing = _load_drawing() if wanting or any(group.needs_picture for group in groups) else None
     if missing:

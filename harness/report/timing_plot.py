@@ -67,7 +67,9 @@ def write_timing_plot(rows: pa.Table, folder: Path) -> list[Path]:
     return [path]
 
 
-def draw_timing_plot(table: pa.Table, path: Path, title: str, stale_ids: Collection[str] = ()) -> None:
+def draw_timing_plot(
+    table: pa.Table, path: Path, title: str, stale_ids: Collection[str] = (), sources: str = ""
+) -> None:
     """Draw the times of a sweep's runs as a PNG file.
 
     The picture is PAGE_WIDTH pixels wide and at most PAGE_HEIGHT high. Failed runs are crosses at the upper edge, with
@@ -79,6 +81,7 @@ def draw_timing_plot(table: pa.Table, path: Path, title: str, stale_ids: Collect
         path: target file.
         title: title of the picture.
         stale_ids: ids of runs that were executed by other code than the current version; their marks are hollow.
+        sources: digest of all these, stored in the file (`springbench.harness.report.page_layout.save_page`).
     """
     found = read_run_times(table)
     names = label_runs(found)
@@ -103,7 +106,7 @@ def draw_timing_plot(table: pa.Table, path: Path, title: str, stale_ids: Collect
             drawn = (draw_timing_rows if one else _draw_scene)(page, scene, found, names, looks, box, stale_ids)
             used = max(used, drawn)
         _draw_failure_notes(page, failed, names, bottom)
-        save_page(page, path, used_height=min(used, PAGE_HEIGHT))
+        save_page(page, path, used_height=min(used, PAGE_HEIGHT), sources=sources)
 
 
 def _collect_facts(table: pa.Table) -> list[str]:

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from rich.console import Console
 from springbench.harness.report import page_layout, timing_plot
 from springbench.harness.report.line_end_labels import LABEL_SPACING, spread_heights
 from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH, assign_solver_styles
+from springbench.harness.report.sweep_pictures import PictureJob, draw_sweep_pictures
 from springbench.harness.report.sweep_summary import build_closing_lines, summarise_sweep
 from springbench.harness.report.timing_plot import draw_timing_plot
 from springbench.harness.report.timing_table import (
@@ -396,3 +398,24 @@ def test_the_summary_marks_times_that_are_doubtful_and_says_why() -> None:
     console.print(build_summary_table(rows(sizes=(10,), solvers=("sparse",))))
     text = " ".join(console.export_text().split())
     assert not {"!", "~"} & set(text.split("below")[-1]), "rows that say nothing of it have no marks"
+
+
+def test_the_plot_of_times_is_drawn_again_only_if_its_runs_have_changed(tmp_path: Path, monkeypatch):
+    drawn: list[str] = []
+
+    def draw(*given: Any) -> None:
+        drawn.append(given[4])
+        draw_timing_plot(*given)
+
+    monkeypatch.setattr(timing_plot, "draw_timing_plot", draw)
+    (tmp_path / "pictures").mkdir()
+    run: Any = SimpleNamespace(pictures=True, record=False)
+    jobs, table = [PictureJob(run, tmp_path, tmp_path)], rows(sizes=(8,), solvers=("sparse", "dense"))
+    stale = table["run_id"][0].as_py()
+    for more, stale_ids in ((table, ()), (table, ()), (table, {stale}), (table, {stale, "of another sweep"})):
+        draw_sweep_pictures("Sweep", jobs, tmp_path, more, print, stale_ids=stale_ids)
+    draw_sweep_pictures("Sweep", jobs, tmp_path, rows(sizes=(8,)), print, stale_ids={stale})
+    assert len(drawn) == len(set(drawn)) == 3
+    (tmp_path / "pictures" / "timing.png").write_bytes(b"no picture")
+    draw_sweep_pictures("Sweep", jobs, tmp_path, rows(sizes=(8,)), print, stale_ids={stale})
+    assert len(drawn) == 4

@@ -1,0 +1,37 @@
+"""Digest of the data of a picture, stored in the PNG file: a picture is drawn again only if they change."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection
+from pathlib import Path
+
+import pyarrow as pa
+
+SOURCES_KEY = "Source"
+"""Keyword of the PNG text that holds the digest."""
+
+
+def digest_runs(title: str, table: pa.Table, stale_ids: Collection[str]) -> str:
+    """Return a digest of the runs in a table.
+
+    Args:
+        title: title of the picture.
+        table: rows of the runs; a run that is repeated has another `started_at`.
+        stale_ids: ids of runs that were executed by other code than the current version.
+    """
+    runs = {*zip(table["run_id"].to_pylist(), map(str, table["started_at"].to_pylist()), strict=True)}
+    stale = sorted({run for run, _ in runs}.intersection(stale_ids))
+    return hashlib.sha256(json.dumps([title, sorted(runs), stale]).encode()).hexdigest()
+
+
+def read_sources(path: Path) -> str | None:
+    """Return the digest stored in a picture; None if the picture is missing or unreadable."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            return str(picture.info.get(SOURCES_KEY, ""))
+    except OSError:
+        return None
