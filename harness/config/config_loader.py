@@ -35,13 +35,14 @@ from springbench.harness.scenes.assignment_scene import (
     read_assignment_scene,
 )
 from springbench.harness.scenes.effects import effect_table
+from springbench.harness.scenes.fabric_table import FabricChoice, fill_effect, find_fabric
 from springbench.harness.scenes.mesh import mesh_table
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.scenes.scene_plugins import PluginEffect, PluginMesh, build_plugin_part, load_plugin
 from springbench.harness.scenes.scene_spec import NAME_PATTERN, SceneFile, SceneSpec
-from springbench.harness.schema.base_model import ConfigModel
+from springbench.harness.schema.base_model import ConfigModel, Vector3
 from springbench.harness.schema.config_document import (
     IMPORT_USER_CODE,
     ConfigDocument,
@@ -283,7 +284,8 @@ def build_scene_from_document(document: ConfigDocument) -> SceneSpec:
     if not is_list(listed):
         document.add_mistake("should be a list of mappings, each with a `kind`", ("effects",))
         listed = []
-    effects = tuple(_build_part(document, "effect", effect, ("effects", i), own) for i, effect in enumerate(listed))
+    filled = listed if fields is None else _fill_from_fabric(document, fields, listed)
+    effects = tuple(_build_part(document, "effect", effect, ("effects", i), own) for i, effect in enumerate(filled))
     if fields is None or document.mistakes:
         raise document.build_error()
     try:
@@ -292,12 +294,30 @@ def build_scene_from_document(document: ConfigDocument) -> SceneSpec:
         document.add_errors(error)
         raise document.build_error() from None
     parts: dict[str, Any] = {"mesh": mesh, "mesh_digest": digest, "effects": effects}
+    if fields.fabric is not None and fields.mass is None and fields.mass_per_area is None:
+        parts["mass_per_area"] = find_fabric(_split_fabric(fields.fabric)[0]).density
     return SceneSpec(
         **vars(fields) | parts,
         path=document.path,
         plugins=own,
         key_lines={format_key(key): line for key, line in document.lines.items()},
     )
+
+
+def _fill_from_fabric(document: ConfigDocument, fields: SceneFile, listed: list[Any]) -> list[Any]:
+    """Return the effects with the material of the scene's fabric; a fabric that provides nothing is a mistake."""
+    if fields.fabric is None:
+        return listed
+    name, warp = _split_fabric(fields.fabric)
+    filled = [fill_effect(effect, name, warp) for effect in listed]
+    if filled == listed and (fields.mass is not None or fields.mass_per_area is not None):
+        document.add_mistake("provides nothing, because the scene states all its values; leave it out", ("fabric",))
+    return filled
+
+
+def _split_fabric(fabric: str | FabricChoice) -> tuple[str, Vector3 | None]:
+    """Return the name of a fabric and the direction of its warp, None if it is not stated."""
+    return (fabric, None) if isinstance(fabric, str) else (fabric.name, fabric.warp)
 
 
 def _hash_mesh(source: Any) -> str:

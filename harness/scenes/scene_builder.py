@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -17,11 +17,14 @@ from springbench.harness.scenes.effects.effect_interface import (
     EffectContribution,
     ForceFunction,
     PinGroup,
+    SceneEffect,
     VelocityFilter,
 )
+from springbench.harness.scenes.fabric_table import BENDING_RANGE, DENSITY_RANGE, MEMBRANE_RANGE
 from springbench.harness.scenes.key_frames import KeyFrameMotion
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_topology import lump_areas
+from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.scenes.start_positions import RestStart
 from springbench.harness.scenes.vertex_selectors import VertexSelection
@@ -165,6 +168,8 @@ def build_scene(spec: SceneSpec, size: int, integrator: str = "implicit-euler", 
     _check_start(parts, start.compute_positions(mesh.rest_positions))
     if log_warnings:
         _warn_unusual(spec)
+        for problem in find_implausible_materials(spec.effects, mesh, mass):
+            _LOG.warning("%s: %s", spec.path.name, problem)
     other = spec.alternate_time_step
     return Scene(
         mesh=mesh,
@@ -265,6 +270,30 @@ def _warn_unusual(spec: SceneSpec) -> None:
         k = spec.effects.index(effect)
         if k < i:
             _LOG.warning("%s: effects[%d] repeats effects[%d] (%s); both act", spec.path.name, i, k, effect.kind)
+
+
+def find_implausible_materials(effects: Sequence[SceneEffect], mesh: Mesh, mass: NDArray[np.float64]) -> Iterator[str]:
+    """Describe stiffnesses and densities of a cloth that are far from those of published fabrics.
+
+    Args:
+        effects: the effects of the scene; only `springs` by the rule `continuum`, and `bending`, are checked.
+        mesh: the mesh; only cloth is checked.
+        mass: vertex masses (n,) [kg].
+    """
+    if mesh.dimension != 2 or not len(mesh.triangles):
+        return
+    area = lump_areas(mesh.rest_positions, mesh.triangles).sum()
+    if problem := DENSITY_RANGE.describe_outlier(float(mass.sum() / area) if area else 0.0):
+        yield problem
+    for i, effect in enumerate(effects):
+        is_material = effect.kind == "springs" and getattr(effect, "scaling_rule", "") == "continuum"
+        values = [getattr(effect, "stretch", None) if is_material else None]
+        if isinstance(values[0], OrthotropicStiffness):
+            values = [values[0].warp, values[0].weft]
+        found = [MEMBRANE_RANGE.describe_outlier(value) for value in values if isinstance(value, float)]
+        if effect.kind == "bending" and isinstance(rigidity := getattr(effect, "stiffness", None), float):
+            found.append(BENDING_RANGE.describe_outlier(rigidity))
+        yield from (f"effects[{i}] ({effect.kind}): {problem}" for problem in found if problem)
 
 
 def _compute_vertex_masses(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:

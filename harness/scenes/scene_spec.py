@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, cast
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, SkipValidation, ValidationInfo, WithJsonSchema
 from springbench.harness.errors import InputError, InputMistake, suggest_name
 from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.fabric_table import FabricChoice, FabricName
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_generator import MAX_VERTICES
 from springbench.harness.scenes.scene_plugins import PluginEffect, PluginMesh
@@ -102,6 +103,9 @@ class SceneFields(ConfigModel):
     """Total mass [kg]; optional if the mesh provides masses."""
     mass_per_area: float | None = Field(default=None, gt=0, le=1e12)
     """Area density of the mesh's triangles at rest [kg/m^2], instead of `mass`."""
+    fabric: FabricName | FabricChoice | None = None
+    """A published fabric, by its name, or `{name: NAME, warp: [x, y, z]}`. It provides the mass per area, the membrane
+    stiffness of `springs` and the flexural rigidity of `bending` that the scene does not state."""
     time_step: TimeStep
     """Time step [s], a number or a fraction such as "1/30"."""
     alternate_time_step: TimeStep | None = None

@@ -110,6 +110,8 @@ def build_springs_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
 def compute_reference_stiffness(effect: Any, declared: SceneDeclaration) -> Array:
     """Compute the stiffness (m,) [N/m] of an effect `springs`."""
     along = 0.0 if effect.stretch is None else effect.stretch
+    if effect.youngs_modulus is not None:
+        along = effect.youngs_modulus * (1.0 if effect.thickness is None else effect.thickness)
     given = along, along if effect.shear is None else effect.shear
     stretch, shear = (np.inf if x == "exact" else x for x in given)
     k = compute_edge_stiffness(declared.mesh, effect, stretch, shear, effect.bend)

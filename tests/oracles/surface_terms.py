@@ -27,10 +27,23 @@ _RECTANGLE_RTOL = 1e-6
 
 def build_bending_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms:
     """Build the quadratic bending energy of the mesh's triangles."""
-    corners, K, weight = build_stencils(effect.stiffness, declared)
+    corners, K, weight = build_stencils(compute_flexural_rigidity(effect, declared), declared)
     share = np.asarray(weight[:, None] * K**2, float)
     resists = np.asarray(np.bincount(corners.ravel(), share.ravel(), len(declared.mass)), float)
     return EffectTerms(lambda moment: _bending_energy(corners, K, weight, 0.0), resists)
+
+
+def compute_flexural_rigidity(effect: Any, declared: SceneDeclaration) -> float:
+    """Compute the flexural rigidity [N m] of an effect `bending`: weight per area times bending length cubed."""
+    given = effect.bending_length if effect.stiffness is None else effect.stiffness
+    value = float(given if isinstance(given, float) else np.sqrt(given.warp * given.weft))
+    if effect.stiffness is not None:
+        return value
+    rest = declared.mesh.rest_positions
+    area = sum(
+        float(np.linalg.norm(np.cross(rest[b] - rest[a], rest[c] - rest[a]))) / 2 for a, b, c in declared.mesh.triangles
+    )
+    return 9.81 * float(declared.mass.sum()) / area * value**3
 
 
 def build_bending_damping(effect: Any, b: float, declared: SceneDeclaration) -> Any:
@@ -43,7 +56,7 @@ def build_bending_damping(effect: Any, b: float, declared: SceneDeclaration) -> 
 
     Returns: builder of the energy of a step.
     """
-    corners, K, weight = build_stencils(effect.stiffness, declared)
+    corners, K, weight = build_stencils(compute_flexural_rigidity(effect, declared), declared)
 
     def begin(moment: StepMoment) -> ValueFunction:
         return _bending_energy(corners, K, b * moment.velocity_rate * weight, moment.velocity_origin)

@@ -1,19 +1,37 @@
 """Bending: the quadratic energy of nearly inextensible surfaces (Bergou et al. 2006), flat at rest."""
 
+from __future__ import annotations
+
+import logging
 from math import inf
 from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import NonNegativeFloat
-from springbench.harness.errors import InputError
+from pydantic import NonNegativeFloat, PositiveFloat, model_validator
+from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.effects.effect_interface import NEGLIGIBLE_FRACTION, EffectContribution, ObservedMotion
 from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.mesh_topology import lump_areas
 from springbench.harness.schema.base_model import ConfigModel
 from springbench.solvers.model.energies import bending_energy
 
 SHARP_ANGLE = np.deg2rad(60.0)
 """Dihedral angle above which a mesh shows its edges."""
+
+
+STANDARD_GRAVITY = 9.81
+"""Acceleration [m/s^2] by which a bending length becomes a flexural rigidity."""
+_LOG = logging.getLogger("springbench")
+
+
+class ThreadValues(ConfigModel):
+    """Values along both threads of a woven cloth; their geometric mean acts in all directions."""
+
+    warp: PositiveFloat
+    """Value along the warp."""
+    weft: PositiveFloat
+    """Value along the weft."""
 
 
 class BendingEffect(ConfigModel):
@@ -25,12 +43,16 @@ class BendingEffect(ConfigModel):
     max_convergence_order: ClassVar[float] = inf
 
     kind: Literal["bending"] = "bending"
-    stiffness: NonNegativeFloat
-    """Flexural rigidity B [N m]: the moment per metre of width for a curvature of 1/m, at every mesh size."""
+    stiffness: NonNegativeFloat | ThreadValues | None = None
+    """Flexural rigidity B [N m]: the moment per metre of width for a curvature of 1/m, at every mesh size. Of warp and
+    weft the geometric mean is used (overall flexural rigidity, ASTM D1388)."""
+    bending_length: PositiveFloat | ThreadValues | None = None
+    """Bending length c [m], half the overhang of the cantilever test, instead of `stiffness`: B = w c^3 with the weight
+    per area w [N/m^2] (ASTM D1388)."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the energy, empty for zero stiffness; raise InputError if the mesh is no surface."""
-        if not self.stiffness:
+        if self.stiffness == 0.0:
             return EffectContribution()
         triangles = mesh.triangles
         if not len(triangles):
@@ -51,9 +73,28 @@ class BendingEffect(ConfigModel):
                 "bending: more than two triangles meet at the edge "
                 f"{ends}{mesh.format_file_numbers(*ends)}; repair the mesh"
             )
-        return EffectContribution(
-            energies=(bending_energy.Bending.from_rest_shape(mesh.rest_positions, triangles, self.stiffness),)
-        )
+        B = self._compute_rigidity(mesh, mass)
+        return EffectContribution(energies=(bending_energy.Bending.from_rest_shape(mesh.rest_positions, triangles, B),))
+
+    @model_validator(mode="after")
+    def _check_rigidity(self) -> BendingEffect:
+        if self.stiffness is not None and self.bending_length is not None:
+            raise ValueError("has `stiffness` and `bending_length`; leave out one of them")
+        if self.stiffness is None and self.bending_length is None:
+            raise ValueError("needs a `stiffness` [N m] or a `bending_length` [m]")
+        return self
+
+    def _compute_rigidity(self, mesh: Mesh, mass: NDArray[np.float64]) -> float:
+        """Return the flexural rigidity [N m] of the mesh; raise InputError for a bending length without a mass."""
+        if self.stiffness is not None:
+            return _average_threads(self.stiffness)
+        areas = lump_areas(mesh.rest_positions, mesh.triangles) if mesh.vertex_areas is None else mesh.vertex_areas
+        weight = STANDARD_GRAVITY * float(mass.sum() / areas.sum())
+        if weight == 0.0:
+            raise InputError(InputMistake("`bending_length` needs a cloth with a mass", key="bending_length"))
+        B = weight * _average_threads(self.bending_length) ** 3
+        _LOG.info("bending: the bending length makes a flexural rigidity of %.4g N m at %.4g N/m^2", B, weight)
+        return B
 
     @classmethod
     def find_evidence(cls, observed: ObservedMotion) -> str:
@@ -76,6 +117,10 @@ class BendingEffect(ConfigModel):
             f"{np.rad2deg(turned.max()):.0f}: folds as sharp as "
             "the mesh"
         )
+
+
+def _average_threads(value: float | ThreadValues | None) -> float:
+    return float((value.warp * value.weft) ** 0.5 if isinstance(value, ThreadValues) else value or 0.0)
 
 
 def _find_hinges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -4,13 +4,16 @@
 Springs of infinite stiffness have no energy: they are length constraints.
 """
 
+from __future__ import annotations
+
+import logging
 from dataclasses import replace
 from math import inf
 from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import NonNegativeFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.effects.effect_interface import (
     EffectContribution,
@@ -22,6 +25,11 @@ from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.spring_stiffness import compute_spring_stiffness
 from springbench.harness.schema.base_model import ConfigModel
 from springbench.solvers.model.energies import tension_only_energy
+
+_LOG = logging.getLogger("springbench")
+
+StretchConstant = float | Literal["exact"] | OrthotropicStiffness
+"""Constant of the springs along the lines."""
 
 
 class SpringsEffect(ConfigModel):
@@ -43,6 +51,10 @@ class SpringsEffect(ConfigModel):
     """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids; or one value
     each for warp, weft and bias of a woven cloth; or `exact`: length constraints, supported by `avbd` only. Left out if
     the mesh states the stiffness of each spring itself."""
+    youngs_modulus: PositiveFloat | None = None
+    """Young's modulus E [Pa] instead of `stretch`: that of a cloth is E times `thickness`, that of a solid E."""
+    thickness: PositiveFloat | None = None
+    """Thickness t [m] of a cloth of Young's modulus E; its membrane stiffness is E t."""
     shear: NonNegativeFloat | Literal["exact"] | None = None
     """Across the mesh's cells, in the same unit; equal to `stretch` by default."""
     bend: NonNegativeFloat = 0.0
@@ -52,7 +64,7 @@ class SpringsEffect(ConfigModel):
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the springs as one energy, empty without stiffness, and the length constraints."""
-        given = _require_stretch(self.stretch, mesh)
+        given = _require_stretch(self._compute_stretch(mesh), mesh)
         stretch, shear = (inf if x == "exact" else x for x in (given, given if self.shear is None else self.shear))
         k = compute_spring_stiffness(
             mesh,
@@ -76,10 +88,35 @@ class SpringsEffect(ConfigModel):
             parts = springs, tension_only_energy.TensionOnlySprings.from_springs(cables)
         return replace(found, energies=tuple(one for one in parts if len(one.edges)))
 
+    def _compute_stretch(self, mesh: Mesh) -> StretchConstant | None:
+        """Return `stretch`, or what Young's modulus and thickness amount to; raise InputError if they do not fit."""
+        if self.youngs_modulus is None:
+            return self.stretch
+        E, t = self.youngs_modulus, self.thickness
+        if mesh.dimension == 1:
+            problem = "`youngs_modulus` needs a cloth or a solid; give `stretch`, the axial stiffness EA [N]"
+            raise InputError(InputMistake(problem, key="youngs_modulus"))
+        if mesh.dimension == 3:
+            if t is not None:
+                raise InputError(InputMistake("`thickness` has no meaning for a solid; leave it out", key="thickness"))
+            return E
+        if t is None:
+            raise InputError(InputMistake("`thickness` [m] is missing beside `youngs_modulus`", key="thickness"))
+        _LOG.info("springs: a Young's modulus of %g Pa and a thickness of %g m make a stretch of %g N/m", E, t, E * t)
+        return E * t
 
-def _require_stretch(
-    stretch: float | Literal["exact"] | OrthotropicStiffness | None, mesh: Mesh
-) -> float | Literal["exact"] | OrthotropicStiffness:
+    @model_validator(mode="after")
+    def _check_material(self) -> SpringsEffect:
+        if self.youngs_modulus is None and self.thickness is not None:
+            raise ValueError("has a `thickness`, which needs a `youngs_modulus`")
+        if self.youngs_modulus is not None and self.stretch is not None:
+            raise ValueError("has `stretch` and `youngs_modulus`; leave out one of them")
+        if self.youngs_modulus is not None and self.scaling_rule != "continuum":
+            raise ValueError("has a `youngs_modulus`, which needs the scaling rule `continuum`")
+        return self
+
+
+def _require_stretch(stretch: StretchConstant | None, mesh: Mesh) -> StretchConstant:
     """Return the constant of the springs along the lines; raise InputError if it is missing or has no effect."""
     along, own = mesh.spring_families[STRETCH], mesh.spring_properties
     stated = np.zeros(len(along), np.bool_) if own is None else ~np.isnan(own.stiffness[along])
