@@ -47,6 +47,7 @@ from springbench.harness.config.cli_options import build_command_class
 from springbench.harness.console import get_error_console, get_output_console, split_wide_table
 from springbench.harness.console import print_message as _say
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution.optional_parts import RECORDINGS
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -140,6 +141,8 @@ def run(
         key = f"--{name.replace('_', '-')}"
         raise InputError(InputMistake("is of a run with --error; leave it out", key=key))
     sweep = load_config(config, solvers=solver or (), sizes=size or (), **context.obj)
+    if sweep.options.record and not RECORDINGS.is_installed():
+        _say(f"nothing is recorded, and no pictures are drawn: {RECORDINGS.describe_absence()}")
     folder = claim_folder(results / sweep.name, config)
     table = run_sweep(
         sweep.name,

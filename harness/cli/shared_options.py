@@ -11,7 +11,8 @@ import typer
 from springbench.harness.atomic_files import USER_ERRNOS, describe_os_error
 from springbench.harness.config.shipped_configs import locate_config
 from springbench.harness.console import enable_logging, print_message
-from springbench.harness.errors import SpringbenchError
+from springbench.harness.errors import InputError, SpringbenchError
+from springbench.harness.execution.optional_parts import find_part
 from springbench.harness.results import remote_storage
 from typer.core import TyperGroup
 
@@ -65,6 +66,12 @@ class ErrorReportingGroup(TyperGroup):
             for mistake in getattr(error, "mistakes", (error,)):
                 print_message(f"springbench: {mistake}")
             raise typer.Exit(error.exit_code) from error
+        except ModuleNotFoundError as error:
+            part = find_part(error)
+            if part is None:
+                raise
+            print_message(f"springbench: {part.describe_absence()}")
+            raise typer.Exit(InputError.exit_code) from error
         except BrokenPipeError:  # the reader of the output closed the pipe
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(1) from None

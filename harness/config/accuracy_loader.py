@@ -36,6 +36,7 @@ from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS, load_in_sandbox
 from springbench.harness.errors import suggest_name
+from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, UserCodePolicy, quote_value
@@ -140,6 +141,8 @@ class _StudyExpansion:
         if "coarse-to-fine" in study.initial_guess:
             problem = "a curve's clock begins at its first guess, and this one is a solve itself; compare it in a sweep"
             self.document.add_mistake(f"coarse-to-fine: {problem}", (*at, "initial_guess"))
+        if study.recordings and not RECORDINGS.is_installed():
+            self.document.add_mistake(RECORDINGS.describe_absence(), (*at, "recordings"))
         solvers = [solver for solver in self._select_solvers(study, at) if solver.is_minimiser]
         for case, moment, solver in product(self._expand_cases(study, at), study.snapshot, solvers):
             if isinstance(moment, int) and moment > case.scene.frames:

@@ -27,6 +27,7 @@ from springbench.harness.config.user_code import (
     resolve_tag,
 )
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.results.solver_metadata import list_packages, read_solver_metadata
 from springbench.harness.scenes.assignment_scene import (
     ASSIGNMENT_FORCE,
@@ -417,7 +418,8 @@ def _expand_sweep(document: ConfigDocument, scenes: dict[str, SceneSpec]) -> Swe
     solvers = read_solvers(document)
     if sweep is None or document.mistakes:
         raise document.build_error()
-    runs = GridExpansion(document, document.path.stem, sweep, scenes, solvers).expand_runs()
+    fields = _omit_missing_recordings(document, sweep)
+    runs = GridExpansion(document, document.path.stem, fields, scenes, solvers).expand_runs()
     if document.user_code.imports_code:
         for integrator in select_plugins({run.integrator: None for run in runs}):
             load_plugin(document, integrator, "integrator", ("options", "integrator"))
@@ -429,6 +431,15 @@ def _expand_sweep(document: ConfigDocument, scenes: dict[str, SceneSpec]) -> Swe
     if document.mistakes:
         raise document.build_error()
     return SweepPlan(document.path.stem, sweep.options, runs, sweep.reports)
+
+
+def _omit_missing_recordings(document: ConfigDocument, sweep: SweepConfig) -> SweepConfig:
+    """Return the sweep without recordings if Rerun is not installed; that the file requests some is a mistake."""
+    if RECORDINGS.is_installed() or not sweep.options.record:
+        return sweep
+    if "record" in sweep.options.model_fields_set:
+        document.add_mistake(f"{RECORDINGS.describe_absence()}; or set `record: false`", ("options", "record"))
+    return sweep.model_copy(update={"options": sweep.options.model_copy(update={"record": False})})
 
 
 def require_fixed_steps(runs: Iterable[RunSpec]) -> None:

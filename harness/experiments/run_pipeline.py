@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,15 +37,13 @@ from springbench.harness.experiments.source_fingerprint import (
     load_solver_class,
 )
 from springbench.harness.experiments.sweep_plan import RunFiles
-from springbench.harness.recording.obstacle_shapes import list_obstacles
+from springbench.harness.recording.obstacle_properties import list_obstacles
 from springbench.harness.recording.recorder_interface import (
     INTERSECTION_FREE_PROPERTY,
     FrameSamples,
     RecordedFrame,
     RecordingInfo,
 )
-from springbench.harness.recording.recording_check import require_recorded_frames
-from springbench.harness.recording.rerun_recorder import RerunRecorder
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.gradient_check import measure_gradient_errors
 from springbench.harness.reference.residual_audit import AuditedSolver
@@ -73,6 +71,9 @@ from springbench.harness.simulation.timing_pass import (
 from springbench.solvers.jit import source_digest
 from springbench.solvers.model.step_problem import Positions, Solver
 from springbench.solvers.registry import SOLVERS, is_minimiser, load_target
+
+if TYPE_CHECKING:
+    from springbench.harness.recording.rerun_recorder import RerunRecorder
 
 
 def execute_run(
@@ -215,6 +216,8 @@ def _run_error_controlled(
     if positions:
         save_positions(positions, seen[1:])
     if run.record:
+        from springbench.harness.recording.recording_check import require_recorded_frames
+
         chosen = {name: rows[0][name] for name in ("status", "integrator", "error_estimated")}
         recorder = _open_recorder(
             run, files, found.scene, chosen | {"milliseconds_per_step": found.ms_per_step}, seen[-1]
@@ -290,6 +293,8 @@ def _run_instrumentation_pass(
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
         stands = _build_status_columns(run, scene, found)
         if recorder and measured.final_positions is not None:
+            from springbench.harness.recording.recording_check import require_recorded_frames
+
             ended = {name: stands[name] for name in ("status", "reason")} if stands["status"] != "ok" else None
             recorder.finish_recording(timing_rows.compute_milliseconds(measured, run.frames), ended)
             due = {frame: scene.compute_time(frame) for frame in samples.frames}
@@ -410,6 +415,10 @@ def _open_recorder(
 
     `outcome` is how the run ended, stored among the recording's properties. `final_positions` set the colour scale.
     """
+    from springbench.harness.recording.rerun_recorder import (
+        RerunRecorder,  # with Rerun, which a light installation lacks
+    )
+
     files.recording_path.parent.mkdir(parents=True, exist_ok=True)
     here = machine_info.describe_machine()
     properties = {

@@ -5,7 +5,7 @@ Entities: `/scene/obstacles/<number>-<kind>`. Planes are infinite; only the part
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,6 @@ import rerun as rr
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:  # a scene without obstacles imports none of them
-    from springbench.harness.scenes.effects.effect_interface import SceneEffect
     from springbench.harness.scenes.key_frames import KeyFrameMotion
     from springbench.harness.scenes.primitive_obstacles import (
         BoxObstacle,
@@ -25,26 +24,9 @@ if TYPE_CHECKING:  # a scene without obstacles imports none of them
 
 Array = NDArray[np.float64]
 
-OBSTACLES_PROPERTY = "obstacles"
-"""Property of a recording that declares its obstacles in JSON, in the format of scene files."""
-
 _COLOUR = (0x9C, 0x97, 0x8D)
 _PLANE_SIZE_FACTOR = 2.0
 """Half the side of the drawn part of a plane, relative to the mesh size plus its distance from the plane."""
-
-
-def list_obstacles(effects: Iterable[SceneEffect]) -> tuple[AnySurface, ...]:
-    """Return the obstacles of a scene's effects, to be drawn with the mesh."""
-    return tuple(one for effect in effects for one in getattr(effect, "obstacles", ()))
-
-
-def build_obstacles_property(obstacles: Sequence[AnySurface]) -> dict[str, str]:
-    """Return the property that declares these obstacles; empty where there are none."""
-    return (
-        {OBSTACLES_PROPERTY: f"[{', '.join(one.model_dump_json(exclude_none=True) for one in obstacles)}]"}
-        if obstacles
-        else {}
-    )
 
 
 class ObstacleRecorder:

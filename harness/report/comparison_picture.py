@@ -31,7 +31,6 @@ from springbench.harness.report.mesh_rendering import (
     choose_view_angles,
     compute_area_vectors,
     fit_camera,
-    mean_rest_length,
     view_aspect,
 )
 from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
@@ -57,6 +56,7 @@ from springbench.harness.report.plot_style import (
     assign_solver_styles,
 )
 from springbench.harness.report.provenance_words import draw_provenance
+from springbench.harness.report.recorded_strain import mean_rest_length
 from springbench.harness.report.self_intersection_notes import describe_self_intersection
 
 _PANELS_LEFT, _PANELS_TOP, _PANELS_RIGHT, _PANELS_BOTTOM = 40, 118, PAGE_WIDTH - 40, PAGE_HEIGHT - 28

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.recording.strain_shading import round_scale_end
-from springbench.harness.report.mesh_rendering import compute_spring_strain, compute_vertex_strain, mean_rest_length
+from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain, mean_rest_length
 from springbench.harness.results import quantities
 
 _MAX_DRAWABLE_EXTENT = 1e4  # coordinates this many times larger than the start's are drawn as if not finite

@@ -23,6 +23,7 @@ from springbench.harness.recording.strain_shading import PIN_COLOUR
 from springbench.harness.report import opengl_probe
 from springbench.harness.report.obstacle_meshes import build_obstacle_meshes
 from springbench.harness.report.plot_style import BACKGROUND_COLOUR, STRAIN_MAP, TEXT_COLOUR
+from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain, mean_rest_length
 
 PointArray = NDArray[np.floating]
 ColouredPoints = tuple[PointArray, str]
@@ -35,36 +36,6 @@ _JOINT_COLOUR = "#8a8d92"  # vertices of a network without triangles
 _OBSTACLE_COLOUR = "#c9c3b8"  # obstacles
 _SHADOW_COLOUR = "#d3d0ca"  # where the ground is fully in shadow
 _MATERIAL_OPTIONS: dict[str, Any] = {"ambient": 0.62, "diffuse": 0.44, "specular": 0.06, "specular_power": 18.0}
-
-
-def compute_spring_strain(replay: RecordingReplay, frame: int) -> NDArray[np.float64]:
-    """Compute the strain, length / rest length - 1, of each spring.
-
-    Args:
-        replay: recording.
-        frame: index among the recorded frames.
-    Returns: strains (m,); 0 where the rest length is 0.
-    """
-    i, j = replay.springs.T
-    p = replay.positions[frame].astype(np.float64)
-    rest = replay.rest_lengths
-    stretch = np.linalg.norm(p[i] - p[j], axis=1) - rest
-    return np.divide(stretch, rest, out=np.zeros(len(rest)), where=rest > 0)
-
-
-def compute_vertex_strain(replay: RecordingReplay, frame: int) -> NDArray[np.float64]:
-    """Return the signed strain of the most strained spring at each vertex, shape (n,)."""
-    strain = np.repeat(compute_spring_strain(replay, frame), 2)
-    ends = replay.springs.ravel()
-    by_size = np.argsort(np.abs(strain))
-    out = np.zeros(replay.positions.shape[1])
-    out[ends[by_size]] = strain[by_size]  # the last write to a vertex, its largest strain, stays
-    return out
-
-
-def mean_rest_length(replay: RecordingReplay) -> float:
-    """Return the mean rest length [m], or 1 if there are no springs."""
-    return float(replay.rest_lengths.mean()) if len(replay.rest_lengths) else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

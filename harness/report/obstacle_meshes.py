@@ -11,7 +11,7 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 from springbench.harness.recording.camera_framing import find_framed_vertices
-from springbench.harness.recording.obstacle_shapes import OBSTACLES_PROPERTY
+from springbench.harness.recording.obstacle_properties import OBSTACLES_PROPERTY
 from springbench.harness.recording.recorder_interface import RecordingReplay
 
 if TYPE_CHECKING:  # a recording without obstacles imports none of them

@@ -11,6 +11,7 @@ import sys
 from functools import cache
 
 from springbench.harness.errors import RunFailed
+from springbench.harness.execution.optional_parts import PICTURES
 
 _PROBE_SCRIPT = """
 from vtkmodules.vtkRenderingCore import vtkRenderWindow
@@ -29,7 +30,7 @@ _PROBES = list["subprocess.Popen[bytes]"]()
 
 def start_opengl_probe() -> None:
     """Start the probe in the background."""
-    if _PROBES or find_opengl_problem.cache_info().currsize:
+    if _PROBES or find_opengl_problem.cache_info().currsize or not PICTURES.is_installed():
         return
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
@@ -43,6 +44,8 @@ def find_opengl_problem() -> str | None:
 
     Without a display VTK is configured to draw through EGL. The result is computed once per process.
     """
+    if not PICTURES.is_installed():
+        return PICTURES.describe_absence()
     start_opengl_probe()
     child = _PROBES.pop()
     try:

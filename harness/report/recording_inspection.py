@@ -226,7 +226,7 @@ def _export_mesh(replay: RecordingReplay, recording: Path, export: Path) -> None
         problem = f"has single precision, which moves vertices by up to {coarse:.2g} m this far from (0, 0, 0)"
         raise InputError(InputMistake(f"{problem}; export to .vtp, .vtk or .obj", file=export))
     import pyvista as pv  # slow to load, and most inspections export nothing
-    from springbench.harness.report.mesh_rendering import compute_spring_strain, compute_vertex_strain
+    from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain
 
     points = replay.absolute_positions(0)
     if len(replay.triangles):

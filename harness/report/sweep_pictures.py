@@ -16,6 +16,7 @@ import pyarrow as pa
 from springbench.harness.config.run_options import RUN_OPTIONS
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
+from springbench.harness.execution.optional_parts import PICTURES
 from springbench.harness.execution.progress_display import ThrottledMessages
 from springbench.harness.execution.timing_lock import lock_timing_shared
 from springbench.harness.execution.worker_pool import PoolTask, run_tasks
@@ -86,7 +87,9 @@ def preload_drawing() -> None:
     with lock_timing_shared(_ignore_progress):
         opengl_probe.start_opengl_probe()
         import_module("springbench.harness.report.timing_plot")  # with Matplotlib
-        opengl_probe.find_opengl_problem()
+        problem = opengl_probe.find_opengl_problem()
+    if problem is not None:
+        return
     for name in ("springbench.harness.recording.recording_reader", "pyvista", "springbench.harness.report.run_picture"):
         with lock_timing_shared(_ignore_progress):
             import_module(name)
@@ -97,7 +100,8 @@ def _load_drawing() -> str | None:
     from springbench.harness.report import opengl_probe
 
     opengl_probe.start_opengl_probe()
-    import_module("springbench.harness.report.run_picture")
+    if PICTURES.is_installed():
+        import_module("springbench.harness.report.run_picture")
     return opengl_probe.find_opengl_problem()
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.mutations.base import Mutation
 
-_QUANTITIES, _RENDER = "harness/results/quantities.py", "harness/report/mesh_rendering.py"
+_QUANTITIES = "harness/results/quantities.py"
 _STATED, _TIMES = "tests/unit/test_quantities.py", "tests/unit/test_report_timing.py"
 _PAGE, _SITE, _ROWS = "tests/contracts/test_page.py", "tests/unit/test_site.py", "tests/contracts/test_hostile_rows.py"
 _STATIC = "harness/report/site/static"
@@ -26,7 +26,7 @@ PAGE = (
     ),
     Mutation(
         "rest-length-median",
-        _RENDER,
+        "harness/report/recorded_strain.py",
         "float(replay.rest_lengths.mean())",
         "float(np.median(replay.rest_lengths))",
         (_STATED,),

@@ -23,7 +23,7 @@ from springbench.harness.report.equal_accuracy import compare_runs
 from springbench.harness.report.equal_accuracy import describe_comparison as compared
 from springbench.harness.report.figures.timing_panels import timing_panels
 from springbench.harness.report.median_times import write_medians
-from springbench.harness.report.mesh_rendering import mean_rest_length
+from springbench.harness.report.recorded_strain import mean_rest_length
 from springbench.harness.report.robustness import CORRECT, OTHER_MINIMUM, classify_run
 from springbench.harness.report.site import update_page
 from springbench.harness.report.timing_table import build_summary_table, label_runs, read_run_times

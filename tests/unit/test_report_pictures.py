@@ -24,12 +24,11 @@ from springbench.harness.report.mesh_rendering import (
     OffscreenRenderer,
     choose_view_angles,
     compute_area_vectors,
-    compute_spring_strain,
-    compute_vertex_strain,
     fit_camera,
 )
 from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
 from springbench.harness.report.plot_style import BACKGROUND_COLOUR, PAGE_HEIGHT, PAGE_WIDTH
+from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain
 from springbench.harness.report.run_picture import PixelBox, draw_run_picture, layout_frames
 from springbench.harness.report.self_intersection_notes import describe_self_intersection
 

@@ -17,6 +17,7 @@ from springbench.harness.config.sweep_config import FixedOptions
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.isolated_call import run_isolated
+from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.execution.worker_process import TaskLimits
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
@@ -37,7 +38,6 @@ from springbench.harness.experiments.error_control.third_party_comparison import
 from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.experiments.run_pipeline import save_positions
 from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
-from springbench.harness.recording.rerun_recorder import RerunRecorder
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth
 from springbench.harness.results import parquet_rows
@@ -142,13 +142,15 @@ def _execute_error_control(
         print_message(f"{status['status']}: {status['reason']}")
     measured = _verify_error(error_target, error, path.positions[-1], results, print_message) if verify else None
     label = f"{config.stem}-{error_target.size}-asked-{error:g}-{error_target.t_end:g}"
-    recording = _record_motion(
-        folder / "recordings" / f"{label}.rrd", config.stem, error_target, motion_scene, answer, status
-    )
-    row = _build_row(config.stem, error_target, error, answer, status) | {
-        "error": measured,
-        "recording_path": f"recordings/{recording.name}",
-    }
+    row = _build_row(config.stem, error_target, error, answer, status) | {"error": measured}
+    if RECORDINGS.is_installed():
+        recording = _record_motion(
+            folder / "recordings" / f"{label}.rrd", config.stem, error_target, motion_scene, answer, status
+        )
+        row["recording_path"] = f"recordings/{recording.name}"
+        print_message(f"the recording is {recording}")
+    else:
+        print_message(f"the motion is not recorded: {RECORDINGS.describe_absence()}")
     (folder / "accuracy").mkdir(exist_ok=True)
     found = [
         row,
@@ -161,7 +163,7 @@ def _execute_error_control(
     )
     if positions:
         save_positions(positions, path.positions[1:])
-    print_message(f"the row is in {folder / 'accuracy'}, the recording is {recording}")
+    print_message(f"the row is in {folder / 'accuracy'}")
     return status["status"] == "ok" and (not verify or (measured is not None and measured <= error))
 
 
@@ -320,6 +322,8 @@ def _record_motion(
         },
     )
     path.parent.mkdir(parents=True, exist_ok=True)
+    from springbench.harness.recording.rerun_recorder import RerunRecorder
+
     recorder = RerunRecorder(path, info)
     try:
         for k, p in enumerate(best.trajectory.positions):

@@ -11,7 +11,6 @@ from springbench.harness.execution import machine_info
 from springbench.harness.experiments.accuracy.convergence_curves import ScoredCurve
 from springbench.harness.experiments.accuracy.step_scales import compute_energy_roundoff
 from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
-from springbench.harness.recording.rerun_recorder import RerunRecorder
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.certified_minimum import KnownMinima
 from springbench.harness.reference.step_snapshot import StepSnapshot
@@ -79,6 +78,8 @@ def record_solve(
         },
         is_solve=True,
     )
+    from springbench.harness.recording.rerun_recorder import RerunRecorder
+
     recorder = RerunRecorder(path, info)
     try:
         for k, p in enumerate(curve.positions):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from importlib import import_module
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,6 @@ from springbench.harness.report.figures import (
     accuracy_panels,
     benchmark_panels,
     engine_panels,
-    mesh_panels,
     robustness_panels,
     timing_panels,
     winner_panels,
@@ -45,7 +45,14 @@ class FigureKind(NamedTuple):
     ]
 
 
+def _list_mesh_panels(function: str) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
+    """Return a function of `mesh_panels`, which is imported on the first call: it needs PyVista."""
+    return _without_stale(lambda folder: getattr(import_module(_MESH_PANELS), function)(folder))
+
+
 def _align_mesh_pictures(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
+    from springbench.harness.report.figures import mesh_panels
+
     pictures = [panel for panel in (entry.build_panel() for entry in entries) if isinstance(panel, MeshPicture)]
     return [
         one
@@ -55,6 +62,8 @@ def _align_mesh_pictures(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
 
 
 def _prepare_scene_sheet(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
+    from springbench.harness.report.figures import mesh_panels
+
     return [
         *mesh_panels.build_scene_sheet(
             [panel for panel in (e.build_panel() for e in entries) if isinstance(panel, MeshPicture)]
@@ -79,6 +88,7 @@ def _without_stale(
     return read
 
 
+_MESH_PANELS = "springbench.harness.report.figures.mesh_panels"
 _ACCURACY_ROWS, _SWEEP_ROWS = accuracy_panels.REQUIRED_ROWS, "rows of `springbench run CONFIG`"
 _GAP_PANELS = (("gap", "time"), ("gap", "iterations"))
 _PROFILE_PANELS = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
@@ -131,19 +141,19 @@ FIGURE_KINDS: dict[str, FigureKind] = {
     "run": FigureKind(
         "The mesh at the end",
         f"{_SWEEP_ROWS} with recordings",
-        _without_stale(mesh_panels.last_frame_panels),
+        _list_mesh_panels("last_frame_panels"),
         prepare_panels=_align_mesh_pictures,
     ),
     "comparison": FigureKind(
         "Solvers side by side",
         f"{_SWEEP_ROWS} with recordings",
-        _without_stale(mesh_panels.solver_comparison_panels),
+        _list_mesh_panels("solver_comparison_panels"),
         prepare_panels=_align_mesh_pictures,
     ),
     "scenes": FigureKind(
         "Scenes at their end",
         f"{_SWEEP_ROWS} with recordings",
-        _without_stale(mesh_panels.scene_panels),
+        _list_mesh_panels("scene_panels"),
         prepare_panels=_prepare_scene_sheet,
     ),
     "history": FigureKind(

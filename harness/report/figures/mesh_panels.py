@@ -26,7 +26,6 @@ from springbench.harness.report.mesh_rendering import (
     OffscreenRenderer,
     choose_view_angles,
     compute_area_vectors,
-    compute_vertex_strain,
     fit_camera,
     view_aspect,
 )
@@ -34,6 +33,7 @@ from springbench.harness.report.obstacle_meshes import framed_vertex_mask, point
 from springbench.harness.report.page_layout import format_count, format_frame_time, format_quantity
 from springbench.harness.report.plot_style import SeriesStyle, assign_solver_styles
 from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
+from springbench.harness.report.recorded_strain import compute_vertex_strain
 from springbench.harness.report.self_intersection_notes import describe_self_intersection
 from springbench.harness.report.timing_table import RunTimes, label_runs, read_run_times
 

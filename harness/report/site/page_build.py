@@ -11,6 +11,7 @@ from typing import Any
 
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import InputError
+from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.report.site import data_scripts
 from springbench.harness.report.site.page_assets import install_assets
 from springbench.harness.report.site.sweep_folders import (
@@ -61,7 +62,8 @@ def update_page(
                 build_overview(folder, home, with_recordings=with_recordings, print_message=print_message),
                 state,
             )
-    if with_viewer and any(True for folder in found for _ in (data / folder.slug / "recordings").glob("*.js")):
+    replays = (path for folder in found for path in (data / folder.slug / "recordings").glob("*.js"))
+    if with_viewer and RECORDINGS.is_installed() and any(replays):
         from springbench.harness.report.site.rerun_viewer import write_viewer
 
         write_viewer(results / "site")

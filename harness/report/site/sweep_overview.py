@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.report.device_speedup import summarise_table as of_devices
 from springbench.harness.report.site import (
     ablation_charts,
@@ -171,6 +172,7 @@ def _mark_recordings(
     With `include_missing`, missing ones are added.
     """
     there = {part: {path.stem for path in (data_folder / part).glob("*.js")} for part in ("meshes", "recordings")}
+    include_missing = include_missing and RECORDINGS.is_installed()
     if include_missing and (recorded := {run["unit"]: run_title(run) for run in run_records if run["recording"]}):
         from springbench.harness.report.site.mesh_scripts import write_last_frames, write_recordings
 
@@ -216,7 +218,7 @@ def _build_accuracy_section(
 
     table = read_accuracy(folder.path, on_invalid=_report_skipped(print_message))
     scripts, facts = build_accuracy_charts(table, folder.path), dict[str, Any]()
-    if with_recordings:
+    if with_recordings and RECORDINGS.is_installed():
         from springbench.harness.report.site.mesh_scripts import write_recordings, write_solves
 
         facts["solves"] = write_solves(folder, data_folder, without_short_curves(table), print_message)
