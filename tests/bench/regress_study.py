@@ -7,18 +7,28 @@ python -m tests.bench.regress_study live RESULTS CONFIG      real tests of the s
 
 from __future__ import annotations
 
+import os
+import re
 from collections.abc import Sequence
+from dataclasses import asdict
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 from statistics import median
-from typing import Annotated
+from typing import Annotated, Any
 
+import pyarrow as pa
 import typer
 from rich.table import Table
 from springbench.harness.cli.shared_options import ErrorReportingGroup
 from springbench.harness.console import get_output_console, print_message, split_wide_table
 from springbench.harness.errors import InputError
+from springbench.harness.experiments.archive.study_publication import (
+    summarise_provenance,
+    write_published_table,
+    write_study_file,
+)
+from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.experiments.regression import git_worktrees
 from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
 from springbench.harness.experiments.regression.revision_comparison import (
@@ -27,10 +37,14 @@ from springbench.harness.experiments.regression.revision_comparison import (
     build_config_requests,
 )
 from springbench.harness.experiments.regression.revision_process import GitRevision
+from springbench.harness.results import parquet_rows
+from springbench.harness.results.published_set import TABLE_FILES, compute_file_digest
 
 from tests.bench.live_study import run_live_study, summarise_live_study
 from tests.bench.replay_study import (
     OTHER_COMPARISONS,
+    RECORD_SCHEMA,
+    RecordedBlocks,
     read_recorded_blocks,
     record_blocks,
     replay_comparison,
@@ -135,25 +149,73 @@ def replay(
     samples: Annotated[list[Path], typer.Argument(help="Recorded blocks (.parquet).")],
     replays: Annotated[int, typer.Option(help="Replayed tests of each kind.")] = 10_000,
     budget: Annotated[float, typer.Option(help="Seconds of a test; at least 300 for slowdowns of 2 %.")] = 240.0,
+    publish: Annotated[Path | None, typer.Option(help="Folder of a published study for blocks and rates.")] = None,
 ) -> None:
     """Print the rates of the verdicts of replayed tests, compared with other benchmark tools."""
     if missing := [str(path) for path in samples if not path.is_file()]:
         raise InputError(f"{', '.join(missing)}: no such file; `record` writes one")
-    columns = "slower", "limit", "fail", "pass", "inconclusive", "median s", *OTHER_COMPARISONS
+    rates: list[dict[str, Any]] = []
     for (gate, condition), blocks in read_recorded_blocks(samples).items():
-        load = f"{median(start.load_average for start in blocks):.1f}"
-        table = Table(*columns, title=f"{gate}\nbackground load: {condition}; load average {load}")
-        for slowdown, max_ratio in SLOWDOWN_CASES:
-            seconds = max(budget, 300.0) if max_ratio < 1.02 else budget
-            found = replay_tests(blocks, slowdown, SequentialTest(max_ratio), seconds, replays)
-            others = [
-                replay_comparison(rule, blocks, slowdown, seconds / 2, replays // 10)
-                for rule in OTHER_COMPARISONS.values()
-            ]
-            rates = [f"{rate:.2%}" for rate in (found.fail_rate, found.pass_rate, found.inconclusive_rate)]
-            cells = [f"{slowdown - 1:.0%}", f"{max_ratio - 1:.0%}", *rates, f"{found.median_seconds:.1f}"]
-            table.add_row(*cells, *(f"{rate:.1%}" for rate in others))
-        get_output_console().print(split_wide_table(table))
+        load = median(start.load_average for start in blocks)
+        own = [
+            {"benchmark": gate, "background_load": condition, "load_average": load}
+            | compute_rates(blocks, slowdown, max_ratio, max(budget, 300.0) if max_ratio < 1.02 else budget, replays)
+            for slowdown, max_ratio in SLOWDOWN_CASES
+        ]
+        get_output_console().print(split_wide_table(build_rate_table(own)))
+        rates += own
+    if publish:
+        publish_rates(publish, samples, rates)
+
+
+def compute_rates(
+    blocks: Sequence[RecordedBlocks], slowdown: float, max_ratio: float, seconds: float, replays: int
+) -> dict[str, Any]:
+    """Compute the rates of the verdicts for one slowdown, here and by other tools."""
+    found = replay_tests(blocks, slowdown, SequentialTest(max_ratio), seconds, replays)
+    others = {
+        name: replay_comparison(rule, blocks, slowdown, seconds / 2, replays // 10)
+        for name, rule in OTHER_COMPARISONS.items()
+    }
+    return {"slowdown": slowdown - 1, "max_slowdown": max_ratio - 1, "num_replays": replays, **asdict(found), **others}
+
+
+def build_rate_table(rates: Sequence[dict[str, Any]]) -> Table:
+    """Build the printed table of one benchmark under one background load."""
+    first = rates[0]
+    title = (
+        f"{first['benchmark']}\nbackground load: {first['background_load']}; load average {first['load_average']:.1f}"
+    )
+    table = Table("slower", "limit", "fail", "pass", "inconclusive", "median s", *OTHER_COMPARISONS, title=title)
+    for row in rates:
+        verdicts = [f"{row[name]:.2%}" for name in ("fail_rate", "pass_rate", "inconclusive_rate")]
+        cells = [f"{row['slowdown']:.0%}", f"{row['max_slowdown']:.0%}", *verdicts, f"{row['median_seconds']:.1f}"]
+        table.add_row(*cells, *(f"{row[name]:.1%}" for name in OTHER_COMPARISONS))
+    return table
+
+
+def rename_tools(row: dict[str, Any]) -> dict[str, Any]:
+    """Rename the columns of other tools to identifiers of SQL: asv_continuous_1_05 and so on."""
+    return {re.sub(r"\W+", "_", name).strip("_"): value for name, value in row.items()}
+
+
+def publish_rates(folder: Path, samples: Sequence[Path], rates: Sequence[dict[str, Any]]) -> None:
+    """Write blocks and rates as a study of the published set; the date is that of the replay."""
+    folder.mkdir(parents=True, exist_ok=True)
+    blocks = parquet_rows.read_rows(samples, RECORD_SCHEMA)
+    write_published_table(folder / TABLE_FILES["blocks"], blocks)
+    write_published_table(folder / TABLE_FILES["rates"], pa.Table.from_pylist([rename_tools(row) for row in rates]))
+    config = Path("configs/scenes/hanging-cloth.yaml")
+    metadata = {
+        "config": os.path.relpath(config.resolve(), folder.resolve()),
+        "config_digest": compute_file_digest(config),
+        "command": f"python -m tests.bench.regress_study replay {folder / TABLE_FILES['blocks']}",
+        "is_timed": True,
+        **summarise_provenance([build_provenance_columns() | {"load_average": row["load_average"]} for row in rates]),
+        "runs": len(blocks),
+    }
+    write_study_file(folder, metadata)
+    print_message(f"published in {folder}")
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from springbench.harness.report.figures.direct_labels import spread_positions
 from springbench.harness.report.plot_style import BACKGROUND_COLOUR, MUTED_COLOUR, PAGE_RC, RULE_COLOUR, TEXT_COLOUR
 
@@ -28,13 +29,15 @@ ChartForm = Literal["bars", "lines", "heatmap"]
 
 _WIDTH, _DPI, _FONT_SIZE = 5.2, 200, 9.0
 """Width [inches], resolution and font size [points]: at 85 mm the type is 6 points high."""
-_TITLE_LETTERS = 62
+_TITLE_LETTERS = 58
 """Number of letters of the title on one line."""
 _ROW_HEIGHT, _FRAME_HEIGHT, _MARGIN = 0.21, 2.9, 0.62
 """Inches: height of a row of names, of the frame of curves, and of the axis with its label."""
 _ACCENTS = ("#0072b2", "#d55e00", "#00a878", "#cc79a7", "#e69f00", "#7a5fd0")
 """Colours of the series that a chart is about."""
 _GREY = "#c4c7cc"
+_MAX_NAMED_PLACES = 7
+"""Largest number of places of a logarithmic x axis that are all written out."""
 _SHARE_MAP = LinearSegmentedColormap.from_list("share", ("#f6f4ef", "#8fcbad", "#1f7a55"))
 
 
@@ -122,8 +125,8 @@ def _draw_bars(ax: Axes, chart: PageChart) -> None:
     known = [(point, point.y) for point in chart.points if point.y is not None]
     for k, (point, value) in enumerate(known):
         name = point.series
-        colour = _ACCENTS[0] if not chart.highlights else _choose_colour(chart, name, k)
-        ax.barh(k, value, height=0.72, color=colour)
+        is_grey = bool(chart.highlights) and name not in chart.highlights
+        ax.barh(k, value, height=0.72, color=_GREY if is_grey else _ACCENTS[0])
         if point.low is not None and point.high is not None:
             ax.plot([point.low, point.high], [k, k], color=TEXT_COLOUR, linewidth=1.0)
         end = max(value, point.high or value)
@@ -133,7 +136,9 @@ def _draw_bars(ax: Axes, chart: PageChart) -> None:
     ax.set_yticks(range(len(known)), [point.series for point, _ in known])
     ax.set_ylim(len(known) - 0.4, -0.6)
     ax.set_xscale(chart.x_scale)
-    ax.set_xlabel(chart.x_label)
+    ax.set_xlabel(chart.x_label, loc="right")
+    if chart.x_scale == "log":
+        _set_plain_ticks(ax, [m * 10.0**e for e in range(-3, 7) for m in (1, 2, 5)])
     ax.tick_params(axis="y", length=0)
     ax.margins(x=0.12)
     if chart.is_percentage:
@@ -166,6 +171,9 @@ def _draw_lines(ax: Axes, chart: PageChart) -> None:
             ends.append((xs[-1], ys[-1], name, colour))
     ax.set_xscale(chart.x_scale)
     ax.set_yscale(chart.y_scale)
+    places = sorted({float(point.x) for point in chart.points})
+    if chart.x_scale == "log" and len(places) <= _MAX_NAMED_PLACES:
+        _set_plain_ticks(ax, places)
     ax.set_xlabel(chart.x_label)
     ax.set_ylabel(chart.y_label)
     ax.grid(visible=True, color=RULE_COLOUR, linewidth=0.6)
@@ -175,6 +183,14 @@ def _draw_lines(ax: Axes, chart: PageChart) -> None:
             chart.limit[1], (0.01, chart.limit[0]), xycoords=("axes fraction", "data"), fontsize=7.5, va="bottom"
         )
     _label_ends(ax, chart, ends)
+
+
+def _set_plain_ticks(ax: Axes, places: Sequence[float]) -> None:
+    """Write numbers instead of powers at those places of the x axis that lie within its limits."""
+    low, high = ax.get_xlim()
+    inside = [place for place in places if low <= place <= high]
+    ax.set_xticks(inside, [f"{place:,.0f}" if place >= 1.0 else f"{place:g}" for place in inside])
+    ax.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _label_ends(ax: Axes, chart: PageChart, ends: Sequence[tuple[float, float, str, str]]) -> None:
