@@ -81,7 +81,8 @@ class _PageFields:
             raise InputError(f"table() wants rows; {' '.join(sql.split())!r:.200} has none")
         names = list(found[0])
         numeric = [all(isinstance(row[name], int | float | None) for row in found) for name in names]
-        lines = [" | ".join(name.replace("_", " ") for name in names), " | ".join("---:" if right else "---" for right in numeric)]
+        lines = [" | ".join(name.replace("_", " ") for name in names)]
+        lines.append(" | ".join("---:" if right else "---" for right in numeric))
         lines += [" | ".join(_format_cell(row[name], digits) for name in names) for row in found]
         return "\n".join(f"| {line} |" for line in lines)
 
