@@ -21,9 +21,9 @@ def digest_runs(title: str, table: pa.Table, stale_ids: Collection[str]) -> str:
         table: rows of the runs; a run that is repeated has another `started_at`.
         stale_ids: ids of runs that were executed by other code than the current version.
     """
-    runs = {*zip(table["run_id"].to_pylist(), map(str, table["started_at"].to_pylist()), strict=True)}
-    stale = sorted({run for run, _ in runs}.intersection(stale_ids))
-    return hashlib.sha256(json.dumps([title, sorted(runs), stale]).encode()).hexdigest()
+    ids, starts = (list(map(str, table[name].to_pylist())) for name in ("run_id", "started_at"))
+    stale = sorted({*ids}.intersection(stale_ids))
+    return hashlib.sha256(json.dumps([title, sorted({*zip(ids, starts, strict=True)}), stale]).encode()).hexdigest()
 
 
 def read_sources(path: Path) -> str | None:

@@ -1,11 +1,14 @@
 """Robustness of solvers: the outcome of each verified run of a sweep.
 
 Outcomes follow from the rows only. A run of a minimising solver is correct if, in every step, the result is stationary
-to the requested tolerance, up to round-off at each vertex, and a certified minimum, and if the motion matches the
-reference in every frame. All three are checked by the reference evaluator, never by the solver's own report. That
-report is compared: if a step ended because its residual met the tolerance, but the evaluator finds it not stationary,
-the run is falsely converged instead of merely unconverged. A method that does not minimise is scored by its motion
-only. If the independent implementation of the formulas disagrees with the steps themselves, no run of them is correct.
+to the requested tolerance, up to round-off at each vertex, and a certified minimum. Both are checked by the reference
+evaluator, never by the solver's own report. That report is compared: if a step ended because its residual met the
+tolerance, but the evaluator finds it not stationary, the run is falsely converged instead of merely unconverged. A
+method that does not minimise is scored by its motion only.
+
+A step may have several minima. Which of them a run takes is stated, and is no part of its outcome: whether its motion
+is that of the reference, and by how much the objective after its first step, which all runs of a case share, exceeds
+the lowest one that any run found.
 """
 
 from __future__ import annotations
@@ -14,7 +17,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,8 +42,11 @@ SAME_MOTION_DISTANCE = 1e-2
 
 Steps are solved to 1e-6 of their displacement, and instability amplifies that error. The limit lies in a gap: of 670
 runs of configs/hard that end at minima, 595 stay within 0.5 % and 71 deviate by more than 2 %. Half the limit would
-remove 2 of the correct runs, twice the limit would add 2.
+remove 2 of these runs, twice the limit would add 2.
 """
+SAME_ENERGY_RTOL = 1e-9
+"""Excess of the objective, over its magnitude, up to which it counts as the lowest: steps are solved to residuals of
+1e-6, and the objective is flat to second order at its minimum."""
 CLOSE_MOTION_DISTANCE = 0.05
 """Share of the rest shape's size: required distance of a method that does not minimise, roughly what is visible.
 
@@ -57,21 +63,20 @@ class RunOutcome(NamedTuple):
 
 
 CORRECT = RunOutcome(
-    "right", "#3a9e72", "stationary to the tolerance, a certified minimum, and the motion of the reference"
-)
-OTHER_MINIMUM = RunOutcome(
-    "another minimum", "#8fcbad", "a certified minimum in every step, and another motion than the reference, or none"
+    "right",
+    "#3a9e72",
+    "a certified minimum in every step; of methods that do not minimise, the motion of the reference",
 )
 DEGENERATE_MINIMUM = RunOutcome(
-    "in a valley", "#c9c27a", "stationary, with a curvature that is zero up to round-off: a continuum of minima"
+    "degenerate minimum", "#c9c27a", "stationary, with a curvature that is zero up to round-off: a continuum of minima"
 )
-SADDLE_POINT = RunOutcome("no minimum", "#b9a3d6", "stationary, but where the objective falls some way: a saddle")
+SADDLE_POINT = RunOutcome("saddle point", "#b9a3d6", "stationary, with a direction of negative curvature")
 NOT_CONVERGED = RunOutcome("not converged", "#f2c45f", "finite, and not yet stationary, or not close to the reference")
 SILENTLY_WRONG = RunOutcome(
-    "silently wrong", "#e0683c", "said of a step that it had converged, which the oracle finds untrue"
+    "silently wrong", "#e0683c", "reported a step as converged, which the reference evaluator contradicts"
 )
 DIVERGED = RunOutcome("diverged", "#d1495b", "not finite any more, or far beyond the energy of its scene")
-ENERGY_GROWTH = RunOutcome("energy growth", "#c98ba6", "finite, with more energy than the scene can have given it")
+ENERGY_GROWTH = RunOutcome("energy growth", "#c98ba6", "finite, with more energy than the scene provides")
 TIMED_OUT = RunOutcome("too slow", "#7b7f87", "did not end within its time limit")
 FAILED = RunOutcome("failed", "#23262b", "ended with an error")
 WRONG_GRADIENT = RunOutcome(
@@ -80,7 +85,6 @@ WRONG_GRADIENT = RunOutcome(
 UNSUPPORTED = RunOutcome("refused", "#d9d9d6", "refused before it began, with a reason")
 RUN_OUTCOMES = (
     CORRECT,
-    OTHER_MINIMUM,
     DEGENERATE_MINIMUM,
     SADDLE_POINT,
     NOT_CONVERGED,
@@ -120,7 +124,11 @@ class VerifiedRun:
         worst_error: largest `stationarity_above_roundoff` of a step, or, if `error_kind` is "distance", the largest
             distance from the reference; None if unknown.
         error_kind: "stationarity" or "distance".
-        reason: why the run is not correct.
+        reason: why the run is not correct, or how its motion differs from the reference.
+        same_motion: whether the motion is that of the reference; None without a reference, and of methods that do not
+            minimise, whose outcome is the motion itself.
+        energy_excess: objective after the first step less the lowest of all runs of the case, over the largest
+            magnitude of these; None if unknown or if the solver does not minimise.
         citation: reference of the solver as in the rows.
         run_id: id of the run.
         cpu: processor that executed the run.
@@ -134,11 +142,23 @@ class VerifiedRun:
     worst_error: float | None
     error_kind: str
     reason: str
+    same_motion: bool | None = None
+    energy_excess: float | None = None
     citation: str = ""
     run_id: str = ""
     cpu: str = ""
     commit: str = ""
     solver_name: str = ""
+
+    @property
+    def has_other_motion(self) -> bool:
+        """Whether the run is correct, by other minima than the reference."""
+        return self.outcome is CORRECT and self.same_motion is False
+
+    @property
+    def has_lowest_energy(self) -> bool:
+        """Whether the run is correct, and no run of the case has a lower objective after the first step."""
+        return self.outcome is CORRECT and self.energy_excess is not None and self.energy_excess <= SAME_ENERGY_RTOL
 
     @property
     def error_text(self) -> str:
@@ -174,13 +194,28 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
         raise InputError(f"{folder}: holds runs that another version judged; run the sweep again")
     firsts = [run[0] for run in runs.values()]
     cells: dict[tuple[str, str], VerifiedRun] = {}
+    energies: dict[str, dict[str, float]] = {}
     for run in sorted(runs.values(), key=lambda run: run[0]["started_at"]):
         case, solver = _case_name(run[0], firsts), _solver_label(run[0], firsts)
-        outcome, worst, graded, reason = classify_run(run)
-        run_id, reference = run[0]["run_id"], run[0]["citation"] or ""
-        made = run[0]["cpu"] or "", run[0]["commit"] or ""
-        named = *made, run[0]["solver"]
-        cells[case, solver] = VerifiedRun(case, solver, outcome, worst, graded, reason, reference, run_id, *named)
+        first = run[0]
+        cells[case, solver] = VerifiedRun(
+            case,
+            solver,
+            *classify_run(run),
+            citation=first["citation"] or "",
+            run_id=first["run_id"],
+            cpu=first["cpu"] or "",
+            commit=first["commit"] or "",
+            solver_name=first["solver"],
+        )
+        energy = min(run, key=lambda row: row["frame"] or 0).get("objective")
+        if first.get("is_minimiser") and energy is not None and math.isfinite(energy):
+            energies.setdefault(case, {})[solver] = energy
+    for case, found in energies.items():
+        lowest, scale = min(found.values()), max(map(abs, found.values()))
+        for solver, energy in found.items():
+            excess = (energy - lowest) / scale if scale else 0.0
+            cells[case, solver] = replace(cells[case, solver], energy_excess=excess)
     order = {
         name: k for k, name in enumerate(dict.fromkeys([*SOLVERS, *OPTIONAL_SOLVERS, *(r["solver"] for r in firsts)]))
     }
@@ -192,21 +227,31 @@ def _natural_sort_key(name: str) -> list[tuple[int, str]]:
     return [(len(part.lstrip("0")) if k % 2 else 0, part) for k, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
-def classify_run(run: Sequence[dict[str, Any]]) -> tuple[RunOutcome, float | None, str, str]:
-    """Classify a run from its rows, one per step.
+class RunVerdict(NamedTuple):
+    """Outcome of a run, with its worst error and the kind of that error; see `VerifiedRun` for the others."""
 
-    Returns: outcome, worst error, kind of that error, and the reason why the run is not correct.
-    """
+    outcome: RunOutcome
+    worst_error: float | None
+    error_kind: str
+    reason: str
+    same_motion: bool | None = None
+
+
+def classify_run(run: Sequence[dict[str, Any]]) -> RunVerdict:
+    """Classify a run from its rows, one per step."""
     first = run[0]
     if first["status"] != "ok":
         where = f"frame {first['frame']}: " if first["frame"] and first["status"] not in _COMPLETED_STATUSES else ""
-        return _OUTCOME_OF_STATUS.get(first["status"], FAILED), None, "", where + (first["reason"] or first["status"])
+        return RunVerdict(
+            _OUTCOME_OF_STATUS.get(first["status"], FAILED), None, "", where + (first["reason"] or first["status"])
+        )
     farthest = max((away for row in run if (away := row["reference_distance"]) is not None), default=None)
     lost = any(row["reference_distance"] is None for row in run)
+    same = None if lost or farthest is None else farthest <= SAME_MOTION_DISTANCE
     if all(row["stationarity"] is None for row in run):
         near = farthest is not None and not lost and farthest <= CLOSE_MOTION_DISTANCE
         why = "" if near else "there is no reference" if lost else "away from the reference"
-        return (CORRECT if near else NOT_CONVERGED), farthest, "distance", why
+        return RunVerdict(CORRECT if near else NOT_CONVERGED, farthest, "distance", why)
     beyond = [
         math.nan if row["stationarity_above_roundoff"] is None else row["stationarity_above_roundoff"] for row in run
     ]
@@ -220,22 +265,21 @@ def classify_run(run: Sequence[dict[str, Any]]) -> tuple[RunOutcome, float | Non
         claimed = sum(row["termination_reason"] in _CONVERGED_REASONS for row in missed)
         claims = f", {claimed} of which said they had met it" if claimed else ""
         why = f"{len(missed)} of {len(run)} steps missed the tolerance{claims}"
-        return (SILENTLY_WRONG if claimed else NOT_CONVERGED), worst, "stationarity", why
+        return RunVerdict(SILENTLY_WRONG if claimed else NOT_CONVERGED, worst, "stationarity", why, same)
     none = [row for row in run if not row["is_local_minimum"]]
     if none:
         if all(row["is_degenerate"] for row in none):
-            return (
-                DEGENERATE_MINIMUM,
-                worst,
-                "stationarity",
-                f"in {len(none)} of {len(run)} steps some curvature is round-off",
-            )
-        return SADDLE_POINT, worst, "stationarity", "the Hessian is not positive definite"
-    if lost or farthest is None:
-        return OTHER_MINIMUM, worst, "stationarity", "there is no reference to compare the motion with"
-    if farthest > SAME_MOTION_DISTANCE:
-        return OTHER_MINIMUM, worst, "stationarity", f"up to {100 * farthest:.2g} % of the size from the reference"
-    return CORRECT, worst, "stationarity", ""
+            why = f"in {len(none)} of {len(run)} steps some curvature is round-off"
+            return RunVerdict(DEGENERATE_MINIMUM, worst, "stationarity", why, same)
+        return RunVerdict(SADDLE_POINT, worst, "stationarity", "the Hessian is not positive definite", same)
+    why = ""
+    if same is None:
+        why = "certified minima; there is no reference to compare the motion with"
+    elif not same:
+        why = (
+            f"certified minima, by another motion: up to {100 * (farthest or 0.0):.2g} % of the size from the reference"
+        )
+    return RunVerdict(CORRECT, worst, "stationarity", why, same)
 
 
 _OPTION_COLUMNS = ("size", *(option.column for option in RUN_OPTIONS.values() if option.column))
@@ -265,6 +309,8 @@ class SolverScore:
         outcome_counts: number of runs with each outcome, in the order of RUN_OUTCOMES.
         correct_share: share of correct runs among supported cases; None if no case is supported.
         finite_share: share of runs that stayed finite, likewise.
+        other_motion_count: number of correct runs with another motion than the reference.
+        lowest_energy_count: number of correct runs whose first step has the lowest objective of all solvers.
         worst_run: run with the largest error.
     """
 
@@ -272,6 +318,8 @@ class SolverScore:
     outcome_counts: tuple[int, ...]
     correct_share: float | None
     finite_share: float | None
+    other_motion_count: int
+    lowest_energy_count: int
     worst_run: VerifiedRun
 
 
@@ -290,7 +338,8 @@ def score_solvers(cells: Sequence[VerifiedRun]) -> list[SolverScore]:
                 -1.0 if cell.worst_error is None else math.inf if math.isnan(cell.worst_error) else cell.worst_error
             ),
         )
-        found.append(SolverScore(solver, tuple(of.values()), *shares, worst))
+        motions = sum(cell.has_other_motion for cell in own), sum(cell.has_lowest_energy for cell in own)
+        found.append(SolverScore(solver, tuple(of.values()), *shares, *motions, worst))
     return found
 
 
@@ -309,11 +358,13 @@ def build_score_table(cells: Sequence[VerifiedRun]) -> Table:
     table = Table(box=SIMPLE_HEAD, caption_justify="left")
     table.caption = "none of these are times: they may be compared across machines"
     table.add_column("solver", vertical="bottom")
-    for words in (*(RUN_OUTCOMES[k].label for k in there), "part right", "part finite", "worst residual"):
-        table.add_column("\n".join(words.rsplit(" ", 1)), justify="right", vertical="bottom")
+    motions = ("by another_motion", "at lowest_energy")
+    for words in (*(RUN_OUTCOMES[k].label for k in there), *motions, "part right", "part finite", "worst residual"):
+        table.add_column("\n".join(words.rsplit(" ", 1)).replace("_", " "), justify="right", vertical="bottom")
     for score in found:
         worst = "" if score.worst_run.worst_error is None else f"{score.worst_run.worst_error:.1e}"
-        counts = (str(score.outcome_counts[k]) for k in there)
+        counts = [str(score.outcome_counts[k]) for k in there]
+        counts += [str(score.other_motion_count), str(score.lowest_energy_count)]
         table.add_row(
             escape(score.solver), *counts, format_share(score.correct_share), format_share(score.finite_share), worst
         )

@@ -55,8 +55,13 @@ _SCORE_ROWS, _HEADING_ROWS = 3, 1.2
 MAP_NOTE = (
     "Numbers: the largest final residual |Q\u207b\u00b9 grad g|_Q of a step, over its value at the start of the step "
     "(or round-off); for methods that do not minimise, the largest distance from a converged run, in percent of the "
-    "scene's size. Shares: of the cases that a solver supports."
+    "scene's size. \u2248: right, by other minima than the reference. Shares: of the cases that a solver supports."
 )
+
+
+def format_cell(cell: VerifiedRun) -> str:
+    """Format the worst error of a run, marked if it is correct by another motion than the reference."""
+    return f"{cell.error_text} \u2248".lstrip() if cell.has_other_motion else cell.error_text
 
 
 def map_headline(cells: Sequence[VerifiedRun], name: str) -> str:
@@ -105,7 +110,7 @@ def draw_robustness_map(cells: Sequence[VerifiedRun], path: Path, title: str, st
         x, y = solvers.index(cell.solver), places[cell.case]
         ax.add_patch(Rectangle((x + 0.02, y + 0.05), 0.96, 0.9, facecolor=cell.outcome.color, linewidth=0))
         ax.text(
-            x + 0.5, y + 0.53, cell.error_text, ha="center", va="center", fontsize=8, color=_text_colour(cell.outcome)
+            x + 0.5, y + 0.53, format_cell(cell), ha="center", va="center", fontsize=8, color=_text_colour(cell.outcome)
         )
         if cell.run_id in stale_ids:
             ax.plot(x + 0.1, y + 0.5, "o", mfc=BACKGROUND_COLOUR, mec=TEXT_COLOUR, ms=4.5, mew=1.0)

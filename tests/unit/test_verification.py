@@ -20,7 +20,6 @@ from springbench.harness.report.robustness import (
     DEGENERATE_MINIMUM,
     DIVERGED,
     NOT_CONVERGED,
-    OTHER_MINIMUM,
     SADDLE_POINT,
     SILENTLY_WRONG,
     UNSUPPORTED,
@@ -31,7 +30,7 @@ from springbench.harness.report.robustness import (
     read_verified_runs,
     score_solvers,
 )
-from springbench.harness.report.robustness_map import draw_robustness_map, map_headline
+from springbench.harness.report.robustness_map import draw_robustness_map, format_cell, map_headline
 from springbench.harness.results import parquet_rows
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
@@ -138,13 +137,13 @@ GRADES = {
         [OK | {"stationarity_roundoff_bound": 1.0, "stationarity_above_roundoff": 1e-3}],
         SILENTLY_WRONG,
     ),
-    "in a valley": ([OK, OK | {"is_local_minimum": False, "is_degenerate": True}], DEGENERATE_MINIMUM),
-    "in a valley, and at a saddle": (
+    "degenerate": ([OK, OK | {"is_local_minimum": False, "is_degenerate": True}], DEGENERATE_MINIMUM),
+    "degenerate, and at a saddle": (
         [OK | {"is_local_minimum": False}, OK | {"is_local_minimum": False, "is_degenerate": True}],
         SADDLE_POINT,
     ),
-    "no reference": ([OK | {"reference_distance": None}], OTHER_MINIMUM),
-    "a reference that is lost": ([OK, OK | {"reference_distance": None}], OTHER_MINIMUM),
+    "no reference": ([OK | {"reference_distance": None}], CORRECT),
+    "a reference that is lost": ([OK, OK | {"reference_distance": None}], CORRECT),
     "one step short": (
         [OK, OK | {"stationarity_above_roundoff": 2e-6, "termination_reason": "max-iter"}],
         NOT_CONVERGED,
@@ -163,7 +162,7 @@ GRADES = {
         SILENTLY_WRONG,
     ),
     "no tolerance asked": ([OK | {"residual_rtol": None}], CORRECT),
-    "elsewhere": ([OK, OK | {"reference_distance": 0.5}], OTHER_MINIMUM),
+    "elsewhere": ([OK, OK | {"reference_distance": 0.5}], CORRECT),
     "a saddle": ([OK | {"is_local_minimum": False}], SADDLE_POINT),
     "a motion that is close": ([OK | {"stationarity": None, "reference_distance": 0.04}], CORRECT),
     "a motion that is not": ([OK | {"stationarity": None, "reference_distance": 0.06}], NOT_CONVERGED),
@@ -210,6 +209,18 @@ def test_a_solver_is_scored_by_the_cases_that_it_does_not_refuse():
     assert map_headline(cells, "hard") == "hard: 1 of 6 runs right, 0 silently wrong, 1 diverged or failed"
 
 
+def test_runs_that_end_at_other_minima_are_right_counted_and_marked():
+    step = OK | {"reference_distance": 0.5}
+    verdict = classify_run([step])
+    assert verdict.reason == "certified minima, by another motion: up to 50 % of the size from the reference"
+    other = VerifiedRun("a", "b", *verdict, energy_excess=1e-3)
+    same = VerifiedRun("c", "b", *classify_run([OK]), energy_excess=0.0)
+    unknown = VerifiedRun("d", "b", *classify_run([OK | {"reference_distance": None}]), energy_excess=1e-12)
+    assert [format_cell(cell) for cell in (other, same, unknown)] == ["1e-7 \u2248", "1e-7", "1e-7"]
+    (score,) = score_solvers([other, same, unknown])
+    assert (score.correct_share, score.other_motion_count, score.lowest_energy_count) == (1.0, 1, 2)
+
+
 SCENE = "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 3\ndefault_size: 3\n"
 SCENE += "effects: [{kind: gravity}, {kind: springs, stretch: 10}, {kind: pins, parts: [first]}]\n"
 SWEEP = "scenes: [scene.yaml]\nsolvers: [newton, xpbd, {name: numba, precision: float32}, numba]\n"
@@ -229,6 +240,9 @@ def test_a_judged_sweep_becomes_a_map_whose_cells_name_their_runs(tmp_path: Path
     assert newton.outcome is CORRECT
     assert newton.worst_error is not None
     assert newton.worst_error < 1.1e-6
+    assert newton.same_motion
+    assert newton.has_lowest_energy
+    assert [cell.energy_excess is None for cell in cells] == [False, False, False, True], "XPBD minimises nothing"
     assert build_score_table(cells).row_count == 4
     assert newton.run_id
     assert next((tmp_path / "recordings").glob(f"*-{newton.run_id}.rrd"))

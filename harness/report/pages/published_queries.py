@@ -65,6 +65,8 @@ def list_outcomes(study: PublishedStudy) -> Sequence[dict[str, Any]]:
             "outcome": cell.outcome.label,
             "is_right": cell.outcome is CORRECT,
             "is_supported": cell.outcome is not UNSUPPORTED,
+            "same_motion": cell.same_motion,
+            "energy_excess": cell.energy_excess,
             "worst_error": cell.worst_error,
             "reason": cell.reason,
         }

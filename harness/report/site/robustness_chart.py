@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 from springbench.harness.report.citations import format_citation
 from springbench.harness.report.robustness import RUN_OUTCOMES, read_verified_runs, score_solvers
-from springbench.harness.report.robustness_map import MAP_NOTE, map_headline
+from springbench.harness.report.robustness_map import MAP_NOTE, format_cell, map_headline
 from springbench.harness.report.site.data_scripts import round_number
 from springbench.harness.report.site.sweep_folders import SweepFolder
 
@@ -52,7 +52,7 @@ def build_robustness_chart(folder: SweepFolder) -> dict[str, Any]:
             for s in score_solvers(cells)
         ],
         "cells": [
-            [cell.case, cell.solver, words.index(cell.outcome.label), cell.error_text, cell.reason, cell.run_id]
+            [cell.case, cell.solver, words.index(cell.outcome.label), format_cell(cell), cell.reason, cell.run_id]
             for cell in cells
         ],
     }

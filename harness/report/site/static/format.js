@@ -82,7 +82,7 @@ Object.assign(springbench, (() => {
   }
 
   // A word for how a run ended, with a symbol in addition to the colour.
-  const SIGNS = { ok: "✓", right: "✓", unsupported: "–", refused: "–", "another minimum": "≈", "not converged": "…" };
+  const SIGNS = { ok: "✓", right: "✓", unsupported: "–", refused: "–", "not converged": "…" };
   function state(words, plain = "") {
     const kind = words === "ok" || words === "right" ? "good" : own(SIGNS, words) ? "mild" : "bad";
     return element(`span.state.${kind}`, {}, element("span", { "aria-hidden": "true" }, `${own(SIGNS, words) || "×"} `), plain || words);
