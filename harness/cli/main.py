@@ -20,6 +20,7 @@ from springbench.harness.cli.commands.archive import compact, merge, publish, ve
 from springbench.harness.cli.commands.export_script import export_script
 from springbench.harness.cli.commands.figure import figure
 from springbench.harness.cli.commands.gallery import gallery
+from springbench.harness.cli.commands.grade import grade
 from springbench.harness.cli.commands.list_runs import list_command
 from springbench.harness.cli.commands.matrices import matrices
 from springbench.harness.cli.commands.mesh import mesh
@@ -277,6 +278,7 @@ app.command()(gallery)
 app.command()(mesh)
 app.command()(preview)
 app.command()(matrices)
+app.command()(grade)
 app.command()(regress)
 
 

@@ -1,6 +1,7 @@
-"""Reader of numeric arrays in untrusted .npz files, in a sandboxed subprocess within limits.
+"""Reader of numeric arrays in untrusted .npz and .npy files, in a sandboxed subprocess within limits.
 
-The whole array is read, so that its checksum is verified. Pickles, other types, NaN and infinities are rejected.
+The whole array is read, so that its checksum is verified. Pickles, other types, and by default NaN and infinities are
+rejected.
 """
 
 from __future__ import annotations
@@ -24,19 +25,40 @@ _BASE_SECONDS, _BYTES_PER_SECOND = 5.0, 2e7
 _MEMORY_LIMIT = 2**28 + 3 * MAX_NPZ_BYTES
 
 
-def read_npz_array(path: Path, name: str) -> NDArray[np.float64]:
+def read_npz_array(path: Path, name: str, *, allows_nonfinite: bool = False) -> NDArray[np.float64]:
     """Read one array of an .npz file as float64.
 
     Args:
         path: the .npz file.
         name: name of the array.
-    Returns: C-contiguous array of finite numbers.
+        allows_nonfinite: whether NaN and infinities are accepted.
+    Returns: C-contiguous array.
     Raises:
         InputError: if the file or the array is invalid; it names the file.
     """
+    _check_file(path, ".npz")
+    try:
+        return sandbox.call_in_sandbox(_extract_array, path, name, allows_nonfinite, limits=_build_limits())
+    except sandbox.SandboxError as error:
+        raise InputError(
+            InputMistake(f"cannot be read as an .npz file with an array `{name}`: {error}", path)
+        ) from None
+
+
+def read_npy_array(path: Path, *, allows_nonfinite: bool = False) -> NDArray[np.float64]:
+    """Read the array of an .npy file as float64, like `read_npz_array`."""
+    _check_file(path, ".npy")
+    try:
+        return sandbox.call_in_sandbox(_read_npy, path, allows_nonfinite, limits=_build_limits())
+    except sandbox.SandboxError as error:
+        raise InputError(InputMistake(f"cannot be read as an .npy file: {error}", path)) from None
+
+
+def _check_file(path: Path, suffix: str) -> None:
+    """Raise InputError for a file that is missing, misnamed or too large."""
     try:
         if not path.is_file():
-            raise InputError(InputMistake("is no file; give the path of an .npz file", path))
+            raise InputError(InputMistake(f"is no file; give the path of an {suffix} file", path))
         size = path.stat().st_size
         with path.open("rb") as file:
             problem = describe_misnamed_file(file.read(HEAD_BYTES), size)
@@ -46,16 +68,18 @@ def read_npz_array(path: Path, name: str) -> NDArray[np.float64]:
         problem = f"has {size:,} bytes; at most {MAX_NPZ_BYTES:,} are read"
     if problem:
         raise InputError(InputMistake(problem, path))
-    limits = sandbox.CallLimits(_BASE_SECONDS + MAX_NPZ_BYTES / _BYTES_PER_SECOND, _MEMORY_LIMIT)
-    try:
-        return sandbox.call_in_sandbox(_extract_array, path, name, limits=limits)
-    except sandbox.SandboxError as error:
-        raise InputError(
-            InputMistake(f"cannot be read as an .npz file with an array `{name}`: {error}", path)
-        ) from None
 
 
-def _extract_array(path: Path, name: str) -> NDArray[np.float64]:
+def _build_limits() -> sandbox.CallLimits:
+    return sandbox.CallLimits(_BASE_SECONDS + MAX_NPZ_BYTES / _BYTES_PER_SECOND, _MEMORY_LIMIT)
+
+
+def _read_npy(path: Path, allows_nonfinite: bool) -> NDArray[np.float64]:
+    """Read an .npy file in the sandbox."""
+    return _parse_npy(path.read_bytes(), InputMistake("its array", path), allows_nonfinite)
+
+
+def _extract_array(path: Path, name: str, allows_nonfinite: bool) -> NDArray[np.float64]:
     """Extract an array in the sandbox.
 
     Raise InputError, or errors of the standard library for a broken file.
@@ -75,10 +99,10 @@ def _extract_array(path: Path, name: str) -> NDArray[np.float64]:
             content = packed.read(found[0])  # to its end, where the check sum is compared
     except zipfile.BadZipFile as error:
         raise InputError(InputMistake(f"is no whole .npz file ({error}); write it once more", path)) from None
-    return _parse_npy(content, InputMistake(f"its array `{name}`", path))
+    return _parse_npy(content, InputMistake(f"its array `{name}`", path), allows_nonfinite)
 
 
-def _parse_npy(content: bytes, what: InputMistake) -> NDArray[np.float64]:
+def _parse_npy(content: bytes, what: InputMistake, allows_nonfinite: bool) -> NDArray[np.float64]:
     """Parse the content of an .npy file; raise InputError if it is invalid."""
 
     def refuse(problem: str) -> InputError:
@@ -102,7 +126,7 @@ def _parse_npy(content: bytes, what: InputMistake) -> NDArray[np.float64]:
         raise refuse(f"has {count:,} numbers; at most {MAX_NPZ_BYTES // 8:,} are read")
     with np.errstate(over="ignore"):
         numbers = np.frombuffer(content, dtype, count, begun).astype(np.float64)
-    if not np.isfinite(numbers).all():
+    if not (allows_nonfinite or np.isfinite(numbers).all()):
         at = int(np.flatnonzero(~np.isfinite(numbers))[0])
         raise refuse(f"holds {numbers[at]} (number {at:,} from 0); wanted finite numbers")
     return np.ascontiguousarray(numbers.reshape(shape, order="F" if is_fortran else "C"))

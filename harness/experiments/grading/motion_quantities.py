@@ -1,0 +1,101 @@
+"""Energy, momentum, strain and intersections of positions over time.
+
+    E_t = 1/2 |(p^t - p^(t-dt))/dt|_M^2 + sum of potentials(p^t) - f . (p^t - p^0)
+    momentum error = |M (v^t - v^(t-dt)) - dt sum f| / (sum of |m v| + |dt f|)
+
+Implicit Euler conserves the linear momentum of a scene without pins up to its forces.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.harness.experiments.grading.submission import Submission
+from springbench.harness.recording.strain_shading import compute_strains
+from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.solvers.model.step_problem import is_lagged
+
+MAX_CHECKED_FRAMES = 6
+"""Number of frames in which intersections are counted."""
+
+
+class MotionQuantities(NamedTuple):
+    """Quantities after each step, arrays (k,), with the start first (k + 1,) for energies and strains.
+
+    Attributes:
+      energy: kinetic and potential energy less the work of constant forces [J].
+      kinetic_energy: [J].
+      max_strain: largest magnitude of a spring's strain.
+      momentum_error: relative violation of the balance of momentum; None with pins, which take momentum.
+      intersections: numbers of intersections of edges with triangles by step; empty without surfaces.
+    """
+
+    energy: NDArray[np.float64]
+    kinetic_energy: NDArray[np.float64]
+    max_strain: NDArray[np.float64]
+    momentum_error: NDArray[np.float64] | None
+    intersections: dict[int, int]
+
+
+def measure_motion(scene: Scene, submission: Submission) -> MotionQuantities:
+    """Measure the quantities of a submission."""
+    p, system, springs = submission.positions, scene.system, scene.all_springs
+    start = p[1]
+    _, vertices, weight = system.penalty_pins
+    soft = system.penalty_pins[0]
+    mass = np.where(system.unpinned_mask, system.mass, 0.0)
+    kinetic, energy, strain = list[float](), list[float](), list[float]()
+    with np.errstate(all="ignore"):
+        velocities = np.diff(p, axis=0) / system.time_step
+        for step, q in enumerate(p[1:]):
+            kinetic.append(0.5 * float(mass @ np.einsum("ij,ij->i", velocities[step], velocities[step])))
+            away = q[vertices] - scene.pin_targets_at(scene.compute_time(step))[soft]
+            near = np.abs(away) <= 4.0 * submission.precision.bound_error(
+                q
+            )  # round-off of the file, which heavy pins amplify
+            away = np.where(near, 0.0, away)
+            potential = sum(one.value(q) for one in system.energies if not is_lagged(one))
+            potential += 0.5 * float(weight @ np.einsum("ij,ij->i", away, away))
+            free = system.unpinned_mask
+            work = float(np.einsum("ij,ij->", scene.constant_force[free], (q - start)[free]))
+            energy.append(kinetic[-1] + float(potential) - work)
+            strains = compute_strains(q, springs.edges, springs.rest_length)[0]
+            strain.append(float(np.abs(strains).max(initial=0.0)))
+        momentum = _measure_momentum(scene, velocities) if not len(system.pins.vertices) else None
+    return MotionQuantities(
+        np.array(energy), np.array(kinetic), np.array(strain), momentum, _count_intersections(scene, submission)
+    )
+
+
+def _measure_momentum(scene: Scene, velocities: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Measure the violation of the balance of linear momentum; None with forces that change or filters."""
+    if scene.varying_forces or scene.velocity_filters:
+        return None
+    mass, dt = scene.system.mass, scene.system.time_step
+    momentum = np.einsum("i,tij->tj", mass, velocities)
+    impulse = dt * scene.constant_force.sum(axis=0)
+    size = np.einsum("i,tij->t", mass, np.abs(velocities))[1:] + float(np.abs(dt * scene.constant_force).sum())
+    away = np.linalg.norm(np.diff(momentum, axis=0) - impulse, axis=1)
+    return np.divide(away, size, out=np.zeros_like(away), where=size > 0.0)
+
+
+def _count_intersections(scene: Scene, submission: Submission) -> dict[int, int]:
+    """Count intersections in some frames: those that an effect prevents, or those of the mesh with itself."""
+    triangles, steps = scene.mesh.triangles, submission.num_steps
+    if not scene.intersection_checks and not len(triangles):
+        return {}
+    sides = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]) if len(triangles) else triangles
+    edges = np.unique(np.sort(sides, axis=1), axis=0)
+    chosen = sorted({round(x) for x in np.linspace(1, steps, MAX_CHECKED_FRAMES)} & set(range(1, steps + 1)))
+    counts = dict[int, int]()
+    for step in chosen:
+        p = submission.position_after(step)
+        if scene.intersection_checks:
+            time = scene.compute_time(step)
+            counts[step] = sum(len(check.find_intersections(p, time)) for check in scene.intersection_checks)
+        else:
+            counts[step] = len(find_edge_triangle_intersections(p, edges, triangles))
+    return counts

@@ -1,0 +1,145 @@
+"""Verdicts on single steps of a submission, each from the two positions before it.
+
+    residual = |Q^-1 grad g(p)|_Q / |Q^-1 grad g(p^t)|_Q                 0 at a minimum, 1 at the step's start
+    gap      = (g(p) - g(p*)) / (g(p^t) - g(p*))                         p*: certified minimum in the basin of p
+    distance = max_i |p_i - p*_i| / size
+
+g is the objective of implicit Euler whose p^t and p^(t-dt) are those of the submission, so that errors of earlier steps
+do not count. The digits that a file stores limit all of them: `residual_floor` is the residual of a minimum with
+positions rounded as those of the file. Pins by penalty are placed where the minimum has them if the difference is
+round-off of the file.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from springbench.harness.experiments.grading.spring_terms import build_step_problem
+from springbench.harness.experiments.grading.submission import Submission
+from springbench.harness.reference.certified_minimum import MinimumCertificate, refine_minimum
+from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Positions, StepProblem, Unsupported
+
+CONVERGED_RESIDUAL = 1e-6
+"""Residual up to which a step is a minimum."""
+FLOOR_FACTOR = 4.0
+"""Factor on the residual that rounded positions have, up to which a step is a minimum."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepVerdict:
+    """Verdict on one step.
+
+    Attributes:
+      step: number of the step, from 1.
+      residual: relative to the residual at the step's start.
+      residual_floor: residual that the stored digits allow.
+      gap: energy gap relative to that of the step's start; None where no minimum was computed.
+      distance: distance to the minimum relative to the mesh; None likewise.
+      flaw: why the minimum is not certified; empty if it is.
+    """
+
+    step: int
+    residual: float
+    residual_floor: float
+    gap: float | None = None
+    distance: float | None = None
+    flaw: str = ""
+
+    @property
+    def is_minimum(self) -> bool:
+        """Whether the step minimises its objective as far as the stored digits show."""
+        return self.residual <= max(CONVERGED_RESIDUAL, FLOOR_FACTOR * self.residual_floor)
+
+
+class StepJudge:
+    """Judge of the steps of submissions of one scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Assemble and factorise Q; raises NotPositiveDefinite."""
+        self._scene, self._evaluator = scene, ReferenceEvaluator(scene.system)
+        self._size = scene.mesh.bounding_box_diagonal or 1.0
+        self._solver = NewtonSolver()
+
+    def build_problem(self, submission: Submission, step: int) -> StepProblem:
+        """Build the problem of a step from the two positions before it."""
+        return build_step_problem(
+            self._scene, submission.position_after(step - 1), submission.position_after(step - 2), step - 1
+        )
+
+    def judge_steps(self, submission: Submission, seconds: float) -> list[StepVerdict]:
+        """Judge all steps; certified minima are computed for as many of them as the time [s] allows."""
+        verdicts = {step: self._judge_residual(submission, step) for step in range(1, submission.num_steps + 1)}
+        until = time.monotonic() + seconds
+        for step in spread_order(submission.num_steps):
+            if time.monotonic() > until:
+                break
+            verdicts[step] = self._judge_minimum(submission, verdicts[step])
+        return list(verdicts.values())
+
+    def find_minimum(self, problem: StepProblem, p: Positions) -> MinimumCertificate | None:
+        """Find the minimum of the basin of p (n, 3) [m]; None where Newton's method does not support the scene."""
+        try:
+            return refine_minimum(problem, p, self._solver)
+        except Unsupported:
+            return None
+
+    def _judge_residual(self, submission: Submission, step: int) -> StepVerdict:
+        problem, p = self.build_problem(submission, step), submission.position_after(step)
+        with np.errstate(all="ignore"):
+            start = self._evaluator.compute_initial_residual(problem)
+            residual = self._evaluator.compute_residual(problem, p) / start
+            floor = self._measure_floor(problem, p, submission.bound_error(step)) / start
+        return StepVerdict(step, float(residual), float(floor))
+
+    def _measure_floor(self, problem: StepProblem, p: Positions, error: float) -> float:
+        """Measure the change of the residual by rounding errors [m] of the three positions."""
+        rng = np.random.default_rng(0)
+        moved = rng.uniform(-1.0, 1.0, (2, *p.shape)) * error
+        change = problem.gradient(p + moved[0]) - problem.gradient(p)
+        change += problem.system.inertia_diagonal[:, None] * 2.24 * moved[1]  # sqrt(1 + 4) for p^(t-dt) and 2 p^t
+        return self._evaluator.compute_energy_norm(change)
+
+    def _judge_minimum(self, submission: Submission, verdict: StepVerdict) -> StepVerdict:
+        problem, p = self.build_problem(submission, verdict.step), submission.position_after(verdict.step)
+        with np.errstate(all="ignore"):
+            found = self.find_minimum(problem, p)
+            if found is None:
+                return verdict
+            p = _snap_pins(problem, p, found.positions, 4.0 * submission.bound_error(verdict.step))
+            lowest, begun = found.objective, problem.value(problem.current_positions)
+            noise = 64.0 * np.finfo(float).eps * problem.value_scale(p)
+            above = problem.value(p) - lowest
+            gap = 0.0 if abs(above) <= noise else above / max(begun - lowest, noise)
+            distance = float(np.linalg.norm(p - found.positions, axis=1).max(initial=0.0)) / self._size
+        flaw = "" if found.is_certified else found.describe_flaw
+        return StepVerdict(verdict.step, verdict.residual, verdict.residual_floor, float(gap), distance, flaw)
+
+
+def _snap_pins(problem: StepProblem, p: Positions, there: Positions, tolerance: float) -> Positions:
+    """Return p with the pinned vertices placed as those of `there`, where they are within a tolerance [m]."""
+    pinned, out = problem.system.pins.vertices, p.copy()
+    near = (np.abs(p[pinned] - there[pinned]) <= tolerance).all(axis=1)
+    out[pinned[near]] = there[pinned[near]]
+    return out
+
+
+def spread_order(count: int) -> Iterable[int]:
+    """Yield 1, count, then the middles of ever smaller intervals, each number once."""
+    if count < 1:
+        return
+    seen = {1, count}
+    yield from sorted(seen)
+    parts = 2
+    while len(seen) < count:
+        for k in range(1, parts):
+            step = 1 + round(k * (count - 1) / parts)
+            if step not in seen:
+                seen.add(step)
+                yield step
+        parts *= 2
