@@ -20,7 +20,7 @@ from springbench.harness.experiments.grading.grading import (
     SceneGrader,
 )
 from springbench.harness.experiments.grading.mistaken_programs import MISTAKES as KNOWN_MISTAKES
-from springbench.harness.experiments.grading.position_files import PositionSequence, read_positions
+from springbench.harness.experiments.grading.position_files import PositionSequence, read_position_file
 from springbench.harness.experiments.grading.step_verdicts import spread_order
 from springbench.harness.experiments.grading.submission import align_submission, estimate_precision
 from springbench.harness.scenes.scene_builder import build_scene
@@ -116,7 +116,7 @@ FORMATS: dict[str, Callable[[Path, np.ndarray], Path]] = {
 @pytest.mark.parametrize("form", FORMATS)
 def test_every_format_gives_the_same_positions(form, tmp_path):
     p = np.random.default_rng(1).normal(size=(3, 4, 3))
-    np.testing.assert_array_equal(read_positions(FORMATS[form](tmp_path, p), 4).positions, p)
+    np.testing.assert_array_equal(read_position_file(FORMATS[form](tmp_path, p), 4).positions, p)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_every_format_gives_the_same_positions(form, tmp_path):
 def test_a_file_that_cannot_be_graded_is_refused_with_its_place(name, content, words, tmp_path):
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError) as caught:
-        read_positions(tmp_path / name, 4)
+        read_position_file(tmp_path / name, 4)
     assert words in str(caught.value)
     assert name in str(caught.value)
 
@@ -145,12 +145,12 @@ def test_a_folder_with_a_missing_frame_is_refused(tmp_path):
     folder = write_folder(tmp_path / "p", np.zeros((4, 2, 3)), "obj")
     (folder / "frame02.obj").unlink()
     with pytest.raises(InputError, match="files 1 and 3 in a row"):
-        read_positions(folder, 2)
+        read_position_file(folder, 2)
 
 
 def test_positions_of_another_mesh_are_refused(tmp_path):
     with pytest.raises(InputError, match="has 5 vertices; the scene has 4"):
-        read_positions(save_array(tmp_path / "p.npy", np.zeros((2, 5, 3))), 4)
+        read_position_file(save_array(tmp_path / "p.npy", np.zeros((2, 5, 3))), 4)
 
 
 @pytest.mark.parametrize(

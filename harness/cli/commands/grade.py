@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from springbench.harness.cli.shared_options import SCENE_HELP, describe_config
 from springbench.harness.console import format_plain_table, get_output_console, print_message, split_wide_table
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.isolated_call import run_isolated
@@ -22,7 +23,7 @@ def grade(
     positions: Annotated[
         Path, typer.Argument(help="Positions: .npz, .npy, .csv, .rrd, or a folder of OBJ or PLY files, one a frame.")
     ],
-    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
+    scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
     students: Annotated[
         bool, typer.Option("--students", help="POSITIONS is a folder with one submission of each student.")
     ] = False,
@@ -52,6 +53,7 @@ def grade(
         )
 
     from springbench.harness.config.config_loader import is_assignment_file, load_config
+    from springbench.harness.execution.worker_process import TaskLimits
     from springbench.harness.experiments.grading.grading import GradeRequest
     from springbench.harness.scenes.assignment_scene import ASSIGNMENT_ITERATIONS
 
@@ -59,7 +61,7 @@ def grade(
     required = iterations or (ASSIGNMENT_ITERATIONS if is_assignment_file(scene) else None)
     request = GradeRequest(run.scene, run.size, required, first_frame, rest, array, budget)
     work = partial(_grade_students if students else _grade_one, request, positions)
-    lines, table, cells, is_good = run_isolated(work, run.scene.find_plugins(), print_message)
+    lines, table, cells, is_good = run_isolated(work, run.scene.find_plugins(), TaskLimits(), print_message)
     if students:
         get_output_console().print(_build_class_table(table))
     for line in lines if students else (*lines, "", *format_plain_table(table)):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from springbench.harness.cli.shared_options import SCENE_HELP, describe_config
 from springbench.harness.console import print_message
 from springbench.harness.errors import InputError
 from springbench.harness.execution.isolated_call import run_isolated
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def matrices(
-    scene: Annotated[Path, typer.Argument(help="Scene (YAML), or scene of the assignment (JSON).")],
+    scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
     frame: Annotated[int, typer.Option(min=1, max=10_000, help="Number of the step that y, d and b belong to.")] = 1,
     output: Annotated[
@@ -30,10 +31,14 @@ def matrices(
         raise InputError(f"--output: came {folder}, a file; wanted a folder, which is made if it is missing")
 
     from springbench.harness.config.config_loader import load_config
+    from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
+    from springbench.harness.execution.worker_process import TaskLimits
 
     run = load_config(scene, sizes=() if size is None else (size,)).list_runs()[0]
     text, messages = run_isolated(
-        partial(_write_matrices, run.scene, run.size, run.scene_name, frame, folder), run.scene.find_plugins()
+        partial(_write_matrices, run.scene, run.size, run.scene_name, frame, folder),
+        run.scene.find_plugins(),
+        TaskLimits(*DEFAULT_LOAD_LIMITS),
     )
     for line in text:
         print(line)

@@ -22,12 +22,12 @@ from scipy.optimize import minimize_scalar
 from springbench.harness.experiments.grading.mistaken_programs import (
     MISTAKES,
     AssignmentProgram,
-    Mistake,
+    ProgramMistake,
     StepBatch,
     change_time_step,
 )
 from springbench.harness.experiments.grading.spring_terms import SpringTerms, build_step_problem
-from springbench.harness.experiments.grading.submission import StoredPrecision, Submission
+from springbench.harness.experiments.grading.submission import StoredPrecision, SubmittedMotion
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.time_loop import build_initial_state
 from springbench.solvers.model.step_problem import Positions, StepProblem
@@ -82,7 +82,7 @@ class NamedMistake:
 
 
 @dataclass(frozen=True, slots=True)
-class Fingerprint:
+class ProgramFingerprint:
     """The programs that are closest to a submission.
 
     Attributes:
@@ -149,7 +149,7 @@ class FingerprintFinder:
         }
         self._num_iterations = max(MAX_ITERATIONS, required_iterations or 0)
 
-    def find_fingerprint(self, submission: Submission, find_minimum: FindMinimum) -> Fingerprint:
+    def find_fingerprint(self, submission: SubmittedMotion, find_minimum: FindMinimum) -> ProgramFingerprint:
         """Find the closest programs.
 
         Args:
@@ -159,7 +159,7 @@ class FingerprintFinder:
         with np.errstate(all="ignore"):
             return self._find_fingerprint(submission, find_minimum)
 
-    def _find_fingerprint(self, submission: Submission, find_minimum: FindMinimum) -> Fingerprint:
+    def _find_fingerprint(self, submission: SubmittedMotion, find_minimum: FindMinimum) -> ProgramFingerprint:
         chosen, all_steps = self._select_steps(submission.positions, submission.precision)
         noise = all_steps.noise
         by_count = self._compare_correct(all_steps)
@@ -179,7 +179,7 @@ class FingerprintFinder:
         names = {mistake.name for mistake, _ in visible}
         invisible = tuple(one.name for one in MISTAKES if one.variants and one.name not in names)
         if deviation <= limit:
-            return Fingerprint(deviation, noise, *correct, (), None, (), invisible)
+            return ProgramFingerprint(deviation, noise, *correct, (), None, (), invisible)
         found = self._compare_mistakes(submission, all_steps, visible)
         found.append(self._fit_time_step(all_steps))
         if self._required and k < self._required:
@@ -190,10 +190,10 @@ class FingerprintFinder:
         alike = tuple(
             one.name for one in named[1:] if best and one.deviation <= max(SAME_FACTOR * best.deviation, noise, 1e-9)
         )
-        return Fingerprint(deviation, noise, *correct, named[:5], best, alike, invisible)
+        return ProgramFingerprint(deviation, noise, *correct, named[:5], best, alike, invisible)
 
     def _compare_minima(
-        self, submission: Submission, chosen: Sequence[int], compared: _Comparison, find_minimum: FindMinimum
+        self, submission: SubmittedMotion, chosen: Sequence[int], compared: _Comparison, find_minimum: FindMinimum
     ) -> float:
         """Return D of the minima of the steps; infinite where there are none."""
         found = [
@@ -271,19 +271,22 @@ class FingerprintFinder:
         return found
 
     def _compare_mistakes(
-        self, submission: Submission, compared: _Comparison, visible: Sequence[tuple[Mistake, AssignmentProgram]]
-    ) -> list[tuple[Mistake, float]]:
+        self,
+        submission: SubmittedMotion,
+        compared: _Comparison,
+        visible: Sequence[tuple[ProgramMistake, AssignmentProgram]],
+    ) -> list[tuple[ProgramMistake, float]]:
         """Return D of all mistakes; those that are far off on some steps are not compared on the others."""
         count = len(compared.scales)
         screening = compared.select_steps(sorted({0, min(1, count - 1), count // 2}))
-        others = list[tuple[Mistake, float]]()
+        others = list[tuple[ProgramMistake, float]]()
         ranked = [(self._best(one[1], screening), place, *one) for place, one in enumerate(visible)]
         for mistake in MISTAKES:
             if outputs := list(_undo_output(mistake, submission)):
                 deviation = min(self._compare_output(undone, submission.precision) for undone in outputs)
                 others.append((mistake, deviation))
         ranked.sort(key=lambda one: one[:2])
-        found, farthest = dict[str, tuple[Mistake, float]](), 0.0
+        found, farthest = dict[str, tuple[ProgramMistake, float]](), 0.0
         for place, (screened, _, mistake, program) in enumerate(ranked):
             if place < NUM_FINALISTS:
                 d = self._best(program, compared)
@@ -310,7 +313,7 @@ class FingerprintFinder:
         best = float(self._compare_correct(compared)[(self._required or MIN_MISTAKEN_ITERATIONS) - 1 :].min())
         return float(np.hypot(best, _distance(undone[1], self._start) / float(compared.scales.max())))
 
-    def _fit_time_step(self, compared: _Comparison) -> tuple[Mistake, float]:
+    def _fit_time_step(self, compared: _Comparison) -> tuple[ProgramMistake, float]:
         """Fit the time step, and return it as a mistake."""
         count, dt = len(compared.scales), self._terms.time_step
         some = compared.select_steps(sorted({0, min(1, count - 1), count - 1}))
@@ -328,7 +331,7 @@ class FingerprintFinder:
             return _describe_time_step(found, dt), np.inf
         return _describe_time_step(found, dt), self._best(change_time_step(self._correct, found), compared)
 
-    def _find_visible_programs(self, compared: _Comparison) -> list[tuple[Mistake, AssignmentProgram]]:
+    def _find_visible_programs(self, compared: _Comparison) -> list[tuple[ProgramMistake, AssignmentProgram]]:
         """Return the mistakes and their programs whose steps differ from those of the correct program."""
         few = compared.select_steps(range(min(3, len(compared.scales))))
         correct = next(islice(self._correct.iterate_steps(few.steps), 4, None))
@@ -343,7 +346,7 @@ class FingerprintFinder:
         return bool((_distances(p, correct) <= INVISIBLE * compared.scales).all())
 
 
-def _undo_output(mistake: Mistake, submission: Submission) -> Iterator[NDArray[np.float64]]:
+def _undo_output(mistake: ProgramMistake, submission: SubmittedMotion) -> Iterator[NDArray[np.float64]]:
     """Yield the positions with a mistake of the output undone."""
     sequence = submission.positions
     if mistake.is_late:
@@ -355,18 +358,20 @@ def _undo_output(mistake: Mistake, submission: Submission) -> Iterator[NDArray[n
         yield undone
 
 
-def _describe_time_step(found: float, dt: float) -> Mistake:
+def _describe_time_step(found: float, dt: float) -> ProgramMistake:
     words = f"uses a time step of {found:.4g} s instead of {dt:.4g} s"
     if abs(found / dt**0.5 - 1.0) < 1e-2:
         words = "divides by dt instead of dt^2"
     elif abs(found - 1.0) < 1e-2:
         words = "does not divide by dt^2"
-    return Mistake("wrong time step", words, "M/dt^2 in Q and in y, with the dt of the scene")
+    return ProgramMistake("wrong time step", words, "M/dt^2 in Q and in y, with the dt of the scene")
 
 
-def _describe_iterations(found: int, required: int) -> Mistake:
+def _describe_iterations(found: int, required: int) -> ProgramMistake:
     words = f"takes {found} iteration{'s' if found > 1 else ''} a step instead of {required}"
-    return Mistake("too few iterations", words, f"{required} iterations of the local and the global step in each step")
+    return ProgramMistake(
+        "too few iterations", words, f"{required} iterations of the local and the global step in each step"
+    )
 
 
 def _compute_fit(deviation: float, of_correct: float) -> float:

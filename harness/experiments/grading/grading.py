@@ -8,13 +8,17 @@ from pathlib import Path
 
 import numpy as np
 from springbench.harness.errors import InputError
-from springbench.harness.experiments.grading.fingerprints import Fingerprint, FingerprintFinder
+from springbench.harness.experiments.grading.fingerprints import FingerprintFinder, ProgramFingerprint
 from springbench.harness.experiments.grading.motion_error import ErrorShares, MotionReference
 from springbench.harness.experiments.grading.motion_quantities import MotionQuantities, measure_motion
-from springbench.harness.experiments.grading.position_files import DEFAULT_ARRAY, read_positions, read_rest_positions
+from springbench.harness.experiments.grading.position_files import (
+    DEFAULT_ARRAY,
+    read_position_file,
+    read_rest_positions,
+)
 from springbench.harness.experiments.grading.spring_terms import build_graded_scene, collect_spring_terms
 from springbench.harness.experiments.grading.step_verdicts import StepJudge, StepVerdict
-from springbench.harness.experiments.grading.submission import Submission, align_submission
+from springbench.harness.experiments.grading.submission import SubmittedMotion, align_submission
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.solvers.model.step_problem import Positions, StepProblem
@@ -64,12 +68,12 @@ class PositionGrade:
       verdict: the verdict in words.
     """
 
-    submission: Submission
+    submission: SubmittedMotion
     steps: list[StepVerdict]
     quantities: MotionQuantities
     shares: list[ErrorShares]
     shares_note: str
-    fingerprint: Fingerprint | None
+    fingerprint: ProgramFingerprint | None
     fingerprint_note: str
     kind: str
     verdict: str
@@ -130,10 +134,10 @@ class SceneGrader:
 
     def grade_file(self, path: Path) -> PositionGrade:
         """Read and grade a submission; raises InputError for a file that cannot be graded."""
-        read = read_positions(path, len(self.scene.mesh.rest_positions), self.request.array)
+        read = read_position_file(path, len(self.scene.mesh.rest_positions), self.request.array)
         return self.grade_submission(align_submission(self.scene, read, self.request.first_frame, self._rest))
 
-    def grade_submission(self, submission: Submission) -> PositionGrade:
+    def grade_submission(self, submission: SubmittedMotion) -> PositionGrade:
         """Grade a submission."""
         if not submission.num_steps:
             raise InputError(f"{submission.source}: has only the start; wanted the positions after some steps")
@@ -146,7 +150,7 @@ class SceneGrader:
         quantities = measure_motion(self.scene, submission)
         return PositionGrade(submission, steps, quantities, shares, note, fingerprint, self._finder_note, kind, verdict)
 
-    def find_fingerprint(self, submission: Submission) -> Fingerprint | None:
+    def find_fingerprint(self, submission: SubmittedMotion) -> ProgramFingerprint | None:
         """Find the closest programs; None for scenes with other terms than springs, masses, forces and pins."""
         return self._finder.find_fingerprint(submission, self._find_minimum) if self._finder else None
 
@@ -154,7 +158,7 @@ class SceneGrader:
         found = self._judge.find_minimum(problem, p)
         return found.positions if found else None
 
-    def _decide(self, fingerprint: Fingerprint | None, steps: list[StepVerdict]) -> tuple[str, str]:
+    def _decide(self, fingerprint: ProgramFingerprint | None, steps: list[StepVerdict]) -> tuple[str, str]:
         """Return the kind of the verdict and its sentence."""
         residual = float(np.median([one.residual for one in steps]))
         minima = sum(one.is_minimum for one in steps)

@@ -196,7 +196,7 @@ def _unstack(x: RealArray, s: int) -> RealArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Mistake:
+class ProgramMistake:
     """A mistake, as changes of the correct program or of its output.
 
     Attributes:
@@ -263,108 +263,108 @@ def _multiply_force(exponent: float) -> Callable[[AssignmentProgram, Positions],
     return multiplied
 
 
-MISTAKES: tuple[Mistake, ...] = (
-    Mistake(
+MISTAKES: tuple[ProgramMistake, ...] = (
+    ProgramMistake(
         "force times mass",
         "multiplies the external force by the masses, as if it were an acceleration",
         "f_ext is in newtons in y; it is not multiplied by M",
         (_multiply_force(1.0),),
     ),
-    Mistake(
+    ProgramMistake(
         "force without mass",
         "divides the external force by the masses, as if gravity were a force of 9.8 N",
         "gravity is m g at each vertex",
         (_multiply_force(-1.0),),
     ),
-    Mistake(
+    ProgramMistake(
         "no external force",
         "leaves out the external force",
         "y ends in + f_ext",
         (_change(map_force=np.zeros_like),),
     ),
-    Mistake(
+    ProgramMistake(
         "force upwards",
         "applies the external force with the wrong sign",
         "y ends in + f_ext",
         (_change(map_force=np.negative),),
     ),
-    Mistake(
+    ProgramMistake(
         "force on another axis",
         "applies the external force along another axis",
         "the vertical axis of the scene",
         tuple(_permute_force(order) for order in ((1, 0, 2), (0, 2, 1), (2, 1, 0))),
     ),
-    Mistake(
+    ProgramMistake(
         "masses left out of y",
         "leaves the masses out of y",
         "y = M (2 p^t - p^(t-dt))/dt^2 + f_ext",
         (_fill("target_mass"),),
     ),
-    Mistake(
+    ProgramMistake(
         "masses left out of Q",
         "leaves the masses out of Q",
         "Q = k A'A + M/dt^2 + w C'C",
         (_fill("system_mass"),),
     ),
-    Mistake(
+    ProgramMistake(
         "all masses 1", "uses a mass of 1 kg for every vertex", "M_ii = m_i", (_fill("system_mass", "target_mass"),)
     ),
-    Mistake(
+    ProgramMistake(
         "k left out of b",
         "leaves k out of the right-hand side",
         "b = k A'd + y",
         (_fill("side_stiffness"),),
     ),
-    Mistake("k left out of Q", "leaves k out of Q", "Q = k A'A + M/dt^2 + w C'C", (_fill("system_stiffness"),)),
-    Mistake(
+    ProgramMistake("k left out of Q", "leaves k out of Q", "Q = k A'A + M/dt^2 + w C'C", (_fill("system_stiffness"),)),
+    ProgramMistake(
         "wrong stiffness",
         "uses half or twice the stiffness",
         "the energy is k/2 (|v| - r)^2, so its gradient has k",
         tuple(_scale(system_stiffness=f, side_stiffness=f) for f in (0.5, 2.0)),
     ),
-    Mistake(
+    ProgramMistake(
         "no inertia",
         "overwrites the previous positions by the current ones before the step, so that no velocity is left",
         "update p^(t-dt) after the step, from p^t",
         (_change(map_target=lambda q, p, before: p),),
     ),
-    Mistake(
+    ProgramMistake(
         "y from the iterate",
         "computes y from the iterate in each iteration",
         "y is constant during a step; compute it before the iterations from p^t",
         (_change(uses_iterate=True),),
     ),
-    Mistake(
+    ProgramMistake(
         "pins left out of Q",
         "leaves the pins out of Q",
         "Q = k A'A + M/dt^2 + w C'C",
         (_scale(system_weight=0.0),),
     ),
-    Mistake(
+    ProgramMistake(
         "pins left out of b",
         "leaves the pins out of the right-hand side",
         "y ends in + w C'C p_rest",
         (_scale(side_weight=0.0),),
     ),
-    Mistake(
+    ProgramMistake(
         "no pins",
         "leaves out the pins",
         "Q has + w C'C, and y has + w C'C p_rest",
         (_scale(system_weight=0.0, side_weight=0.0),),
     ),
-    Mistake(
+    ProgramMistake(
         "pins with the wrong sign",
         "adds the penalty of the pins with the wrong sign",
         "the derivative of w/2 |C p - C p_rest|^2 is w C'C p - w C'C p_rest; its second part goes to the other side",
         (_scale(side_weight=-1.0), _scale(system_weight=-1.0)),
     ),
-    Mistake(
+    ProgramMistake(
         "other pins",
         "pins the vertices whose numbers are one too large or too small",
         "the pins of scene.json are counted from 1",
         (_shift_pins(1), _shift_pins(-1)),
     ),
-    Mistake(
+    ProgramMistake(
         "d not normalised",
         "does not divide d by the length of the spring",
         "d_e = r_e v_e/|v_e|",
@@ -373,7 +373,7 @@ MISTAKES: tuple[Mistake, ...] = (
             _change(compute_directions=lambda v, unit, rest, current: rest[:, None] * v),
         ),
     ),
-    Mistake(
+    ProgramMistake(
         "d without rest lengths",
         "does not multiply d by the rest length",
         "d_e = r_e v_e/|v_e|",
@@ -382,26 +382,26 @@ MISTAKES: tuple[Mistake, ...] = (
             _change(compute_directions=lambda v, unit, rest, current: np.zeros_like(v)),
         ),
     ),
-    Mistake(
+    ProgramMistake(
         "d with the wrong sign",
         "takes d in the opposite direction",
         "v_ij = p_i - p_j, with A_ei = +1 and A_ej = -1",
         (_change(compute_directions=lambda v, unit, rest, current: -rest[:, None] * unit),),
     ),
-    Mistake(
+    ProgramMistake(
         "rest lengths of the current mesh",
         "takes the rest lengths from the positions at the start of each step",
         "r_e is the length at rest, computed once from V",
         (_change(compute_directions=lambda v, unit, rest, current: current[:, None] * unit),),
     ),
-    Mistake(
+    ProgramMistake(
         "explicit step",
         "steps explicitly: the springs act at known positions, and no system is solved",
         "implicit Euler minimises over the new positions",
         (_change(is_explicit="end"), _change(is_explicit="start")),
     ),
-    Mistake("axes swapped", "writes the coordinates in another order", "the order is x, y, z", axes=AXES[1:]),
-    Mistake(
+    ProgramMistake("axes swapped", "writes the coordinates in another order", "the order is x, y, z", axes=AXES[1:]),
+    ProgramMistake(
         "one frame late",
         "writes each frame one step late",
         "write p^(t+dt) after the step, not p^t before it",

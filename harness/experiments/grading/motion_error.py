@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from springbench.harness.errors import RunFailed
-from springbench.harness.experiments.grading.submission import Submission
+from springbench.harness.experiments.grading.submission import SubmittedMotion
 from springbench.harness.reference.certified_minimum import UNLIMITED_STOP_RULE
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import UnpredictableMotion
@@ -59,7 +59,7 @@ class MotionReference:
         self._converged: dict[int, Positions] = {}
         self._known: dict[int, tuple[tuple[int, ...], Any, str]] = {}
 
-    def measure_shares(self, submission: Submission) -> tuple[list[ErrorShares], str]:
+    def measure_shares(self, submission: SubmittedMotion) -> tuple[list[ErrorShares], str]:
         """Measure the errors at some steps, and return a sentence on what could not be measured."""
         steps, trajectory, note = self._load_trajectory(submission.num_steps)
         if trajectory is None:

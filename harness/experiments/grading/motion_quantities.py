@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.harness.experiments.grading.submission import Submission
+from springbench.harness.experiments.grading.submission import SubmittedMotion
 from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
 from springbench.harness.scenes.scene_builder import Scene
@@ -40,7 +40,7 @@ class MotionQuantities(NamedTuple):
     intersections: dict[int, int]
 
 
-def measure_motion(scene: Scene, submission: Submission) -> MotionQuantities:
+def measure_motion(scene: Scene, submission: SubmittedMotion) -> MotionQuantities:
     """Measure the quantities of a submission."""
     p, system, springs = submission.positions, scene.system, scene.all_springs
     start = p[1]
@@ -82,7 +82,7 @@ def _measure_momentum(scene: Scene, velocities: NDArray[np.float64]) -> NDArray[
     return np.divide(away, size, out=np.zeros_like(away), where=size > 0.0)
 
 
-def _count_intersections(scene: Scene, submission: Submission) -> dict[int, int]:
+def _count_intersections(scene: Scene, submission: SubmittedMotion) -> dict[int, int]:
     """Count intersections in some frames: those that an effect prevents, or those of the mesh with itself."""
     triangles, steps = scene.mesh.triangles, submission.num_steps
     if not scene.intersection_checks and not len(triangles):

@@ -53,7 +53,7 @@ class PositionSequence:
     times: NDArray[np.float64] | None = None
 
 
-def read_positions(path: Path, num_vertices: int, array: str = DEFAULT_ARRAY) -> PositionSequence:
+def read_position_file(path: Path, num_vertices: int, array: str = DEFAULT_ARRAY) -> PositionSequence:
     """Read positions over time.
 
     Args:
@@ -87,7 +87,7 @@ def read_rest_positions(path: Path, num_vertices: int) -> NDArray[np.float64]:
         if len(points) != num_vertices:
             raise InputError(InputMistake(f"has {len(points):,} vertices; the scene has {num_vertices:,}", path))
         return points
-    found = read_positions(path, num_vertices)
+    found = read_position_file(path, num_vertices)
     if len(found.positions) != 1:
         raise InputError(InputMistake(f"has {len(found.positions)} frames; wanted one, the rest positions", path))
     return found.positions[0]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from springbench.harness.experiments.grading.spring_terms import build_step_problem
-from springbench.harness.experiments.grading.submission import Submission
+from springbench.harness.experiments.grading.submission import SubmittedMotion
 from springbench.harness.reference.certified_minimum import MinimumCertificate, refine_minimum
 from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
 from springbench.harness.scenes.scene_builder import Scene
@@ -66,13 +66,13 @@ class StepJudge:
         self._size = scene.mesh.bounding_box_diagonal or 1.0
         self._solver = NewtonSolver()
 
-    def build_problem(self, submission: Submission, step: int) -> StepProblem:
+    def build_problem(self, submission: SubmittedMotion, step: int) -> StepProblem:
         """Build the problem of a step from the two positions before it."""
         return build_step_problem(
             self._scene, submission.position_after(step - 1), submission.position_after(step - 2), step - 1
         )
 
-    def judge_steps(self, submission: Submission, seconds: float) -> list[StepVerdict]:
+    def judge_steps(self, submission: SubmittedMotion, seconds: float) -> list[StepVerdict]:
         """Judge all steps; certified minima are computed for as many of them as the time [s] allows."""
         verdicts = {step: self._judge_residual(submission, step) for step in range(1, submission.num_steps + 1)}
         until = time.monotonic() + seconds
@@ -89,7 +89,7 @@ class StepJudge:
         except Unsupported:
             return None
 
-    def _judge_residual(self, submission: Submission, step: int) -> StepVerdict:
+    def _judge_residual(self, submission: SubmittedMotion, step: int) -> StepVerdict:
         problem, p = self.build_problem(submission, step), submission.position_after(step)
         with np.errstate(all="ignore"):
             start = self._evaluator.compute_initial_residual(problem)
@@ -105,7 +105,7 @@ class StepJudge:
         change += problem.system.inertia_diagonal[:, None] * 2.24 * moved[1]  # sqrt(1 + 4) for p^(t-dt) and 2 p^t
         return self._evaluator.compute_energy_norm(change)
 
-    def _judge_minimum(self, submission: Submission, verdict: StepVerdict) -> StepVerdict:
+    def _judge_minimum(self, submission: SubmittedMotion, verdict: StepVerdict) -> StepVerdict:
         problem, p = self.build_problem(submission, verdict.step), submission.position_after(verdict.step)
         with np.errstate(all="ignore"):
             found = self.find_minimum(problem, p)

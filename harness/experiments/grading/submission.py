@@ -53,7 +53,7 @@ class StoredPrecision(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Submission:
+class SubmittedMotion:
     """Positions of a scene's steps.
 
     Attributes:
@@ -105,7 +105,7 @@ class VertexMatch(NamedTuple):
 
 def align_submission(
     scene: Scene, read: PositionSequence, first_frame: int | None = None, rest: Positions | None = None
-) -> Submission:
+) -> SubmittedMotion:
     """Give positions the frame numbers and the vertex order of a scene.
 
     Args:
@@ -150,7 +150,7 @@ def align_submission(
     before, begin = compute_position_before_start(scene), [start] if first_frame else []
     precision = estimate_precision(p)
     notes.append(f"precision: coordinates are stored to about {precision.bound_error(p[0]):.0e} m")
-    return Submission(
+    return SubmittedMotion(
         read.source, np.array([before, *begin, *p]), first_frame == 0, precision, tuple(notes), scene.system.time_step
     )
 
