@@ -9,6 +9,7 @@ from springbench.harness.report.pages.page_files import check_pages, write_pages
 from springbench.harness.results.published_set import read_study
 from typer.testing import CliRunner
 
+from tests.contracts.hostile import scene
 from tests.synthetic_run_rows import write_dummy_runs
 
 TEMPLATE = """# Runs
@@ -23,13 +24,16 @@ TEMPLATE = """# Runs
 {{ provenance("dummy") }} {{ typed("2026-01-02", "abc") }}
 """
 
+SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [sparse, dense]\n"
+
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """A checkout with one published study and one template."""
     write_dummy_runs(tmp_path / "runs", 10)
     (tmp_path / "configs").mkdir()
-    (tmp_path / "configs" / "dummy.yaml").write_text("scenes: []\n")
+    (tmp_path / "configs" / "cloth.yaml").write_text(scene())
+    (tmp_path / "configs" / "dummy.yaml").write_text(SWEEP)
     publish_dummy_study(tmp_path)
     (tmp_path / "results" / "findings").mkdir()
     (tmp_path / "results" / "findings" / "runs.md.j2").write_text(TEMPLATE)
@@ -61,7 +65,7 @@ def test_equal_data_give_equal_bytes(checkout: Path) -> None:
     text, pixels = page.read_bytes(), picture.read_bytes()
     assert "10 runs, of which 25 % are slow." in page.read_text()
     assert "| hybrid | 200 |" in page.read_text()
-    assert "`springbench run configs/dummy.yaml`, 10 runs, a processor, 2 cores, 2026-01-01" in page.read_text()
+    assert "`springbench run configs/dummy.yaml`, 10 of 2 runs, a processor, 2 cores, 2026-01-01" in page.read_text()
     assert check_pages(checkout, draws_pictures=True) == []
     assert write_pages(checkout) == []
     page.unlink()

@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write
+from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
 
@@ -80,6 +81,7 @@ def write_study(
         "config_digest": published_set.compute_file_digest(config),
         "command": _describe_command(tables, config),
         "is_timed": is_timed,
+        "requested_runs": _count_requested_runs(config) if "rows" in tables else None,
         **summarise_provenance([row for rows in tables.values() for row in _select_provenance(rows)]),
     }
     study = write_study_file(folder, metadata)
@@ -169,6 +171,11 @@ _PROVENANCE_COLUMNS = (
 
 def _select_provenance(rows: pa.Table) -> list[dict[str, Any]]:
     return rows.select([name for name in _PROVENANCE_COLUMNS if name in rows.column_names]).to_pylist()
+
+
+def _count_requested_runs(config: Path) -> int:
+    """Count the runs that a sweep requests: more than are published if software is missing or runs are."""
+    return len(load_config(config, imports_code=False).list_runs())
 
 
 def _describe_command(tables: Mapping[str, pa.Table], config: Path) -> str:

@@ -116,7 +116,9 @@ class _PageFields:
         date = started[-1][:10] if started else "undated"
         commits = ", ".join(commit[:9] for commit in about["commits"]) or "unknown"
         where = f"{machine['cpu']}, {machine['cores']} cores"
-        return f"Data: `{about['command']}`, {about['runs']:,} runs, {where}, {date}, commit {commits}."
+        requested = about.get("requested_runs")
+        count = f"{about['runs']:,}" + (f" of {requested:,}" if requested else "")
+        return f"Data: `{about['command']}`, {count} runs, {where}, {date}, commit {commits}."
 
     def _add_picture(self, name: str, alt: str, digest: str, draw_png: Callable[[], bytes]) -> str:
         path = self.page.parent / PICTURE_FOLDER / f"{name}.png"
