@@ -1,0 +1,80 @@
+"""The wheel does the main job in an empty folder and an environment of its own: the commands of the how-to page.
+
+No network is used: the libraries are those of this environment, and only springbench is installed anew.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.long
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "configs" / "howto" / "without-a-checkout.md"
+
+
+def read_commands(heading: str) -> list[str]:
+    """The commands in the fence of a section of the page."""
+    (section,) = re.findall(rf"^## {heading}\n(.*?)(?=^## |\Z)", PAGE.read_text(), re.M | re.S)
+    (fence,) = re.findall(r"^```sh\n(.*?)^```", section, re.M | re.S)
+    return fence.splitlines()
+
+
+def call(*command: str, folder: Path, path: str = "") -> str:
+    outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTEST_ADDOPTS")}
+    environment = outside | {"PATH": f"{path}{os.pathsep}{os.environ['PATH']}"} if path else outside
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def scripts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of programs of an environment with the wheel."""
+    folder = tmp_path_factory.mktemp("wheel")
+    build = ["pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "--wheel-dir", ".", str(ROOT)]
+    call(sys.executable, "-m", *build, folder=folder)
+    (wheel,) = folder.glob("*.whl")
+    call(sys.executable, "-m", "venv", "--without-pip", "environment", folder=folder)
+    python = folder / "environment" / "bin" / "python"
+    (library,) = folder.glob("environment/lib/python*/site-packages")
+    install = ["pip", "--python", str(python), "install", "--no-deps", "--no-index", "--quiet", str(wheel)]
+    call(sys.executable, "-m", *install, folder=folder)
+    (library / "libraries.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
+    assert str(library) in call(str(python), "-c", "import springbench; print(springbench.__file__)", folder=folder)
+    return python.parent
+
+
+def test_the_page_installs_the_package_by_its_name():
+    assert 'pip install "springbench[gates]"' in read_commands("Install")
+
+
+def test_the_commands_of_the_page_end_well(scripts: Path, tmp_path: Path):
+    said = dict[str, str]()
+    folder = tmp_path
+    for command in [*read_commands("Run"), *read_commands("Begin a study")]:
+        if command.startswith("cd "):
+            folder /= command.removeprefix("cd ")
+            continue
+        program = f"{scripts / 'python'} -m pytest --benchmark-disable" if command == "pytest" else command
+        said[command] = call("bash", "-c", program, folder=folder, path=str(scripts))
+    assert "hanging-cloth" in said["springbench list --shipped"]
+    assert "HeavyBall" in said["springbench run compare.yaml"].replace(" ", "").replace("\n", "").replace("-", "")
+    assert "1 passed" in said["pytest"]
+    study = tmp_path / "my-study" / "results"
+    assert (study / "index.html").is_file()
+    assert len([*(study / "compare" / "recordings").glob("*.rrd")]) >= 6
+    assert len([*(study / "compare" / "pictures").glob("*.png")]) >= 6
+
+
+def test_the_light_list_leaves_out_the_libraries_of_recordings_and_pictures(scripts: Path, tmp_path: Path):
+    light = call(str(scripts / "python"), "-m", "springbench.requirements", folder=tmp_path)
+    assert "numba" in light
+    assert not re.search("rerun|pyvista|vtk", light)
