@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from springbench.harness.experiments.regression import gates_file
 from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
+from springbench.harness.experiments.regression.solver_pair import prepare_solver_pair
 
 from tests.contracts.hostile import scene
 
@@ -30,3 +31,16 @@ def test_gates_share_the_error_probability_and_each_may_have_a_budget_of_its_own
     monkeypatch.setattr(gates_file, "run_confirmed_benchmark", run_confirmed_benchmark)
     gates_file.run_gates_file(tmp_path / "gates.yaml", 60.0, lambda line: None, alpha=0.01)
     assert calls == [(SequentialTest(1.5, 0.005), 60.0), (SequentialTest(2.0, 0.005), 7.0)]
+
+
+def test_a_gate_compares_a_solver_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal\n\n\n"
+        "class Mine(SparseLocalGlobal):\n    pass\n"
+    )
+    (tmp_path / "chain.yaml").write_text(
+        "mesh: {kind: chain}\nmass: 1\ntime_step: 0.01\nframes: 2\ndefault_size: 4\n"
+        "effects: [{kind: springs, stretch: 100}, {kind: gravity}, {kind: pins, parts: [ends]}]\n"
+    )
+    mine, baseline = prepare_solver_pair(tmp_path / "chain.yaml", "./mine.py:Mine", "sparse", max_iterations=3)
+    assert (mine() == baseline()).all()

@@ -149,11 +149,11 @@ class _RevisionSteps:
         from springbench.harness.scenes.scene_builder import build_scene
         from springbench.harness.simulation.auto_tolerance import build_stop_rule
         from springbench.harness.simulation.time_loop import prepare
-        from springbench.solvers.registry import SOLVERS, load_target
+        from springbench.solvers.registry import SOLVER_TABLE, load_target
 
         self._run, self._num_frames, self._injected_slowdown, self._iterations = run, frames, injected_slowdown, 0
         self._scene = build_scene(run.scene, run.size, run.integrator)
-        self._prepared = prepare(self._scene, load_target(SOLVERS[run.solver.name])(**run.solver.parameters))
+        self._prepared = prepare(self._scene, load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters))
         self._stop = build_stop_rule(run.max_iterations, run.rtol)
 
     def __call__(self) -> Any:

@@ -21,7 +21,7 @@ from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.auto_tolerance import build_stop_rule
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.model.step_problem import Positions, Solver
-from springbench.solvers.registry import SOLVERS, load_target
+from springbench.solvers.registry import SOLVER_TABLE, load_target
 
 SolverInput = str | Mapping[str, Any] | Solver
 """A solver: its name, a mapping of its name and parameters, or a solver object."""
@@ -77,7 +77,7 @@ def _prepare_steps(scene: Path, solver_input: SolverInput, size: int | None, opt
         raise InputError(f"{scene}: got {len(runs)} runs; a gate compares one run")
     require_fixed_steps(runs)
     (run,) = runs
-    solver: Solver = load_target(SOLVERS[run.solver.name])(**run.solver.parameters) if is_named else named
+    solver: Solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters) if is_named else named
     bound = build_scene(run.scene, run.size, run.integrator)
     prepared, stop = prepare(bound, solver), build_stop_rule(run.max_iterations, run.rtol)
 
