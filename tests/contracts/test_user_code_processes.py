@@ -6,10 +6,13 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from time import sleep
 
 import pytest
 from springbench.harness.cli.main import app
-from springbench.harness.config import user_code
+from springbench.harness.errors import RunFailed
+from springbench.harness.execution.isolated_call import run_isolated
+from springbench.harness.execution.worker_process import ProgressCallback, TaskLimits
 from typer.testing import CliRunner
 
 USER_CODE = """
@@ -47,7 +50,7 @@ class Hum(ConfigModel):
         with (Path(__file__).parent / "count").open("a") as count:
             count.write(".")
             if count.tell() >= {exits_at}:
-                {ends}
+                os._exit(0)
         force = 0.0 * mesh.rest_positions
         force[:, 0] = 0.1
         return EffectContribution(forces=build_constant_force(force))
@@ -95,11 +98,9 @@ DRAWING = ("accuracy", "roofline", "gallery")
 """Commands that draw pictures even so, or that import what draws them."""
 
 
-def command(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, exits_at: float, ends: str = "os._exit(0)"
-) -> tuple[int, str]:
+def command(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, exits_at: float) -> tuple[int, str]:
     """Exit code and output of a command, whose effect ends its process in one of its bindings."""
-    (folder / "mine.py").write_text(USER_CODE.format(command=os.getpid(), exits_at=exits_at, ends=ends))
+    (folder / "mine.py").write_text(USER_CODE.format(command=os.getpid(), exits_at=exits_at))
     for file, text in FILES.items():
         (folder / file).write_text(text)
     monkeypatch.chdir(folder)
@@ -127,11 +128,14 @@ def test_user_code_that_works_never_runs_in_the_command(name: str, tmp_path: Pat
     assert code == 0, said
 
 
-def test_user_code_that_hangs_after_its_trial_is_stopped_at_the_time_limit(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(user_code, "DEFAULT_LOAD_LIMITS", user_code.LoadLimits(3.0, 2.0))
-    code, said = command(tmp_path, monkeypatch, "preview", exits_at=2, ends="while True: pass")
-    assert code == 1
-    assert "did not end within 3 s" in said
+def hang(tick: ProgressCallback) -> None:
+    while True:
+        sleep(1.0)
+
+
+def test_user_code_that_hangs_after_its_trial_is_stopped_at_the_time_limit():
+    with pytest.raises(RunFailed, match=r"the process that runs ./mine.py:Hum did not end within 0.5 s"):
+        run_isolated(hang, ["./mine.py:Hum"], TaskLimits(0.5))
 
 
 STOPPED_WHILE_IMPORTING = """

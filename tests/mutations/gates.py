@@ -5,7 +5,7 @@ from __future__ import annotations
 from tests.mutations.base import Mutation
 
 _UNIT_ABBA, _UNIT_LISTED, _UNIT_SEQUENTIAL = (
-    f"tests/unit/test_gate_{name}.py" for name in ("abba", "listed", "sequential")
+    f"tests/unit/test_{name}.py" for name in ("abba_benchmark", "gates_file", "confidence_sequence")
 )
 
 GATES = (
