@@ -6,6 +6,8 @@ import logging
 from pathlib import Path
 
 import numpy as np
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.membrane_modulus import compute_membrane_modulus
 from springbench.harness.scenes.mesh.file_mesh import FileMesh
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_checks import NO_VERTICES, MeshSupport
@@ -13,12 +15,15 @@ from springbench.harness.scenes.mesh.mesh_report import find_mesh_remarks, forma
 from springbench.harness.scenes.mesh.mesh_topology import NO_PAIRS
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.scenes.vertex_selectors import find_selections
+from springbench.solvers.model.energies.spring_energy import Springs
 
 _HOLDING_EFFECTS = ("pins", "attachments")
 _JOINING_EFFECTS = ("sewing",)
 _OTHER_EFFECTS = ("springs", "gravity", "constant-force", "wind", "air-drag", "ether-drag", "dashpots", "rayleigh",
                   "bending", "strain-limits", "gas", "self-contact")  # fmt: skip
 """Effects that neither hold nor join anything; an obstacle or user code may."""
+_MAX_MODULUS_VERTICES = 50_000
+"""Number of vertices above which the modulus is not computed: its factorisation would delay the start by seconds."""
 _LOG = logging.getLogger("springbench")
 
 
@@ -38,12 +43,30 @@ def find_mesh_support(scene: SceneSpec, mesh: Mesh) -> MeshSupport | None:
 
 
 def log_mesh_remarks(scene: SceneSpec, mesh: Mesh) -> None:
-    """Log what is suspicious in the mesh of a scene if it comes from a file, each finding in one line."""
+    """Log what is suspicious in the mesh of a scene if it comes from a file, and the membrane stiffness it has."""
     if not isinstance(scene.mesh, FileMesh):
         return
     path: Path = scene.mesh.find_geometry_path()
     found = [one for one in find_mesh_remarks(mesh, find_mesh_support(scene, mesh)) if one.is_suspicious]
     for one in found:
         _LOG.warning("%s: %s", path, format_finding(one, mesh))
+    for line in describe_membranes(scene, mesh):
+        _LOG.info("%s: %s", path, line)
     if found:
         _LOG.warning("`springbench mesh %s` checks it and marks the places in a picture", scene.path)
+
+
+def describe_membranes(scene: SceneSpec, mesh: Mesh) -> list[str]:
+    """Describe the membrane stiffness that the springs of a scene have on its mesh, one line for each effect."""
+    if mesh.dimension != 2 or len(mesh.rest_positions) > _MAX_MODULUS_VERTICES:
+        return []
+    lines = list[str]()
+    for k, effect in enumerate(scene.effects):
+        if not isinstance(effect, SpringsEffect) or not isinstance(effect.stretch, float | int):
+            continue
+        energies = effect.build_contribution(mesh, np.ones(len(mesh.rest_positions)), scene.time_step).energies
+        springs = Springs.from_parts([energy for energy in energies if isinstance(energy, Springs)])
+        if len(springs.edges):
+            words = compute_membrane_modulus(mesh, springs.edges, springs.stiffness).describe_modulus()
+            lines.append(f"effects[{k}] (springs, {effect.scaling_rule}) states {effect.stretch:g} N/m: {words}")
+    return lines

@@ -26,6 +26,10 @@ continuum    The material is independent of mesh refinement. With h the spacing:
     stiffness is reduced accordingly, so the membrane stiffness of the sheet is `stretch` at every size. A mesh with
     h < 8 sqrt(B / stretch) would leave no stiffness and is rejected. This rule is original to this project.
 
+area         As continuum in dimension 1. On surfaces and solids of files each spring has a stiffness by the area or
+    volume around it, so that a uniform stretch of any triangulation needs the force of the stated membrane stiffness
+    [N/m] or modulus [Pa]; formula and limits: `springbench.harness.scenes.membrane_modulus`.
+
 liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m] as given for the size
     `reference_size`: Liu et al. 2013 use 150, 300, 600, 1200 for their curtain at 11, 21, 41, 81 vertices per side.
     Proportional to 1/h, the rule stiffens a cloth under refinement; it exists to reproduce their figures. It
@@ -41,6 +45,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.scenes.membrane_modulus import compute_area_stiffness
 from springbench.harness.scenes.mesh.mesh import BEND, SHEAR, STRETCH, Mesh
 from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 
@@ -144,6 +149,12 @@ def _continuum_scale(mesh: Mesh, family: str, reference: int | None) -> NDArray[
     return np.divide(1.0, lengths, out=np.zeros_like(lengths), where=needed)
 
 
+def _area_scale(mesh: Mesh, family: str, reference: int | None) -> NDArray[np.float64] | float:
+    if mesh.dimension == 1 or family == BEND:
+        return _continuum_scale(mesh, family, reference)
+    return compute_area_stiffness(mesh)[mesh.spring_families[family]]
+
+
 def _liu2013_scale(mesh: Mesh, family: str, reference: int | None) -> float:
     if reference is None or reference < 2:
         problem = f"came {reference}; liu2013 needs the mesh size, at least 2, at which the constants hold"
@@ -158,13 +169,14 @@ def compute_modulus_exponent(scaling_rule: str, dimension: int) -> int:
     """Return the exponent of the spacing h in the material modulus of a mesh.
 
     The modulus is EA of a chain (k h), E t of a sheet (k) and E of a solid (k / h), for springs of stiffness k along
-    its lines. With `continuum` it does not depend on h.
+    its lines. With `continuum` and `area` it does not depend on h.
     """
-    return {"continuum": 0, "fixed": 2 - dimension, "liu2013": 1 - dimension}[scaling_rule]
+    return {"continuum": 0, "area": 0, "fixed": 2 - dimension, "liu2013": 1 - dimension}[scaling_rule]
 
 
 SCALING_RULES: dict[str, ScalingRule] = {
     "fixed": _fixed_scale,
     "continuum": _continuum_scale,
+    "area": _area_scale,
     "liu2013": _liu2013_scale,
 }

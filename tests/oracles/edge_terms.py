@@ -47,6 +47,8 @@ def compute_edge_stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, be
                 k[e] = constant
             elif effect.scaling_rule == "liu2013":
                 k[e] = constant * (mesh.resolution - 1) / (effect.reference_size - 1)
+            elif effect.scaling_rule == "area" and mesh.dimension > 1:
+                raise NotImplementedError("stiffness by areas has patch tests, tests/unit/test_membrane_modulus.py")
             elif family == "bend":
                 k[e] = 16 * constant / h**2
             elif mesh.dimension == 1:

@@ -252,4 +252,4 @@ def test_a_bar_without_length_has_no_continuum_stiffness():
 
 
 def test_the_rules_are_those_a_scene_may_name():
-    assert set(SCALING_RULES) == {"fixed", "continuum", "liu2013"}
+    assert set(SCALING_RULES) == {"fixed", "continuum", "area", "liu2013"}

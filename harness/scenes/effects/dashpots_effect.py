@@ -21,7 +21,7 @@ class DashpotsEffect(ConfigModel):
     is_dissipative: ClassVar[bool] = True
 
     kind: Literal["dashpots"] = "dashpots"
-    scaling_rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
+    scaling_rule: Literal["continuum", "area", "fixed", "liu2013"] = "continuum"
     """Scaling rule of the coefficients with the mesh size, as for springs."""
     stretch: NonNegativeFloat
     """Along the mesh's lines, in the unit of spring stiffness times seconds: `fixed` [N s/m] each."""

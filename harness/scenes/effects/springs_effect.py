@@ -43,10 +43,11 @@ class SpringsEffect(ConfigModel):
     is_baseline_effect: ClassVar[bool] = True
 
     kind: Literal["springs"] = "springs"
-    scaling_rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
-    """Scaling rule of the values below with the mesh size. `continuum`: the material is independent of the mesh;
-    `fixed`: each spring has the given stiffness [N/m]; `liu2013`: stiffness proportional to the resolution,
-    given at the size `reference_size`."""
+    scaling_rule: Literal["continuum", "area", "fixed", "liu2013"] = "continuum"
+    """Scaling rule of the values below with the mesh size. `continuum`: the material is independent of the mesh size;
+    `area`: and of the triangulation of a mesh from a file, by the area around each spring; `fixed`: each spring has
+    the given stiffness [N/m]; `liu2013`: stiffness proportional to the resolution, given at the size
+    `reference_size`."""
     stretch: NonNegativeFloat | Literal["exact"] | OrthotropicStiffness | None = None
     """Along the mesh's lines. Continuum: EA [N] for chains and trusses, [N/m] for cloth, [Pa] for solids; or one value
     each for warp, weft and bias of a woven cloth; or `exact`: length constraints, supported by `avbd` only. Left out if

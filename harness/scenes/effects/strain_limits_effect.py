@@ -34,7 +34,7 @@ class StrainLimitsEffect(ConfigModel):
     stiffness: NonNegativeFloat | Literal["exact"]
     """Stiffness of a spring beyond its limits, in the unit of the `stretch` of springs by the same rule; or `exact`:
     inequality constraints of the length, supported by `avbd` only."""
-    scaling_rule: Literal["continuum", "fixed", "liu2013"] = "continuum"
+    scaling_rule: Literal["continuum", "area", "fixed", "liu2013"] = "continuum"
     """Scaling rule of the stiffness with the mesh size, as for springs."""
     reference_size: PositiveInt | None = None
     """liu2013: the mesh size for which the stiffness is given."""

@@ -44,6 +44,7 @@ class Mesh:
         mass: (n,) [kg] if a file gives absolute masses, else None.
         attributes: vertex attributes from a file, each (n,).
         vertex_areas: (n,) [m^2] at rest if they are not thirds of the triangles, else None.
+        spring_areas: area [m^2] that each spring represents, (m,), volume [m^3] in solids; None if unknown.
         file_numbers: number of each vertex in the mesh's file, (n,); None if there is none.
         spring_properties: stiffness, rest lengths and kinds of the springs if the mesh states them, else None.
     """
@@ -60,12 +61,13 @@ class Mesh:
     mass: NDArray[np.float64] | None = None
     attributes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict[str, NDArray[np.float64]])
     vertex_areas: NDArray[np.float64] | None = None
+    spring_areas: NDArray[np.float64] | None = None
     file_numbers: NDArray[np.int64] | None = None
     spring_properties: SpringProperties | None = None
 
     def __post_init__(self) -> None:
         arrays = [self.rest_positions, self.springs, self.triangles, self.mass_fractions]
-        arrays += [self.mass, self.vertex_areas, self.file_numbers]
+        arrays += [self.mass, self.vertex_areas, self.spring_areas, self.file_numbers]
         if own := self.spring_properties:
             arrays += [own.stiffness, own.rest_length]
         for array in [*arrays, *self.spring_families.values(), *self.parts.values(), *self.attributes.values()]:
@@ -76,6 +78,12 @@ class Mesh:
     def bounding_box_diagonal(self) -> float:
         """Diagonal of the bounding box of the rest shape [m]."""
         return float(np.linalg.norm(np.ptp(self.rest_positions, axis=0))) if len(self.rest_positions) else 0.0
+
+    @property
+    def surface_area(self) -> float:
+        """Area of the triangles at rest [m^2]."""
+        a, b, c = (self.rest_positions[self.triangles[:, k]] for k in range(3))
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
     def format_file_numbers(self, *vertices: int) -> str:
         """Format the file numbers of zero-based vertices for a message; empty if they are equal."""

@@ -137,6 +137,7 @@ def assemble_mesh(
     resolution: int = 0,
     parts: Mapping[str, ArrayLike] | None = None,
     vertex_areas: PointArray | None = None,
+    spring_areas: PointArray | None = None,
     file_numbers: IndexArray | None = None,
     attributes: Mapping[str, PointArray] | None = None,
 ) -> Mesh:
@@ -168,6 +169,7 @@ def assemble_mesh(
             for name, part in (parts or {}).items()
         },
         vertex_areas=vertex_areas,
+        spring_areas=spring_areas,
         file_numbers=file_numbers,
         attributes=dict(attributes or {}),
     )

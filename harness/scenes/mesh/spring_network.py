@@ -156,13 +156,17 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
         raise InputError([_make_crossed_face_error(cells, path, *one) for one in surface.crossed[:_MAX_MISTAKES]])
     if surface.repeats:
         _warn_repeated_faces(cells, path, surface.repeats)
-    triangles, areas = surface.triangles, surface.areas
+    triangles, areas, spring_areas = surface.triangles, surface.areas, None
     if len(cells.tetrahedra):
         tetrahedra = _drop_repeated_tetrahedra(cells.tetrahedra, path)
         triangles, areas = find_boundary_triangles(rest, tetrahedra), None
         dimension, weights = 3, lump_volumes(rest, tetrahedra)
+        volumes = np.repeat(np.abs(compute_signed_volumes(rest, tetrahedra)), 6)
+        edges = np.stack([tetrahedra[:, [i, j]] for i, j in combinations(range(4), 2)], axis=1).reshape(-1, 2)
+        spring_areas = _sum_by_pair(np.concatenate(list(springs.values())), edges, volumes, len(rest))
     elif len(triangles):
         dimension, weights = 2, lump_areas(rest, triangles) if areas is None else areas
+        spring_areas = _distribute_areas(surface, springs, len(rest))
     else:
         dimension, weights = 1, lump_lengths(rest, springs[STRETCH])
     if not weights.any():
@@ -180,6 +184,7 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
         parts=find_box_parts(rest) | dict(cells.vertex_groups),
         attributes=cells.attributes,
         vertex_areas=areas,
+        spring_areas=spring_areas,
         file_numbers=cells.file_numbers,
     )
 
@@ -192,12 +197,14 @@ class FaceTriangulation(NamedTuple):
         areas: vertex areas (n,) [m^2]; None if they are thirds of the triangles.
         crossed: place and number of corners of faces whose sides cross; these have no triangles.
         repeats: places of faces that repeat another, or a part of it, and of that one.
+        faces: number of corners k -> the triangulated faces (f, k), and their areas (f,) [m^2].
     """
 
     triangles: IndexArray
     areas: PointArray | None
     crossed: list[tuple[int, int]]
     repeats: list[tuple[int, int]]
+    faces: Mapping[int, tuple[IndexArray, PointArray]]
 
 
 def triangulate_cells(cells: MeshCells) -> FaceTriangulation:
@@ -223,10 +230,49 @@ def triangulate_cells(cells: MeshCells) -> FaceTriangulation:
         new[cover.corners][cover.rows] = False
     selected = {k: surfaces[k].select_rows(new[k]) for k in faces}
     triangles = np.concatenate([NO_TRIANGLES, *(made.triangles.reshape(-1, 3) for made in selected.values())])
+    measured = {k: (faces[k][new[k]], _sum_triangle_areas(cells.points, selected[k].triangles)) for k in faces}
     if set(faces) <= {3}:
-        return FaceTriangulation(triangles, None, sorted(crossed), sorted(repeats))
+        return FaceTriangulation(triangles, None, sorted(crossed), sorted(repeats), measured)
     areas = [compute_vertex_areas(cells.points, faces[k][new[k]], selected[k]) for k in faces]
-    return FaceTriangulation(triangles, np.sum(areas, axis=0), sorted(crossed), sorted(repeats))
+    return FaceTriangulation(triangles, np.sum(areas, axis=0), sorted(crossed), sorted(repeats), measured)
+
+
+def _sum_triangle_areas(points: PointArray, triangles: IndexArray) -> PointArray:
+    """Return the area of each face (f,) [m^2] from its triangles (f, t, 3)."""
+    a, b, c = (points[triangles[:, :, k]] for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=2).sum(axis=1) / 2
+
+
+def _distribute_areas(surface: FaceTriangulation, springs: Mapping[str, IndexArray], num_vertices: int) -> PointArray:
+    """Return the area that each spring represents, (m,) [m^2], sides first, then diagonals.
+
+    A side of a triangle has its area, a side of a face of k corners 2/k of it, the diagonals together four times it.
+    """
+    pairs, shares = [NO_PAIRS], [np.empty(0)]
+    for k, (faces, area) in surface.faces.items():
+        pairs.append(polygon_sides(faces))
+        shares.append(np.repeat(area if k == 3 else 2 * area / k, k))
+    areas = [_sum_by_pair(springs[STRETCH], np.concatenate(pairs), np.concatenate(shares), num_vertices)]
+    if SHEAR in springs:
+        pairs, shares = [NO_PAIRS], [np.empty(0)]
+        for k, (faces, area) in surface.faces.items():
+            if count := k * (k - 3) // 2:
+                i, j = np.array([(i, j) for i, j in combinations(range(k), 2) if j - i not in (1, k - 1)]).T
+                pairs.append(np.stack([faces[:, i], faces[:, j]], axis=2).reshape(-1, 2))
+                shares.append(np.repeat(4 * area / count, count))
+        areas.append(_sum_by_pair(springs[SHEAR], np.concatenate(pairs), np.concatenate(shares), num_vertices))
+    return np.concatenate(areas)
+
+
+def _sum_by_pair(springs: IndexArray, pairs: IndexArray, values: PointArray, num_vertices: int) -> PointArray:
+    """Sum values of pairs (p, 2) to the springs (m, 2) of these vertices, (m,); other pairs are ignored."""
+    codes, wanted = (np.sort(some, axis=1) @ [num_vertices, 1] for some in (springs, pairs))
+    order = np.argsort(codes, kind="stable")
+    if not len(order):
+        return np.empty(0)
+    found = order[np.minimum(np.searchsorted(codes, wanted, sorter=order), len(order) - 1)]
+    valid = codes[found] == wanted
+    return np.bincount(found[valid], values[valid], minlength=len(springs)).astype(np.float64, copy=False)
 
 
 def _make_crossed_face_error(cells: MeshCells, path: Path, place: int, corners: int) -> InputMistake:
