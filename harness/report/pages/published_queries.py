@@ -67,6 +67,8 @@ def list_outcomes(study: PublishedStudy) -> Sequence[dict[str, Any]]:
             "is_supported": cell.outcome is not UNSUPPORTED,
             "same_motion": cell.same_motion,
             "energy_excess": cell.energy_excess,
+            "has_other_motion": cell.has_other_motion,
+            "has_lowest_energy": cell.has_lowest_energy,
             "worst_error": cell.worst_error,
             "reason": cell.reason,
         }
