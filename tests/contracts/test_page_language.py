@@ -7,12 +7,17 @@ import shlex
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from shutil import copyfile
 from typing import Any, NamedTuple
 
 import pytest
 import typer
 from springbench.harness.cli.main import app
 from springbench.harness.cli.reference_pages.markdown_text import build_anchor
+from springbench.harness.experiments.ablation.ablation_schema import ABLATION_SCHEMA
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.results.parquet_rows import write_rows
+from springbench.harness.results.run_schema import RUN_SCHEMA
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -179,15 +184,31 @@ def test_the_files_of_a_command_are_there(command: PageCommand) -> None:
     assert [word for word in named if not (ROOT / word).exists()] == []
 
 
-QUICK = {"list", "schema"}
-"""Commands that take a second and need no results."""
+QUICK = {"list", "schema", "query"}
+"""Commands that take a second."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the configs and with a row of each table, in which commands run."""
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+    row = {"scene": "chain", "size": 4, "solver": "sparse", "status": "ok"}
+    for table, schema, kind in (
+        ("rows", RUN_SCHEMA, {"phase": "step", "seconds": 0.5}),
+        ("accuracy", ACCURACY_SCHEMA, {"kind": "work", "error": 0.5}),
+        ("ablation", ABLATION_SCHEMA, {"kind": "ablated", "added_seconds": 0.5}),
+    ):
+        (tmp_path / "results" / "study" / table).mkdir(parents=True)
+        write_rows(tmp_path / "results" / "study" / table / "a.parquet", [row | kind], schema)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [one for one in COMMANDS if one.words[0] in QUICK], ids=str)
-def test_a_quick_command_of_a_page_runs(command: PageCommand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "configs").symlink_to(ROOT / "configs")
-    monkeypatch.chdir(tmp_path)
+def test_a_quick_command_of_a_page_runs(command: PageCommand, folder: Path) -> None:
+    for path in (*command.page.parent.glob("*.yaml"), *command.page.parent.glob("*.py")):  # files next to the page
+        copyfile(path, folder / path.name)
     outcome = CliRunner().invoke(app, list(command.words))
     assert outcome.exit_code == 0, outcome.output
 
