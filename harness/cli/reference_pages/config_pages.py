@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from springbench.harness.cli.reference_pages.markdown_text import build_anchor, format_table
+from springbench.harness.cli.reference_pages.markdown_text import build_anchor, format_docstring, format_table
 from springbench.harness.config.json_schema import build_json_schema
 from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
 from springbench.harness.scenes.mesh.mesh_table import MESH_CLASSES
 from springbench.solvers.plugins.plugin_discovery import PLUGIN_PATTERN
-from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS
+from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 
 Schema = Mapping[str, Any]
 
@@ -88,7 +90,10 @@ class SchemaWriter:
             for key, one in definition.get("properties", {}).items()
             if not (key == "kind" and self._page != CONFIG_PAGE)
         ]
-        parts = [f"## {_DOCUMENTS.get(name, name)}", definition.get("description", "")]
+        parts = [f"## {_DOCUMENTS.get(name, name)}"]
+        if self._page == EFFECT_PAGE:
+            parts += _describe_formula(load_target(EFFECT_CLASSES[name]))
+        parts.append(definition.get("description", ""))
         parts.append(format_table(("key", "type", "default", "meaning"), rows) if rows else "It has no keys.")
         return "\n\n".join(part for part in parts if part)
 
@@ -144,6 +149,13 @@ class SchemaWriter:
         if kind == "string" and schema.get("pattern") == PLUGIN_PATTERN:
             return "`module:Name`"
         return {"string": "text", "boolean": "true or false", "object": "mapping", "": "any"}.get(kind, kind)
+
+
+def _describe_formula(effect: Any) -> list[str]:
+    """Describe the formula and the source of an effect, as its module states them, and its limit of the order."""
+    order = getattr(effect, "max_convergence_order", math.inf)
+    limit = "" if order == math.inf else f"Every integrator has at most order {order:g} with it."
+    return [format_docstring(sys.modules[effect.__module__].__doc__), limit]
 
 
 def format_default(schema: Schema, is_required: bool) -> str:
