@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from springbench.harness.cli.commands.ablate import ablate
 from springbench.harness.cli.commands.archive import compact, merge, publish, verify_archive
+from springbench.harness.cli.commands.convergence import convergence
 from springbench.harness.cli.commands.export_script import export_script
 from springbench.harness.cli.commands.figure import figure
 from springbench.harness.cli.commands.gallery import gallery
@@ -264,6 +265,7 @@ app.command("list")(list_command)
 app.command("new")(new_study)
 app.command()(roofline)
 app.command()(recommend)
+app.command()(convergence)
 app.command()(export_script)
 app.command()(compact)
 app.command()(merge)

@@ -236,14 +236,14 @@ def test_steps_that_a_solver_takes_within_a_frame_are_printed() -> None:
 def test_without_a_horizon_it_is_the_longest_at_which_the_error_can_be_measured(tmp_path: Path) -> None:
     path = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
     spec, said = load_scene(path), list[str]()
-    longest = module._find_longest_t_end(path, spec, 12, 1e-7, ReferenceStore(tmp_path), said.append)
+    longest = module.find_default_t_end(path, spec, 12, 1e-7, ReferenceStore(tmp_path), said.append)
     assert 0.5 < longest < module.DEFAULT_T_END
     assert f"up to {longest:g} s" in said[0]
     assert (
-        module._find_longest_t_end(path, spec, 12, 1e-2, ReferenceStore(tmp_path), said.append) == module.DEFAULT_T_END
+        module.find_default_t_end(path, spec, 12, 1e-2, ReferenceStore(tmp_path), said.append) == module.DEFAULT_T_END
     )
     with pytest.raises(RunFailed, match="cannot be reached or measured"):
-        module._find_longest_t_end(path, spec, 12, 1e-14, ReferenceStore(tmp_path), said.append)
+        module.find_default_t_end(path, spec, 12, 1e-14, ReferenceStore(tmp_path), said.append)
 
 
 def test_a_budget_gets_the_least_error_within_it_and_what_half_and_twice_would_buy(scene: Path) -> None:

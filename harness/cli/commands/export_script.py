@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from springbench.harness.config.accuracy_config import WorkSpec
     from springbench.harness.execution.worker_process import ProgressCallback
     from springbench.harness.scenes.scene_builder import Scene
+    from springbench.solvers.external.external_engine import ExternalEngine
 
 
 def export_script(
@@ -71,19 +72,39 @@ def _format_point(spec: WorkSpec) -> tuple[str, ...]:
 
 def _write_script(name: str, spec: WorkSpec, folder: Path, tick: ProgressCallback) -> dict[str, str]:
     """Write the script's files next to their data, and return their texts by name."""
-    import numpy as np
-    from springbench.harness.execution import machine_info
     from springbench.harness.reference.step_snapshot import build_exact_scene
-    from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
-    from springbench.solvers.external.external_engine import EngineNetwork, ExternalEngine
-    from springbench.solvers.model.step_problem import StopRule, Unsupported
     from springbench.solvers.registry import SOLVER_TABLE, load_target
 
     scene = build_exact_scene(spec.case.scene, spec.case.size, spec.case.integrator)
-    if acts := _list_external_changes(scene):
-        raise RunFailed(f"{name}: between frames springbench sets {' and '.join(acts)}; take another point")
     engine: ExternalEngine = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters)
     frames, substeps = round(spec.t_end / spec.case.scene.time_step), int(spec.options["max_iterations"])
+    return write_engine_script(name, scene, engine, substeps, frames, folder)
+
+
+def write_engine_script(
+    name: str, scene: Scene, engine: ExternalEngine, substeps: int, frames: int, folder: Path
+) -> dict[str, str]:
+    """Write a script that repeats a simulation with an engine alone, and return the texts of its files by name.
+
+    Args:
+        name: stem of the files.
+        scene: scene whose step is a frame.
+        engine: engine with its parameters.
+        substeps: substeps of a frame.
+        frames: number of frames.
+        folder: folder of the files, made if it is missing.
+
+    Raises:
+        RunFailed: springbench changes something between frames, or the engine does not support the scene.
+    """
+    import numpy as np
+    from springbench.harness.execution import machine_info
+    from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
+    from springbench.solvers.external.external_engine import EngineNetwork
+    from springbench.solvers.model.step_problem import StopRule, Unsupported
+
+    if acts := _list_external_changes(scene):
+        raise RunFailed(f"{name}: between frames springbench sets {' and '.join(acts)}; take another point")
     begun = build_problem(scene, build_initial_state(scene), "previous")
     try:
         network = EngineNetwork.from_system(scene.system, engine.solver_name, supports_damping=engine.supports_damping)

@@ -408,7 +408,7 @@ def _plan_study(
     """Return the study that may be measured, and compute its reference. Raises InputError, RunFailed."""
     max_error = goal.reference_error
     if t_end is None:
-        t_end = _find_longest_t_end(path, scene, size, max_error, reference_store, print_message)
+        t_end = find_default_t_end(path, scene, size, max_error, reference_store, print_message)
     try:
         study = _build_study(path, scene, size, candidates, t_end, time_limit)
     except InputError as refused:  # the studies are ours; what is wrong came with an option
@@ -417,7 +417,7 @@ def _plan_study(
     return study
 
 
-def _find_longest_t_end(
+def find_default_t_end(
     path: Path,
     scene: SceneSpec,
     size: int,

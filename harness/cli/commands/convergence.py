@@ -1,0 +1,190 @@
+"""Command `springbench convergence`: is a given setting converged?"""
+
+from __future__ import annotations
+
+import csv
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.cli.shared_options import SCENE_HELP, ResultsOption, describe_config
+from springbench.harness.console import print_message
+from springbench.harness.errors import InputError, InputMistake, RunFailed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from springbench.harness.config.sweep_config import SolverSpec
+    from springbench.harness.experiments.setting_convergence import SettingSimulator
+    from springbench.harness.results.setting_verdict import ConvergenceStudy, StepSetting
+    from springbench.harness.scenes.scene_spec import SceneSpec
+
+
+def convergence(
+    scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
+    solver: Annotated[str, typer.Option(help="Solver, or outside engine such as mujoco or newton-physics.")],
+    substeps: Annotated[int, typer.Option(help="Substeps of a frame, which is a time step of the scene.")] = 1,
+    iterations: Annotated[int, typer.Option(help="Iterations of a substep.")] = 50,
+    parameter: Annotated[list[str] | None, typer.Option(help="Parameter of the solver, KEY=VALUE; repeatable.")] = None,
+    integrator: Annotated[str | None, typer.Option(help="Integrator; the usual one of the solver by default.")] = None,
+    error: Annotated[float, typer.Option(help="Relative error that counts as converged.")] = 0.05,
+    doublings: Annotated[int, typer.Option(min=1, max=4, help="Powers of two around the setting.")] = 2,
+    size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
+    t_end: Annotated[
+        float | None, typer.Option(help="Simulated time [s]; 1 by default, or less if the motion is unpredictable.")
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Limit of a setting's wall time [s].")] = 30.0,
+    search_time: Annotated[float, typer.Option(help="Wall time after which no further setting starts [s].")] = 200.0,
+    results: ResultsOption = Path("results"),
+) -> None:
+    """Tell whether substeps x iterations of a solver or engine are converged, and which setting would be.
+
+    Settings are simulated by powers of two around the given one, and compared with the reference motion.
+    """
+    from springbench.harness.config.config_loader import load_scene
+    from springbench.harness.execution.isolated_call import run_isolated
+    from springbench.harness.execution.worker_process import TaskLimits
+    from springbench.harness.experiments.accuracy.accuracy_units import EXTRA_WALL_SECONDS
+    from springbench.harness.experiments.setting_convergence import require_setting
+    from springbench.harness.results.folder_ownership import claim_folder
+    from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
+
+    given = require_setting(substeps, iterations)
+    for key, value in (("--error", error), ("--time-limit", time_limit), ("--search-time", search_time)):
+        if not 0.0 < value < 1e5:
+            raise InputError(InputMistake(f"came {value:g}; expected a number above 0", key=key))
+    if t_end is not None and not 0.0 < t_end <= 1e4:
+        raise InputError(InputMistake(f"came {t_end:g}; expected seconds above 0, at most 10,000", key="--t-end"))
+    spec = load_scene(scene)
+    spec.require_fixed_time_step()
+    made = read_solver_options(scene, solver, parameter or ())
+    number = (size or spec.default_size or 0) if isinstance(spec.mesh, MeshGenerator) else 0
+    folder = claim_folder(results / f"convergence-{scene.stem}", scene)
+    options = {"error": error, "doublings": doublings, "time_limit": time_limit, "search_time": search_time}
+    study = run_isolated(
+        partial(_study_setting, spec, scene.stem, number, made, integrator, t_end, given, results, folder, options),
+        spec.find_plugins(),
+        TaskLimits(search_time + 10.0 * time_limit + EXTRA_WALL_SECONDS),
+        print_message,
+    )
+    for line in study.describe_verdict():
+        print_message(line)
+    raise typer.Exit(0 if study.is_converged else 1)
+
+
+def read_solver_options(path: Path, name: str, parameters: tuple[str, ...] | list[str]) -> SolverSpec:
+    """Read a solver and its parameters from options.
+
+    Args:
+        path: file of the scene, for messages.
+        name: name of the solver.
+        parameters: `key=value` each; values are read as in YAML.
+
+    Raises:
+        InputError: there is no such solver, or a parameter is wrong.
+    """
+    from springbench.harness.config.solver_parameters import read_solvers
+    from springbench.harness.errors import suggest_name
+    from springbench.harness.schema.config_document import ConfigDocument
+    from springbench.harness.schema.yaml_loader import parse_scalar
+    from springbench.solvers.registry import SOLVER_TABLE
+
+    if name not in SOLVER_TABLE:
+        raise InputError(InputMistake(f"came {name!r}; expected {suggest_name(name, SOLVER_TABLE)}", key="--solver"))
+    chosen: dict[str, Any] = {"name": name}
+    for text in parameters:
+        key, sign, value = text.partition("=")
+        if not (key and sign and value):
+            raise InputError(InputMistake(f"came {text!r}; expected KEY=VALUE", key="--parameter"))
+        chosen[key] = parse_scalar(value)
+    document = ConfigDocument(path, {"solvers": [chosen]})
+    found = read_solvers(document)
+    if document.mistakes or not found:
+        raise InputError([InputMistake(one.problem, key=f"--parameter {one.key}") for one in document.mistakes])
+    return found[0]
+
+
+def _study_setting(
+    spec: SceneSpec,
+    name: str,
+    size: int,
+    solver: SolverSpec,
+    integrator: str | None,
+    t_end: float | None,
+    given: StepSetting,
+    results: Path,
+    folder: Path,
+    options: dict[str, float],
+    print_message: Callable[[str], None],
+) -> ConvergenceStudy:
+    """Run the study, write its table, its picture and the setting in the engine's own words."""
+    from springbench.harness.config.config_loader import find_scene_mistakes
+    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
+    from springbench.harness.experiments.accuracy.method_recommendation import find_default_t_end
+    from springbench.harness.experiments.setting_convergence import SettingSimulator, study_convergence
+    from springbench.harness.report.convergence_map import draw_convergence_map
+
+    spec = spec.load_plugins()
+    if mistakes := find_scene_mistakes(spec, [size]):
+        raise InputError(mistakes)
+    store = open_reference_store(results)
+    if t_end is None:
+        t_end = find_default_t_end(spec.path, spec, size, options["error"], store, print_message)
+    simulator = SettingSimulator(spec, size, solver, integrator, max(t_end, spec.time_step))
+    study = study_convergence(
+        simulator,
+        given,
+        store,
+        options["error"],
+        num_doublings=int(options["doublings"]),
+        time_limit=options["time_limit"],
+        search_time=options["search_time"],
+        print_message=print_message,
+    )
+    stem = f"{name}-{size}-{solver.name}-{given.substeps}x{given.iterations}"
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_write(folder / f"{stem}.csv") as partial_path, partial_path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(study.results[0].columns))
+        writer.writeheader()
+        writer.writerows(result.columns for result in study.results)
+    title = f"Is {given} converged? {name} {size or ''}".rstrip() + f", {solver.name}"
+    frames = f"{simulator.num_frames} frames of {spec.time_step:.6g} s"
+    facts = [frames, simulator.integrator, f"errors against {study.reference}"]
+    picture, *_ = draw_convergence_map(folder / "pictures" / stem, study, title, facts)
+    print_message(f"the map is {picture}, its numbers are in {folder / f'{stem}.csv'}")
+    best = study.find_cheapest(options["error"])
+    for label, setting in (("given", given), ("cheapest", best.setting if best else None)):
+        if setting is not None and (label == "given" or setting != given):
+            lines = _export_setting(simulator, setting, name, folder / f"{stem}-{label}")
+            print_message(f"the {label} setting, {setting}, to run it:")
+            for line in lines:
+                print_message(f"  {line}")
+    return study
+
+
+def _export_setting(simulator: SettingSimulator, setting: StepSetting, name: str, folder: Path) -> list[str]:
+    """Return how to repeat a setting: the command of a solver of ours, or an engine's script, which is written."""
+    import shlex
+
+    from springbench.harness.cli.commands.export_script import write_engine_script
+
+    spec, frames = simulator.spec, simulator.num_frames
+    if not simulator.is_engine:
+        given: dict[str, Any] = {"size": simulator.size or None, "solver": simulator.name}
+        given |= {"integrator": simulator.integrator, "time-step": repr(spec.time_step / setting.substeps)}
+        given |= {"frames": frames * setting.substeps, "max-iterations": setting.iterations}
+        parts = [part for key, value in given.items() if value is not None for part in (f"--{key}", str(value))]
+        return [shlex.join(["springbench", "run", str(spec.path), *parts])]
+    scene, engine, _, _ = simulator.build_step(spec, setting)
+    step = f"{simulator.name}: steps of {spec.time_step / setting.substeps:.9g} s"
+    lines = [f"{step}, {setting.iterations} iterations each" if simulator.has_iterations else step]
+    try:
+        texts = write_engine_script(name, scene, engine, setting.substeps, frames, folder)
+    except RunFailed as refused:
+        return [*lines, f"no script of it: {refused}"]
+    return [
+        *lines,
+        f"cd {folder} && python {name}.py    # reads {', '.join(file for file in texts if file[-3:] != '.py')}",
+    ]

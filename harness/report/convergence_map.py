@@ -1,0 +1,110 @@
+# pyright: reportUnknownMemberType=false
+# Matplotlib's stubs do not type most keywords.
+"""Heat map of a setting's convergence: error over substeps and iterations, with iso-error lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import BoundaryNorm
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
+from springbench.harness.report.accuracy.plot_sheet import (
+    PANEL_BOTTOM,
+    PANEL_LEFT,
+    PANEL_TOP,
+    add_panel,
+    plot_sheet,
+    sheet_paths,
+)
+from springbench.harness.report.page_layout import draw_text, tick_formatter
+from springbench.harness.report.plot_style import MUTED_COLOUR, PAGE_HEIGHT, PAGE_WIDTH, TEXT_COLOUR
+from springbench.harness.results.setting_verdict import ERROR_LEVELS, ConvergenceStudy, StepSetting
+
+_COLOUR_BOUNDS = (1e-4, 1e-3, 3e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.3, 1.0, 10.0)
+"""Bounds of the colours: relative errors, with the levels of the verdict among them."""
+
+_MAP_WIDTH, _TEXT_LEFT, _TEXT_LETTERS = 880, 1010, 72
+"""Width of the map, and left edge of the verdict beside it [pixels]; letters of a line of the verdict."""
+
+_LINE_STYLES = ("dotted", "solid", "dashed")
+"""Of the iso-error lines, from the smallest error."""
+
+
+def draw_convergence_map(stem: Path, study: ConvergenceStudy, title: str, facts: Sequence[str]) -> list[Path]:
+    """Draw a study's errors, with the given setting and the cheapest ones marked, and return the files.
+
+    Args:
+        stem: path of the files without suffix.
+        study: settings with their errors.
+        title: title of the picture.
+        facts: phrases below the title.
+    """
+    substeps = sorted({result.setting.substeps for result in study.results})
+    iterations = sorted({result.setting.iterations for result in study.results})
+    by_setting = {result.setting: result for result in study.results}
+    errors = np.array([[by_setting[StepSetting(s, i)].error for s in substeps] for i in iterations])
+    with plot_sheet(stem, title, facts) as page:
+        height = min(PANEL_BOTTOM - PANEL_TOP - 90, 160 * len(iterations))
+        heading = "iterations of a substep, upwards" if len(iterations) > 1 else ""
+        heading = "; ".join(filter(None, [heading, "in each field the error and the processor time of a frame"]))
+        ax = add_panel(page, PANEL_LEFT + 46, PANEL_TOP + 30, _MAP_WIDTH, height, heading)
+        ax.grid(visible=False)
+        x, y = np.arange(len(substeps)), np.arange(len(iterations))
+        norm = BoundaryNorm(_COLOUR_BOUNDS, 256, extend="both")
+        shown = np.where(np.isfinite(errors), errors, np.nan)
+        ax.pcolormesh(x, y, shown, cmap="RdYlBu_r", norm=norm, shading="nearest", alpha=0.75, edgecolors="white", lw=2)
+        if len(x) > 1 and len(y) > 1 and np.isfinite(shown).sum() > 3:
+            levels = sorted({*ERROR_LEVELS, study.error_requested})
+            filled = np.log10(np.where(np.isfinite(errors), np.maximum(errors, 1e-12), 1e3))
+            styles = [_LINE_STYLES[k % len(_LINE_STYLES)] for k in range(len(levels))]
+            ax.contour(x, y, filled, np.log10(levels), colors=TEXT_COLOUR, linewidths=1.8, linestyles=styles, alpha=0.6)
+            lines = [Line2D([], [], color=TEXT_COLOUR, ls=style, lw=1.8, alpha=0.6) for style in styles]
+            labels = [f"an error of {100 * level:.3g} %" for level in levels]
+            place = ((_TEXT_LEFT - 8) / PAGE_WIDTH, 60 / PAGE_HEIGHT)
+            page.legend(lines, labels, loc="lower left", bbox_to_anchor=place, frameon=False, fontsize=9.5)
+        for j, many in enumerate(iterations):
+            for i, pieces in enumerate(substeps):
+                result = by_setting[StepSetting(pieces, many)]
+                cost = f"\n{1e3 * result.frame_seconds:.3g} ms" if np.isfinite(result.frame_seconds) else ""
+                label = f"{100 * result.error:.2g} %" if np.isfinite(result.error) else _shorten(result.reason)
+                ax.text(i, j - 0.02, label + cost, ha="center", va="center", fontsize=8.5, color=TEXT_COLOUR)
+        _mark_settings(ax, study, substeps, iterations)
+        ax.set_xticks(x, [str(value) for value in substeps])
+        ax.set_yticks(y, [str(value) for value in iterations])
+        ax.yaxis.set_major_formatter(tick_formatter(lambda k: str(iterations[int(k)])))
+        ax.set_xlabel("substeps of a frame", fontsize=9, loc="left")
+        y_text = PANEL_TOP + 40
+        for sentence in study.describe_verdict():
+            for line in wrap(sentence, _TEXT_LETTERS):
+                draw_text(page, _TEXT_LEFT, y_text, line, size=10.5)
+                y_text += 20
+            y_text += 10
+    return sheet_paths(stem)
+
+
+def _mark_settings(ax: Any, study: ConvergenceStudy, substeps: Sequence[int], iterations: Sequence[int]) -> None:
+    """Mark the given setting with a thick frame, and the cheapest one of each level below its field."""
+    marks: dict[StepSetting, list[str]] = {study.given: ["given"]}
+    for level in ERROR_LEVELS:
+        if best := study.find_cheapest(level):
+            marks.setdefault(best.setting, []).append(f"cheapest within {100 * level:.3g} %")
+    for setting, names in marks.items():
+        i, j = substeps.index(setting.substeps), iterations.index(setting.iterations)
+        is_given = setting == study.given
+        frame: dict[str, Any] = {"fill": False, "ec": TEXT_COLOUR if is_given else MUTED_COLOUR, "zorder": 5}
+        ax.add_patch(_rectangle(i, j, 2.6 if is_given else 1.4, frame))
+        ax.text(i, j - 0.4, "\n".join(names), ha="center", va="bottom", fontsize=8, color=TEXT_COLOUR, weight="bold")
+
+
+def _rectangle(i: int, j: int, line_width: float, style: dict[str, Any]) -> Any:
+    return Rectangle((i - 0.47, j - 0.47), 0.94, 0.94, lw=line_width, **style)
+
+
+def _shorten(reason: str) -> str:
+    words = reason.split(":")[0]
+    return words if len(words) <= 16 else words[:15] + "…"
