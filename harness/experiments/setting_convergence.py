@@ -330,7 +330,7 @@ def _find_reference(
 def _compare_with_finest(
     simulator: SettingSimulator, results: Sequence[SettingResult]
 ) -> tuple[SampledReference, list[SettingResult]]:
-    """Return the finest setting as reference, and the results with their errors against it."""
+    """Return the finest setting as reference, and the results with their errors against it; its own is unknown."""
     fine = max((result for result in results if not result.reason), key=_number_of_iterations, default=None)
     if fine is None:
         raise RunFailed("all settings failed, and there is no reference")
@@ -338,7 +338,7 @@ def _compare_with_finest(
     start = build_initial_state(scene).motion.positions
     words = f"the finest setting, {fine.setting}, for there is no reference"
     reference = SampledReference(words, scene.system.free_vertices, start, fine.positions, None, 0.0)
-    errors = (inf if one.reason else reference.measure_distance(one.positions) for one in results)
+    errors = (inf if one.reason or one is fine else reference.measure_distance(one.positions) for one in results)
     return reference, [replace(one, error=error) for one, error in zip(results, errors, strict=True)]
 
 

@@ -80,7 +80,7 @@ def draw_convergence_map(stem: Path, study: ConvergenceStudy, title: str, facts:
         ax.set_xlabel("substeps of a frame", fontsize=9, loc="left")
         y_text = PANEL_TOP + 40
         for sentence in study.describe_verdict():
-            for line in wrap(sentence, _TEXT_LETTERS):
+            for line in wrap(sentence.replace(" %", "\u00a0%"), _TEXT_LETTERS):
                 draw_text(page, _TEXT_LEFT, y_text, line, size=10.5)
                 y_text += 20
             y_text += 10
@@ -106,5 +106,5 @@ def _rectangle(i: int, j: int, line_width: float, style: dict[str, Any]) -> Any:
 
 
 def _shorten(reason: str) -> str:
-    words = reason.split(":")[0]
+    words = reason.split(":")[0] or "the finest"
     return words if len(words) <= 16 else words[:15] + "…"

@@ -29,7 +29,7 @@ class SettingResult:
 
     Attributes:
       setting: substeps and iterations.
-      error: relative error over the whole motion; infinite where it failed.
+      error: relative error over the whole motion; infinite where it failed or is the reference itself.
       max_strain: largest strain of a spring after any frame.
       energy_drift: energy at the end, minus that of the reference, over its largest kinetic energy.
       frame_seconds: median processor time of a frame [s].
@@ -105,8 +105,7 @@ class ConvergenceStudy:
             lines = [
                 f"{self.given} substeps x iterations is {state} to {asked}: "
                 f"its error is {describe_percent(given.error)}, against {self.reference}.",
-                f"Its largest strain is {describe_percent(given.max_strain)}; its energy at the end is off by "
-                f"{describe_percent(given.energy_drift)} of the largest kinetic energy.",
+                f"Its largest strain is {describe_percent(given.max_strain)}{_describe_drift(given.energy_drift)}.",
             ]
         for what, change in names.items():
             if change is not None:
@@ -147,6 +146,13 @@ SIMILAR_STIFFNESS = 0.02
 def describe_percent(value: float) -> str:
     """Describe a share in percent, or as unknown."""
     return f"{100 * value:.3g} %" if isfinite(value) else "unknown"
+
+
+def _describe_drift(drift: float) -> str:
+    if not isfinite(drift):
+        return ""
+    more = "more" if drift > 0.0 else "less"
+    return f"; its energy at the end is {describe_percent(abs(drift))} of the largest kinetic energy {more} than true"
 
 
 def _describe_stiffness(ratio: float) -> str:

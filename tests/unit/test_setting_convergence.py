@@ -1,0 +1,214 @@
+"""Is a setting converged: the map around it, the verdict in words, and how stiff the material seems."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from importlib.util import find_spec
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from springbench.harness.cli.commands.convergence import read_solver_options
+from springbench.harness.cli.main import app
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.config.sweep_config import SolverSpec
+from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
+from springbench.harness.experiments.setting_convergence import SettingSimulator, measure_change, study_convergence
+from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.report.convergence_map import draw_convergence_map
+from springbench.harness.results.setting_verdict import ConvergenceStudy, SettingResult, StepSetting, list_settings
+from typer.testing import CliRunner
+
+SCENE = """
+mesh: {kind: chain, length: 2.0}
+mass: 1.0
+time_step: 1/30
+frames: 8
+default_size: 6
+effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, parts: [ends]}]
+"""
+GIVEN = StepSetting(2, 4)
+END = 0.2
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    (tmp_path / "chain.yaml").write_text(SCENE)
+    return tmp_path / "chain.yaml"
+
+
+def simulate(scene: Path, solver: str, **parameters: Any) -> SettingSimulator:
+    return SettingSimulator(load_scene(scene), 6, SolverSpec(solver, parameters), None, END)
+
+
+def study(scene: Path, solver: str = "sparse", given: StepSetting = GIVEN, error: float = 0.05) -> ConvergenceStudy:
+    store = open_reference_store(scene.parent / "results")
+    limits: dict[str, Any] = {"num_doublings": 1, "time_limit": 60.0, "search_time": 60.0}
+    return study_convergence(simulate(scene, solver), given, store, error, print_message=lambda line: None, **limits)
+
+
+def synthetic(errors: dict[tuple[int, int], float], **how: Any) -> ConvergenceStudy:
+    results = tuple(
+        SettingResult(StepSetting(*setting), error, 0.1, -0.02, 1e-3 * setting[0] * setting[1])
+        for setting, error in errors.items()
+    )
+    options: dict[str, Any] = {"substep_change": 0.2, "iteration_change": 0.03, "effective_stiffness": 0.5} | how
+    return ConvergenceStudy("sparse", GIVEN, 0.05, "the integrated motion", results, **options)
+
+
+MAP = {(1, 4): 0.4, (2, 2): 0.5, (2, 4): 0.2, (2, 8): 0.1, (4, 4): 0.04, (4, 8): 0.03, (8, 8): 0.009}
+
+
+def test_settings_are_powers_of_two_around_the_given_one():
+    found = list_settings(StepSetting(2, 5), 2, has_iterations=True)
+    assert {setting.substeps for setting in found} == {1, 2, 4, 8}
+    assert {setting.iterations for setting in found} == {1, 2, 5, 10, 20}
+    assert len(found) == len(set(found)) == 20
+    assert list_settings(StepSetting(4, 1), 1, has_iterations=False) == [(2, 1), (4, 1), (8, 1)]
+
+
+def test_the_verdict_names_what_is_wrong_and_the_cheapest_setting_for_each_error():
+    lines = synthetic(MAP).describe_verdict()
+    assert lines[0].startswith("2 x 4 substeps x iterations is not converged to 5 %: its error is 20 %, against the")
+    assert (
+        "largest strain is 10 %; its energy at the end is 2 % of the largest kinetic energy less than true" in lines[1]
+    )
+    assert lines[2] == "Twice the substeps change the motion by 20 %, which is more than is asked."
+    assert lines[3] == "Twice the iterations change the motion by 3 %, less than is asked."
+    assert "as if it were 0.5 times as stiff" in lines[4]
+    assert lines[5] == "Within 5 %: 4 x 4 is the cheapest, 16 ms a frame, 2 times the given."
+    assert lines[6] == "Within 1 %: 8 x 8 is the cheapest, 64 ms a frame, 8 times the given."
+
+
+@pytest.mark.parametrize(
+    ("error", "change", "converged"), [(0.04, 0.04, True), (0.06, 0.04, False), (0.04, 0.06, False), (inf, None, False)]
+)
+def test_converged_is_a_small_error_that_doubling_does_not_change(error: float, change: float | None, converged: bool):
+    assert synthetic(MAP | {(2, 4): error}, substep_change=change, iteration_change=0.0).is_converged is converged
+
+
+def test_the_change_of_two_motions_is_relative_to_the_largest_displacement():
+    start, q = np.zeros((2, 3)), np.zeros((3, 2, 3))
+    q[:, 1, 0] = 1.0, 4.0, 2.0
+    p = q.copy()
+    p[2, 1, 1], p[0, 0, 0] = 0.4, 9.0  # the first vertex is pinned, and does not count
+    assert measure_change(p, q, start, np.array([1])) == pytest.approx(0.1)
+
+
+def test_a_study_finds_that_a_setting_is_not_converged_and_what_would_be(scene: Path):
+    found = study(scene)
+    errors = {result.setting: result.error for result in found.results}
+    assert len(errors) == 9
+    assert min(errors, key=lambda setting: errors[setting]) == (4, 8)
+    assert not found.is_converged
+    assert found.substep_change is not None
+    assert found.substep_change > 0.05
+    p, q = (found.find_result(StepSetting(k, 4)).positions for k in (2, 4))
+    free = np.arange(1, 5)
+    start = np.linspace(0, 1, 6)[:, None] * (q[0, -1] - q[0, 0]) + q[0, 0]
+    assert found.substep_change == pytest.approx(measure_change(p, q, start, free), rel=1e-9)
+    assert found.effective_stiffness == pytest.approx(1.0, abs=0.05), "local-global rests where it should"
+    assert all(result.max_strain < 1.0 and not result.reason for result in found.results)
+
+
+def test_an_unconverged_method_of_constraints_seems_softer(scene: Path):
+    simulator = simulate(scene, "xpbd")
+    true, soft, stiff = (simulator.measure_sag(one) for one in (None, StepSetting(1, 1), StepSetting(4, 60)))
+    assert soft > 1.1 * true
+    assert stiff == pytest.approx(true, rel=0.05)
+
+
+@pytest.mark.slow
+def test_without_a_reference_settings_are_compared_with_the_finest(scene: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*given: Any, **how: Any) -> Any:
+        raise RunFailed("unpredictable")
+
+    monkeypatch.setattr(ReferenceStore, "load_trajectory", refuse)
+    found = study(scene)
+    assert found.reference == "the finest setting, 4 x 8, for there is no reference"
+    assert found.find_result(StepSetting(4, 8)).error == inf
+    assert "energy" not in found.describe_verdict()[1]
+
+
+def test_a_setting_that_is_not_supported_ends_the_study(scene: Path):
+    scene.write_text(SCENE.replace("stretch: 200", "stretch: exact"))
+    with pytest.raises(RunFailed, match=r"sparse 2 x 4: sparse: supports finite stiffness only"):
+        study(scene)
+
+
+def test_a_map_marks_the_given_setting_and_the_iso_error_lines(tmp_path: Path):
+    full = {(s, i): 0.3 / (s * i) for s in (1, 2, 4) for i in (2, 4, 8)}
+    failed = replace(synthetic(full).results[0], error=inf, reason="diverged in frame 1")
+    drawn = replace(synthetic(full), results=(failed, *synthetic(full).results[1:]))
+    paths = draw_convergence_map(tmp_path / "map", drawn, "Is 2 x 4 converged?", ["facts"])
+    text = paths[1].read_text()
+    assert all(path.is_file() for path in paths)
+    assert "given" in text
+    assert "an error of 5" in text
+    assert "diverged in fra" in text
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_map_its_numbers_and_the_settings(scene: Path):
+    results = scene.parent / "results"
+    line = ["convergence", str(scene), "--solver", "newton", "--substeps", "1", "--iterations", "4", "--doublings", "1"]
+    answer = CliRunner().invoke(app, [*line, "--t-end", str(END), "--results", str(results)])
+    assert answer.exit_code == 1, answer.output
+    (table,) = (results / "convergence-chain").glob("*.csv")
+    rows = list(csv.DictReader(table.open()))
+    assert {(row["substeps"], row["iterations"]) for row in rows} == {(s, i) for s in "12" for i in "248"}
+    assert float(rows[0]["error"]) > float(rows[-1]["error"]) > 0.0
+    assert len(list((results / "convergence-chain" / "pictures").glob("*.png"))) == 1
+    assert "--solver newton --integrator implicit-euler --time-step 0.03333333333333333 --frames 6" in answer.output
+    assert "is not converged to 5 %" in answer.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--solver", "sparce"], "--solver: came 'sparce'; expected"),
+        (["--solver", "sparse", "--substeps", "0"], "--substeps: came 0; expected a whole number above 0"),
+        (["--solver", "sparse", "--error", "-1"], "--error: came -1; expected a number above 0"),
+        (["--solver", "sparse", "--parameter", "omega"], "--parameter: came 'omega'; expected KEY=VALUE"),
+        (["--solver", "sparse", "--t-end", "nan"], "--t-end: came nan"),
+    ],
+)
+def test_mistakes_are_named(scene: Path, arguments: list[str], message: str):
+    answer = CliRunner().invoke(app, ["convergence", str(scene), *arguments])
+    assert answer.exit_code == 2
+    assert message in answer.output
+
+
+def test_parameters_of_a_solver_are_checked(scene: Path):
+    found = read_solver_options(scene, "xpbd-small-steps", [])
+    assert found.name == "xpbd-small-steps"
+    with pytest.raises(InputError, match="--parameter"):
+        read_solver_options(scene, "sparse", ["no_such=1"])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed: pip install 'springbench[mujoco]'")
+def test_an_engine_has_a_row_of_substeps_and_a_script(scene: Path):
+    results = scene.parent / "results"
+    line = [
+        "convergence",
+        str(scene),
+        "--solver",
+        "mujoco",
+        "--substeps",
+        "16",
+        "--iterations",
+        "1",
+        "--doublings",
+        "1",
+    ]
+    answer = CliRunner().invoke(app, [*line, "--t-end", str(END), "--results", str(results)])
+    assert answer.exit_code in (0, 1), answer.output
+    (table,) = (results / "convergence-chain").glob("*.csv")
+    assert [row["substeps"] for row in csv.DictReader(table.open())] == ["8", "16", "32"]
+    assert (results / "convergence-chain" / "chain-6-mujoco-16x1-given" / "chain.py").is_file()
+    assert "mujoco: steps of 0.00208333333 s" in answer.output
