@@ -39,7 +39,7 @@ def convergence(
     search_time: Annotated[float, typer.Option(help="Wall time after which no further setting starts [s].")] = 200.0,
     results: ResultsOption = Path("results"),
 ) -> None:
-    """Tell whether substeps x iterations of a solver or engine are converged, and which setting would be.
+    """Check whether substeps x iterations of a solver or engine are converged, and find what would be.
 
     Settings are simulated by powers of two around the given one, and compared with the reference motion.
     """
