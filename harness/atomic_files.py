@@ -66,7 +66,7 @@ def open_lock_file(path: Path, access: int = os.O_RDWR, *, hint: str = "") -> in
     Raises:
         InputError: if something else is at this path.
     """
-    flags = access | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    flags = access | sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"))
     try:
         try:
             lock = os.open(path, flags)

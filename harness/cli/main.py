@@ -50,6 +50,7 @@ from springbench.harness.console import get_error_console, get_output_console, s
 from springbench.harness.console import print_message as _say
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.optional_parts import RECORDINGS
+from springbench.harness.execution.platform_calls import can_isolate_processes
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -143,6 +144,8 @@ def run(
         key = f"--{name.replace('_', '-')}"
         raise InputError(InputMistake("is of a run with --error; leave it out", key=key))
     sweep = load_config(config, solvers=solver or (), sizes=size or (), **context.obj)
+    if not in_process and not can_isolate_processes():
+        _say("runs share this process, without limits of time and memory: worker processes need Linux")
     if sweep.options.record and not RECORDINGS.is_installed():
         _say(f"nothing is recorded, and no pictures are drawn: {RECORDINGS.describe_absence()}")
     folder = claim_folder(results / sweep.name, config)

@@ -5,7 +5,6 @@ Processes that share a folder claim its units one by one.
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
@@ -15,6 +14,13 @@ from time import monotonic, sleep
 
 from springbench.harness.atomic_files import open_lock_file
 from springbench.harness.errors import InputError
+from springbench.harness.execution.platform_calls import (
+    LockMode,
+    run_after_fork,
+    try_lock_byte,
+    try_lock_file,
+    wait_for_lock,
+)
 
 DONE_ELSEWHERE, CLAIMED_ELSEWHERE = "was done by another command", "is left to another command"
 
@@ -33,7 +39,7 @@ def lock_folder_exclusive(folder: Path) -> Generator[None]:
         InputError: if another process has locked the folder.
     """
     with _open_folder_lock(folder) as lock:
-        if not _try_lock(lock, fcntl.LOCK_EX):
+        if not try_lock_file(lock, LockMode.EXCLUSIVE):
             raise InputError(f"{folder}: another springbench is running this sweep; wait for it or stop it")
         _remove_partial_files(folder)
         try:
@@ -53,17 +59,17 @@ def lock_folder_shared(folder: Path) -> Generator[None]:
     """
     with _open_folder_lock(folder) as lock:
         until = monotonic() + _LOCK_TIMEOUT
-        while not (first := _try_lock(lock, fcntl.LOCK_EX)) and not _try_lock(lock, fcntl.LOCK_SH):
+        while not (first := try_lock_file(lock, LockMode.EXCLUSIVE)) and not try_lock_file(lock, LockMode.SHARED):
             if monotonic() > until:
                 raise InputError(f"{folder}: another springbench has it for itself; wait for it or stop it")
             sleep(0.05)
         if first:
             _remove_partial_files(folder)
-            fcntl.flock(lock, fcntl.LOCK_SH)
+            wait_for_lock(lock, LockMode.SHARED)
         try:
             yield
         finally:
-            if _try_lock(lock, fcntl.LOCK_EX):
+            if try_lock_file(lock, LockMode.EXCLUSIVE):
                 _remove_partial_files(folder)
 
 
@@ -77,15 +83,6 @@ def _open_folder_lock(folder: Path) -> Generator[int]:
     finally:
         _OPEN_LOCKS.discard(lock)
         os.close(lock)
-
-
-def _try_lock(lock: int, mode: int) -> bool:
-    """Try to lock a file without waiting, and return whether it succeeded."""
-    try:
-        fcntl.flock(lock, mode | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 def _remove_partial_files(folder: Path) -> None:
@@ -102,7 +99,7 @@ def _close_locks() -> None:
         os.close(_OPEN_LOCKS.pop())
 
 
-os.register_at_fork(after_in_child=_close_locks)
+run_after_fork(_close_locks)
 
 
 class UnitClaims:
@@ -124,9 +121,7 @@ class UnitClaims:
         if self._has_changed(unit):
             return DONE_ELSEWHERE
         place = int.from_bytes(sha256(unit.name.encode()).digest()[:7])
-        try:
-            fcntl.lockf(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
-        except OSError:
+        if not try_lock_byte(self._lock, place):
             return CLAIMED_ELSEWHERE
         return (
             DONE_ELSEWHERE if self._has_changed(unit) else ""

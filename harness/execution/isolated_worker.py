@@ -26,8 +26,10 @@ from time import monotonic
 from typing import Any
 
 from springbench.harness.atomic_files import WriteError, atomic_write
+from springbench.harness.errors import SpringbenchError
 from springbench.harness.execution import interrupts
-from springbench.harness.execution.error_location import parse_fault_location
+from springbench.harness.execution.error_location import format_error, locate_error, parse_fault_location
+from springbench.harness.execution.platform_calls import can_isolate_processes
 from springbench.harness.execution.process_memory import ProcessTreeMemory
 from springbench.harness.execution.progress_events import (
     POLL,
@@ -90,6 +92,8 @@ class IsolatedWorker:
 
     def start_worker(self) -> None:
         """Start a worker if there is none; it initialises itself concurrently."""
+        if not can_isolate_processes():
+            return
         if self._worker is None or not self._worker.is_ready:
             self.stop_worker()
             with interrupts.block_interrupts():  # a worker that has started is known to this, and never receives Ctrl-C
@@ -142,6 +146,8 @@ class IsolatedWorker:
         Returns: generator that yields the connection to wait for, and returns the task's value.
         Raises: as `run_task`.
         """
+        if not can_isolate_processes():
+            return _run_unlimited(function, tick)
         if not self._own <= user_code:
             self.stop_worker()
         self.start_worker()
@@ -167,6 +173,16 @@ class IsolatedWorker:
         if self._worker:
             self._worker.stop_process()
             self._worker, self._own = None, frozenset[Hashable]()
+
+
+def _run_unlimited(function: TaskFunction, tick: ProgressCallback) -> Any:
+    """Run a task in this process, without limits, with the errors of a worker."""
+    try:
+        return function(tick)
+    except SpringbenchError:
+        raise
+    except Exception as error:
+        raise TaskFailure("failed", f"raised {format_error(error)} ({locate_error(error, ())})") from error
 
 
 class _WorkerProcess:

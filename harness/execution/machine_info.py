@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution.platform_calls import list_usable_cores, read_load_average
 
 _PROJECT_ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("harness", "solvers")
@@ -81,9 +82,7 @@ def _count_usable_cores() -> int:
 
 
 def _count_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(list_usable_cores())
 
 
 @cache
@@ -162,11 +161,11 @@ def _count_idle_cores() -> ThreadChoice:
     import psutil  # as long to load as the rest of this module
 
     usable = _count_usable_cores()
-    mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(usable)
+    mine = list_usable_cores()
     busy = psutil.cpu_percent(_LOAD_SAMPLE_SECONDS, percpu=True)
     idle = sum(1.0 - busy[core] / 100 for core in mine if core < len(busy))
     number = min(usable, max(1, int(idle + _IDLE_ROUND_UP)))
-    load = os.getloadavg()[0]
+    load = read_load_average()
     return ThreadChoice(
         number, f"threads: {number} of {usable}, for {idle:.1f} cores were idle (load average {load:.1f})"
     )

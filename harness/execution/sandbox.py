@@ -10,7 +10,6 @@ from __future__ import annotations
 import atexit
 import os
 import pickle
-import resource
 import signal
 import struct
 import subprocess
@@ -18,10 +17,18 @@ import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from math import inf
 from threading import Timer
+from time import process_time
 from typing import Any, BinaryIO
 
 from springbench.harness.errors import InputError
+from springbench.harness.execution.platform_calls import (
+    can_isolate_processes,
+    disable_core_dumps,
+    get_soft_limit,
+    set_soft_limit,
+)
 
 _TIMEOUT_FACTOR = 10.0
 """Wall seconds allowed per second of processor time, because other processes may occupy the cores."""
@@ -56,6 +63,8 @@ def call_in_sandbox(function: Callable[..., Any], *arguments: Any, limits: CallL
         InputError: if the function raises it.
         SandboxError: if the function raises anything else, exceeds a limit, or crashes.
     """
+    if not can_isolate_processes():
+        return _call_unlimited(function, arguments)
     child = _SandboxProcess.get_running()
     try:
         child.send_message((os.getcwd(), function, arguments, limits))
@@ -67,6 +76,16 @@ def call_in_sandbox(function: Callable[..., Any], *arguments: Any, limits: CallL
     if kind == "error":
         raise SandboxError(answer)
     return answer
+
+
+def _call_unlimited(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """Call a function in this process, with the errors that the sandbox reports."""
+    try:
+        return function(*arguments)
+    except InputError:
+        raise
+    except Exception as error:  # readers raise anything on a broken file
+        raise SandboxError(" ".join(str(error).split())[:300] or type(error).__name__) from error
 
 
 def _describe_exit(code: int, limits: CallLimits) -> str:
@@ -181,9 +200,8 @@ def serve_calls() -> None:
 
 
 def _run_call(function: Callable[..., Any], arguments: tuple[Any, ...], limits: CallLimits) -> tuple[str, Any]:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    set_soft_limit(resource.RLIMIT_CPU, used.ru_utime + used.ru_stime + limits.cpu_seconds)
-    set_soft_limit(resource.RLIMIT_DATA, read_data_bytes() + limits.memory_bytes)
+    set_soft_limit("RLIMIT_CPU", process_time() + limits.cpu_seconds)
+    set_soft_limit("RLIMIT_DATA", read_data_bytes() + limits.memory_bytes)
     try:
         return "answer", function(*arguments)
     except InputError as error:
@@ -194,8 +212,8 @@ def _run_call(function: Callable[..., Any], arguments: tuple[Any, ...], limits: 
         message = " ".join(str(error).split())[:300]
         return "error", message or type(error).__name__
     finally:
-        for what in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):
-            set_soft_limit(what, resource.RLIM_INFINITY)
+        for what in ("RLIMIT_CPU", "RLIMIT_DATA"):
+            set_soft_limit(what, inf)
 
 
 @contextmanager
@@ -207,37 +225,17 @@ def limit_memory(memory_bytes: int) -> Generator[None]:
     Args:
         memory_bytes: allowed bytes beyond those in use now.
     """
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    wanted = read_data_bytes() + memory_bytes
-    set_soft_limit(resource.RLIMIT_DATA, wanted if soft == resource.RLIM_INFINITY else min(wanted, soft))
+    before = get_soft_limit("RLIMIT_DATA")
+    set_soft_limit("RLIMIT_DATA", min(read_data_bytes() + memory_bytes, before))
     try:
         yield
     finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+        set_soft_limit("RLIMIT_DATA", before)
 
 
 def get_sandbox_pid() -> int:
     """Return the process id of this process's sandbox, or 0 without one."""
     return _SandboxProcess.current_pid()
-
-
-def disable_core_dumps() -> None:
-    """Disable core dumps of this process and its children."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def set_soft_limit(resource_id: int, value: float) -> None:
-    """Set a soft resource limit and leave the hard limit unchanged.
-
-    The next call can therefore use another value.
-
-    Args:
-        resource_id: constant `resource.RLIMIT_*`.
-        value: limit in the unit of the resource, or RLIM_INFINITY.
-    """
-    hard = resource.getrlimit(resource_id)[1]
-    soft = int(value) if value != resource.RLIM_INFINITY else hard
-    resource.setrlimit(resource_id, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
 
 
 def read_data_bytes() -> int:

@@ -13,16 +13,23 @@ which the system releases when a process dies. All commands and workers of a mac
 
 from __future__ import annotations
 
-import fcntl
 import os
 import tempfile
 from collections.abc import Generator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from time import sleep
 
 from springbench.harness.atomic_files import open_lock_file
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.execution.platform_calls import (
+    LockMode,
+    list_usable_cores,
+    pin_threads,
+    try_lock_file,
+    unlock_file,
+    wait_for_lock,
+)
 from springbench.harness.execution.progress_events import WAITING, ProgressCallback, report_activity
 
 _RETRY_SECONDS = 0.02
@@ -32,15 +39,15 @@ _RETRY_SECONDS = 0.02
 @contextmanager
 def lock_timing_exclusive(tick: ProgressCallback) -> Generator[None]:
     """Compute alone on the machine; tick reports the waiting time."""
-    with _lock_context("wanted", fcntl.LOCK_SH, tick), _lock_context("used", fcntl.LOCK_EX, tick):
+    with _lock_context("wanted", LockMode.SHARED, tick), _lock_context("used", LockMode.EXCLUSIVE, tick):
         yield
 
 
 @contextmanager
 def lock_timing_shared(tick: ProgressCallback) -> Generator[None]:
     """Compute while no run is timed exclusively; tick reports the waiting time."""
-    with _lock_context("wanted", fcntl.LOCK_EX, tick):  # timed runs have priority
-        used = _acquire_lock("used", fcntl.LOCK_SH, tick)
+    with _lock_context("wanted", LockMode.EXCLUSIVE, tick):  # timed runs have priority
+        used = _acquire_lock("used", LockMode.SHARED, tick)
     try:
         yield
     finally:
@@ -60,7 +67,7 @@ class TimingSession:
 
     def __enter__(self) -> TimingSession:
         if self._exclusive:
-            self._coming.enter_context(_lock_context("wanted", fcntl.LOCK_SH, self._tick))
+            self._coming.enter_context(_lock_context("wanted", LockMode.SHARED, self._tick))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -69,7 +76,7 @@ class TimingSession:
 
     def lock_for_preparation(self) -> AbstractContextManager[None]:
         """Lock the machine for preparation before the timing."""
-        return _lock_context("used", fcntl.LOCK_SH, self._tick) if self._exclusive else lock_timing_shared(self._tick)
+        return _lock_context("used", LockMode.SHARED, self._tick) if self._exclusive else lock_timing_shared(self._tick)
 
     def finish_timing(self) -> None:
         """End the priority for timing, and lock for shared computation.
@@ -94,7 +101,7 @@ def reserve_cores(number: int, tick: ProgressCallback) -> Generator[list[int]]:
     Raises:
         ValueError: if this process may not use that many cores.
     """
-    mine = sorted(os.sched_getaffinity(0))
+    mine = list_usable_cores()
     if number > len(mine):
         raise ValueError(f"{number} cores of {len(mine)}")
     with lock_timing_shared(tick):
@@ -108,10 +115,10 @@ def reserve_cores(number: int, tick: ProgressCallback) -> Generator[list[int]]:
                         claimed = {}
                         sleep(_RETRY_SECONDS)
                         claimed = _claim_free_cores(mine, number)
-            _pin_threads(set(claimed))
+            pin_threads(set(claimed))
             yield sorted(claimed)
         finally:
-            _pin_threads(set(mine))
+            pin_threads(set(mine))
             _release_locks(*claimed.values())
 
 
@@ -122,23 +129,15 @@ def _claim_free_cores(cores: list[int], limit: int) -> dict[int, int]:
         if len(found) == limit:
             break
         lock = _open_machine_lock(f"core-{core}")
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if try_lock_file(lock, LockMode.EXCLUSIVE):
             found[core] = lock
-        except BlockingIOError:
+        else:
             os.close(lock)
     return found
 
 
-def _pin_threads(cores: set[int]) -> None:
-    """Pin all threads of this process to the given cores."""
-    for thread in os.listdir("/proc/self/task"):
-        with suppress(OSError):  # it has ended
-            os.sched_setaffinity(int(thread), cores)
-
-
 @contextmanager
-def _lock_context(name: str, mode: int, tick: ProgressCallback) -> Generator[None]:
+def _lock_context(name: str, mode: LockMode, tick: ProgressCallback) -> Generator[None]:
     lock = _acquire_lock(name, mode, tick)
     try:
         yield
@@ -146,14 +145,12 @@ def _lock_context(name: str, mode: int, tick: ProgressCallback) -> Generator[Non
         _release_locks(lock)
 
 
-def _acquire_lock(name: str, mode: int, tick: ProgressCallback) -> int:
+def _acquire_lock(name: str, mode: LockMode, tick: ProgressCallback) -> int:
     lock = _open_machine_lock(name)
     try:
-        try:
-            fcntl.flock(lock, mode | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not try_lock_file(lock, mode):
             with report_activity(tick, WAITING):
-                fcntl.flock(lock, mode)
+                wait_for_lock(lock, mode)
     except BaseException:
         os.close(lock)
         raise
@@ -162,7 +159,7 @@ def _acquire_lock(name: str, mode: int, tick: ProgressCallback) -> int:
 
 def _release_locks(*locks: int) -> None:
     for lock in locks:
-        fcntl.flock(lock, fcntl.LOCK_UN)  # copies that this process has made of itself have it open too
+        unlock_file(lock)
         os.close(lock)
 
 

@@ -9,12 +9,12 @@ import ctypes
 import faulthandler
 import gc
 import os
-import resource
 import signal
 import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from math import inf
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import monotonic
@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 from springbench.harness.console import reset_error_console
 from springbench.harness.errors import SpringbenchError
 from springbench.harness.execution.error_location import format_error, locate_error
-from springbench.harness.execution.sandbox import disable_core_dumps, get_sandbox_pid, read_data_bytes, set_soft_limit
+from springbench.harness.execution.platform_calls import disable_core_dumps, get_signal, set_soft_limit
+from springbench.harness.execution.sandbox import get_sandbox_pid, read_data_bytes
 from springbench.solvers.iteration.device_interface import is_device_lost
 
 ProgressCallback = Callable[[str], None]
@@ -32,8 +33,11 @@ TaskFunction = Callable[[ProgressCallback], Any]
 function and its result must pickle.
 """
 
-DUMP_SIGNAL = signal.SIGUSR1
+DUMP_SIGNAL = get_signal("SIGUSR1")
 """Signal that makes a worker dump its stack."""
+
+KILL_SIGNAL = get_signal("SIGKILL")
+"""Signal that ends a process at once."""
 
 _FULL_CHECK_SECONDS = 10.0
 """Seconds between two full garbage collections, which include objects of earlier tasks; a cache may have released
@@ -124,7 +128,7 @@ def serve_tasks(
             gc.freeze()  # compiled kernels leave 10^5 objects, which take longer to look through than a short run
 
 
-def tie_to_parent(parent: int, death_signal: signal.Signals = signal.SIGKILL) -> None:
+def tie_to_parent(parent: int, death_signal: signal.Signals = KILL_SIGNAL) -> None:
     """End this child process by a signal when its parent ends.
 
     It is also the first to be killed when memory runs out.
@@ -146,7 +150,7 @@ def adopt_orphans() -> None:
 def _run_task(piece: TaskFunction, limits: TaskLimits, tick: ProgressCallback) -> TaskOutcome:
     before = threading.active_count(), _list_children()
     if limits.memory_gib is not None:
-        set_soft_limit(resource.RLIMIT_DATA, read_data_bytes() + limits.memory_gib * 2**30)
+        set_soft_limit("RLIMIT_DATA", read_data_bytes() + limits.memory_gib * 2**30)
     try:
         value: Any = piece(tick)
     except SpringbenchError as error:
@@ -157,7 +161,7 @@ def _run_task(piece: TaskFunction, limits: TaskLimits, tick: ProgressCallback) -
             None, why, is_clean=isinstance(error, Exception) and _is_clean_after(before) and not is_device_lost()
         )
     finally:
-        set_soft_limit(resource.RLIMIT_DATA, resource.RLIM_INFINITY)
+        set_soft_limit("RLIMIT_DATA", inf)
     return TaskOutcome(value, is_clean=_is_clean_after(before) and not is_device_lost())
 
 

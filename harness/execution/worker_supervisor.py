@@ -16,7 +16,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import NoReturn
 
-from springbench.harness.execution.sandbox import disable_core_dumps
+from springbench.harness.execution.platform_calls import disable_core_dumps
 from springbench.harness.execution.worker_process import (
     DUMP_SIGNAL,
     adopt_orphans,

@@ -53,7 +53,7 @@ def mark_verified(path: Path, *, shared: bool = True) -> None:
         with suppress(OSError):  # then it is found out again
             notes = _notes_path()
             notes.parent.mkdir(parents=True, exist_ok=True)
-            file = os.open(notes, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            file = os.open(notes, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
             try:
                 if os.fstat(file).st_size > _MAX_NOTES_BYTES:
                     os.truncate(file, 0)

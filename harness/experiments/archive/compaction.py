@@ -148,6 +148,8 @@ def _sync_folder(folder: Path) -> None:
 
     A rename is then durable before the replaced files are removed.
     """
+    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folders
+        return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

@@ -13,7 +13,6 @@ study measures the error rate for these.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from random import Random, SystemRandom
 from time import perf_counter
 from typing import Literal
 
+from springbench.harness.execution.platform_calls import read_load_average
 from springbench.harness.experiments.regression.confidence_sequence import (
     RatioInterval,
     SequentialTest,
@@ -239,7 +239,7 @@ def build_result(sequential_test: SequentialTest, blocks: list[TimedBlock], elap
         compute_interval(x, sequential_test.alpha),
         tuple(blocks),
         elapsed,
-        os.getloadavg()[0],
+        read_load_average(),
     )
 
 

@@ -5,7 +5,6 @@ Worktrees stay in the user's cache, so that a revision is compiled once. Only th
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import subprocess
@@ -18,6 +17,7 @@ from typing import Any
 
 from springbench.harness.atomic_files import open_lock_file, user_cache_dir
 from springbench.harness.errors import InputError
+from springbench.harness.execution.platform_calls import LockMode, wait_for_lock
 from springbench.harness.experiments.regression.revision_process import PACKAGE_FOLDER, GitRevision
 
 MAX_WORKTREES = 6
@@ -146,7 +146,7 @@ def _lock_exclusive(folder: Path) -> Generator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     lock = open_lock_file(folder / ".lock")
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        wait_for_lock(lock, LockMode.EXCLUSIVE)
         yield
     finally:
         os.close(lock)

@@ -9,7 +9,6 @@ predicted from its smaller sizes, is skipped with a row that states so.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from math import exp, log
@@ -19,6 +18,7 @@ import numpy as np
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.errors import RunFailed
 from springbench.harness.execution import machine_info
+from springbench.harness.execution.platform_calls import read_load_average
 from springbench.harness.execution.worker_process import ProgressCallback
 from springbench.harness.experiments.failure_columns import build_failure_columns
 from springbench.harness.experiments.provenance import build_run_columns
@@ -153,7 +153,7 @@ def _build_row(reading: CandidateTiming, round: int) -> ResultRow:
         "phase": reading.phase,
         "seconds": reading.call_seconds,
         "round": round,
-        "load_average": os.getloadavg()[0],
+        "load_average": read_load_average(),
     }
     if reading.phase == "step":
         found["frame"] = 1
