@@ -32,6 +32,7 @@ from springbench.harness.cli.commands.published import compare, publish_study, r
 from springbench.harness.cli.commands.recommend import recommend
 from springbench.harness.cli.commands.regress import regress
 from springbench.harness.cli.commands.roofline import roofline
+from springbench.harness.cli.commands.validate import validate
 from springbench.harness.cli.shared_options import (
     CompareOption,
     EndTimeOption,
@@ -282,6 +283,7 @@ app.command()(figure)
 app.command()(gallery)
 app.command()(mesh)
 app.command()(preview)
+app.command()(validate)
 app.command()(matrices)
 app.command()(grade)
 app.command()(regress)

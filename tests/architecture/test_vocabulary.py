@@ -42,7 +42,7 @@ NOUNS = _split_words(
 """The classes that everything else is described by."""
 COMMANDS = _split_words(
     "ablate compact merge mesh publish figure gallery preview recommend convergence regress roofline accuracy report "
-    "query reference schema inspect view matrices grade pages reproduce compare"
+    "query reference schema inspect view matrices grade validate pages reproduce compare"
 )
 """Commands of the command line."""
 REQUIRED = _split_words(

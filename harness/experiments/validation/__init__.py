@@ -1,0 +1,1 @@
+"""Validation: simulations compared with closed forms and with published measurements."""

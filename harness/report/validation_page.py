@@ -1,0 +1,170 @@
+"""Page of a validation: a table in Markdown, and a picture of errors by refinement and of textile tests."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from springbench.harness.atomic_files import atomic_write
+from springbench.harness.report.plot_style import (
+    FASTER_COLOUR,
+    MUTED_COLOUR,
+    PAGE_DPI,
+    PAGE_HEIGHT,
+    PAGE_RC,
+    PAGE_WIDTH,
+    RULE_COLOUR,
+    TEXT_COLOUR,
+    WARNING_COLOUR,
+)
+
+LIMITS = """What springs cannot do:
+
+* A network of springs has no Poisson's ratio of its own. On square cells the diagonals alone resist shear, and they add
+  to the stiffness along the threads.
+* Bending is that of an isotropic sheet. It lacks the friction and hysteresis of yarns, and the loss of stiffness that
+  fabrics show with curvature.
+* Compressed cells resist until the mesh buckles, where yarns give way at once. Drape is therefore stiffer than that of
+  a fabric, the more so on coarse meshes."""
+"""Statement of the model's limits, on every page."""
+
+
+def write_validation_page(rows: Sequence[dict[str, Any]], solver: str, folder: Path) -> list[Path]:
+    """Write `validation.json`, `validation.md` and `validation.png` to a folder.
+
+    Args:
+        rows: rows of `springbench validate`.
+        solver: name of the solver.
+        folder: existing folder.
+    Returns: the paths of the files.
+    """
+    paths = [folder / f"validation.{suffix}" for suffix in ("json", "md", "png")]
+    listed = [{key: value for key, value in row.items() if key not in ("positions", "triangles")} for row in rows]
+    with atomic_write(paths[0]) as partial:
+        partial.write_text(json.dumps({"solver": solver, "rows": listed}, indent=1) + "\n", encoding="utf-8")
+    with atomic_write(paths[1]) as partial:
+        partial.write_text(format_validation_page(rows, solver), encoding="utf-8")
+    with atomic_write(paths[2]) as partial:
+        draw_validation(rows, solver, partial)
+    return paths
+
+
+def format_validation_page(rows: Sequence[dict[str, Any]], solver: str) -> str:
+    """Format the page as Markdown."""
+    lines = [f"# Validation of `{solver}`", "", "![Errors by refinement, and textile tests](validation.png)", ""]
+    forms = [row for row in rows if row["kind"] == "closed form"]
+    if forms:
+        lines += [
+            "## Closed forms", "",
+            "The error is that of the finest level. It is confirmed if discretisation, model and round-off explain it.",
+            "",
+            "| case | quantity | exact | simulated | error | explained | order | verdict |",
+            "|---|---|---|---|---|---|---|---|",
+            *map(_format_form, forms), "",
+            *(f"* {row['name']}: {row['remark']}" for row in forms if row["remark"]), "",
+        ]  # fmt: skip
+    tests = [row for row in rows if row["kind"] == "textile test"]
+    if tests:
+        lines += [
+            "## Textile tests", "",
+            "Bands: bending lengths from the smallest and largest measured rigidity (Wang, O'Brien and Ramamoorthi "
+            "2011); drape coefficients from Cusick's regression (1965) for these bending lengths.",
+            "",
+            "| fabric | bending length [mm] | band | drape coefficient [%] | band | verdict |",
+            "|---|---|---|---|---|---|",
+            *map(_format_test, tests), "", LIMITS, "",
+        ]  # fmt: skip
+    return "\n".join(lines)
+
+
+def _format_form(row: dict[str, Any]) -> str:
+    head = f"| {row['name']} | {row['quantity']} | {row['exact']:.6g} |"
+    if "values" not in row:
+        return f"{head} | | | | {row['verdict']} |"
+    order = "" if row["observed_order"] is None else f"{row['observed_order']:.2f} of {row['order']:g}"
+    return (
+        f"{head} {row['values'][-1]:.6g} | {row['errors'][-1]:.2g} | {row['explained_error']:.2g} | {order} | "
+        f"{row['verdict']} |"
+    )
+
+
+def _format_test(row: dict[str, Any]) -> str:
+    if "bending_length" not in row:
+        return f"| {row['name']} | | | | | {row['verdict']} |"
+    c, drape = row["bending_length"], row["drape_coefficient"]
+    return (
+        f"| {row['name'].removeprefix('fabric ')} | {1e3 * c['value']:.1f} | {1e3 * c['low']:.1f} to "
+        f"{1e3 * c['high']:.1f} | {drape['value']:.0f} | {drape['low']:.0f} to {drape['high']:.0f} | {row['verdict']} |"
+    )
+
+
+def draw_validation(rows: Sequence[dict[str, Any]], solver: str, path: Path) -> None:
+    """Draw the errors of closed forms by refinement, and the textile tests in their bands, to a PNG."""
+    forms = [row for row in rows if "errors" in row]
+    tests = [row for row in rows if "bending_length" in row]
+    with plt.rc_context(PAGE_RC):
+        figure = plt.figure(figsize=(PAGE_WIDTH / PAGE_DPI, PAGE_HEIGHT / PAGE_DPI), dpi=PAGE_DPI)
+        figure.text(0.025, 0.95, f"Validation of {solver}", fontsize=20, weight="bold", va="center")
+        count = sum(row["verdict"] == "confirmed" for row in forms)
+        inside = sum(row["verdict"] == "in band" for row in tests)
+        said = [f"{count} of {len(forms)} closed forms confirmed"] if forms else []
+        said += [f"{inside} of {len(tests)} fabrics in all bands"] if tests else []
+        figure.text(0.025, 0.91, "   ·   ".join(said), color=MUTED_COLOUR, va="center", fontsize=11)
+        _draw_forms(figure, forms, 0.74 if tests else 0.99)
+        for k, key in enumerate(("bending_length", "drape_coefficient") if tests else ()):
+            _draw_bands(figure.add_axes((0.83, 0.545 - 0.425 * k, 0.15, 0.28)), tests, key)
+        figure.savefig(path, format="png")
+        plt.close(figure)
+
+
+def _draw_forms(figure: Any, forms: Sequence[dict[str, Any]], right: float) -> None:
+    """Draw a panel for each closed form: relative error and what explains it, by level."""
+    columns = 4
+    for k, row in enumerate(forms):
+        width = (right - 0.05) / columns
+        left, bottom = 0.05 + (k % columns) * width, 0.66 - (k // columns) * 0.27
+        axes = figure.add_axes((left, bottom, 0.74 * width, 0.165))
+        scale = abs(row["exact"]) or 1.0
+        floor = 1e-11
+        errors = np.maximum(np.array(row["errors"]) / scale, floor)
+        levels = np.array(row["levels"], float)
+        is_good = row["verdict"] == "confirmed"
+        axes.plot(levels, errors, "-o", color=FASTER_COLOUR if is_good else WARNING_COLOUR, markersize=5)
+        if row["observed_order"] is not None:
+            expected = errors[-1] * (levels[-1] / levels) ** row["order"]
+            axes.plot(levels, expected, ":", color=MUTED_COLOUR, linewidth=1.2, zorder=0)
+        axes.plot(levels[-1:], [max(row["explained_error"] / scale, floor)], "_", color=TEXT_COLOUR, markersize=14)
+        axes.set_xscale("log", base=2)
+        axes.set_yscale("log")
+        axes.set_ylim(10 ** (np.floor(np.log10(errors.min())) - 0.3), 10 ** (np.ceil(np.log10(errors.max())) + 0.3))
+        axes.set_xticks(levels, [f"{level:g}" for level in levels])
+        axes.minorticks_off()
+        axes.grid(axis="y")
+        axes.tick_params(labelsize=8)
+        title = row["name"] if row["exact"] else f"{row['name']}: error [m]"
+        axes.set_title(title, fontsize=10, loc="left", color=TEXT_COLOUR)
+        axes.set_xlabel("steps" if row["refined"] == "time step" else row["refined"], fontsize=8)
+    figure.text(
+        0.05, 0.025, "relative error by refinement; dotted: the order of the method; dash: the error that is explained",
+        fontsize=9, color=MUTED_COLOUR,
+    )  # fmt: skip
+
+
+def _draw_bands(axes: Any, tests: Sequence[dict[str, Any]], key: str) -> None:
+    """Draw simulated values as points on their published bands."""
+    factor, title = (1e3, "bending length [mm]") if key == "bending_length" else (1.0, "drape coefficient [%]")
+    for k, row in enumerate(reversed(tests)):
+        band = {name: factor * value for name, value in row[key].items()}
+        is_inside = band["low"] <= band["value"] <= band["high"]
+        axes.plot([band["low"], band["high"]], [k, k], color=RULE_COLOUR, linewidth=9, solid_capstyle="butt")
+        axes.plot(band["value"], k, "o", color=FASTER_COLOUR if is_inside else WARNING_COLOUR, markersize=7)
+    axes.set_yticks(range(len(tests)), [row["name"].removeprefix("fabric ") for row in reversed(tests)], fontsize=8)
+    axes.set_ylim(-0.6, len(tests) - 0.4)
+    axes.set_xlim(left=0.0)
+    axes.tick_params(labelsize=8)
+    axes.set_title(title, fontsize=10, loc="left", color=TEXT_COLOUR)
+    axes.set_xlabel("bar: published band; point: simulated", fontsize=8)
