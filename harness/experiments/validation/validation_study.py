@@ -1,4 +1,4 @@
-"""The validation as a table: closed forms by refinement, textile tests beside published bands.
+"""The validation as a table: closed forms by refinement, textile tests and their published bands.
 
 A closed form is confirmed if the error of the finest level is at most what its discretisation explains: the difference
 of the two finest levels over 2^p - 1, p the order, times a safety factor (Roache 1994), plus the difference of the
