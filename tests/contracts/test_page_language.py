@@ -178,6 +178,15 @@ def test_a_command_of_a_page_exists_with_its_options(command: PageCommand) -> No
     parser.parse_args([word for word in arguments if not word.startswith("[")])
 
 
+@pytest.mark.parametrize("page", WRITTEN, ids=name_page)
+def test_a_command_in_a_sentence_exists_with_its_options(page: Path) -> None:
+    for span in re.findall(r"`springbench ([a-z-]+)([^`]*)`", page.read_text(encoding="utf-8")):
+        found = find_command(span[0])
+        assert found, span[0]
+        known = {name for one in found.params for name in (*one.opts, *getattr(one, "secondary_opts", ()))}
+        assert set(re.findall(r"(?<=\s)--[a-z-]+", span[1])) - {"--help"} <= known
+
+
 @pytest.mark.parametrize("command", [one for one in COMMANDS if "*" not in str(one.words)], ids=str)
 def test_the_files_of_a_command_are_there(command: PageCommand) -> None:
     named = [word for word in command.words if re.match(r"(configs|tests|solvers|harness)/[\w./-]+$", word)]

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from springbench.harness.cli.reference_pages.markdown_text import format_table
 from springbench.harness.experiments.ablation.ablation_schema import ABLATION_COLUMNS
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_COLUMNS
+from springbench.harness.report.robustness import RUN_OUTCOMES
 from springbench.harness.results.run_schema import RUN_COLUMNS, ColumnSpec
 
 _INTRODUCTION = """# Columns
@@ -14,7 +15,7 @@ _INTRODUCTION = """# Columns
 For readers of Parquet files and writers of queries: the columns of the three tables `rows`, `accuracy` and `ablation`.
 
 [Rows of a run](#rows-of-a-run), [rows of an accuracy study](#rows-of-an-accuracy-study), [rows of an
-ablation](#rows-of-an-ablation). [SQL over rows](../howto/sql-over-rows.md) shows how to use them."""
+ablation](#rows-of-an-ablation), [outcomes](#outcomes-of-verified-runs). [SQL over rows](../howto/sql-over-rows.md) shows how to use them."""
 
 _RUN_TEXT = """## Rows of a run
 
@@ -32,6 +33,11 @@ _ABLATION_TEXT = """## Rows of an ablation
 
 Columns that are not listed here have the meaning that they have in rows of a run."""
 
+_OUTCOME_TEXT = """## Outcomes of verified runs
+
+`springbench report` gives each verified run one outcome, from its rows. [Certificates](../explanation/certificates.md)
+explains the checks."""
+
 
 def build_column_page() -> str:
     """Build the page of the columns of rows, accuracy studies and ablations."""
@@ -44,6 +50,8 @@ def build_column_page() -> str:
             _format_columns(one for one in ACCURACY_COLUMNS if one not in RUN_COLUMNS),
             _ABLATION_TEXT,
             _format_columns(one for one in ABLATION_COLUMNS if one not in RUN_COLUMNS),
+            _OUTCOME_TEXT,
+            format_table(("outcome", "meaning"), ((one.label, one.description) for one in RUN_OUTCOMES)),
         ]
     )
 
