@@ -3,7 +3,7 @@ nobody would call slow once all is compiled, and what a first run on a fresh mac
 
     pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.3      on an idle machine, with all kernels compiled
 
-A line is a test or a whole file. A file is, where tests share what takes long to make: the next of them would make it.
+A line is a test, with or without its parameters, or a whole file. A file is, where tests share what takes long to make: the next of them would make it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ def mark_slow_tests(items: list[pytest.Item]) -> None:
         name = item.nodeid
         if any(part in name for part in LONG_NAME_PARTS):
             item.add_marker(pytest.mark.long)
-        elif name in slow or name.partition("::")[0] in slow or any(kind in name for kind in SLOW_NAME_PARTS):
+        elif slow & {name, name.partition("[")[0], name.partition("::")[0]} or any(
+            kind in name for kind in SLOW_NAME_PARTS
+        ):
             item.add_marker(pytest.mark.slow)
 
 
