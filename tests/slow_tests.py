@@ -3,7 +3,8 @@ nobody would call slow once all is compiled, and what a first run on a fresh mac
 
     pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.3      on an idle machine, with all kernels compiled
 
-A line is a test, with or without its parameters, or a whole file. A file is, where tests share what takes long to make: the next of them would make it.
+A line is a test, with or without its parameters, or a whole file. A file is, where tests share what takes long to make:
+the next of them would make it.
 """
 
 from __future__ import annotations
