@@ -32,7 +32,10 @@ from springbench.harness.config.typed_keys import (
     UserCodeName,
 )
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.recording.local_origin import compute_local_origin, store_relative
+from springbench.harness.recording.obstacle_properties import build_obstacles_property, list_obstacles
 from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.scenes.effects.effect_interface import SceneEffect
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.scene_builder import build_scene
@@ -156,7 +159,7 @@ class Simulation:
         Raises: InputError, and the errors of the solver's preparation.
         """
         size = size if size is not None else scene.default_size
-        self._scene = build_scene(scene, size or 0, integrator)
+        self._spec, self._scene = scene, build_scene(scene, size or 0, integrator)
         if isinstance(solver, str):
             solver = _create_solver(solver, parameters or {}, scene.path)
         self._prepared = prepare(self._scene, solver)
@@ -164,7 +167,7 @@ class Simulation:
             StopRule(max_iterations, rtol),
             initial_guess or scene.choose_initial_guess(integrator),
         )
-        self._state = build_initial_state(self._scene)
+        self._start = self._state = build_initial_state(self._scene)
         self.mesh: Mesh = self._scene.mesh
         self.last_step: SimulationStep | None = None
 
@@ -195,6 +198,33 @@ class Simulation:
     def run_steps(self, count: int) -> NDArray[np.float64]:
         """Advance by `count` steps and return all their positions, (count, n, 3) [m]."""
         return np.array([self.step() for _ in range(count)])
+
+    def draw_state(self) -> PngImage:
+        """Draw the present positions, after the positions at the start; raise RunFailed if the system cannot draw."""
+        states = [self._start, self._state] if self._state.index > self._start.index else [self._state]
+        springs, origin = self._scene.all_springs, compute_local_origin(self.mesh.rest_positions)
+        replay = RecordingReplay(
+            title=self._spec.path.stem,
+            run_id="",
+            frames=np.array([state.index for state in states]),
+            times=np.array([self._scene.compute_time(state.index) for state in states]),
+            positions=np.stack([store_relative(state.motion.positions, origin) for state in states]),
+            triangles=self.mesh.triangles,
+            springs=springs.edges,
+            rest_lengths=springs.rest_length,
+            pinned_vertices=self._scene.system.pins.vertices,
+            strain_range=compute_strain_range([self._state.motion.positions], springs.edges, springs.rest_length),
+            scalars={},
+            properties=build_obstacles_property(list_obstacles(self._spec.effects)),
+            origin=origin,
+        )
+        return draw_picture(replay)
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the picture that a notebook displays; None where nothing can be drawn."""
+        from springbench.harness.report.opengl_probe import find_opengl_problem
+
+        return None if find_opengl_problem() else self.draw_state().content
 
 
 def _create_solver(name: str, parameters: Mapping[str, Any], path: Path) -> Solver:
