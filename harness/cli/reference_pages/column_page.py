@@ -15,8 +15,8 @@ _INTRODUCTION = """# Columns
 For readers of Parquet files and writers of queries: the columns of the three tables `rows`, `accuracy` and `ablation`.
 
 [Rows of a run](#rows-of-a-run), [rows of an accuracy study](#rows-of-an-accuracy-study), [rows of an
-ablation](#rows-of-an-ablation), [outcomes](#outcomes-of-verified-runs). [SQL over rows](../howto/sql-over-rows.md) shows
-how to use them."""
+ablation](#rows-of-an-ablation), [outcomes](#outcomes-of-verified-runs). [SQL over rows](../howto/sql-over-rows.md)
+shows how to use them."""
 
 _RUN_TEXT = """## Rows of a run
 
