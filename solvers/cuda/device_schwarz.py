@@ -168,4 +168,4 @@ class DeviceAdditiveSchwarz:
         return device_sums.count_blocks(items), device_sums.THREADS_PER_BLOCK, self._stream.cuda_stream
 
     def _subdomain_launch_shape(self, level: SchwarzLevel) -> tuple[int, int, Any]:
-        return min(level.num_subdomains, _MAX_GRID_BLOCKS), THREADS_PER_SUBDOMAIN, self._stream.cuda_stream
+        return int(max(1, min(level.num_subdomains, _MAX_GRID_BLOCKS))), THREADS_PER_SUBDOMAIN, self._stream.cuda_stream

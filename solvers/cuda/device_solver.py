@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.cuda import cuda_device
-from springbench.solvers.cuda.cuda_target import DeviceStream
+from springbench.solvers.cuda.cuda_target import DeviceStream, ReusedUploads
 from springbench.solvers.cuda.device_step import DeviceStep, UploadedNetwork
 from springbench.solvers.iteration.descent_method import ResidualMetric
 from springbench.solvers.iteration.device_interface import SolveEvents
@@ -29,23 +30,26 @@ ITERATIONS_PER_RESIDUAL = 8
 
 
 class DeviceSolverState(SolverState):
-    """State of a solve on a device, with its own memory.
+    """State of a solve on a device, with its own memory, which later solves reuse.
 
     Attributes:
+        uploads: the arrays of its step.
         row_vertices: (n,), the vertex of each row.
         is_stalled: whether the last iteration moved nothing.
         residual_of_positions: returns the residual [J^(1/2)] at positions; nan for a method that does not minimise.
     """
 
     def __init__(self, stream: DeviceStream, order: NDArray[np.int64]) -> None:
-        self.stream, self.order, self.stalled = stream, order, False
+        self.stream, self.order, self.stalled, self.uploads = stream, order, False, ReusedUploads(stream)
         self.residual_of_positions: Callable[[Positions], float] = lambda p: float("nan")
         self._start_event = self._upload_event = self._kernel_event = self._download_event = stream.record_event()
         self._positions_copy: Positions | None = None
         self._num_iterations = 0
 
     def mark_start(self) -> None:
-        """Mark the start of a solve: the following copies belong to it."""
+        """Mark the start of a solve, of no iterations yet: the following copies belong to it."""
+        self._positions_copy, self._num_iterations, self.stalled, self.velocity = None, 0, False, None
+        self.uploads.restart()
         self._start_event = self.stream.record_event()
 
     def mark_uploaded(self) -> None:
@@ -142,15 +146,20 @@ class DeviceSolver(IterativeSolver):
         """Allocate the memory of a solve."""
 
     @abstractmethod
-    def upload_problem(self, problem: StepProblem, initial_guess: Positions) -> DeviceStep:
+    def upload_problem(self, problem: StepProblem, initial_guess: Positions, uploads: ReusedUploads) -> DeviceStep:
         """Upload a step to the device, with an initial guess (n, 3) [m]."""
+
+    @cached_property
+    def _finished_states(self) -> list[DeviceSolverState]:
+        """States of solves that have ended, with memory and graphs for the next ones."""
+        return []
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> DeviceSolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
         with cuda_device.guard_device_errors():
-            run = self.allocate_state()
+            run = self._finished_states.pop() if self._finished_states else self.allocate_state()
             run.mark_start()
-            step = self.upload_problem(problem, initial_guess)
+            step = self.upload_problem(problem, initial_guess, run.uploads)
             run.mark_uploaded()
             run.load_step(step)
             return run
@@ -159,6 +168,11 @@ class DeviceSolver(IterativeSolver):
         """Iterate until the stop rule is met, or until no iteration descends."""
         with cuda_device.guard_device_errors():
             return super().solve(problem, stop)
+
+    def release_state(self, run: SolverState) -> None:
+        """Keep the state of a solve that has ended for the next one."""
+        assert isinstance(run, DeviceSolverState)
+        self._finished_states.append(run)
 
     def iterates_without_copy(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
         """Yield a function per iterate that copies it; each iterate is complete when it is yielded."""
@@ -176,7 +190,9 @@ class DeviceSolver(IterativeSolver):
             run.run_unchecked(iterations)
             p, nan = run.positions, float("nan")
             found = Solution(p, iterations, nan, nan, "max-iter", run.velocity, self.residual_iterate)
-            return found, run.solve_events()
+            events = run.solve_events()
+            self.release_state(run)
+            return found, events
 
 
 class MinimisingSolver(DeviceSolver):
@@ -193,9 +209,11 @@ class MinimisingSolver(DeviceSolver):
     objective: FixedObjective
     supports_contact: ClassVar[bool] = False
 
-    def upload_problem(self, problem: StepProblem, initial_guess: Positions) -> DeviceStep:
+    def upload_problem(self, problem: StepProblem, initial_guess: Positions, uploads: ReusedUploads) -> DeviceStep:
         """Upload a step to the device, with an initial guess (n, 3) [m]."""
-        return self.uploaded_network.upload_step(problem, initial_guess, supports_contact=self.supports_contact)
+        return self.uploaded_network.upload_step(
+            problem, initial_guess, uploads, supports_contact=self.supports_contact
+        )
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> DeviceSolverState:
         """Start a solve from an initial guess (n, 3) [m]."""

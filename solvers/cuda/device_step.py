@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.cuda import device_sums
-from springbench.solvers.cuda.cuda_target import DeviceStream, cuda
+from springbench.solvers.cuda.cuda_target import DeviceStream, ReusedUploads, cuda
 from springbench.solvers.cuda.device_network import DeviceEdges, DeviceNetwork, DeviceStepData
 from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 from springbench.solvers.model.step_problem import Positions, StepProblem, System
@@ -100,14 +100,14 @@ class UploadedNetwork:
         return cls(network, stream, network.upload_edges(stream), places, hold)
 
     def upload_step(
-        self, problem: StepProblem, initial_guess: Positions, *, supports_contact: bool = False
+        self, problem: StepProblem, initial_guess: Positions, uploads: ReusedUploads, *, supports_contact: bool = False
     ) -> DeviceStep:
         """Upload a step problem with an initial guess (n, 3) [m].
 
         For methods with contact, also upload the start of the step.
         """
-        force, up = self.host_network.spring_form.compute_force(problem), self.stream.upload_array
-        target, pins, start = up(problem.inertial_target), upload_pin_targets(problem, self.stream), problem.step_start
+        force, up = self.host_network.spring_form.compute_force(problem), uploads.upload_array
+        target, pins, start = up(problem.inertial_target), upload_pin_targets(problem, uploads), problem.step_start
         lagged = (
             (up(start.velocity_origin), up(start.lagged_positions))
             if self.host_network.spring_form.dashpots
@@ -129,9 +129,9 @@ def number_pins(system: System) -> NDArray[np.int32]:
     return numbers
 
 
-def upload_pin_targets(problem: StepProblem, stream: DeviceStream) -> Any:
+def upload_pin_targets(problem: StepProblem, uploads: ReusedUploads) -> Any:
     """Upload the pin targets to the device, which does not support empty arrays."""
-    return stream.upload_array(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3)))
+    return uploads.upload_array(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3)))
 
 
 class LoadedStep:

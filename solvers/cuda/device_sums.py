@@ -22,7 +22,7 @@ from other files than the kernel's also require a block of one thread."""
 
 def count_blocks(n: int) -> int:
     """Return the number of blocks of a launch for n terms, over which threads loop with a stride."""
-    return max(1, min(MAX_BLOCKS, -(-n // THREADS_PER_BLOCK)))
+    return int(max(1, min(MAX_BLOCKS, -(-n // THREADS_PER_BLOCK))))
 
 
 @cuda.jit(device=True)

@@ -159,9 +159,15 @@ class IterativeSolver(ABC):
             if not more and ended != iteration_loop.REASON_ITERATIONS:
                 ended = iteration_loop.REASON_STALLED
         ended = _TERMINATION_REASONS[ended]
-        return Solution(
+        found = Solution(
             run.positions, count, residual, yardstick, ended, run.velocity, self.residual_iterate, run.warm_start
         )
+        self.release_state(run)
+        return found
+
+    def release_state(self, run: SolverState) -> None:
+        """Take back the state of a solve that has ended, for a method whose next solve reuses it."""
+        return
 
     def _initial_state(self, problem: StepProblem) -> SolverState:
         if problem.system.length_constraints and not self.supports_length_constraints:

@@ -109,7 +109,15 @@ def together(threads: list[Thread]) -> None:
 
 def call(self: Any, *arguments: Any) -> Any:
     """A kernel or a function of one; of what it names, `cuda` is the running kernel's, if it is there."""
+    if not self._device:
+        assert all(type(n) is int and n > 0 for n in _sizes(self)), "a device takes positive integers of Python alone"
     return self.fn(*arguments) if self._device and not names_cuda(self.fn) else usual(self, *arguments)
+
+
+def _sizes(launched: Any) -> list[Any]:
+    """How many blocks and threads a kernel is launched with."""
+    given = launched.grid_dim, launched.block_dim
+    return [n for one in given for n in (one if isinstance(one, tuple) else (one,))]
 
 
 @cache

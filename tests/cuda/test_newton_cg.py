@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -13,6 +14,7 @@ from springbench.solvers.cuda.cuda_target import cuda
 from springbench.solvers.iteration.preconditioners import PreconditionerName
 from springbench.solvers.linalg import additive_schwarz
 from springbench.solvers.methods.newton.newton_cg import NewtonCG
+from springbench.solvers.model.constraints import DirichletPins
 from springbench.solvers.model.step_problem import StepProblem, StopRule, Unsupported
 
 from tests.cuda.near import same_iterates
@@ -99,3 +101,13 @@ def test_sums_of_blocks_are_added_by_a_tree(monkeypatch: pytest.MonkeyPatch) -> 
     for _ in range(2):  # whoever of the threads goes first
         device_sums.collect_sums[1, device_sums.THREADS_PER_BLOCK](2, given, count, out)
         np.testing.assert_allclose(out.copy_to_host(), terms.sum(axis=1), rtol=1e-12)
+
+
+def test_where_nothing_moves_every_kernel_has_a_block() -> None:
+    made = build_cloth(3, "exact")
+    pins = DirichletPins(np.arange(made.system.num_vertices), np.full(made.system.num_vertices, np.inf))
+    system = replace(made.system, pins=pins)
+    problem = build_first_problem(made)
+    problem = replace(problem, system=system, pin_targets=problem.current_positions)
+    found = schwarz_cg(device="cuda").prepare(system).solve(problem, StopRule(2))
+    np.testing.assert_array_equal(found.positions, problem.pin_targets)

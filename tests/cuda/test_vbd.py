@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from springbench.solvers.cuda.cuda_device import is_simulated
 from springbench.solvers.cuda.device_solver import ITERATIONS_PER_RESIDUAL, DeviceSolver
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.methods.vertex_block import device_vbd
@@ -113,13 +114,25 @@ def test_bits_do_not_depend_on_who_looks() -> None:
 @pytest.mark.parametrize("iterations", [1, 2])
 def test_the_objective_is_summed_over_all_vertices(iterations: int) -> None:
     """By threads that wait for each other, from the reference on; elsewhere it but decides whether to extrapolate."""
-    problem = build_random_problem(1, weights=())
+    vertices = 12 if is_simulated() else 300  # so that they are several blocks
+    problem = build_random_problem(1, n=vertices, m=5 * vertices // 2, weights=())
     run: Any = on_device(problem).init_state(problem, problem.initial_guess)
     run.run_unchecked(iterations)
     run._sum_objective(run._displacement, OBJECTIVE, run._sums[0])
     found, step = run.stream.download_array(run._sums[0]).sum(), StepObjective(FixedObjective(problem.system), problem)
     assert len(run._sums[0]) > 1
     assert found == pytest.approx(step.objective_change(problem.initial_guess, run.positions)[0], rel=1e-5)
+
+
+def test_solves_that_reuse_memory_end_at_the_same_bits() -> None:
+    one, other = build_random_problem(1, weights=()), build_random_problem(1, weights=())
+    other = replace(other, initial_guess=-other.initial_guess, external_force=2.0 * other.external_force)
+    alone = [on_device(p).replay_iterations(p, 5)[0].positions for p in (one, other)]
+    prepared = on_device(one)
+    for _ in range(2):
+        for problem, wanted in zip((one, other), alone, strict=True):
+            np.testing.assert_array_equal(prepared.replay_iterations(problem, 5)[0].positions, wanted)
+            np.testing.assert_array_equal(prepared.solve(problem, StopRule(5)).positions, wanted)
 
 
 def test_a_residual_may_end_it_after_each_few_iterations() -> None:

@@ -15,13 +15,12 @@ The scalars are in `now` on the device, written by kernels of one block. After t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from springbench.solvers.cuda import cuda_device, device_sums, objective_kernels
-from springbench.solvers.cuda.cuda_target import DeviceStream, cuda
+from springbench.solvers.cuda.cuda_target import DeviceStream, LaunchGraph, cuda
 from springbench.solvers.cuda.device_network import DeviceNetwork, require_known_energies
 from springbench.solvers.cuda.device_schwarz import (
     DeviceAdditiveSchwarz,
@@ -178,6 +177,7 @@ class _NewtonCGState(DeviceSolverState):
             device_sums.THREADS_PER_BLOCK,
             stream.cuda_stream,
         )
+        self._linearisation, self._first_cg_iterations, self._cg_iterations = (LaunchGraph(stream) for _ in range(3))
         self._max_eta, self._min_eta = made.forcing
         self._floor = self._eta = self._residual_product = 0.0
 
@@ -213,19 +213,22 @@ class _NewtonCGState(DeviceSolverState):
 
     def _linearise_at_point(self) -> float:
         """Compute the gradient, the Hessian and z at p; return g'z [J]."""
+        self._linearisation.launch(self._launch_linearisation)
+        return float(self.stream.download_array(self._sums)[0])
+
+    def _launch_linearisation(self) -> None:
         objective_kernels.gradient_bytes[self._over](self._edges, self._given, self._p, self._g)
         self._kernels.linearise_hessian[self._over](self._edges, len(self._g), self._p, self._linear)
         self._preconditioner.set_linearisation(self._edges, self._p)
         write_negated[self._over](self._g, self._preconditioner.r)
         self._preconditioner.apply_preconditioner(self._z, 0, self._partials, self._idle)
-        return float(self._collected(1, len(self._d))[0])
+        self._collect_sums(1, len(self._d))
 
-    def _collected(self, count: int, terms: int) -> NDArray[np.float64]:
-        """Wait for the first `count` sums of `terms` terms, and return them."""
+    def _collect_sums(self, count: int, terms: int) -> None:
+        """Launch the second stage of the first `count` sums of `terms` terms."""
         device_sums.collect_sums[1, device_sums.THREADS_PER_BLOCK, self.stream.cuda_stream](
             count, self._partials, device_sums.count_blocks(terms), self._sums
         )
-        return self.stream.download_array(self._sums)[:count]
 
     def _search(self, direction: Any) -> bool:
         """Line search by step halving along a direction (f, 3); return success."""
@@ -235,11 +238,12 @@ class _NewtonCGState(DeviceSolverState):
             objective_kernels.sum_objective_change[self._over_all](
                 self._edges, self._given, self._p, self._q, 1, self._partials
             )
-            slope, rise = map(float, self._collected(2, max(network.num_free, len(network.ends))))
+            self._collect_sums(2, max(network.num_free, len(network.ends)))
+            slope, rise = map(float, self.stream.download_array(self._sums))
             if not slope < 0.0:
                 return False
             if is_armijo_step(rise, t, slope, 0.0):
-                self._p, self._q = self._q, self._p
+                self.stream.copy_array(self._q, self._p)
                 return True
             t *= 0.5
         return False
@@ -252,15 +256,23 @@ class _NewtonCGState(DeviceSolverState):
         now = np.zeros(6)
         now[RESIDUAL_PRODUCT], now[PREVIOUS_PRODUCT], now[PRODUCT_LIMIT] = self._residual_product, np.inf, limit
         self.stream.overwrite_array(now, self._cg_status)
-        z, done = self._z, 0
+        done = 0
         while done < most and now[STATUS] == RUNNING:
             some = min(ITERATIONS_PER_CHECK, most - done)
-            for _ in range(some):
-                self._launch_cg_iteration(z)
-                z = self._w
+            launch = partial(self._launch_cg_iterations, self._w if done else self._z, some)
+            if some == ITERATIONS_PER_CHECK:
+                (self._cg_iterations if done else self._first_cg_iterations).launch(launch)
+            else:
+                launch()
             done += some
             now = self.stream.download_array(self._cg_status)
         return self._s if now[STATUS] == NEGATIVE_CURVATURE and now[NUM_ITERATIONS] == 0.0 else self._d
+
+    def _launch_cg_iterations(self, z: Any, count: int) -> None:
+        """Launch iterations, the first of which has the preconditioned residual z."""
+        for _ in range(count):
+            self._launch_cg_iteration(z)
+            z = self._w
 
     def _launch_cg_iteration(self, z: Any) -> None:
         launch, one, count = self._over, (1, device_sums.THREADS_PER_BLOCK, self.stream.cuda_stream), self._over[0]

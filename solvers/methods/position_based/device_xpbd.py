@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.cuda import cuda_device, device_sums
-from springbench.solvers.cuda.cuda_target import DeviceStream, cuda
+from springbench.solvers.cuda.cuda_target import DeviceStream, LaunchGraph, ReusedUploads, cuda
 from springbench.solvers.cuda.device_solver import DeviceSolver, DeviceSolverState
 from springbench.solvers.cuda.device_step import DeviceStep, number_pins, upload_pin_targets
 from springbench.solvers.iteration import vertex_terms
@@ -151,13 +151,13 @@ class PreparedDeviceXpbd(DeviceSolver):
     stats: dict[str, float] = field(default_factory=dict[str, float])
     is_substepping: ClassVar[bool] = False
 
-    def upload_problem(self, problem: StepProblem, initial_guess: Positions) -> DeviceStep:
+    def upload_problem(self, problem: StepProblem, initial_guess: Positions, uploads: ReusedUploads) -> DeviceStep:
         """Upload a step problem; the initial guess is not used."""
-        up, start = self.stream.upload_array, problem.step_start
+        up, start = uploads.upload_array, problem.step_start
         target, force, pins = (
             up(problem.inertial_target),
             up(problem.external_force),
-            upload_pin_targets(problem, self.stream),
+            upload_pin_targets(problem, uploads),
         )
         here = (up(start.positions), up(start.velocity)) if self.is_substepping else (target, target)
         return DeviceStep(target, force, target, pins, target, target, *here, (start.time, start.stage_time))
@@ -191,6 +191,7 @@ class _DeviceXpbdState(DeviceSolverState):
             build_xpbd_kernels(made.real_dtype),
             made.device_constraints.allocate_solve(made.real_dtype),
         )
+        self.projection = LaunchGraph(stream)
         self.reference, self.position_output = (stream.allocate_array((n, 3), np.float64) for _ in range(2))
         self.displacement, self.vertex_compliance = (
             stream.allocate_array((n, 4), made.real_dtype),
@@ -253,7 +254,7 @@ class DeviceXpbdState(_DeviceXpbdState):
     def launch_iterations(self, num_iterations: int) -> int:
         """Launch iterations; return how many of them moved something."""
         for _ in range(num_iterations):
-            self.project_constraints()
+            self.projection.launch(self.project_constraints)
         return num_iterations
 
 
@@ -307,7 +308,10 @@ class DeviceXpbdSmallStepsState(_DeviceXpbdState):
                 self._float64_compliance, step.external_force, self._v, self._substep_start,
                 self.reference, self.displacement,
             )  # fmt: skip
-            self.linearise_constraints()
-            self.project_constraints()
+            self.projection.launch(self._project_from_reference)
             self.launch_kernel(finish_substep, n, h, self._substep_start, self.reference, self.displacement, self._v)
         return num_iterations
+
+    def _project_from_reference(self) -> None:
+        self.linearise_constraints()
+        self.project_constraints()

@@ -16,7 +16,7 @@ import numpy as np
 from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact
 from springbench.solvers.contact.half_space.vertex_contact import is_vertex_contact, without_vertex_contact
 from springbench.solvers.cuda import cuda_device, device_springs
-from springbench.solvers.cuda.cuda_target import THREADS, DeviceStream, blocks
+from springbench.solvers.cuda.cuda_target import THREADS, DeviceStream, LaunchGraph, blocks
 from springbench.solvers.cuda.device_network import DeviceNetwork
 from springbench.solvers.cuda.device_solver import DeviceSolverState, MinimisingSolver
 from springbench.solvers.cuda.device_springs import DeviceLanes
@@ -159,6 +159,7 @@ class DeviceSweepState(DeviceSolverState):
         )
         self._force = stream.allocate_array((3, max(1, lanes)), made.real_dtype)
         self._rows = stream.allocate_array((n, 3), np.float64)
+        self._iteration = LaunchGraph(stream)
         self._half_spaces = None
         if any(map(is_vertex_contact, made.system.energies)):
             of, self._half_space_kernels = (
@@ -217,7 +218,7 @@ class DeviceSweepState(DeviceSolverState):
         for number in range(self._num_iterations, self._num_iterations + num_iterations):
             if number % REBASE_INTERVAL == 0:
                 self._rebase_reference(moved=number > 0)
-            self._launch_iteration()
+            self._iteration.launch(self._launch_iteration)
         return num_iterations
 
     def _rebase_reference(self, *, moved: bool) -> None:
