@@ -82,7 +82,7 @@ class ReusedUploads:
     def __init__(self, stream: DeviceStream) -> None:
         self._stream, self._arrays, self._next = stream, list[Any](), 0
 
-    def restart(self) -> None:
+    def start_step(self) -> None:
         """Start the uploads of the next step."""
         self._next = 0
 
@@ -110,7 +110,7 @@ class LaunchGraph:
     def __init__(self, stream: DeviceStream) -> None:
         self._stream, self._executable, self._has_launched = stream, None, False
 
-    def launch(self, launch_kernels: Callable[[], None]) -> None:
+    def launch_together(self, launch_kernels: Callable[[], None]) -> None:
         """Launch the kernels.
 
         Args:

@@ -49,7 +49,7 @@ class DeviceSolverState(SolverState):
     def mark_start(self) -> None:
         """Mark the start of a solve, of no iterations yet: the following copies belong to it."""
         self._positions_copy, self._num_iterations, self.stalled, self.velocity = None, 0, False, None
-        self.uploads.restart()
+        self.uploads.start_step()
         self._start_event = self.stream.record_event()
 
     def mark_uploaded(self) -> None:

@@ -213,7 +213,7 @@ class _NewtonCGState(DeviceSolverState):
 
     def _linearise_at_point(self) -> float:
         """Compute the gradient, the Hessian and z at p; return g'z [J]."""
-        self._linearisation.launch(self._launch_linearisation)
+        self._linearisation.launch_together(self._launch_linearisation)
         return float(self.stream.download_array(self._sums)[0])
 
     def _launch_linearisation(self) -> None:
@@ -261,7 +261,7 @@ class _NewtonCGState(DeviceSolverState):
             some = min(ITERATIONS_PER_CHECK, most - done)
             launch = partial(self._launch_cg_iterations, self._w if done else self._z, some)
             if some == ITERATIONS_PER_CHECK:
-                (self._cg_iterations if done else self._first_cg_iterations).launch(launch)
+                (self._cg_iterations if done else self._first_cg_iterations).launch_together(launch)
             else:
                 launch()
             done += some

@@ -254,7 +254,7 @@ class DeviceXpbdState(_DeviceXpbdState):
     def launch_iterations(self, num_iterations: int) -> int:
         """Launch iterations; return how many of them moved something."""
         for _ in range(num_iterations):
-            self.projection.launch(self.project_constraints)
+            self.projection.launch_together(self.project_constraints)
         return num_iterations
 
 
@@ -308,7 +308,7 @@ class DeviceXpbdSmallStepsState(_DeviceXpbdState):
                 self._float64_compliance, step.external_force, self._v, self._substep_start,
                 self.reference, self.displacement,
             )  # fmt: skip
-            self.projection.launch(self._project_from_reference)
+            self.projection.launch_together(self._project_from_reference)
             self.launch_kernel(finish_substep, n, h, self._substep_start, self.reference, self.displacement, self._v)
         return num_iterations
 

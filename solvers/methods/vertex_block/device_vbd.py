@@ -218,7 +218,7 @@ class DeviceSweepState(DeviceSolverState):
         for number in range(self._num_iterations, self._num_iterations + num_iterations):
             if number % REBASE_INTERVAL == 0:
                 self._rebase_reference(moved=number > 0)
-            self._iteration.launch(self._launch_iteration)
+            self._iteration.launch_together(self._launch_iteration)
         return num_iterations
 
     def _rebase_reference(self, *, moved: bool) -> None:
