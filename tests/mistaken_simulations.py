@@ -53,7 +53,7 @@ def simulate(scene: dict, frames: int, mistake: str = "", iterations: int = 50) 
     if mistake == "dt not squared":
         dt = dt**0.5
     if mistake == "pins from 0":
-        b = b + 1
+        b = b[b + 1 < n] + 1
     A, C = np.zeros((len(E), n)), np.zeros((len(b), n))
     A[np.arange(len(E)), E[:, 0]], A[np.arange(len(E)), E[:, 1]] = 1, -1
     C[np.arange(len(C)), b] = 1

@@ -335,6 +335,8 @@ class FingerprintFinder:
         """Return the mistakes and their programs whose steps differ from those of the correct program."""
         few = compared.select_steps(range(min(3, len(compared.scales))))
         correct = next(islice(self._correct.iterate_steps(few.steps), 4, None))
+        tiny = np.finfo(float).eps * np.abs(few.steps.current).max(axis=(1, 2)) + np.finfo(float).tiny
+        few = few._replace(scales=_distances(correct, few.steps.current) + tiny)  # what a submission moves may be huge
         pairs = [(mistake, program) for mistake in MISTAKES for program in self._programs[mistake.name]]
         return [(mistake, program) for mistake, program in pairs if not self._is_alike(program, correct, few)]
 

@@ -130,7 +130,7 @@ class SceneGrader:
             terms = collect_spring_terms(self.scene)
             self._finder = FingerprintFinder(self.scene, terms, request.required_iterations)
         except InputError as error:
-            self._finder_note = f"mistakes are not looked for: {error.mistakes[0].problem}"
+            self._finder_note = f"mistakes are not looked for: {error.mistakes[0].problem.partition('; leave out')[0]}"
 
     def grade_file(self, path: Path) -> PositionGrade:
         """Read and grade a submission; raises InputError for a file that cannot be graded."""

@@ -164,8 +164,13 @@ def estimate_precision(p: NDArray[np.float64]) -> StoredPrecision:
         single = bool((values.astype(np.float32) == values).all())
     relative = 2.0**-25 if single else 2.0**-53
     for decimals in range(2, 13):
-        if (np.abs(np.round(values, decimals) - values) <= 4.0 * relative * np.abs(values)).all():
-            return StoredPrecision(0.5 * 10.0**-decimals, relative)
+        unit = 0.5 * 10.0**-decimals
+        if unit < relative * float(np.abs(values).max()):
+            break
+        rounded = np.round(values, decimals)
+        rounded = rounded.astype(np.float32).astype(float) if single else rounded
+        if (np.abs(rounded - values) <= 4.0 * 2.0**-53 * np.abs(values)).all():
+            return StoredPrecision(unit, relative)
     for digits in range(4, 13):
         if all(float(f"{x:.{digits - 1}e}") == x for x in values.tolist()):
             return StoredPrecision(float(np.finfo(float).tiny), 0.5 * 10.0 ** (1 - digits))
