@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from scipy.sparse.linalg import lsqr
+from scipy.sparse.linalg import splu
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.step_stages import StageSequence
 from springbench.harness.simulation.time_loop import SimulationStep, build_initial_state
@@ -41,8 +41,9 @@ _ACTIVE_LENGTH_RTOL = 1e-6
 """Distance from a bound, relative to it, within which a length is taken to be constrained: solves keep lengths to
 1e-9 and better."""
 
-_TENSION_RTOL = 1e-13
-"""Tolerance of the least-squares problem for tensions, near round-off: what it leaves counts as unconverged."""
+_REGULARISATION, _NUM_REFINEMENTS = 1e-10, 4
+"""Shift of the matrix of the tensions, whose diagonal is 2, as redundant constraints make it singular; and the
+refinements that remove its effect, each by a factor of the shift over an eigenvalue."""
 
 
 class StepDissipation(NamedTuple):
@@ -237,6 +238,8 @@ class DissipationBudget:
         low, high = self._lengths.min_length, self._lengths.max_length
         active = (length >= (1.0 - _ACTIVE_LENGTH_RTOL) * high) | (length <= (1.0 + _ACTIVE_LENGTH_RTOL) * low)
         active &= length > 0.0
+        if not active.any():
+            return np.zeros_like(x)
         i, j, count = i[active], j[active], int(active.sum())
         direction = (x[i] - x[j]) / length[active, None]
         rows = np.repeat(np.arange(count), 6)
@@ -244,7 +247,11 @@ class DissipationBudget:
         entries = np.concatenate([direction, -direction], axis=1).ravel()
         gradients = scipy.sparse.csr_array((entries, (rows, columns)), shape=(count, x.size))
         free = (3 * self._free[:, None] + np.arange(3)).ravel()
-        tensions = lsqr(gradients[:, free].T, residual[self._free].ravel(), atol=_TENSION_RTOL, btol=_TENSION_RTOL)[0]
+        of_free, wanted = gradients[:, free], residual[self._free].ravel()
+        normal = of_free @ of_free.T + scipy.sparse.diags_array(np.full(count, _REGULARISATION))
+        factor, tensions = splu(scipy.sparse.csc_array(normal)), np.zeros(count)
+        for _ in range(_NUM_REFINEMENTS):
+            tensions += factor.solve(of_free @ (wanted - of_free.T @ tensions))
         return (gradients.T @ tensions).reshape(x.shape)
 
     def _parameter_work(
