@@ -84,8 +84,6 @@ def _compare_with_study(own: Sequence[Mapping[str, Any]], study: PublishedStudy)
         here, there = own_ratios.get(key), ratios.get(key)
         if there and here and here.reference != there.reference:
             here = there = None
-        if key not in iterations and here is None:
-            continue
         reference = here.reference[0] if here else ""
         interval = (there.low, there.high) if there else None
         scene, size, solver = key[:3]

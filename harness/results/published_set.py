@@ -32,6 +32,7 @@ TABLE_FILES = {
     "ablation": "effects.parquet",
     "blocks": "blocks.parquet",
     "rates": "rates.parquet",
+    "measurements": "measurements.parquet",
 }
 """File of each table.
 

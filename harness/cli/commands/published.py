@@ -22,8 +22,13 @@ ALL_STUDIES, ENTRIES = "all", "entries"
 
 
 def publish_study(
-    results: Annotated[Path, typer.Argument(help="Results of one config, such as results/hard.")],
+    results: Annotated[
+        Path, typer.Argument(help="Results of one config, such as results/hard; or measurements (.parquet).")
+    ],
     config: Annotated[Path | None, typer.Option(help="Config of these results; the owner of the folder.")] = None,
+    provenance: Annotated[
+        Path | None, typer.Option(help="For measurements: rows (.parquet) of a run by the same machine and code.")
+    ] = None,
     published: PublishedOption = published_set.PUBLISHED_FOLDER,
 ) -> None:
     """Write the results of a study to the published set of this checkout.
@@ -33,10 +38,13 @@ def publish_study(
     from springbench.harness.experiments.archive.study_publication import write_study
     from springbench.harness.results.folder_ownership import read_owner
 
-    owner = config or read_owner(results)
+    owner = config or (read_owner(results) if results.is_dir() else None)
     if owner is None:
         raise InputError(InputMistake("does not state its config; give --config", results))
-    write_study(results, owner, published, print_message)
+    for path in (results, provenance):
+        if path and not path.exists():
+            raise InputError(InputMistake("is not there; wanted results, or a Parquet file of measurements", path))
+    write_study(results, owner, published, print_message, provenance)
 
 
 def compare(

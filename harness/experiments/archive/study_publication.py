@@ -49,47 +49,60 @@ MAX_PUBLISHED_BYTES = 8 * 2**20
 
 
 def write_study(
-    results: Path, config: Path, published: Path, print_message: Callable[[str], None]
+    results: Path,
+    config: Path,
+    published: Path,
+    print_message: Callable[[str], None],
+    provenance: Path | None = None,
 ) -> published_set.PublishedStudy:
     """Write the study of a folder of results to the published set, and return it.
 
     Args:
-        results: results of one config.
+        results: results of one config; or a Parquet file of measurements by a script.
         config: the config; its stem is the name of the study.
         published: folder of the published set.
         print_message: prints a remark.
+        provenance: Parquet file of rows of a run by the same machine and code, for measurements without such columns.
 
     Raises:
         InputError: there are no rows, runs of several configs, or the published set would become too large.
     """
     if not config.is_file():
         raise InputError(InputMistake("is not there; wanted the config of these results", config, key="--config"))
-    tables = {table: _read_table(results / table) for table in _TABLES}
-    tables = {table: _drop_missing_software(rows) for table, rows in tables.items() if rows is not None}
-    if not tables:
+    if results.suffix == ".parquet":
+        tables: dict[str, pa.Table | None] = {"measurements": _read_measurements(results)}
+    else:
+        tables = {table: _read_table(results / table) for table in _TABLES}
+    made = _read_measurements(provenance) if provenance else None
+    found = {table: _drop_missing_software(rows) for table, rows in tables.items() if rows is not None}
+    if not found:
         raise InputError(InputMistake("holds no rows; wanted the folder of one sweep, such as results/hard", results))
-    is_timed = any(_is_timed(rows) for rows in tables.values())
+    is_timed = any(_is_timed(rows) for rows in found.values())
     folder = published / config.stem
     folder.mkdir(parents=True, exist_ok=True)
     for path in folder.glob("*.parquet"):
         path.unlink()
-    for table, rows in tables.items():
+    for table, rows in found.items():
         left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed else _TIME_COLUMNS)
         write_published_table(folder / published_set.TABLE_FILES[table], _drop_columns(rows, left_out))
     metadata = {
         "config": os.path.relpath(config.resolve(), folder.resolve()),
         "config_digest": published_set.compute_file_digest(config),
-        "command": _describe_command(tables, config),
+        "command": _describe_command(found, config),
         "is_timed": is_timed,
-        "requested_runs": _count_requested_runs(config) if "rows" in tables else None,
-        **summarise_provenance([row for rows in tables.values() for row in _select_provenance(rows)]),
+        "requested_runs": _count_requested_runs(config) if "rows" in found else None,
+        **summarise_provenance(
+            [row for rows in ([made] if made else found.values()) for row in _select_provenance(rows)]
+        ),
     }
+    if made:
+        metadata |= {"runs": sum(map(len, found.values())), "duration_seconds": None}
     study = write_study_file(folder, metadata)
     size = sum(path.stat().st_size for path in published.rglob("*.parquet"))
     if size > MAX_PUBLISHED_BYTES:
         why = f"takes {size:,} bytes with this study, and at most {MAX_PUBLISHED_BYTES:,} are part of a clone"
         raise InputError(InputMistake(f"{why}; publish fewer runs", published))
-    print_message(f"{folder}: {sum(map(len, tables.values())):,} rows; the published set takes {size / 2**20:.1f} MiB")
+    print_message(f"{folder}: {sum(map(len, found.values())):,} rows; the published set takes {size / 2**20:.1f} MiB")
     return study
 
 
@@ -145,6 +158,15 @@ def _read_table(folder: Path) -> pa.Table | None:
     return parquet_rows.read_rows(units, schema, with_unit_names=True)
 
 
+def _read_measurements(path: Path) -> pa.Table:
+    """Read a table that a script wrote; a column that names files of its machine is left out."""
+    try:
+        table = pq.read_table(path, partitioning=None)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(InputMistake(f"holds no table ({error}); wanted a Parquet file", path)) from error
+    return table.select([name for name in table.column_names if name != row_store.FILE_COLUMN])
+
+
 def _drop_missing_software(rows: pa.Table) -> pa.Table:
     """Drop solvers that no run supports: they need software that is not installed here."""
     if "status" not in rows.column_names or "solver" not in rows.column_names:
@@ -179,6 +201,8 @@ def _count_requested_runs(config: Path) -> int:
 
 
 def _describe_command(tables: Mapping[str, pa.Table], config: Path) -> str:
+    if "measurements" in tables:
+        return f"measurements of {config.parent.name}/{config.name}"
     command = next(name for table, name in _COMMANDS.items() if table in tables)
     return f"springbench {command} {config.parent.name}/{config.name}"
 

@@ -115,7 +115,7 @@ class _PageFields:
         machine, started = about["machines"][0], about["started"]
         date = started[-1][:10] if started else "undated"
         commits = ", ".join(commit[:9] for commit in about["commits"]) or "unknown"
-        where = f"{machine['cpu']}, {machine['cores']} cores"
+        where = f"{machine['cpu']}, {machine['cores']} core{'s' * (machine['cores'] != 1)}"
         requested = about.get("requested_runs")
         count = f"{about['runs']:,}" + (f" of {requested:,}" if requested else "")
         return f"Data: `{about['command']}`, {count} runs, {where}, {date}, commit {commits}."

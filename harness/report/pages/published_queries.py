@@ -16,6 +16,7 @@ import pyarrow as pa
 from springbench.harness.errors import InputError
 from springbench.harness.report.robustness import CORRECT, UNSUPPORTED, read_verified_runs
 from springbench.harness.results.published_set import (
+    TABLE_FILES,
     PublishedStudy,
     find_changed_tables,
     list_studies,
@@ -45,9 +46,9 @@ class PublishedQueries:
         if changed := find_changed_tables(study):
             raise InputError(f"{changed[0]} differs from its checksum in study.json; restore it or publish it again")
         name = study.study_name.replace("-", "_")
-        for table in ("rows", "accuracy", "ablation", "blocks", "rates"):
+        for table in TABLE_FILES:
             if study.find_table(table):
-                suffix = "" if table in ("rows", "accuracy", "ablation") else f"_{table}"
+                suffix = f"_{table}" if table in ("blocks", "rates") else ""
                 self._connection.register(f"{name}{suffix}", study.read_table(table))
         if study.find_table("rows") and "stationarity" in study.read_table("rows").column_names:
             self._connection.register(f"{name}_outcomes", pa.Table.from_pylist(list_outcomes(study)))
