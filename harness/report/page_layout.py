@@ -111,6 +111,10 @@ def draw_header(page: Figure, headline: str, facts: Sequence[str], *, max_letter
     draw_text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED_COLOUR)
 
 
+_MAX_CAPTION_LENGTH = 22
+"""Number of characters of a caption of the strain scale that leaves room for the one in the middle."""
+
+
 def draw_strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
     """Draw the colour bar of strains in the upper right corner.
 
@@ -127,10 +131,14 @@ def draw_strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, 
     bar = add_axes(page, left, top, width, 12)
     bar.imshow(np.linspace(0, 1, 512)[None], cmap=STRAIN_MAP, aspect="auto", interpolation="bilinear")
     bar.set_axis_off()
-    for place, word, end, align in ((0.0, "compressed", ends[0], "left"), (1.0, "stretched", ends[1], "right")):
-        caption = f"{word}, to {format_percent(end)}" if end else f"{word}: none"
+    captions = [
+        f"{word}, to {format_percent(end)}" if end else f"{word}: none"
+        for word, end in zip(("compressed", "stretched"), ends, strict=True)
+    ]
+    for place, caption, align in ((0.0, captions[0], "left"), (1.0, captions[1], "right")):
         draw_text(page, left + place * width, top - 8, caption, size=9.5, ha=align)
-    draw_text(page, left + width / 2, top - 8, "at rest", size=9.5, ha="center")
+    if max(map(len, captions)) <= _MAX_CAPTION_LENGTH:
+        draw_text(page, left + width / 2, top - 8, "at rest", size=9.5, ha="center")
     for place, beyond, tip in ((0.0, ends[0] < -limit, -14), (1.0, ends[1] > limit, 14)):
         if beyond:
             at = left + place * width
@@ -154,9 +162,15 @@ def scene_headline(replay: RecordingReplay) -> str:
     return f"{scene}, size {size}" if size else str(scene)
 
 
+_TIME_UNITS = (("s", 1.0, 1e-2), ("ms", 1e-3, 1e-3), ("µs", 1e-6, 1e-6), ("ns", 1e-9, 1e-9), ("ps", 1e-12, 1e-12))
+"""Units of time [s], each with the last time from which on it is used [s]."""
+
+
 def format_frame_time(replay: RecordingReplay, frame: int) -> str:
-    """Format the time of a recorded frame."""
-    return f"{replay.times[frame]:.2f} s"
+    """Format the time of a recorded frame, in a unit by the last time: seconds from 0.01 s on."""
+    last = float(np.abs(replay.times).max(initial=0.0))
+    unit, seconds = next(((unit, seconds) for unit, seconds, least in _TIME_UNITS if last >= least), ("s", 1.0))
+    return f"{replay.times[frame] / seconds:.2f} {unit}"
 
 
 def format_count(number: int) -> str:
