@@ -24,12 +24,15 @@ from typer.testing import CliRunner
 
 NEWTON = load_target(SOLVERS["newton"])()
 FORMS = {case.name: case for case in list_closed_forms()}
-QUICK = ("hanging chain", "membrane under pressure")
+QUICK, SLOW = ("hanging chain", "membrane under pressure"), ("free fall", "elastic catenary")
+"""Cases of tests that take a second, or some; the others take longer."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in FORMS]
-)
+def mark_duration(name: str) -> pytest.MarkDecorator | tuple[()]:
+    return () if name in QUICK else pytest.mark.slow if name in SLOW else pytest.mark.long
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=mark_duration(name)) for name in FORMS])
 def test_the_error_of_a_closed_form_is_that_of_its_discretisation(name: str):
     (row,) = validation_study.validate_solver(NEWTON, [name])
     assert row["verdict"] == validation_study.CONFIRMED, row
@@ -73,7 +76,7 @@ def test_a_shadow_counts_folds_once():
     assert len(flat.springs) == 12 + 8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_cantilever_test_gives_the_bending_length_of_its_rigidity():
     """At 41.5 degrees half the overhang is (B/w)^(1/3) by Peirce's approximate formula (1930)."""
     fabric = PUBLISHED_FABRICS["royal-target"]
