@@ -1,4 +1,4 @@
-"""Meshes from files: OBJ, the assignment's JSON scenes, PLY, VTP, and all formats that meshio reads."""
+"""Meshes from files: OBJ, the assignment's JSON scenes, PLY, VTP, glTF, and all formats that meshio reads."""
 
 from __future__ import annotations
 
@@ -58,7 +58,8 @@ class FileMesh(SpringValueKeys):
 
     kind: Literal["file"] = "file"
     path: Path
-    """Path of an OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, a VTP, or a meshio format (VTK, ...)."""
+    """Path of an OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, VTP or glTF, or a meshio format (VTK,
+    Gmsh, Abaqus, ...)."""
     scale: Annotated[float, Field(ge=1e-9, le=1e9)] = 1.0
     """Metres per unit of the file's coordinates, 0.001 for millimetres."""
     units: LengthUnit | None = None

@@ -1,6 +1,6 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
 # meshio has no types.
-"""Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY and .vtp.
+"""Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY, .vtp and glTF.
 
 The subprocess is that of `springbench.harness.execution.sandbox`. meshio accepts some truncated files as complete.
 Hence the
@@ -24,7 +24,7 @@ import meshio
 import numpy as np
 from meshio.gmsh import _gmsh40, _gmsh41
 from numpy.typing import NDArray
-from springbench.harness.scenes.mesh import ply_reader, vtp_reader
+from springbench.harness.scenes.mesh import gltf_reader, ply_reader, vtp_reader
 
 CellBlock = tuple[str, NDArray[np.int64]]
 """Cells of one kind: its meshio name, and the point indices of each cell."""
@@ -90,6 +90,10 @@ def _read_by_suffix(path: Path) -> MeshFileContent:
         return _convert_vtp(vtp_reader.read_vtp(path.read_bytes()))
     if suffix == ".ply":
         return _convert_ply(ply_reader.read_ply(path.read_bytes()))
+    if suffix in (".gltf", ".glb"):
+        return _convert_gltf(gltf_reader.read_gltf(path))
+    if suffix == ".vtk" and _VTK_POLYDATA.search(path.read_bytes()[:_VTK_HEAD_BYTES]):
+        return _convert_vtp(vtp_reader.read_vtp(_convert_legacy_polydata(path)))
     content = path.read_bytes() if suffix in (".msh", ".stl") else b""
     if suffix == ".msh" and _GMSH_PARAMETRIC.search(content):
         raise ValueError("it has parametric nodes; save it without them (Mesh.SaveParametric = 0 in Gmsh)")
@@ -187,6 +191,39 @@ def _convert_ply(read: ply_reader.PlyContent) -> MeshFileContent:
     places = [read.first_face_line + which for _, which in read.faces.values()]
     counted: Literal["line", "face"] = "line" if read.first_face_line else "face"
     return MeshFileContent(read.points, blocks, {}, read.vertex_attributes, places, counted)
+
+
+_VTK_POLYDATA = re.compile(rb"^DATASET\s+POLYDATA", re.M | re.I)
+_VTK_HEAD_BYTES = 2_000
+"""Bytes in which a legacy VTK file names its kind of data, behind a title of 256 characters at most."""
+
+
+def _convert_legacy_polydata(path: Path) -> bytes:
+    """Convert a legacy VTK file of surfaces, which meshio does not support, to the contents of a .vtp."""
+    try:
+        from vtkmodules.vtkIOLegacy import vtkPolyDataReader
+        from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+    except ModuleNotFoundError:
+        raise ValueError('a legacy file of surfaces needs VTK: pip install "springbench[pictures]"') from None
+    reader, writer = vtkPolyDataReader(), vtkXMLPolyDataWriter()
+    reader.SetFileName(str(path))
+    reader.ReadAllScalarsOn()
+    reader.ReadAllVectorsOn()
+    reader.Update()
+    if reader.GetErrorCode() or not reader.GetOutput().GetNumberOfPoints():
+        raise ValueError("it is no complete file of VTK; the file was cut, or has no points")
+    writer.SetInputData(reader.GetOutput())
+    writer.SetDataModeToBinary()
+    writer.SetCompressorTypeToNone()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return writer.GetOutputString().encode()
+
+
+def _convert_gltf(read: gltf_reader.GltfContent) -> MeshFileContent:
+    cells = [("triangle", read.triangles), ("line", read.segments)]
+    blocks = [(kind, data) for kind, data in cells if len(data)]
+    return MeshFileContent(read.points, blocks, read.vertex_groups, {}, _number_faces(blocks))
 
 
 def _convert_vtp(read: vtp_reader.VtpContent) -> MeshFileContent:

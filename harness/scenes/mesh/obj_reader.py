@@ -186,7 +186,8 @@ def _parse_point(words: list[str]) -> tuple[float, float, float]:
 
 
 def _parse_colour(words: list[str]) -> tuple[float, ...]:
-    return tuple(map(_parse_coordinate, words))
+    """Parse a colour; NaN, which some programs write for no colour, is black."""
+    return tuple(0.0 if word.lower() == "nan" else _parse_coordinate(word) for word in words)
 
 
 def _parse_coordinate(word: str) -> float:
