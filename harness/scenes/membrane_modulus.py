@@ -36,6 +36,8 @@ FloatArray = NDArray[np.float64]
 
 _REGULARISATION = 1e-9
 """Part of the diagonal that is added to it, for motions without stiffness; the elongation does not excite them."""
+_PLANE_RATIO = 1e-3
+"""Thickness relative to the extent below which a surface is planar."""
 _NUM_DIRECTIONS = 180
 _SOFT_RATIO = 1e-3
 """Ratio of the smallest to the largest modulus below which a direction has none."""
@@ -101,7 +103,9 @@ def compute_area_stiffness(mesh: Mesh) -> FloatArray:
 def compute_membrane_modulus(mesh: Mesh, springs: NDArray[np.int64], stiffness: FloatArray) -> MembraneModulus:
     """Compute the modulus of a surface by direction, with its inner vertices in equilibrium.
 
-    Directions on curved surfaces are angles to the vertical, or to x where most of the surface is horizontal.
+    No motion strains a curved surface alike everywhere, except for a stretch in all directions. For curved surfaces
+    the tensor is that of vertices that follow the strain, times the part that relaxation leaves of a uniform stretch.
+    Directions are angles to the vertical, or to x where most of the surface is horizontal.
 
     Args:
         mesh: a mesh with triangles.
@@ -110,8 +114,12 @@ def compute_membrane_modulus(mesh: Mesh, springs: NDArray[np.int64], stiffness: 
     """
     network = _SurfaceNetwork(mesh, springs, stiffness)
     x, y = network.directions.T
-    elongations = network.lengths[:, None] * np.column_stack([x * x, y * y, x * y])
+    elongations = network.lengths[:, None] * np.column_stack([x * x, y * y, x * y, np.ones_like(x)])
     relaxed = network.relax_elongations(elongations)
+    if not network.is_planar:
+        affine, least = (stiffness * network.lengths @ some[:, 3] for some in (elongations, relaxed))
+        relaxed = elongations * (least / affine)
+    elongations, relaxed = elongations[:, :3], relaxed[:, :3]
     tensor = elongations.T @ (stiffness[:, None] * relaxed) / mesh.surface_area
     tensor = (tensor + tensor.T) / 2
     compliance = np.linalg.inv(tensor + _REGULARISATION * np.trace(tensor) * np.eye(3))
@@ -135,6 +143,7 @@ class _SurfaceNetwork:
         delta = mesh.rest_positions[j] - mesh.rest_positions[i]
         self.lengths = np.linalg.norm(delta, axis=1)
         unit = delta / np.where(self.lengths > 0.0, self.lengths, 1.0)[:, None]
+        self.is_planar = mesh.dimension == 2 and _is_planar(mesh)
         frames = (
             _compute_tangent_frames(mesh)
             if mesh.dimension == 2
@@ -177,6 +186,13 @@ def _find_inner_vertices(mesh: Mesh) -> NDArray[np.bool_]:
     table = build_edge_table(mesh.triangles)
     surface[table.edges[table.num_triangles == 1].ravel()] = False
     return surface
+
+
+def _is_planar(mesh: Mesh) -> bool:
+    """Return whether the vertices lie in a plane, within a thousandth of the extent of the mesh."""
+    centred = mesh.rest_positions - mesh.rest_positions.mean(axis=0)
+    sizes = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))
+    return bool(sizes[0] <= _PLANE_RATIO * sizes[2])
 
 
 def _compute_tangent_frames(mesh: Mesh) -> FloatArray:
