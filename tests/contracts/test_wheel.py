@@ -1,12 +1,13 @@
 """The wheel does the main job in an empty folder and an environment of its own: the commands of the how-to page.
 
-No network is used: the libraries are those of this environment, and only springbench is installed anew.
+Only the last test uses a network: the libraries of the others are those of this environment.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -25,6 +26,12 @@ def read_commands(heading: str) -> list[str]:
     (section,) = re.findall(rf"^## {heading}\n(.*?)(?=^## |\Z)", PAGE.read_text(), re.M | re.S)
     (fence,) = re.findall(r"^```sh\n(.*?)^```", section, re.M | re.S)
     return fence.splitlines()
+
+
+def find_interpreters() -> list[str]:
+    """The supported interpreters of this machine other than this one, the present release of each."""
+    names = [f"python3.{minor}" for minor in (11, 12, 13, 14) if minor != sys.version_info.minor]
+    return [name for name in names if shutil.which(name) and subprocess.run([name, "-V"]).returncode == 0]
 
 
 def call(*command: str, folder: Path, path: str = "") -> str:
@@ -78,3 +85,19 @@ def test_the_light_list_leaves_out_the_libraries_of_recordings_and_pictures(scri
     light = call(str(scripts / "python"), "-m", "springbench.requirements", folder=tmp_path)
     assert "numba" in light
     assert not re.search("rerun|pyvista|vtk", light)
+
+
+def test_other_interpreters_of_this_machine_run_a_scene_and_a_study(scripts: Path, tmp_path: Path):
+    (wheel,) = scripts.parents[1].glob("*.whl")
+    for name in find_interpreters():
+        call(name, "-m", "venv", name, folder=tmp_path)
+        bin_folder = tmp_path / name / "bin"
+        install = ["uv", "pip", "install", "--quiet", "--python", str(bin_folder / "python"), f"{wheel}[gates]"]
+        call(sys.executable, "-m", *install, folder=tmp_path)
+        home = tmp_path / f"home-{name}"
+        home.mkdir()
+        run = ["run", "net", "--size", "4", "--frames", "2", "--solver", "sparse"]
+        assert "net" in call(str(bin_folder / "springbench"), *run, folder=home)
+        call(str(bin_folder / "springbench"), "new", "study", folder=home)
+        told = call(str(bin_folder / "python"), "-m", "pytest", "-q", "--benchmark-disable", folder=home / "study")
+        assert "1 passed" in told
