@@ -8,15 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scipy.io import mmread
-from scipy.sparse import csr_array
+from scipy.io import mmread, mmwrite
+from scipy.sparse import coo_array, csr_array
 from springbench.harness.cli.main import app
 from springbench.harness.config.config_loader import load_scene
+from springbench.harness.errors import InputError
 from springbench.harness.experiments.grading.local_global_matrices import (
     build_local_global_matrices,
     iterate_local_global,
     save_matrices,
 )
+from springbench.harness.experiments.grading.matrix_comparison import compare_matrix_file
 from springbench.harness.experiments.grading.spring_terms import build_graded_scene, build_step_problem
 from typer.testing import CliRunner
 
@@ -160,3 +162,24 @@ def test_a_scene_that_the_formulas_do_not_cover_is_refused(effects, words, tmp_p
     assert answer.exit_code == 2
     assert words in answer.output
     assert "effects" in answer.output
+
+
+def test_a_matrix_of_another_program_is_compared_and_stored_zeros_are_counted(tmp_path):
+    made = build_local_global_matrices(build_graded_scene(load_scene(written_assignment(tmp_path)), 0))
+    n = made.terms.num_vertices
+    pins = np.diag(np.isin(np.arange(n), made.terms.pinned) * 1e10)
+    rows, columns = np.indices((n, n)).reshape(2, -1)
+    every = coo_array((made.Q.toarray().ravel(), (rows, columns)), shape=(n, n))
+    for matrix, name, words in (
+        (made.Q, "Q", "equal to Q of the scene"),
+        (every, "Q", f"equal to Q of the scene; {n * n - made.Q.nnz} stored entries are zero"),
+        (coo_array(made.Q.toarray() - pins), "Q", "Q without the pins"),
+        (coo_array(-made.A.toarray()[::-1]), "A", "equal to A of the scene, up to the order of its rows"),
+        (coo_array(np.abs(made.A.toarray())), "A", "not A of the scene"),
+        (made.y + (made.b - made.y) / 70, "b", "b without k"),
+        (made.d + np.eye(8, 3), "d", "differs most at row"),
+    ):
+        mmwrite(str(tmp_path / f"{name}.mtx"), matrix, precision=17, symmetry="general")
+        assert words in compare_matrix_file(made, tmp_path / f"{name}.mtx")
+    with pytest.raises(InputError, match="should be named A"):
+        compare_matrix_file(made, tmp_path / "K.mtx")

@@ -21,6 +21,12 @@ def matrices(
     scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
     frame: Annotated[int, typer.Option(min=1, max=10_000, help="Number of the step that y, d and b belong to.")] = 1,
+    compare: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Matrix of another program, named A.mtx, C.mtx, M.mtx, Q.mtx, y.mtx, d.mtx or b.mtx; repeatable."
+        ),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Folder for the files; SCENE-matrices by default.")
     ] = None,
@@ -36,7 +42,7 @@ def matrices(
 
     run = load_config(scene, sizes=() if size is None else (size,)).list_runs()[0]
     text, messages = run_isolated(
-        partial(_write_matrices, run.scene, run.size, run.scene_name, frame, folder),
+        partial(_write_matrices, run.scene, run.size, run.scene_name, frame, folder, compare or []),
         run.scene.find_plugins(),
         TaskLimits(*DEFAULT_LOAD_LIMITS),
     )
@@ -47,7 +53,7 @@ def matrices(
 
 
 def _write_matrices(
-    spec: SceneSpec, size: int, name: str, frame: int, folder: Path, tick: ProgressCallback
+    spec: SceneSpec, size: int, name: str, frame: int, folder: Path, others: list[Path], tick: ProgressCallback
 ) -> tuple[list[str], list[str]]:
     """Write the files, and return the printed matrices and the messages."""
     from springbench.harness.experiments.grading.local_global_matrices import (
@@ -55,13 +61,16 @@ def _write_matrices(
         format_matrices,
         save_matrices,
     )
+    from springbench.harness.experiments.grading.matrix_comparison import compare_matrix_file
     from springbench.harness.experiments.grading.spring_terms import build_graded_scene
     from springbench.harness.report.sparsity_plot import draw_sparsity
 
     made = build_local_global_matrices(build_graded_scene(spec, size), frame, spec.initial_guess)
+    compared = [compare_matrix_file(made, path) for path in others]
     paths = save_matrices(made, folder)
     facts = [f"{made.terms.num_vertices} vertices, {len(made.E)} springs, {len(made.terms.pinned)} pins"]
     facts += ["dark: positive entries", "orange: negative entries"]
     shown = {key: matrix for key, matrix in made.sparse_matrices.items() if matrix.shape[0]}
     picture = draw_sparsity(shown, folder / "sparsity.png", f"Matrices of {name}{f' {size}' if size else ''}", facts)
-    return list(format_matrices(made)), [f"{', '.join(path.name for path in (*paths, picture))} are in {folder}"]
+    text = [*format_matrices(made), *(["", *compared] if compared else [])]
+    return text, [f"{', '.join(path.name for path in (*paths, picture))} are in {folder}"]
