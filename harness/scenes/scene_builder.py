@@ -30,7 +30,6 @@ from springbench.harness.scenes.start_positions import RestStart
 from springbench.harness.scenes.vertex_selectors import VertexSelection
 from springbench.solvers.model import integrators
 from springbench.solvers.model.energies.spring_energy import Springs
-from springbench.solvers.model.energies.tension_only_energy import TensionOnlySprings
 from springbench.solvers.model.integrators import IMPLICIT_EULER, find_integrator
 from springbench.solvers.model.step_problem import (
     DirichletPins,
@@ -124,6 +123,9 @@ class Scene:
 
         Length constraints follow, with infinite stiffness.
         """
+        # It has kernels, and listing runs must not import Numba.
+        from springbench.solvers.model.energies.tension_only_energy import TensionOnlySprings
+
         exact = [x for x in self.system.length_constraints if (x.min_length == x.max_length).all()]
         return Springs.from_parts(
             [

@@ -24,7 +24,6 @@ from springbench.harness.scenes.mesh.mesh import STRETCH, Mesh
 from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.spring_stiffness import compute_spring_stiffness
 from springbench.harness.schema.base_model import ConfigModel
-from springbench.solvers.model.energies import tension_only_energy
 
 _LOG = logging.getLogger("springbench")
 
@@ -86,7 +85,10 @@ class SpringsEffect(ConfigModel):
             # A spring without any rest length is never slack.
             pulls = own.only_pulls[stiff] & (own.rest_length[stiff] > 0.0)
             springs, cables = (build_rest_springs(mesh, some, k[some]) for some in (stiff[~pulls], stiff[pulls]))
-            parts = springs, tension_only_energy.TensionOnlySprings.from_springs(cables)
+            # It has kernels, and listing runs must not import Numba.
+            from springbench.solvers.model.energies.tension_only_energy import TensionOnlySprings
+
+            parts = springs, TensionOnlySprings.from_springs(cables)
         return replace(found, energies=tuple(one for one in parts if len(one.edges)))
 
     def _compute_stretch(self, mesh: Mesh) -> StretchConstant | None:
