@@ -10,6 +10,8 @@ on bending and shear stiffness, J. Text. Inst. 56(11), 1965), for the bending le
 45 degrees:
 
     DC = 35.6 c - 3.61 c^2 - 2.59 A + 0.0461 A^2 + 17.0    [%], c in cm, A in degrees
+
+The coefficients are those that textbooks quote; they were not compared with the paper.
 """
 
 from __future__ import annotations
