@@ -44,6 +44,18 @@ LONG_NAME_PARTS = (
     *("goes_on_where_it_was[without pictures]", "says_whose_it_is[entry-point]"),
     *("[100000 brackets]", "[10001 keys]", "is_said_to_be[topology-degree-1000]", "never_passes_it[0.0-pncg]"),
     "serves_all_steps_of_a_system[cloth large enough for threads",
+    *("what_failed_is_done_again[200k]", "test_pictures_are_drawn_later_without", "is_recorded[nothing]"),
+    *(
+        "a_drawing_process_that_is_lost",
+        "whichever_method_wins[chain-5-0.5-0.0001]",
+        "whichever_method_wins[single-spring",
+    ),
+    *(
+        "a_hundred_steps[penalty-",
+        "an_example_runs[own_report]",
+        "has_order_1[surface-contact]",
+        "has_order_1[self-contact]",
+    ),
 )
 """Parts of names of tests that take 10 to 40 s; `pytest -m long` runs them."""
 

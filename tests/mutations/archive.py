@@ -69,8 +69,8 @@ ARCHIVE = (
     Mutation(
         "locks-that-are-links",
         "harness/atomic_files.py",
-        "access | os.O_NOFOLLOW | os.O_NONBLOCK",
-        "access | os.O_NONBLOCK",
+        '("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")',
+        '("O_NONBLOCK", "O_CLOEXEC")',
         (f"{_LOCKS}::test_what_is_in_the_way_of_a_lock_is_named_at_once",),
     ),
 )

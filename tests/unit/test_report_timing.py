@@ -351,6 +351,8 @@ def test_strains_of_two_sizes_are_reported_with_what_happens_to_the_material() -
 def test_the_modulus_follows_the_spacing_by_rule_and_dimension() -> None:
     for dimension, mesh in ((1, "chain"), (2, "grid"), (3, "block")):
         for rule in SCALING_RULES:
+            if rule == "area":
+                continue  # of meshes from files, which have no spacing
             by_size: dict[int, float] = {}
             for size in (3, 5):
                 made = load_target(MESH_CLASSES[mesh]).model_validate({"kind": mesh}).build_mesh(size)
