@@ -40,9 +40,12 @@ from springbench.harness.results.setting_verdict import (
     describe_percent,
     list_settings,
 )
+from springbench.harness.scenes.effects.bending_effect import BendingEffect
 from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.effects.pins_effect import PinsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.strain_limits_effect import StrainLimitsEffect
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
@@ -52,7 +55,7 @@ from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info
 NUM_SAMPLES = 8
 """Number of times at which motions are compared."""
 
-MATERIAL_EFFECTS = ("springs", "bending", "strain-limits")
+MATERIAL_EFFECTS = (SpringsEffect, BendingEffect, StrainLimitsEffect)
 """Effects that belong to the material, which hangs with them."""
 
 HANG_SECONDS, HANG_DECAY = 1.0, 5.0
@@ -299,7 +302,7 @@ def build_hanging_scene(spec: SceneSpec, size: int) -> tuple[SceneSpec, int, NDA
     top, bottom = rest[:, axis] >= rest[:, axis].max() - reach, rest[:, axis] <= rest[:, axis].min() + reach
     strength = next((np.linalg.norm(e.acceleration) for e in spec.effects if isinstance(e, GravityEffect)), 9.81)
     gravity = tuple(-float(strength) if k == axis else 0.0 for k in range(3))
-    material = [k for k, effect in enumerate(spec.effects) if effect.kind in MATERIAL_EFFECTS]
+    material = [k for k, effect in enumerate(spec.effects) if isinstance(effect, MATERIAL_EFFECTS)]
     kept = spec.keep_effects(material)
     kept["effects"] = (
         *kept["effects"],

@@ -123,14 +123,11 @@ class Scene:
 
         Length constraints follow, with infinite stiffness.
         """
-        # It has kernels, and listing runs must not import Numba.
-        from springbench.solvers.model.energies.tension_only_energy import TensionOnlySprings
-
         exact = [x for x in self.system.length_constraints if (x.min_length == x.max_length).all()]
         return Springs.from_parts(
             [
                 *(energy for energy in self.system.energies if isinstance(energy, Springs)),
-                *(energy.to_springs() for energy in self.system.energies if isinstance(energy, TensionOnlySprings)),
+                *(convert() for energy in self.system.energies if (convert := getattr(energy, "to_springs", None))),
                 *(Springs(x.edges, np.full(len(x.min_length), np.inf), x.max_length, x.rest_direction) for x in exact),
             ]
         )

@@ -299,7 +299,6 @@ def _build_slope(name: str, friction: float, angle: float = np.deg2rad(27.0), du
         start = tuple(gap * one for one in normal)
         mesh = NetworkMesh(positions=(start,)).build_mesh()  # pyright: ignore[reportArgumentType]
         contact: Any = {
-            "kind": "contact",
             "obstacles": ({"kind": "plane", "point": (0.0, 0.0, 0.0), "normal": normal},),
             "min_distance": gap,
             "friction": friction,
