@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Jinja2's and Matplotlib's stubs do not type most members.
 """Page of a validation: a table in Markdown, and a picture of errors by refinement and of textile tests."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# PyArrow's stubs do not type most keywords.
 """Published set of results: compact tables of each study, and what made them.
 
 `results/published/<study>/` holds one Parquet file for each table of a results folder (`TABLE_FILES`) and
@@ -130,7 +132,7 @@ def read_study(folder: Path) -> PublishedStudy:
     try:
         metadata = json.loads(path.read_text(encoding="utf-8"))
         study = PublishedStudy(folder, metadata)
-        if not isinstance(metadata["files"], dict) or not study.config_path.name or study.is_timed is None:
+        if not isinstance(metadata["files"], dict) or not study.config_path.name:
             raise ValueError("its keys are not those of a study")
     except (OSError, ValueError, KeyError, TypeError) as error:
         why = f"describes no study ({error!r}); restore it, or write it again by `springbench publish-study`"

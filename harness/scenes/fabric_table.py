@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# JSON and YAML have no types.
 """Published fabrics: area density, membrane stiffness and flexural rigidity, and the range of plausible materials.
 
 All values are measurements of Wang, O'Brien and Ramamoorthi (Data-driven elastic models for cloth, ACM Trans. Graph.

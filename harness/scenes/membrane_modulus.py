@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# SciPy's and NumPy's stubs leave the types of some results unknown.
 """Membrane stiffness of spring networks: stiffness by areas, and the modulus that a network has.
 
 Stiffness by areas (Van Gelder 1998, "Approximate simulation of elastic membranes by triangulated spring meshes"):

@@ -106,7 +106,8 @@ class ConfigDocument:
 
     def resolve_paths(self, model: type[BaseModel], data: dict[str, Any], at: ConfigKey) -> dict[str, Any]:
         """Resolve file names relative to the config's folder; a missing file is a mistake."""
-        paths = [k for k, f in model.model_fields.items() if f.annotation in (Path, Path | None)]
+        kinds: tuple[Any, ...] = (Path, Path | None)
+        paths = [k for k, f in model.model_fields.items() if f.annotation in kinds]
         names = [k for k in paths if isinstance(data.get(k), str)]
         for key in names:
             data = data | {key: str(self.path.parent / data[key])}

@@ -199,9 +199,9 @@ def test_a_run_with_a_wrong_gradient_is_not_right(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(run_pipeline, "measure_gradient_errors", lambda *given: {"Funnel": 0.0123, "Well": 0.0})
     rows = run_scene(tmp_path, "")
     assert {(row["status"], row["formula_check"]) for row in rows} == {("wrong-gradient", "gradient: Funnel, Well")}
-    outcome, _, _, reason = classify_run(rows)
-    assert outcome is WRONG_GRADIENT
-    assert "the derivative of its energy's value: that of Funnel by 0.012 of its size; mend" in reason
+    verdict = classify_run(rows)
+    assert verdict.outcome is WRONG_GRADIENT
+    assert "the derivative of its energy's value: that of Funnel by 0.012 of its size; mend" in verdict.reason
 
 
 def test_a_run_that_is_not_verified_is_not_checked(tmp_path: Path):

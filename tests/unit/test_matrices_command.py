@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -100,11 +101,12 @@ def test_the_files_have_the_same_matrices(tmp_path):
     with np.load(tmp_path / "out" / "matrices.npz") as stored:
         for name, matrix in made.sparse_matrices.items():
             parts = stored[f"{name}_data"], stored[f"{name}_indices"], stored[f"{name}_indptr"]
-            assert (csr_array(parts, shape=tuple(stored[f"{name}_shape"])) != matrix).nnz == 0
+            difference: Any = csr_array(parts, shape=tuple(stored[f"{name}_shape"])) != matrix
+            assert difference.nnz == 0
         for name, values in made.dense_arrays.items():
             np.testing.assert_array_equal(stored[name], values)
     for name in ("A", "C", "M", "Q"):
-        read = mmread(tmp_path / "out" / f"{name}.mtx")
+        read: Any = mmread(tmp_path / "out" / f"{name}.mtx")
         assert read.nnz == made.sparse_matrices[name].nnz
         np.testing.assert_array_equal(read.toarray(), made.sparse_matrices[name].toarray())
     np.testing.assert_array_equal(mmread(tmp_path / "out" / "b.mtx"), made.b)
@@ -122,10 +124,10 @@ def test_exact_pins_are_no_part_of_q_and_the_iteration_leaves_them_in_place(tmp_
     free = made.terms.free_vertices
     y = M @ (V + dt * v0) / dt**2 + force
     np.testing.assert_allclose(made.y[free], y[free], rtol=1e-9)
+    Q, fixed = made.Q.toarray(), made.terms.pinned
     for _ in range(7):
         v = A @ p
         d = made.r[:, None] * v / np.linalg.norm(v, axis=1)[:, None]
-        Q, fixed = made.Q.toarray(), made.terms.pinned
         right = (A.T @ (made.k[:, None] * d) + y)[free] - Q[np.ix_(free, fixed)] @ V[fixed]
         p[free] = np.linalg.solve(Q[np.ix_(free, free)], right)
     problem = build_step_problem(scene, V, V - dt * v0, 0)

@@ -29,6 +29,7 @@ def obj(folder: Path, text: str, **options) -> FileMesh:
 def test_scale_and_units_give_metres(tmp_path, options, factor):
     mesh = obj(tmp_path, f"{SQUARE}f 1 2 3 4\n", **options).build_mesh()
     assert mesh.rest_positions.tolist() == (factor * np.array([[0, 0, 0], [2, 0, 0], [2, 3, 0], [0, 3, 0]])).tolist()
+    assert mesh.vertex_areas is not None
     assert mesh.vertex_areas.sum() == pytest.approx(6 * factor**2, rel=1e-12)  # sums of four numbers
 
 

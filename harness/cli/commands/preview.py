@@ -13,7 +13,6 @@ from springbench.harness.errors import InputError
 from springbench.harness.execution.isolated_call import run_isolated
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
     from springbench.harness.config.sweep_config import RunSpec
     from springbench.harness.execution.worker_process import ProgressCallback
 
@@ -54,7 +53,7 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
 
     scene, lines = run.scene.load_plugins(), list[str]()
     made = build_scene(scene, run.size)
-    mesh, choices = made.mesh, list[tuple[str, str, NDArray[np.int64]]]()
+    mesh, choices = made.mesh, list[tuple[str, str, Any]]()
     for k, effect in enumerate(scene.effects):
         for key, selection in find_selections(effect):
             name = f"effects[{k}] {effect.kind}{f': {key}' if key else ''}"
@@ -102,10 +101,6 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     ]
     draw_scene_preview(replay, marks, facts, notes, path, camera=(camera.azimuth, camera.elevation) if camera else None)
     return [*lines, f"the picture is {path}"]
-
-
-def _format_vertex_count(count: int) -> str:
-    return f"{count:,} {'vertex' if count == 1 else 'vertices'}"
 
 
 def _list_selectors(mesh: Any) -> list[tuple[str, str]]:

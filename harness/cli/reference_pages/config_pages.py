@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# JSON and YAML have no types.
 """Reference pages of config keys, meshes and effects, from the JSON Schema of all configs."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# SciPy's and NumPy's stubs leave the types of some results unknown.
 """Fingerprints of mistakes: which program predicts each step of a submission from its two positions before it.
 
     D = rms over steps of |predicted - p|_F / scale,   scale = |p - p^t|_F + |predicted by the correct program - p^t|_F

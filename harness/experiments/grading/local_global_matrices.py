@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# SciPy's and NumPy's stubs leave the types of some results unknown.
 """The matrices and vectors of one local-global iteration, named as in the assignment.
 
     Q = A'KA + M/dt^2 + w C'C

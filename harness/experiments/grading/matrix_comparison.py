@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# SciPy's and NumPy's stubs leave the types of some results unknown.
 """Compare matrices of others, in Matrix Market files, with those of a scene: values, and zeros that are stored."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# pyright: reportUnknownLambdaType=false, reportUnknownArgumentType=false, reportUnknownVariableType=false
+# Lambdas have the types of the fields that they are passed to.
 """The assignment's program with one mistake built in, as step maps p^(t-dt), p^t -> p.
 
     Q = A' K_Q A + M_Q/dt_Q^2 + w_Q C'C

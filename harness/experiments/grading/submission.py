@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownLambdaType=false
+# SciPy's and NumPy's stubs leave the types of some results unknown.
 """A submission: positions of others, with the frame numbers and the vertex order of a scene.
 
 Nothing is matched silently: each decision is a sentence in `notes`. The number of the first frame is stated by the

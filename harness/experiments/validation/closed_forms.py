@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# SciPy's and NumPy's stubs leave the types of some results unknown.
 """Cases with a closed form: each returns a simulated value on a series of refinements, and the exact one.
 
 free fall            y = -g t^2/2

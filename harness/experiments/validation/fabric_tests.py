@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# SciPy's and NumPy's stubs leave the types of some results unknown.
 """Textile tests of published fabrics, simulated: the cantilever test and Cusick's drape test.
 
 Cantilever test (ASTM D1388): a strip is pushed over an edge until the line from the edge to its tip is 41.5 degrees

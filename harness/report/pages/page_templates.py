@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# Jinja2's and Matplotlib's stubs do not type most members.
 """Templates of pages: Markdown with fields that queries over the published set fill.
 
 A template is a Jinja2 file next to its page: `hard-cases.md.j2` makes `hard-cases.md`. It has these functions:

@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# JSON and YAML have no types.
 """Reader of the geometry of glTF 2.0 files, `.gltf` and `.glb`: triangles and lines of the default scene.
 
 (Khronos, glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) Positions are transformed

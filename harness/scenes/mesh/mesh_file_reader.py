@@ -1,4 +1,4 @@
-# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
+# pyright: reportMissingTypeStubs=false, reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 # meshio has no types.
 """Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY, .vtp and glTF.
 

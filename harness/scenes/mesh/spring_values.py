@@ -1,3 +1,5 @@
+# pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
+# SciPy's and NumPy's stubs leave the types of some results unknown.
 """Rest length, stiffness and prestress of each spring of a network or a file's mesh.
 
 Of each spring at most one of its stiffness k and its axial stiffness EA is stated, and at most one of its rest length

@@ -1,3 +1,5 @@
+# pyright: reportUnknownMemberType=false
+# PyArrow's stubs do not type most keywords.
 """Reader of tables with named columns: CSV with a header line, or Parquet."""
 
 from __future__ import annotations
