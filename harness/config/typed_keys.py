@@ -38,6 +38,7 @@ class SceneKeys(TypedDict, total=False):
     description: str
     mass: float | None
     mass_per_area: float | None
+    fabric: str | Mapping[str, Any] | None
     time_step: Required[NumberOrText]
     alternate_time_step: NumberOrText | None
     frames: Required[int]

@@ -105,7 +105,7 @@ def test_a_file_that_is_no_config_is_not_published_as_one(config: str, home: Pat
     (home / "results" / "sweep" / ".config").write_text(config)
     said: list[str] = []
     assert not [name for name in published(home, said.append) if name.startswith("configs/")]
-    assert "nobody can do its runs again" in said[0]
+    assert "its runs cannot be repeated" in said[0]
 
 
 def test_effects_and_meshes_of_ones_own_are_published_with_the_files_that_they_name(home: Path):
