@@ -44,6 +44,15 @@ LONG_NAME_PARTS = (
     *("goes_on_where_it_was[without pictures]", "says_whose_it_is[entry-point]"),
     *("[100000 brackets]", "[10001 keys]", "is_said_to_be[topology-degree-1000]", "never_passes_it[0.0-pncg]"),
     "serves_all_steps_of_a_system[cloth large enough for threads",
+    *("refuse_by_name[anderson-dashpots]", "refuse_by_name[numba-dashpots]", "refuse_by_name[avbd-rayleigh]"),
+    *(
+        "refuse_by_name[avbd-strain limits]",
+        "test_a_full_disk_is_a_failure_and",
+        "test_a_balloon_of_a_thousand_vertices",
+    ),
+    *("is_free_and_the_way_to_it[newton]", "test_every_fragment_shows_something", "test_other_platforms.py"),
+    *("blocks of 3000 bytes-supernodal", "test_a_program_that_takes_twice_as_long", "in_any_order_of_imports"),
+    *("test_a_config_next_to_files_of_these_names", "it_is_said_to_be[effects-dashpots-1e12]"),
     *("what_failed_is_done_again[200k]", "test_pictures_are_drawn_later_without", "is_recorded[nothing]"),
     *(
         "a_drawing_process_that_is_lost",
