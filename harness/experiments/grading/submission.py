@@ -185,9 +185,9 @@ def _check_times(scene: Scene, read: PositionSequence, first_frame: int) -> None
         return
     wanted = np.array([scene.compute_time(first_frame + k) for k in range(len(read.times))])
     dt = scene.system.time_step
-    away = np.abs(read.times - wanted)
-    if (away > TIME_TOLERANCE * dt * np.maximum(1, np.arange(len(wanted)))).any():
-        k = int(np.argmax(away > TIME_TOLERANCE * dt))
+    wrong = np.abs(read.times - wanted) > TIME_TOLERANCE * dt * np.maximum(1, np.arange(len(wanted)))
+    if wrong.any():
+        k = int(np.argmax(wrong))
         problem = f"states the time {read.times[k]:g} s for frame {first_frame + k}; the scene's is {wanted[k]:g} s"
         raise InputError(
             InputMistake(f"{problem} (time_step {dt:g} s). Give the positions at the scene's steps", read.source)
