@@ -61,7 +61,9 @@ def grade(
     required = iterations or (ASSIGNMENT_ITERATIONS if is_assignment_file(scene) else None)
     request = GradeRequest(run.scene, run.size, required, first_frame, rest, array, budget)
     work = partial(_grade_students if students else _grade_one, request, positions)
-    lines, table, cells, is_good = run_isolated(work, run.scene.find_plugins(), TaskLimits(), print_message)
+    lines, table, cells, is_good = run_isolated(
+        work, run.scene.find_plugins(), TaskLimits(run.time_limit, run.memory_limit), print_message
+    )
     if students:
         get_output_console().print(_build_class_table(table))
     for line in lines if students else (*lines, "", *format_plain_table(table)):
