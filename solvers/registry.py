@@ -69,6 +69,11 @@ def is_minimiser(solver: Any) -> bool:
     return getattr(solver, "is_minimiser", True)
 
 
+def is_engine(solver: Any) -> bool:
+    """Return whether a solver, or its class, is an outside engine, whose iterations are its substeps."""
+    return hasattr(solver, "write_script")
+
+
 def find_solver_name(solver: Any) -> str:
     """Return the name of a solver: the registered one, or else the name of its class."""
     kind: type = solver if isinstance(solver, type) else solver.__class__

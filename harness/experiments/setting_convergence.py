@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
-from springbench.harness.experiments.accuracy.method_recommendation import find_engine_integrator, is_engine
+from springbench.harness.experiments.accuracy.method_recommendation import find_engine_integrator
 from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import ReferenceTrajectory
@@ -50,7 +50,7 @@ from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, StopRule, Unsupported, is_lagged
-from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, load_target
+from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_engine, load_target
 
 NUM_SAMPLES = 8
 """Number of times at which motions are compared."""
@@ -144,7 +144,7 @@ class SettingSimulator:
             for _ in range(pieces):
                 step = next(run)
                 p, velocity = step.state.motion
-                if not np.isfinite(p).all() or np.abs(p).max() > 1e3 * _bound_of_motion(scene):
+                if not np.isfinite(p).all() or np.abs(p).max() > 1e3 * _measure_scene_scale(scene):
                     raise RunFailed(f"diverged in frame {frame}")
             seconds.append(process_time() - began)
             p = step.positions  # pyright: ignore[reportPossiblyUnboundVariable]
@@ -303,15 +303,19 @@ def build_hanging_scene(spec: SceneSpec, size: int) -> tuple[SceneSpec, int, NDA
     strength = next((np.linalg.norm(e.acceleration) for e in spec.effects if isinstance(e, GravityEffect)), 9.81)
     gravity = tuple(-float(strength) if k == axis else 0.0 for k in range(3))
     material = [k for k, effect in enumerate(spec.effects) if isinstance(effect, MATERIAL_EFFECTS)]
-    kept = spec.keep_effects(material)
-    kept["effects"] = (
-        *kept["effects"],
+    changes = spec.keep_effects(material)
+    changes["effects"] = (
+        *changes["effects"],
         GravityEffect.model_validate({"acceleration": gravity}),
         EtherDragEffect(decay_rate=HANG_DECAY),
         PinsEffect.model_validate({"indices": np.flatnonzero(top).tolist(), "weight": "exact"}),
     )
     values = {key: getattr(spec, key) for key in SceneSpec.model_fields}
-    return SceneSpec.model_construct(None, **values | kept | {"start": None, "velocity": (0.0, 0.0, 0.0)}), axis, bottom
+    return (
+        SceneSpec.model_construct(None, **values | changes | {"start": None, "velocity": (0.0, 0.0, 0.0)}),
+        axis,
+        bottom,
+    )
 
 
 def _find_reference(
@@ -383,8 +387,8 @@ def _kinetic_energy(scene: Scene, v: Positions) -> float:
     return 0.5 * float(scene.system.mass[free] @ np.einsum("ij,ij->i", v[free], v[free]))
 
 
-def _bound_of_motion(scene: Scene) -> float:
-    """Return a length [m] beyond which a scene's positions mean divergence, with obstacles and moving pins in it."""
+def _measure_scene_scale(scene: Scene) -> float:
+    """Return a length [m] of the scale of a scene; coordinates a thousand times as large mean divergence."""
     return 1.0 + float(np.abs(scene.mesh.rest_positions).max()) + scene.mesh.bounding_box_diagonal
 
 

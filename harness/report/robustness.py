@@ -16,7 +16,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -184,10 +184,7 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
     files = row_store.list_units(folder / "rows")
     needed = "run_id", "scene", "size", "solver", "phase", "status", "started_at"
     table = parquet_rows.read_rows(files, required_columns=needed, on_invalid=lambda mistake: None).to_pylist()
-    runs: dict[str, list[dict[str, Any]]] = {}
-    for row in table:
-        if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
-            runs.setdefault(row["run_id"], []).append(row)
+    runs = parquet_rows.group_result_rows(table)
     if not any(row["stationarity"] is not None or row["reference_distance"] is not None for row in table):
         raise InputError(f"{folder}: holds no verified runs; run a sweep with `verify: true`")
     if any(row["stationarity"] is not None and row["stationarity_above_roundoff"] is None for row in table):
@@ -237,7 +234,7 @@ class RunVerdict(NamedTuple):
     same_motion: bool | None = None
 
 
-def classify_run(run: Sequence[dict[str, Any]]) -> RunVerdict:
+def classify_run(run: Sequence[Mapping[str, Any]]) -> RunVerdict:
     """Classify a run from its rows, one per step."""
     first = run[0]
     if first["status"] != "ok":
@@ -285,14 +282,14 @@ def classify_run(run: Sequence[dict[str, Any]]) -> RunVerdict:
 _OPTION_COLUMNS = ("size", *(option.column for option in RUN_OPTIONS.values() if option.column))
 
 
-def _case_name(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
+def _case_name(row: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     """Return the scene with the options in which the runs of that scene differ."""
     own = [other for other in runs if other["scene"] == row["scene"]]
     varied = [str(row[key]) for key in _OPTION_COLUMNS if any(other[key] != row[key] for other in own)]
     return " ".join([row["scene"], *varied])
 
 
-def _solver_label(row: dict[str, Any], runs: Sequence[dict[str, Any]]) -> str:
+def _solver_label(row: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     """Return the solver's name with the parameters in which its runs differ."""
     stated = {run["parameters"] or "{}" for run in runs if run["solver"] == row["solver"]}
     others = [json.loads(text) for text in stated]

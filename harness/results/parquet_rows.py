@@ -113,6 +113,18 @@ def read_rows(
     )
 
 
+def group_result_rows(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    """Group the rows that state the results of runs by `run_id`, in their order.
+
+    These are the rows of the first round of each step, or the single row of a failed run.
+    """
+    runs: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
+            runs.setdefault(row["run_id"], []).append(row)
+    return runs
+
+
 @contextmanager
 def limit_read_memory(units: Sequence[Path]) -> Generator[None]:
     """Limit the memory for reading units inside the block.

@@ -4,8 +4,8 @@
 
 `results/published/<study>/` holds one Parquet file for each table of a results folder (`TABLE_FILES`) and
 `study.json`: config, command, commits, machines, versions, dates, load and checksums. `springbench publish-study`
-writes all of it. The tables are packed rows (`springbench.harness.results.row_store`) without the columns that nobody
-else can confirm, so `open_study_folder` presents a study as an ordinary folder of results to every report.
+writes all of it. The tables are packed rows (`springbench.harness.results.row_store`) without the columns that no
+repetition can confirm, so `open_study_folder` presents a study as an ordinary folder of results to every report.
 """
 
 from __future__ import annotations

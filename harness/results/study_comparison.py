@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
+from springbench.harness.results import parquet_rows
 from springbench.harness.results.published_set import RUN_KEYS
 from springbench.harness.results.time_ratios import MethodTimeRatio
 
@@ -47,13 +48,10 @@ class RunAgreement(NamedTuple):
 def group_runs(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
     """Group the rows that state the results of runs, by `RUN_KEYS` and the number of frames.
 
-    These are the rows of the first round of each step, or the single row of a failed run.
+    Each run is sorted by frame (`springbench.harness.results.parquet_rows.group_result_rows`).
     """
-    runs: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        if row["phase"] == "run" or (row["phase"] == "step" and row["round"] == 0):
-            runs.setdefault(row["run_id"], []).append(row)
-    return {build_run_key(run): sorted(run, key=lambda row: row["frame"] or 0) for run in runs.values()}
+    runs = parquet_rows.group_result_rows(rows).values()
+    return {build_run_key(run): sorted(run, key=lambda row: row["frame"] or 0) for run in runs}
 
 
 def build_run_key(run: RunRows) -> tuple[Any, ...]:

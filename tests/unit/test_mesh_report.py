@@ -1,4 +1,4 @@
-"""Reports on mesh files: each fault is found, named by its place, and told with its remedy."""
+"""Reports on mesh files: each fault is found, named by its place, and reported with its remedy."""
 
 from __future__ import annotations
 

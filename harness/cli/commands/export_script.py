@@ -31,14 +31,13 @@ def export_script(
     from springbench.harness.config.accuracy_loader import load_accuracy
     from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
     from springbench.harness.execution.worker_process import TaskLimits
-    from springbench.solvers.registry import OPTIONAL_SOLVERS, load_target
+    from springbench.solvers.registry import OPTIONAL_SOLVERS, is_engine, load_target
 
     engines = {spec.build_file_stem(): spec for spec in load_accuracy(config).work}
     engines = {
         label: spec
         for label, spec in engines.items()
-        if spec.solver.name in OPTIONAL_SOLVERS
-        and hasattr(load_target(OPTIONAL_SOLVERS[spec.solver.name]), "write_script")
+        if spec.solver.name in OPTIONAL_SOLVERS and is_engine(load_target(OPTIONAL_SOLVERS[spec.solver.name]))
     }
     if not point:
         for line in format_plain_table(

@@ -55,6 +55,7 @@ from springbench.solvers.registry import (
     SOLVER_TABLE,
     SOLVERS,
     find_solver_info,
+    is_engine,
     is_minimiser,
     load_target,
 )
@@ -139,11 +140,6 @@ def list_solver_variants(name: str) -> list[dict[str, Any]]:
         elif parameter.name in ("mujoco_integrator", "newton_solver"):
             values[parameter.name] = get_args(get_type_hints(solver)[parameter.name])
     return [{"name": name, **dict(zip(values, chosen, strict=True))} for chosen in product(*values.values())]
-
-
-def is_engine(solver: Any) -> bool:
-    """Return whether a solver is an outside engine, whose iterations are its substeps."""
-    return hasattr(solver, "write_script")
 
 
 def find_engine_integrator(solver: Any) -> str:

@@ -6,13 +6,12 @@ all columns except IRREPRODUCIBLE_COLUMNS, must be bitwise identical. A step's t
 a factor of MAX_SECONDS_RATIO. The ratio of the two solvers' times is compared step by step
 (`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). It must match within MAX_RATIO_SAME_MACHINE
 on the published
-machine type, within MAX_RATIO_OTHER_MACHINE on others. With another machine, other libraries or other source code, a
+machine type, within OTHER_MACHINE_FACTOR on others. With another machine, other libraries or other source code, a
 difference is inconclusive. So is a run that no config requests.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -44,9 +43,11 @@ from springbench.harness.experiments.run_unit import RunUnit
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.results import bootstrap_statistics, parquet_rows, row_store, run_schema
 from springbench.harness.results.folder_ownership import read_owner
+from springbench.harness.results.published_set import compute_file_digest
 from springbench.harness.results.solver_metadata import read_solver_metadata
+from springbench.harness.results.time_ratios import OTHER_MACHINE_FACTOR
 
-MAX_RATIO_SAME_MACHINE, MAX_RATIO_OTHER_MACHINE, MAX_SECONDS_RATIO = 1.25, 2.0, 3.0
+MAX_RATIO_SAME_MACHINE, MAX_SECONDS_RATIO = 1.25, 3.0
 """Accepted ratios of times.
 
 Minima of two runs of the same code differ by up to 4 % on an idle machine, ratios far more on busy ones. Another
@@ -220,13 +221,8 @@ def verify_checksums(folder: Path) -> list[VerifiedClaim]:
     del there[CHECKSUM_FILE]
     wrong = dict.fromkeys(stated.keys() - there.keys(), "missing")
     wrong |= dict.fromkeys(there.keys() - stated.keys(), "was not published")
-    wrong |= {n: "was changed" for n in there.keys() & stated.keys() if _compute_digest(there[n]) != stated[n]}
+    wrong |= {n: "was changed" for n in there.keys() & stated.keys() if compute_file_digest(there[n]) != stated[n]}
     return [VerifiedClaim(name, ClaimVerdict.FAIL, why) for name, why in sorted(wrong.items())]
-
-
-def _compute_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def load_published_runs(
@@ -545,7 +541,7 @@ def _verify_time_ratio(
     what = f"{old[0].title} takes {published:.3g} times as long as {old[1].run.solver.name}"
     why = f"here {here:.3g} times"
     elsewhere = _describe_environment_change(old[0].rows[0], new[0][0])
-    limit = MAX_RATIO_OTHER_MACHINE if elsewhere else MAX_RATIO_SAME_MACHINE
+    limit = OTHER_MACHINE_FACTOR if elsewhere else MAX_RATIO_SAME_MACHINE
     if 1 / limit <= apart <= limit:
         return VerifiedClaim(what, ClaimVerdict.PASS, why)
     share = _compute_preempted_share([row for found in (old[0].rows, old[1].rows, *new) for row in found])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from springbench.harness.experiments.grading.submission import SubmittedMotion
 from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
+from springbench.harness.scenes.mesh.mesh_checks import build_edge_table
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.solvers.model.step_problem import is_lagged
 
@@ -87,8 +88,7 @@ def _count_intersections(scene: Scene, submission: SubmittedMotion) -> dict[int,
     triangles, steps = scene.mesh.triangles, submission.num_steps
     if not scene.intersection_checks and not len(triangles):
         return {}
-    sides = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])]) if len(triangles) else triangles
-    edges = np.unique(np.sort(sides, axis=1), axis=0)
+    edges = build_edge_table(triangles).edges
     chosen = sorted({round(x) for x in np.linspace(1, steps, MAX_CHECKED_FRAMES)} & set(range(1, steps + 1)))
     counts = dict[int, int]()
     for step in chosen:

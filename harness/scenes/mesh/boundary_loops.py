@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.scenes.mesh.mesh import Mesh
-
-IndexArray = NDArray[np.int64]
+from springbench.harness.scenes.mesh.mesh_topology import IndexArray, find_connected_parts
 
 _COMPARED_DIGITS = 9
 """Number of compared digits of loop lengths, so that round-off does not affect the order."""
@@ -38,19 +37,12 @@ def trace_boundary_loops(points: NDArray[np.float64], triangles: IndexArray) -> 
     """Trace the boundary loops of triangles (f, 3) at points (n, 3) [m], longest first."""
     if not len(triangles):
         return []
-    from scipy.sparse import coo_array  # imported only when loops are needed
-    from scipy.sparse.csgraph import connected_components
-
     n = len(points)
     sides = np.sort(np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
     edges, count = np.unique(sides, axis=0, return_counts=True)
     open_ = edges[count == 1]
 
-    def pieces(pairs: IndexArray) -> IndexArray:
-        graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-        return np.asarray(connected_components(graph, directed=False)[1], np.int64)
-
-    surface, of = pieces(edges), pieces(open_)
+    surface, of = find_connected_parts(n, edges), find_connected_parts(n, open_)
     long = np.linalg.norm(points[open_[:, 0]] - points[open_[:, 1]], axis=1)
     length = np.bincount(of[open_[:, 0]], long, minlength=n)
     found = [np.flatnonzero(of == k) for k in np.unique(of[open_[:, 0]]).tolist()]

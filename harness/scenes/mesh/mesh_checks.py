@@ -14,7 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.scenes.mesh.mesh_cleaning import FLAT_RATIO, find_weld_targets
-from springbench.harness.scenes.mesh.mesh_topology import NO_PAIRS, NO_TRIANGLES, IndexArray, PointArray
+from springbench.harness.scenes.mesh.mesh_topology import (
+    NO_PAIRS,
+    NO_TRIANGLES,
+    IndexArray,
+    PointArray,
+    find_connected_parts,
+)
 
 NO_VERTICES: IndexArray = np.empty(0, np.int64)
 
@@ -90,20 +96,11 @@ def build_edge_table(triangles: IndexArray) -> EdgeTable:
     return EdgeTable(edges, side.reshape(-1, 3).astype(np.int64), first < second, count.astype(np.int64))
 
 
-def find_connected_parts(num_vertices: int, pairs: IndexArray) -> IndexArray:
-    """Return the number of the connected part of each vertex, (n,); parts are numbered by their first vertex."""
-    from scipy.sparse import coo_array  # imported only when meshes are checked
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num_vertices, num_vertices))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
-
-
 class MeshSupport(NamedTuple):
     """What holds a mesh: vertices (q,) with pins or attachments, and pairs (k, 2) that effects join."""
 
-    held: IndexArray = NO_VERTICES
-    joined: IndexArray = NO_PAIRS
+    fixed_vertices: IndexArray = NO_VERTICES
+    joined_pairs: IndexArray = NO_PAIRS
 
 
 def check_parts(num_vertices: int, pairs: IndexArray, support: MeshSupport | None = None) -> list[MeshFinding]:
@@ -114,17 +111,17 @@ def check_parts(num_vertices: int, pairs: IndexArray, support: MeshSupport | Non
         pairs: edges (m, 2).
         support: what holds the mesh; None if that is unknown.
     """
-    joined = pairs if support is None else np.concatenate([pairs, support.joined])
+    joined = pairs if support is None else np.concatenate([pairs, support.joined_pairs])
     part = find_connected_parts(num_vertices, joined)
     used = np.zeros(num_vertices, np.bool_)
     used[pairs.ravel()] = True
     parts = np.unique(part[used])
-    if support is None or not len(support.held):
+    if support is None or not len(support.fixed_vertices):
         if len(parts) < 2:
             return []
         problem = f"parts that no edge joins: {len(parts):,}"
         return [MeshFinding("parts", len(parts), problem, is_suspicious=False)]
-    loose = np.setdiff1d(parts, part[support.held])
+    loose = np.setdiff1d(parts, part[support.fixed_vertices])
     if not len(loose):
         return []
     vertices = np.flatnonzero(np.isin(part, loose) & used)

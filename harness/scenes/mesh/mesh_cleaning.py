@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.mesh.mesh import sort_unique_vertices
-from springbench.harness.scenes.mesh.mesh_topology import IndexArray, PointArray
+from springbench.harness.scenes.mesh.mesh_topology import IndexArray, PointArray, find_connected_parts
 from springbench.harness.scenes.mesh.spring_network import MAX_COORDINATE, MeshCells, describe_repeated_corner
 
 LengthUnit = Literal["km", "m", "dm", "cm", "mm", "um", "nm", "in", "ft", "yd"]
@@ -133,9 +133,7 @@ def find_weld_targets(points: PointArray, distance: float) -> IndexArray:
         points: (n, 3) [m].
         distance: [m], 0 for points in one place.
     """
-    from scipy.sparse import coo_array  # imported only when vertices are welded
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from scipy.spatial import cKDTree  # imported only when vertices are welded
 
     n = len(points)
     if distance == 0.0:
@@ -145,8 +143,7 @@ def find_weld_targets(points: PointArray, distance: float) -> IndexArray:
     if (tree.count_neighbors(tree, distance) - n) // 2 > _MAX_WELD_PAIRS:
         raise ValueError(f"{distance:g} m joins too many vertices; wanted a distance below the edge lengths")
     pairs = np.asarray(tree.query_pairs(distance, output_type="ndarray"), np.int64).reshape(-1, 2)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    label = np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    label = find_connected_parts(n, pairs)
     first = np.full(n, n, np.int64)
     np.minimum.at(first, label, np.arange(n))
     return first[label]

@@ -108,6 +108,15 @@ def lump_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArray:
     return lump_to_vertices(tetrahedra, np.abs(compute_signed_volumes(rest, tetrahedra)), len(rest))
 
 
+def find_connected_parts(num_vertices: int, pairs: IndexArray) -> IndexArray:
+    """Return the number of the connected part of each vertex, (n,); parts are numbered by their first vertex."""
+    from scipy.sparse import coo_array  # imported only when parts are needed
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(num_vertices, num_vertices))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
 def compute_signed_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArray:
     """Compute the volume of each tetrahedron, (t,) [m^3], positive if corner 3 sees 0, 1, 2 counter-clockwise."""
     a, b, c, d = (rest[tetrahedra[:, k]] for k in range(4))
