@@ -29,7 +29,7 @@ _COLOUR_BOUNDS = (1e-4, 1e-3, 3e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.3, 1.0, 10.0)
 """Bounds of the colours: relative errors, with the levels of the verdict among them."""
 
 _MAP_WIDTH, _TEXT_LEFT, _TEXT_LETTERS = 880, 1010, 72
-"""Width of the map, and left edge of the verdict beside it [pixels]; letters of a line of the verdict."""
+"""Width of the map, and left edge of the verdict next to it [pixels]; letters of a line of the verdict."""
 
 _LINE_STYLES = ("dotted", "solid", "dashed")
 """Of the iso-error lines, from the smallest error."""

@@ -76,7 +76,7 @@ class DeviceStream:
 class ReusedUploads:
     """Device arrays that are allocated once, and overwritten by the uploads of each following step.
 
-    Uploads come in the same order in each step; one of another shape or type is allocated anew.
+    Uploads come in the same order in each step; one of another shape or type is allocated again.
     """
 
     def __init__(self, stream: DeviceStream) -> None:

@@ -58,7 +58,7 @@ BOTH: dict[str, tuple[Callable[..., Any], int]] = {
 
 
 def build_step(scene: Path, size: int, frames: int) -> StepProblem:
-    """The step of a scene after so many steps to a residual of 1e-3."""
+    """The step of a scene after a number of steps to a residual of 1e-3."""
     made = build_scene(load_scene(scene), size)
     state = build_initial_state(made)
     if frames:
@@ -69,7 +69,7 @@ def build_step(scene: Path, size: int, frames: int) -> StepProblem:
 
 
 def iterate(prepared: PreparedSolver, problem: StepProblem, count: int) -> Positions:
-    """The last of so many iterates, copied."""
+    """The last of a number of iterates, copied."""
     *_, found = (p.copy() for p in islice(prepared.iterates(problem), count))
     return found
 
@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("--tolerances", type=float, nargs="+", default=[1e-1, 1e-2, 1e-3, 1e-4])
     parser.add_argument("--max-iterations", type=int, default=2000)
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=1e9, help="begin no method after so many")
+    parser.add_argument("--seconds", type=float, default=1e9, help="begin no method after this time")
     parser.add_argument("--save", type=Path)
     given, rows, begun = parser.parse_args(), list[dict[str, Any]](), perf_counter()
 

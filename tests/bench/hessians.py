@@ -3,7 +3,7 @@
     python -m tests.bench.hessians [SCENE ...]
 
 The scenes of `configs/hessians.yaml`, with its limits. Rules take turns, frame by frame, in one process. Elements that
-were looked at are told as a part of all elements in all iterations, which `clamp` looks at; CPU time as a multiple of
+were looked at are stated as a part of all elements in all iterations, which `clamp` looks at; CPU time as a multiple of
 that of the default, without what it takes to prepare. A rule that needs all iterations in some frame is marked by >.
 """
 
@@ -46,7 +46,7 @@ class Tally:
     looked: int = 0
     ended: bool = True
 
-    def told(self, against: Tally) -> str:
+    def format_counts(self, against: Tally) -> str:
         """The cell."""
         looked = f" {100 * self.looked / self.elements:.0f} %" if self.looked else ""
         return f"{'' if self.ended else '>'}{self.iterations}{looked} {self.seconds / against.seconds:.2f}"
@@ -103,7 +103,7 @@ def main() -> None:
         measured(scenes[0])  # compiles
         for path in scenes:
             found = measured(path)
-            table.add_row(path.stem, *(tally.told(found["shift-schedule"]) for tally in found.values()))
+            table.add_row(path.stem, *(tally.format_counts(found["shift-schedule"]) for tally in found.values()))
     Console(width=120).print(table)
 
 

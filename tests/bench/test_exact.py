@@ -95,7 +95,7 @@ def test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame(tmp_path: Path):
 class Factorisations:
     """How often the Hessian was factorised: for later solves, and for one."""
 
-    kept: int = 0
+    separate: int = 0
     once: int = 0
 
 
@@ -105,7 +105,7 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
     found, saved, once = Factorisations(), BlockCholesky.factorise, BlockCholesky.factorise_and_solve
 
     def factorise(self: BlockCholesky, *given: Any) -> Any:
-        found.kept += 1
+        found.separate += 1
         return saved(self, *given)
 
     def solve_anew(self: BlockCholesky, *given: Any) -> Any:
@@ -139,7 +139,7 @@ def test_an_accuracy_takes_as_many_iterations_as_stored(
     # that leaves a Newton step to do it takes a factorisation, or some on an indefinite Hessian.
     room, more = (0, 0) if solver == "newton" else (2, 4)
     assert [step.solution.num_iterations for step in found] == pytest.approx(iterations, abs=room)
-    assert factorisations.kept == pytest.approx(saved, abs=room)
+    assert factorisations.separate == pytest.approx(saved, abs=room)
     assert factorisations.once == pytest.approx(once, abs=more)
 
 

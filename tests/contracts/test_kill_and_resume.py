@@ -86,7 +86,7 @@ class Sweep:
         return ["run", str(self.config), "--results", str(self.folder.parent)]
 
     @property
-    def told(self) -> str:
+    def output(self) -> str:
         """What the last start of it said."""
         return self.config.with_suffix(".log").read_text()
 
@@ -100,7 +100,7 @@ class Sweep:
         """Run it to its end."""
         process = self.start()
         process.join()
-        assert process.exitcode == 0, self.told
+        assert process.exitcode == 0, self.output
 
     def files(self) -> set[str]:
         return {str(path.relative_to(self.folder)) for path in self.folder.rglob("*") if path.is_file()}
@@ -191,7 +191,7 @@ def test_a_killed_sweep_goes_on_where_it_was(undisturbed: Undisturbed, tmp_path:
             process.kill()
             process.join()
             kills += process.exitcode == -signal.SIGKILL
-        assert process.exitcode in (0, -signal.SIGKILL), sweep.told
+        assert process.exitcode in (0, -signal.SIGKILL), sweep.output
         assert complete.items() <= sweep.complete().items(), "a run that was complete was done again"
         complete = sweep.complete()
         if process.exitcode == 0:
@@ -253,9 +253,9 @@ def test_a_failing_run_is_a_row_with_its_reason_and_the_others_are_done(tmp_path
     for again in (False, True):
         process = sweep.start()
         process.join()
-        assert process.exitcode == 1, sweep.told
-        assert "Traceback" not in sweep.told
-        assert ("are there already" in sweep.told) == again
+        assert process.exitcode == 1, sweep.output
+        assert "Traceback" not in sweep.output
+        assert ("are there already" in sweep.output) == again
         found = {(row["scene"], row["solver"], row["status"]) for row in sweep.rows()}
         failed = {("blown", solver, "diverged") for solver in ("sparse", "numba")}
         assert found == failed | {("cloth", solver, "ok") for solver in ("sparse", "numba")}

@@ -99,5 +99,5 @@ def test_other_interpreters_of_this_machine_run_a_scene_and_a_study(scripts: Pat
         run = ["run", "net", "--size", "4", "--frames", "2", "--solver", "sparse"]
         assert "net" in call(str(bin_folder / "springbench"), *run, folder=home)
         call(str(bin_folder / "springbench"), "new", "study", folder=home)
-        told = call(str(bin_folder / "python"), "-m", "pytest", "-q", "--benchmark-disable", folder=home / "study")
-        assert "1 passed" in told
+        output = call(str(bin_folder / "python"), "-m", "pytest", "-q", "--benchmark-disable", folder=home / "study")
+        assert "1 passed" in output

@@ -109,7 +109,7 @@ class Copy:
             os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
             shutil.rmtree(self._own, ignore_errors=True)
 
-    def told(self, lie: Mutation, command: list[str], limit: float) -> tuple[int, str]:
+    def run_command(self, lie: Mutation, command: list[str], limit: float) -> tuple[int, str]:
         """The exit code of a Python command in the copy, and what it printed; -1 where it takes too long."""
         cache = self._own if lie.compiled else self._compiled
         environment = os.environ | {
@@ -137,7 +137,7 @@ def _run(copy: Copy, lie: Mutation, chosen: Iterable[str], limit: float, most: i
     """The exit code of the tests with a lie in place, which end at so many failures, and the tests that failed, or what
     was said last."""
     with copy.planted(lie):
-        code, output = copy.told(lie, [*PYTEST, f"--maxfail={most}", *chosen], limit)
+        code, output = copy.run_command(lie, [*PYTEST, f"--maxfail={most}", *chosen], limit)
     lines = output.splitlines()
     failures = [line.removeprefix("FAILED ").split(" - ")[0] for line in lines if line.startswith("FAILED ")]
     return code, failures or lines[-1:] or [""]
@@ -146,7 +146,7 @@ def _run(copy: Copy, lie: Mutation, chosen: Iterable[str], limit: float, most: i
 def _by_the_lie(copy: Copy, lie: Mutation, test: str) -> bool:
     """Whether a test fails with the lie once more, and does not without: else chance found out what it did."""
     again, _ = _run(copy, lie, [test], LONGEST)
-    truth, _ = copy.told(lie, [*PYTEST, test], LONGEST)
+    truth, _ = copy.run_command(lie, [*PYTEST, test], LONGEST)
     return again != 0 and truth == 0
 
 
@@ -176,6 +176,6 @@ def examine(copy: Copy, lie: Mutation, *, whole: bool = False) -> Outcome:
     if lie.product and not whole:
         solver, reason = lie.product
         with copy.planted(lie):
-            _, said = copy.told(lie, ["-m", "tests.mutations.product", solver], LONGEST)
+            _, said = copy.run_command(lie, ["-m", "tests.mutations.product", solver], LONGEST)
         product = CAUGHT if "failed:" in said and reason in said else SURVIVED
     return Outcome(lie.name, tests, product, round(monotonic() - began, 1), lie.digest, sources(), failed)

@@ -1,4 +1,4 @@
-"""One material on any mesh: stiffness by areas passes patch tests, and the modulus that results is told."""
+"""One material on any mesh: stiffness by areas passes patch tests, and the resulting modulus is stated."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class ByChance(Copy):
         yield
         self.planted_now = False
 
-    def told(self, lie: Mutation, command: list[str], limit: float) -> tuple[int, str]:
+    def run_command(self, lie: Mutation, command: list[str], limit: float) -> tuple[int, str]:
         if "tests/unit" in command:
             self.whole += 1
             failed = "test_found" if "--deselect=test_chance[a b]" in command else "test_chance[a b]"

@@ -1,4 +1,4 @@
-"""Pictures of very short runs, very small and very far meshes say and show what is there."""
+"""Pictures of very short runs, very small and very far meshes have readable units and show the mesh."""
 
 from __future__ import annotations
 

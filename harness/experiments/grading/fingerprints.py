@@ -41,7 +41,7 @@ MIN_DEVIATION = 1e-4
 NOISE_FACTOR = 20.0
 """Factor on the stored digits' share of the deviation, up to which a submission counts as correct."""
 SAME_FACTOR = 3.0
-"""Mistakes whose deviations differ by less than this factor, or by the noise, cannot be told apart."""
+"""Mistakes whose deviations differ by less than this factor, or by the noise, cannot be distinguished."""
 MAX_ITERATIONS = 100
 """Number of iterations whose iterates are compared, unless more are required."""
 MIN_MISTAKEN_ITERATIONS = 10
@@ -259,7 +259,7 @@ class FingerprintFinder:
 
     def _compare(self, program: AssignmentProgram, compared: _Comparison) -> NDArray[np.float64]:
         """Return D of a program after each number of iterations, infinite where it fails."""
-        count = 1 if program.is_explicit else self._num_iterations
+        count = 1 if program.explicit_at else self._num_iterations
         found, before = np.full(count, np.inf), None
         try:
             for k, p in enumerate(islice(program.iterate_steps(compared.steps), count)):
@@ -301,7 +301,7 @@ class FingerprintFinder:
 
     def _best(self, program: AssignmentProgram, compared: _Comparison) -> float:
         """Return D of a program with the number of iterations that fits best."""
-        first = 0 if program.is_explicit else MIN_MISTAKEN_ITERATIONS - 1
+        first = 0 if program.explicit_at else MIN_MISTAKEN_ITERATIONS - 1
         return float(self._compare(program, compared)[first:].min())
 
     def _compare_output(self, undone: NDArray[np.float64], precision: StoredPrecision) -> float:

@@ -82,7 +82,8 @@ class AssignmentProgram:
       map_target: inertial target (n, 3) [m], of target, p^t and p^(t-dt).
       uses_iterate: whether the target uses the iterate instead of p^t.
       compute_directions: d.
-      is_explicit: "" or "end" or "start": forces of the springs at p^t or at p^(t-dt), without a solve.
+      explicit_at: positions at which an explicit step has its spring forces, "current" (p^t) or "previous"
+        (p^(t-dt)); "" for an implicit step.
       initial_guess: "current" or "target".
     """
 
@@ -103,7 +104,7 @@ class AssignmentProgram:
     map_target: Callable[[Positions, Positions, Positions], Positions] = field(default=lambda q, p, before: q)
     uses_iterate: bool = False
     compute_directions: SpringVectors = field(default=_project)
-    is_explicit: str = ""
+    explicit_at: str = ""
     initial_guess: str = "current"
 
     @classmethod
@@ -147,7 +148,7 @@ class AssignmentProgram:
         """Yield the iterates (s, n, 3) [m] of some steps, without end; raises RuntimeError where Q is singular."""
         force = self.map_force(steps.force)
         target = self.map_target(steps.target, steps.current, steps.previous)
-        if self.is_explicit:
+        if self.explicit_at:
             p = self._step_explicitly(steps, force)
             while True:
                 yield p
@@ -176,7 +177,7 @@ class AssignmentProgram:
     def _step_explicitly(self, steps: StepBatch, force: Positions) -> Positions:
         """Return the explicit steps (s, n, 3) [m]."""
         i, j = self.edges.T
-        at = steps.current if self.is_explicit == "end" else steps.previous
+        at = steps.current if self.explicit_at == "current" else steps.previous
         v = at[:, i] - at[:, j]
         flat = v.reshape(-1, 3)
         _, unit = unit_directions(flat, np.tile(self.rest_direction, (len(at), 1)))
@@ -400,7 +401,7 @@ MISTAKES: tuple[ProgramMistake, ...] = (
         "explicit step",
         "steps explicitly: the springs act at known positions, and no system is solved",
         "implicit Euler minimises over the new positions",
-        (_change(is_explicit="end"), _change(is_explicit="start")),
+        (_change(explicit_at="current"), _change(explicit_at="previous")),
     ),
     ProgramMistake("axes swapped", "writes the coordinates in another order", "the order is x, y, z", axes=AXES[1:]),
     ProgramMistake(

@@ -155,12 +155,12 @@ def _read_table(path: Path, n: int, array: str) -> PositionSequence:
     if set(_LONG_COLUMNS) <= set(names):
         return _read_long_table(path, n, names, table)
     leading = {name: table[:, names.index(name)] for name in ("frame", "time") if name in names}
-    kept = [column for column in range(table.shape[1]) if not (names and names[column] in leading)]
-    if len(kept) != 3 * n:
+    coordinates = [column for column in range(table.shape[1]) if not (names and names[column] in leading)]
+    if len(coordinates) != 3 * n:
         wanted = f"one line a frame of {3 * n} numbers, or the columns frame, vertex, x, y, z"
-        raise InputError(InputMistake(f"has {len(kept)} columns; wanted {wanted}", path, numbers[0]))
+        raise InputError(InputMistake(f"has {len(coordinates)} columns; wanted {wanted}", path, numbers[0]))
     frames = leading["frame"].astype(np.int64) if "frame" in leading else None
-    return PositionSequence(path, table[:, kept].reshape(-1, n, 3), frames, leading.get("time"))
+    return PositionSequence(path, table[:, coordinates].reshape(-1, n, 3), frames, leading.get("time"))
 
 
 def _read_long_table(path: Path, n: int, names: list[str], table: NDArray[np.float64]) -> PositionSequence:

@@ -22,7 +22,7 @@ from springbench.harness.report.pages.page_templates import (
     PagePicture,
     RenderedPage,
     find_templates,
-    list_picture_digests,
+    index_pictures,
     render_page,
 )
 from springbench.harness.report.pages.published_queries import PublishedQueries
@@ -46,7 +46,7 @@ def render_pages(root: Path) -> list[RenderedPage]:
 def write_pages(root: Path) -> list[Path]:
     """Write all pages, and the pictures that changed; return the files that were written."""
     pages = render_pages(root)
-    pictures, digests = list_picture_digests(pages, root), _read_digests(root)
+    pictures, digests = index_pictures(pages, root), _read_digests(root)
     written: list[Path] = []
     for page in pages:
         if not page.path.is_file() or page.path.read_text(encoding="utf-8") != page.text:
@@ -73,7 +73,7 @@ def check_pages(root: Path, *, draws_pictures: bool = False) -> list[str]:
         draws_pictures: whether to draw all pictures and compare their pixels.
     """
     pages = render_pages(root)
-    pictures, digests = list_picture_digests(pages, root), _read_digests(root)
+    pictures, digests = index_pictures(pages, root), _read_digests(root)
     lines = [
         f"{page.path} differs from its template and the published set"
         for page in pages

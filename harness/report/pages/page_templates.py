@@ -230,6 +230,6 @@ def find_templates(root: Path) -> list[Path]:
     return sorted({*root.glob(f"*{TEMPLATE_SUFFIX}"), *chain(*(f.rglob(f"*{TEMPLATE_SUFFIX}") for f in folders))})
 
 
-def list_picture_digests(pages: Sequence[RenderedPage], root: Path) -> Mapping[str, PagePicture]:
+def index_pictures(pages: Sequence[RenderedPage], root: Path) -> Mapping[str, PagePicture]:
     """Return the pictures of pages by their path relative to the root."""
     return {picture.path.relative_to(root).as_posix(): picture for page in pages for picture in page.pictures}
