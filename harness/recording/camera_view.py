@@ -19,7 +19,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from springbench.harness.recording.camera_framing import describe_outside, find_framed_vertices
-from springbench.harness.recording.strain_shading import NUM_LEVELS, build_palette, format_percent
+from springbench.harness.recording.strain_scale import NUM_LEVELS, build_palette, format_percent
 
 _DEFAULT_AZIMUTH, _DEFAULT_ELEVATION = 38.5, 20.8
 """Default azimuth and elevation of the camera [degrees]: from the side and slightly from above; y is up."""

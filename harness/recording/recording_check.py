@@ -22,7 +22,7 @@ from springbench.harness.errors import RunFailed
 from springbench.harness.recording.local_origin import MIN_DIAGONALS_PER_CELL, read_origin, store_relative
 from springbench.harness.recording.recorder_interface import RecordingInfo
 from springbench.harness.recording.recording_reader import open_recording_source, read_cell, read_properties
-from springbench.harness.recording.strain_shading import NUM_LEVELS, build_palette
+from springbench.harness.recording.strain_scale import NUM_LEVELS, build_palette
 from springbench.solvers.model.step_problem import Positions
 
 ROUNDING_RTOL = 1e-9

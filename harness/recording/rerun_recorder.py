@@ -42,7 +42,8 @@ from springbench.harness.recording.obstacle_properties import build_obstacles_pr
 from springbench.harness.recording.obstacle_shapes import ObstacleRecorder
 from springbench.harness.recording.partial_file import PartialFile
 from springbench.harness.recording.recorder_interface import LAYOUT_VERSION, RecordedFrame, RecordingInfo
-from springbench.harness.recording.strain_shading import PIN_COLOUR, StrainShading, widen_range
+from springbench.harness.recording.strain_scale import PIN_COLOUR, widen_range
+from springbench.harness.recording.strain_shading import StrainShading
 
 FLUSH_INTERVAL = 20
 """Maximum number of frames between flushes, the most that a kill can lose. A chunk costs 1.5 kB, plus 0.5 kB of

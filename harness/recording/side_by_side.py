@@ -29,7 +29,8 @@ from springbench.harness.recording.recording_reader import (
     read_properties,
     read_triangles,
 )
-from springbench.harness.recording.strain_shading import compute_strain_colours, compute_strains, widen_range
+from springbench.harness.recording.strain_scale import compute_strain_colours, widen_range
+from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.recording.viewer_blueprint import build_panels, build_plot, build_scene_view
 
 _QUANTITIES = {

@@ -9,41 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.recording.recorder_interface import RecordingInfo
+from springbench.harness.recording.strain_scale import DEFAULT_STRAIN_RANGE, compute_strain_colours, round_scale_end
 from springbench.solvers.jit.kernel_compilation import cached_njit
 from springbench.solvers.model.step_problem import Positions
 
 RealArray = NDArray[np.float64]
 
-STRAIN_COLOURS = ("#125490", "#64a2d6", "#d9d7d2", "#e5863b", "#943404")
-"""Colours at strains -range, -range/2, 0, range/2, range: blue compressed, grey at rest, orange stretched.
-
-They are colour-blind safe, and the middle is grey enough for light and shadow to remain visible."""
-
-PIN_COLOUR = "#c5299b"
-"""Colour of pinned vertices in recordings and pictures: not on any strain scale, clear on light and on dark."""
-
-DEFAULT_STRAIN_RANGE = 0.1
-"""End of the scale where a run states no strain range."""
-MIN_STRAIN_RANGE = 1e-3
-
-NUM_LEVELS = 65
 NORMAL_STEPS = 32
-NEUTRAL_COLOUR = (128, 128, 128, 255)
-"""Colour of a strain that is NaN."""
-
-
-def build_palette() -> NDArray[np.uint8]:
-    """Return the colours of the levels, most compressed first, then NEUTRAL_COLOUR: (NUM_LEVELS + 1, 4)."""
-    stops = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] + [255] for colour in STRAIN_COLOURS])
-    at = np.linspace(0, len(stops) - 1, NUM_LEVELS)
-    channels: list[NDArray[np.float64]] = [np.interp(at, range(len(stops)), channel) for channel in stops.T]
-    colours = np.stack(channels, axis=1)
-    return np.vstack([np.rint(colours), NEUTRAL_COLOUR]).astype(np.uint8)
 
 
 def compute_strain_range(
@@ -60,43 +36,6 @@ def compute_strain_range(
     """
     found = [compute_strains(p, springs, rest_lengths)[1] for p in positions if len(rest_lengths)]
     return round_scale_end(np.concatenate(found)) if found else DEFAULT_STRAIN_RANGE
-
-
-def round_scale_end(strain: NDArray[np.float64]) -> float:
-    """Return the end of a scale: the round number above 99 % of the strains.
-
-    A few large strains at a pin thus do not leave all others grey. The result is DEFAULT_STRAIN_RANGE where none is
-    finite.
-    """
-    known = np.abs(strain[np.isfinite(strain)])
-    if not len(known):
-        return DEFAULT_STRAIN_RANGE
-    wanted = max(float(np.quantile(known, 0.99)), MIN_STRAIN_RANGE)
-    decade = 10.0 ** np.floor(np.log10(wanted) + 1e-9)
-    return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= 0.999 * wanted))
-
-
-def format_percent(strain: float, digits: int = 3) -> str:
-    """Format a strain with its sign as a percentage."""
-    return f"{100 * strain:+.{digits}g} %".replace("-", "−")
-
-
-def compute_strain_colours(strain: NDArray[np.float64], end: float) -> NDArray[np.uint32]:
-    """Return the colours 0xRRGGBBAA (m,) of strains (m,) on the scale from -end to end."""
-    with np.errstate(invalid="ignore"):
-        level = np.rint((np.clip(strain / end, -1, 1) + 1) * (NUM_LEVELS - 1) / 2)
-    return _packed_palette()[np.where(np.isnan(level), NUM_LEVELS, level).astype(np.intp)]
-
-
-@cache
-def _packed_palette() -> NDArray[np.uint32]:
-    return build_palette().view(">u4").astype(np.uint32).ravel()
-
-
-def widen_range(ends: tuple[float, float], strain: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the smallest and the largest of `ends` and the finite strains."""
-    known = strain[np.isfinite(strain)]
-    return float(known.min(initial=ends[0])), float(known.max(initial=ends[1]))
 
 
 class StrainShading:

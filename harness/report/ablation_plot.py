@@ -17,15 +17,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from springbench.harness.execution import machine_info
 from springbench.harness.report.ablation_summary import ResultRow, largest_known_error, select_kind
-from springbench.harness.report.page_layout import (
-    add_axes,
-    draw_header,
-    draw_text,
-    format_quantity,
-    new_page,
-    save_page,
-    tick_formatter,
-)
+from springbench.harness.report.number_format import format_quantity
+from springbench.harness.report.page_layout import add_axes, draw_header, draw_text, new_page, save_page, tick_formatter
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     MUTED_COLOUR,

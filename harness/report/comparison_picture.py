@@ -33,18 +33,16 @@ from springbench.harness.report.mesh_rendering import (
     fit_camera,
     view_aspect,
 )
+from springbench.harness.report.number_format import format_count, format_quantity, shorten_words
 from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
 from springbench.harness.report.page_layout import (
     draw_header,
     draw_strain_scale,
     draw_text,
-    format_count,
-    format_quantity,
     new_page,
     paste_picture,
     save_page,
     scene_headline,
-    shorten_words,
 )
 from springbench.harness.report.plot_style import (
     MUTED_COLOUR,

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import pyarrow as pa
-from springbench.harness.report.page_layout import format_count, format_factor
+from springbench.harness.report.number_format import format_count, format_factor
 from springbench.harness.report.table_queries import query_table
 from springbench.solvers.iteration.device_interface import SIMULATOR_NAME
 

@@ -22,16 +22,8 @@ from springbench.harness.report.device_speedup import (
     read_device_runs,
     summarise_runs,
 )
-from springbench.harness.report.page_layout import (
-    add_axes,
-    draw_header,
-    draw_text,
-    format_count,
-    format_quantity,
-    new_page,
-    save_page,
-    tick_formatter,
-)
+from springbench.harness.report.number_format import format_count, format_quantity
+from springbench.harness.report.page_layout import add_axes, draw_header, draw_text, new_page, save_page, tick_formatter
 from springbench.harness.report.plot_style import (
     FASTER_COLOUR,
     MUTED_COLOUR,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.recording.recorder_interface import RecordingReplay
-from springbench.harness.recording.strain_shading import round_scale_end
+from springbench.harness.recording.strain_scale import round_scale_end
 from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain, mean_rest_length
 from springbench.harness.results import quantities
 

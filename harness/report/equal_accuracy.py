@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from math import inf, isfinite
 from typing import NamedTuple
 
-from springbench.harness.report.page_layout import format_factor, format_quantity
+from springbench.harness.report.number_format import format_factor, format_quantity
 from springbench.harness.report.timing_table import ROUNDOFF_RATIO, RunTimes
 from springbench.harness.results.quantities import compute_slowdown
 

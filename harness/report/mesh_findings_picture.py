@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from springbench.harness.execution import machine_info
 from springbench.harness.recording.local_origin import compute_local_origin, store_relative
 from springbench.harness.recording.recorder_interface import RecordingReplay
-from springbench.harness.recording.strain_shading import DEFAULT_STRAIN_RANGE
+from springbench.harness.recording.strain_scale import DEFAULT_STRAIN_RANGE
 from springbench.harness.report.scene_preview import MarkedPoints, draw_scene_preview
 from springbench.harness.scenes.mesh.mesh_checks import MeshFinding
 from springbench.harness.scenes.mesh.mesh_report import MeshReport, format_finding

@@ -19,7 +19,7 @@ import pyvista as pv
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 from springbench.harness.recording.recorder_interface import RecordingReplay
-from springbench.harness.recording.strain_shading import PIN_COLOUR
+from springbench.harness.recording.strain_scale import PIN_COLOUR
 from springbench.harness.report import opengl_probe
 from springbench.harness.report.obstacle_meshes import build_obstacle_meshes
 from springbench.harness.report.plot_style import BACKGROUND_COLOUR, STRAIN_MAP, TEXT_COLOUR

@@ -23,7 +23,8 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.recording.recorder_interface import RecordingReplay
-from springbench.harness.recording.strain_shading import PIN_COLOUR, format_percent
+from springbench.harness.recording.strain_scale import PIN_COLOUR, format_percent
+from springbench.harness.report.number_format import shorten_words
 from springbench.harness.report.picture_sources import SOURCES_KEY
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
@@ -171,34 +172,3 @@ def format_frame_time(replay: RecordingReplay, frame: int) -> str:
     last = float(np.abs(replay.times).max(initial=0.0))
     unit, seconds = next(((unit, seconds) for unit, seconds, least in _TIME_UNITS if last >= least), ("s", 1.0))
     return f"{replay.times[frame] / seconds:.2f} {unit}"
-
-
-def format_count(number: int) -> str:
-    """Format an integer with thin spaces between thousands."""
-    return f"{number:,}".replace(",", "\u2009")
-
-
-def format_quantity(value: float) -> str:
-    """Format a number to three significant digits, with an exponent only from 1e7 on."""
-    if value >= 1e7:
-        return f"{value:.1e}"
-    return f"{value:.3g}" if value < 1000 else format_count(round(value))
-
-
-def format_factor(value: float) -> str:
-    """Format a ratio to two significant digits, or to an integer from 100 on."""
-    return f"{value:.2g}" if value < 100 else format_quantity(value)
-
-
-def shorten_words(words: str, limit: int) -> str:
-    """Shorten text to `limit` characters, with an ellipsis at the end."""
-    return words if len(words) <= limit else words[: limit - 1].rstrip() + "…"
-
-
-def format_time_step(dt: float) -> str:
-    """Format a time step [s], such as 1/30 s.
-
-    It is given in milliseconds if it is not the inverse of an integer.
-    """
-    whole = round(1 / dt)
-    return f"1/{whole} s" if abs(whole * dt - 1) < 1e-9 else f"{1e3 * dt:.3g} ms"

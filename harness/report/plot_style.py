@@ -8,7 +8,7 @@ from hashlib import sha256
 from typing import Any, NamedTuple
 
 from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgb
-from springbench.harness.recording.strain_shading import STRAIN_COLOURS
+from springbench.harness.recording.strain_scale import STRAIN_COLOURS
 from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, load_target
 
 PAGE_WIDTH, PAGE_HEIGHT, PAGE_DPI = 1600, 900, 100

@@ -7,7 +7,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from springbench.harness.recording.recorder_interface import RecordingReplay
-from springbench.harness.report.page_layout import draw_text, shorten_words
+from springbench.harness.report.number_format import shorten_words
+from springbench.harness.report.page_layout import draw_text
 from springbench.harness.report.plot_style import MUTED_COLOUR, PAGE_WIDTH
 
 _DIRTY_SUFFIX = "-dirty"

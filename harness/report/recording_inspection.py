@@ -27,7 +27,7 @@ from springbench.harness.recording.recording_reader import (
     read_replay,
     summarise_recording,
 )
-from springbench.harness.report.page_layout import format_quantity
+from springbench.harness.report.number_format import format_quantity
 from springbench.harness.results.quantities import compute_slowdown
 
 _SURFACE_SUFFIXES = (".obj", ".ply", ".stl", ".vtk", ".vtp")

@@ -19,17 +19,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, LogLocator, NullLocator
 from springbench.harness.report.line_end_labels import LABEL_SPACING, LineEnd, draw_direct_labels
-from springbench.harness.report.page_layout import (
-    add_axes,
-    draw_header,
-    draw_text,
-    format_count,
-    format_quantity,
-    new_page,
-    save_page,
-    shorten_words,
-    tick_formatter,
-)
+from springbench.harness.report.number_format import format_count, format_quantity, shorten_words
+from springbench.harness.report.page_layout import add_axes, draw_header, draw_text, new_page, save_page, tick_formatter
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     DASH_DOTTED_LINE,

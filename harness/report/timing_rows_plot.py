@@ -13,14 +13,8 @@ from math import log10
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
-from springbench.harness.report.page_layout import (
-    add_axes,
-    draw_text,
-    format_count,
-    format_quantity,
-    shorten_words,
-    tick_formatter,
-)
+from springbench.harness.report.number_format import format_count, format_quantity, shorten_words
+from springbench.harness.report.page_layout import add_axes, draw_text, tick_formatter
 from springbench.harness.report.plot_style import BACKGROUND_COLOUR, MUTED_COLOUR, TEXT_COLOUR, SeriesStyle
 from springbench.harness.report.timing_table import RunTimes
 

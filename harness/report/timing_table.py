@@ -21,7 +21,7 @@ from rich.text import Text
 from springbench.harness.report.citations import format_citation
 from springbench.harness.report.machine_footer import assign_machine_names as machine_names
 from springbench.harness.report.machine_footer import machine_footer
-from springbench.harness.report.page_layout import format_quantity, format_time_step
+from springbench.harness.report.number_format import format_quantity, format_time_step
 from springbench.harness.report.table_queries import query_table
 from springbench.harness.results.quantities import DISSIPATION_CAUSES, SQL_EXPRESSIONS
 from springbench.harness.results.run_schema import RUN_SCHEMA

@@ -22,7 +22,7 @@ from springbench.harness.recording.recording_reader import (
 )
 from springbench.harness.recording.rerun_recorder import FLUSH_INTERVAL, RerunRecorder
 from springbench.harness.recording.side_by_side import LineStyle, read_residuals, write_side_by_side
-from springbench.harness.recording.strain_shading import NUM_LEVELS, build_palette
+from springbench.harness.recording.strain_scale import NUM_LEVELS, build_palette
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 
 from tests.synthetic_recordings import (

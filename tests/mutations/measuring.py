@@ -146,7 +146,7 @@ MEASURING = (
     ),
     Mutation(
         "colours-inverted",
-        "harness/recording/strain_shading.py",
+        "harness/recording/strain_scale.py",
         "np.clip(strain / end, -1, 1)",
         "np.clip(-strain / end, -1, 1)",
         ("tests/unit/test_record_shading.py",),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from springbench.harness.recording.camera_view import ViewExtent
-from springbench.harness.recording.strain_shading import NUM_LEVELS
+from springbench.harness.recording.strain_scale import NUM_LEVELS
 from springbench.harness.recording.viewer_blueprint import (
     build_panels,
     build_plot,

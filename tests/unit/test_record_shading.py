@@ -6,13 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from springbench.harness.recording.strain_shading import (
-    NEUTRAL_COLOUR,
-    NUM_LEVELS,
-    STRAIN_COLOURS,
-    StrainShading,
-    build_palette,
-)
+from springbench.harness.recording.strain_scale import NEUTRAL_COLOUR, NUM_LEVELS, STRAIN_COLOURS, build_palette
+from springbench.harness.recording.strain_shading import StrainShading
 
 from tests.synthetic_recordings import MESHES_BY_KIND, build_recording_info
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from springbench.harness.recording.camera_framing import describe_outside
 from springbench.harness.recording.recorder_interface import RecordingReplay
-from springbench.harness.recording.strain_shading import STRAIN_COLOURS
+from springbench.harness.recording.strain_scale import STRAIN_COLOURS
 from springbench.harness.report import comparison_picture, opengl_probe, page_layout, run_picture
 from springbench.harness.report.comparison_picture import draw_comparison_picture
 from springbench.harness.report.drawable_frames import find_drawable_frames

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.execution import machine_info
-from springbench.harness.report.page_layout import format_time_step
+from springbench.harness.report.number_format import format_time_step
 
 FloatArray = NDArray[np.float64]
 

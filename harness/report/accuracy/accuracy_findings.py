@@ -36,7 +36,7 @@ from springbench.harness.report.accuracy.time_to_accuracy import (
     group_by_start,
 )
 from springbench.harness.report.citations import format_citation
-from springbench.harness.report.page_layout import format_factor
+from springbench.harness.report.number_format import format_factor
 
 FindingChapters = dict[str, list[str]]
 

@@ -37,7 +37,8 @@ from springbench.harness.report.accuracy.plot_sheet import (
     plot_sheet,
     sheet_paths,
 )
-from springbench.harness.report.page_layout import draw_text, format_count, format_quantity, format_time_step
+from springbench.harness.report.number_format import format_count, format_quantity, format_time_step
+from springbench.harness.report.page_layout import draw_text
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     MUTED_COLOUR,

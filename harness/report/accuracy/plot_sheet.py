@@ -24,16 +24,8 @@ from matplotlib.ticker import FixedLocator, LogFormatterMathtext, LogLocator, Nu
 from numpy.typing import ArrayLike
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.report.accuracy.time_to_accuracy import format_duration
-from springbench.harness.report.page_layout import (
-    add_axes,
-    draw_header,
-    draw_text,
-    format_quantity,
-    new_page,
-    save_page,
-    shorten_words,
-    tick_formatter,
-)
+from springbench.harness.report.number_format import format_quantity, shorten_words
+from springbench.harness.report.page_layout import add_axes, draw_header, draw_text, new_page, save_page, tick_formatter
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     MUTED_COLOUR,

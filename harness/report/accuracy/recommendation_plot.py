@@ -24,7 +24,7 @@ from springbench.harness.report.accuracy.plot_sheet import (
 from springbench.harness.report.accuracy.plot_sheet import marker_scale as sized
 from springbench.harness.report.accuracy.plot_sheet import plot_sheet as page_of
 from springbench.harness.report.accuracy.time_to_accuracy import format_duration
-from springbench.harness.report.page_layout import format_quantity
+from springbench.harness.report.number_format import format_quantity
 from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEXT_COLOUR, assign_solver_styles
 
 MAX_RUNNERS_UP = 4

@@ -12,7 +12,7 @@ from math import ceil, inf, log
 
 import numpy as np
 from springbench.harness.report.accuracy.accuracy_data import AccuracyData, ConvergenceCurve, SnapshotProblem
-from springbench.harness.report.page_layout import format_quantity
+from springbench.harness.report.number_format import format_quantity
 
 GAP_TARGETS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
 """Energy gaps at which solvers are compared."""

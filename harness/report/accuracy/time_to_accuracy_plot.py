@@ -42,7 +42,8 @@ from springbench.harness.report.accuracy.time_to_accuracy import (
     format_gap,
     is_solvable,
 )
-from springbench.harness.report.page_layout import draw_text, format_count
+from springbench.harness.report.number_format import format_count
+from springbench.harness.report.page_layout import draw_text
 from springbench.harness.report.plot_style import STALE_NOTE, TEXT_COLOUR, SeriesStyle, assign_label_styles
 
 _COLUMN_TITLES = {

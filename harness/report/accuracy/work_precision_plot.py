@@ -28,7 +28,8 @@ from springbench.harness.report.accuracy.plot_sheet import (
     sheet_paths,
 )
 from springbench.harness.report.accuracy.time_to_accuracy import format_duration, format_gap
-from springbench.harness.report.page_layout import draw_text, format_quantity, format_time_step
+from springbench.harness.report.number_format import format_quantity, format_time_step
+from springbench.harness.report.page_layout import draw_text
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     MUTED_COLOUR,

@@ -42,7 +42,7 @@ from springbench.harness.report.accuracy.work_precision_plot import pareto_front
 from springbench.harness.report.figures.axis_scales import format_power
 from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot, CurveSeries, ShadedBand
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
-from springbench.harness.report.page_layout import format_count, format_quantity
+from springbench.harness.report.number_format import format_count, format_quantity
 from springbench.harness.report.plot_style import MUTED_COLOUR, STALE_NOTE, SeriesStyle, assign_label_styles
 
 _MIN_ERROR = 1e-16

@@ -18,7 +18,8 @@ from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import Bbox
 from springbench.harness.report.accuracy.time_to_accuracy import format_duration
 from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot, FloatArray
-from springbench.harness.report.page_layout import format_count, format_quantity, tick_formatter
+from springbench.harness.report.number_format import format_count, format_quantity
+from springbench.harness.report.page_layout import tick_formatter
 
 _SUPERSCRIPT_TABLE = str.maketrans("-0123456789.", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹·")
 _AXIS_MARGIN = 0.06

@@ -18,7 +18,7 @@ from springbench.harness.report.accuracy.engine_comparison import (
 )
 from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
-from springbench.harness.report.page_layout import format_quantity
+from springbench.harness.report.number_format import format_quantity
 from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle
 
 _FRONT_NOTE = (

@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.legend import Legend
 from matplotlib.patches import Patch
 from matplotlib.text import Text
-from springbench.harness.recording.strain_shading import format_percent
+from springbench.harness.recording.strain_scale import format_percent
 from springbench.harness.report.figures.axis_scales import thin_ticks
 from springbench.harness.report.figures.direct_labels import add_direct_labels
 from springbench.harness.report.figures.figure_options import FigureOptions

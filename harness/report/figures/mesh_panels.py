@@ -29,8 +29,9 @@ from springbench.harness.report.mesh_rendering import (
     fit_camera,
     view_aspect,
 )
+from springbench.harness.report.number_format import format_count, format_quantity
 from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
-from springbench.harness.report.page_layout import format_count, format_frame_time, format_quantity
+from springbench.harness.report.page_layout import format_frame_time
 from springbench.harness.report.plot_style import SeriesStyle, assign_solver_styles
 from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
 from springbench.harness.report.recorded_strain import compute_vertex_strain

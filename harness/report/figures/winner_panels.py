@@ -12,7 +12,7 @@ from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy.winner_map import NO_WINNER, assign_family_styles, build_winner_cells
 from springbench.harness.report.figures.figure_panels import CellMap, MapCell
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
-from springbench.harness.report.page_layout import format_count, format_quantity
+from springbench.harness.report.number_format import format_count, format_quantity
 
 _WINNER_NOTE = (
     "Columns: k dt²/m at dt = 1/30 s; rows: error of the positions at the end, relative to the way from the start. "

@@ -37,7 +37,7 @@ from springbench.harness.report.accuracy.time_to_accuracy import (
     find_time_to_accuracy,
     format_gap,
 )
-from springbench.harness.report.page_layout import format_time_step
+from springbench.harness.report.number_format import format_time_step
 from springbench.harness.report.plot_style import assign_label_styles
 from springbench.harness.report.site import engine_chart, liu2013_chart, winner_chart
 from springbench.harness.report.site.data_scripts import round_numbers as _numbers

@@ -14,7 +14,7 @@ from springbench.harness.report.accuracy.winner_map import (
     assign_family_styles,
     build_winner_cells,
 )
-from springbench.harness.report.page_layout import format_count
+from springbench.harness.report.number_format import format_count
 from springbench.harness.report.site.data_scripts import round_numbers
 from springbench.harness.report.site.plotly_styles import axis_choice, plotly_style
 

@@ -16,16 +16,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, LogLocator, MultipleLocator, NullLocator
-from springbench.harness.report.page_layout import (
-    add_axes,
-    draw_header,
-    format_count,
-    format_quantity,
-    new_page,
-    save_page,
-    shorten_words,
-    tick_formatter,
-)
+from springbench.harness.report.number_format import format_count, format_quantity, shorten_words
+from springbench.harness.report.page_layout import add_axes, draw_header, new_page, save_page, tick_formatter
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     PAGE_HEIGHT,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from springbench.harness.report.page_layout import format_count, format_quantity
+from springbench.harness.report.number_format import format_count, format_quantity
 from springbench.harness.report.speed.speed_figures import STEP_ITERATIONS, SpeedFigures
 from springbench.harness.results.bootstrap_statistics import ConfidenceInterval
 
