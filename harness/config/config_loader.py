@@ -46,6 +46,7 @@ from springbench.harness.scenes.scene_spec import NAME_PATTERN, SceneFile, Scene
 from springbench.harness.schema.base_model import ConfigModel, Vector3
 from springbench.harness.schema.config_document import (
     IMPORT_USER_CODE,
+    SKIP_USER_CODE,
     ConfigDocument,
     ConfigKey,
     UserCodePolicy,
@@ -162,7 +163,7 @@ def load_config(
         InputError: for all mistakes.
     """
     load = partial(_load_any, path, solvers, sizes, options)
-    return _load_sweep_checked(load) if imports_code else load(UserCodePolicy(imports_code=False, uses_cache=True))
+    return _load_sweep_checked(load) if imports_code else load(SKIP_USER_CODE)
 
 
 def _load_any(

@@ -1,14 +1,15 @@
 """Solvers of a config with all of their parameters.
 
 The parameters are the fields of a solver's dataclass. Importing a solver also imports Numba and its kernels, which
-would be most of the time of `springbench list`. The parameters of shipped solvers are therefore cached for the user, by
-the digest of all sources of solvers. Any change of the sources invalidates the entry, and checkouts with other sources
-have entries of their own.
+would be most of the time of a command that has nothing to run. The valid parameters of shipped solvers are therefore
+cached for the user, by what a config states and the digest of all sources of solvers. Any change of the sources
+invalidates the entry, and checkouts with other sources have entries of their own.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import time
 from contextlib import suppress
@@ -56,7 +57,7 @@ def _read_solver(document: ConfigDocument, entry: str | dict[str, Any], at: Conf
     own = isinstance(name, PluginName)
     if own and not document.user_code.imports_code:
         return SolverSpec(name, requested, document.user_code.solver_metadata.get(name, {}))
-    cache_path = None if own or requested or not document.user_code.uses_cache else _cache_path(name)
+    cache_path = None if own else _cache_path(name, requested)
     if cache_path is not None and (known := _read_cache(cache_path)) is not None:
         return SolverSpec(name, known)
     if own:
@@ -70,6 +71,7 @@ def _read_solver(document: ConfigDocument, entry: str | dict[str, Any], at: Conf
         solver(**vars(parameters))
     except ValueError as error:
         document.add_mistake(str(error), at)
+        return None
     found: dict[str, Any] = _select_parameters(solver, parameters)
     if cache_path is not None:
         _write_cache(cache_path, found)
@@ -130,9 +132,10 @@ def _select_parameters(solver: type, parameters: ConfigModel) -> dict[str, Any]:
     return parameters.model_dump(mode="json", exclude=usual)
 
 
-def _cache_path(name: str) -> Path:
-    """Return the cache path of a shipped solver that a config names without parameters."""
-    return user_cache_dir("parameters") / f"{name}-{_hash_solver_sources()[:16]}.json"
+def _cache_path(name: str, requested: dict[str, Any]) -> Path:
+    """Return the cache path of a shipped solver with the parameters that a config states."""
+    stated = f"{_hash_solver_sources()}{json.dumps(requested, sort_keys=True, default=repr)}"
+    return user_cache_dir("parameters") / f"{name}-{hashlib.sha256(stated.encode()).hexdigest()[:16]}.json"
 
 
 @cache

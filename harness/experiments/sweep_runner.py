@@ -27,6 +27,8 @@ from springbench.harness.experiments.experiment_units import (
 from springbench.harness.experiments.run_unit import RunUnit
 from springbench.harness.experiments.sweep_plan import REQUIRED_COLUMNS, RunFiles, find_stale_run_ids, plan_runs
 from springbench.harness.results import parquet_rows
+from springbench.solvers.plugins.plugin_discovery import PluginName, load_target
+from springbench.solvers.registry import SOLVER_TABLE
 
 if TYPE_CHECKING:
     from springbench.harness.experiments.dask_cluster import DaskCluster
@@ -115,6 +117,8 @@ def run_sweep(
             import_module(
                 "springbench.harness.experiments.run_pipeline"
             )  # here, for workers that are forks of this process
+            for name in {p.run.solver.name: None for p in todo if not isinstance(p.run.solver.name, PluginName)}:
+                load_target(SOLVER_TABLE[name])
         many = min(num_workers or choose_num_workers(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
         if away:

@@ -34,13 +34,11 @@ class UserCodePolicy:
     imports_code: whether the code is imported here; otherwise only its files identify it.
     on_import: called with a description before each import.
     solver_metadata: metadata of each solver class by solver name, as far as it was read before.
-    uses_cache: whether cached parameters of shipped solvers may be used.
     """
 
     imports_code: bool = True
     on_import: Callable[[str], None] = _ignore_message
     solver_metadata: Mapping[str, Mapping[str, Any]] = field(default_factory=dict[str, Mapping[str, Any]])
-    uses_cache: bool = False
 
 
 IMPORT_USER_CODE = UserCodePolicy()

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import InputError
@@ -21,8 +21,10 @@ from springbench.harness.report.site.sweep_folders import (
     find_folders,
     locate_folder,
 )
-from springbench.harness.report.site.sweep_overview import SweepOverview, build_overview
 from springbench.harness.results import row_store
+
+if TYPE_CHECKING:
+    from springbench.harness.report.site.sweep_overview import SweepOverview
 
 SUMMARY_FILE = "summary.json"
 """File with a sweep's entry in the index, stored next to its data."""
@@ -56,6 +58,10 @@ def update_page(
         home = data / folder.slug
         state = _sweep_state(folder, code, with_recordings)
         if _read_summary(home).get("fingerprint") != state:
+            from springbench.harness.report.site.sweep_overview import (
+                build_overview,  # half of a second, with all charts
+            )
+
             _write_sweep(
                 home,
                 folder,
