@@ -17,8 +17,13 @@ from springbench.harness.recording.recorder_interface import RecordedFrame, RunR
 from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
-from springbench.harness.simulation.dissipation import DissipationBudget, StepDissipation
-from springbench.harness.simulation.energy_balance import BLOW_UP_FACTOR, EnergyBalance, EnergyGain
+from springbench.harness.simulation.energy_balance import (
+    BLOW_UP_FACTOR,
+    DissipationBudget,
+    EnergyBalance,
+    EnergyGain,
+    StepDissipation,
+)
 from springbench.harness.simulation.time_loop import SimulationStep, build_initial_state
 from springbench.harness.simulation.timing_pass import (
     NO_CLOCK,

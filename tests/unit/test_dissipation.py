@@ -22,7 +22,7 @@ from springbench.harness.scenes.effects.pins_effect import PinsEffect
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.scene_builder import Scene, build_scene
-from springbench.harness.simulation.dissipation import DissipationBudget, StepDissipation
+from springbench.harness.simulation.energy_balance import DissipationBudget, StepDissipation
 from springbench.harness.simulation.time_loop import SimulationStep, prepare, simulate_scene
 from springbench.solvers.model import integrators
 from springbench.solvers.model.energies.spring_energy import Springs
