@@ -48,6 +48,7 @@ from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.effects.strain_limits_effect import StrainLimitsEffect
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.energy_balance import compute_kinetic_energy
 from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, StopRule, Unsupported, is_lagged
 from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_engine, load_target
@@ -384,7 +385,7 @@ def _compute_energy(scene: Scene, p: Positions, v: Positions) -> float:
 
 def _kinetic_energy(scene: Scene, v: Positions) -> float:
     free = scene.system.free_vertices
-    return 0.5 * float(scene.system.mass[free] @ np.einsum("ij,ij->i", v[free], v[free]))
+    return compute_kinetic_energy(scene.system.mass[free], v[free])
 
 
 def _measure_scene_scale(scene: Scene) -> float:

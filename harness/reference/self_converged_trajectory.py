@@ -33,7 +33,8 @@ MAX_SECONDS = 60.0
 """Limit on the processor time [s] for a reference."""
 MAX_RELATIVE_ERROR = 0.05
 """Relative error for which a reference is always accurate enough."""
-_SOLVED_STOP_RULE = StopRule(100, 1e-6)
+SOLVED_STOP_RULE = StopRule(100, 1e-6)
+"""Stop rule of the steps."""
 _DISAGREEMENT_FACTOR = 4.0
 """Ratio of the distance between two limits to the last change by step halving above which the limits differ."""
 
@@ -94,7 +95,7 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
 
 
 def compute_self_converged(
-    bound: SceneBuilder, frame: float, times: Sequence[float], error: float
+    bound: SceneBuilder, frame: float, times: Sequence[float], error: float, seconds: float = MAX_SECONDS
 ) -> SelfConvergedTrajectory:
     """Compute a self-converged motion at given times.
 
@@ -102,7 +103,8 @@ def compute_self_converged(
       bound: builds the scene from a step size and an integrator.
       frame: approximate first step size [s].
       times: ascending times [s], each a multiple of the step size.
-      error: smallest relative error to be measured, if that takes no longer than MAX_SECONDS.
+      error: smallest relative error to be measured, if that takes no longer than `seconds`.
+      seconds: limit on the processor time [s].
 
     Raises:
       NotConverged: not even two step sizes could be compared.
@@ -112,8 +114,7 @@ def compute_self_converged(
     found: SelfConvergedTrajectory | None = None
     while True:
         motions = {
-            name: _sample_motion(bound(times[-1] / steps, name), times, began + MAX_SECONDS)
-            for name in LIMIT_INTEGRATORS
+            name: _sample_motion(bound(times[-1] / steps, name), times, began + seconds) for name in LIMIT_INTEGRATORS
         }
         if any(motion is None for motion in motions.values()):
             break
@@ -125,7 +126,7 @@ def compute_self_converged(
                 break
         before, steps = ends, 2 * steps
     if found is None:
-        raise NotConverged(f"contact has no certified reference, and two motions take longer than {MAX_SECONDS:g} s")
+        raise NotConverged(f"contact has no certified reference, and two motions take longer than {seconds:g} s")
     return found
 
 
@@ -154,7 +155,7 @@ def _sample_motion(scene: Scene, times: Sequence[float], until: float) -> _Sampl
         raise NotConverged("the times are no whole numbers of steps")
     samples: dict[int, tuple[Positions, Positions]] = {}
     run = simulate_scene(
-        scene, prepare(scene, NewtonSolver()), _SOLVED_STOP_RULE, initial_guess="previous", frames=wanted[-1]
+        scene, prepare(scene, NewtonSolver()), SOLVED_STOP_RULE, initial_guess="previous", frames=wanted[-1]
     )
     for step in run:
         if not np.isfinite(step.positions).all():

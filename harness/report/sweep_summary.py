@@ -163,18 +163,20 @@ def _compare_strains(coarse_run: RunTimes, ok_runs: RunTimes) -> str:
 def _describe_dissipation(ok_runs: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
     """Describe the energy that integrators and unconverged solves took, for the scenes where they took most.
 
-    Of each scene and integrator it is the run of the largest mesh whose solves changed the energy least.
+    Of each scene and integrator it is the run of the largest mesh whose solves changed the energy least. A solver that
+    integrates frames itself counts as an integrator.
     """
     chosen: dict[tuple[str, str, float], RunTimes] = {}
     for run in sorted(ok_runs, key=lambda run: (run.size, -abs(run.solve_share or 0.0))):
         if run.dissipation_shares and run.integrator and run.time_step:
-            chosen[run.scene, run.integrator, run.time_step] = run
-    notable = [run for run in chosen.values() if abs(run.integrator_share or 0.0) >= NOTABLE_SHARE]
-    notable.sort(key=lambda run: -abs(run.integrator_share or 0.0))
+            chosen[run.scene, _name_integrator(run), run.time_step] = run
+    notable = [run for run in chosen.values() if abs(_integration_share(run)) >= NOTABLE_SHARE]
+    notable.sort(key=lambda run: -abs(_integration_share(run)))
     for run in notable[:MAX_DISSIPATION_SENTENCES]:
         yield f"{run.scene}: {_describe_losses(run)}"
     if (more := len(notable) - MAX_DISSIPATION_SENTENCES) > 0:
-        yield f"Integrators took less in {more} other cases (column `dissipation_integrator`)."
+        columns = "columns `dissipation_integrator` and `dissipation_engine`"
+        yield f"Integrators took less in {more} other cases ({columns})."
     unsolved = [run for run in ok_runs if abs(run.solve_share or 0.0) >= NOTABLE_SHARE]
     if unsolved:
         run = max(unsolved, key=lambda run: abs(run.solve_share or 0.0))
@@ -188,17 +190,52 @@ def _describe_dissipation(ok_runs: Sequence[RunTimes], names: Mapping[str, str])
 
 def _describe_losses(run: RunTimes) -> str:
     """Describe where the energy of a run went, in words."""
-    damping, friction, integrator, _ = run.dissipation_shares or (0.0,) * 4
-    seconds = (run.frames or 0) * (run.time_step or 0.0)
-    others = [(damping, "damping effects"), (friction, "friction")]
-    effects = " and ".join(f"{what} {_format_share(share)}" for share, what in others if share >= NOTABLE_SHARE / 2)
-    words = (
-        f"{run.integrator} {'took' if integrator > 0 else 'added'} {_format_share(integrator)} of the energy in "
-        f"{seconds:.3g} s{', ' if effects else ''}{effects}"
+    words = describe_losses(
+        _name_integrator(run),
+        (run.frames or 0) * (run.time_step or 0.0),
+        _integration_share(run),
+        *(run.dissipation_shares or (0.0, 0.0))[:2],
+        by_engine=run.engine_share is not None,
     )
-    if run.integrator == "implicit-euler":
+    if run.integrator == "implicit-euler" and _has_steps_of_integrator(run):
         return f"{words}; half the time step takes about half of that, and midpoint none of a linear motion."
     return f"{words}."
+
+
+def describe_losses(
+    name: str, seconds: float, integrator: float, damping: float, friction: float, *, by_engine: bool = False
+) -> str:
+    """Describe the shares of the energy that an integrator, damping and friction dissipated.
+
+    Args:
+        name: name of the integrator or engine.
+        seconds: simulated time [s].
+        integrator, damping, friction: shares of the provided energy.
+        by_engine: whether the integrator's share includes unconverged solves.
+
+    Returns: a sentence without its full stop.
+    """
+    others = [(damping, "damping effects"), (friction, "friction")]
+    effects = " and ".join(f"{what} {_format_share(share)}" for share, what in others if share >= NOTABLE_SHARE / 2)
+    return (
+        f"{name} {'took' if integrator > 0 else 'added'} {_format_share(integrator)} of the energy in "
+        f"{seconds:.3g} s{' by its integrator and its solves' if by_engine else ''}{', ' if effects else ''}{effects}"
+    )
+
+
+def _name_integrator(run: RunTimes) -> str:
+    """Return the integrator of a run; the solver, where it integrates frames itself."""
+    return (run.integrator or "") if _has_steps_of_integrator(run) else run.solver
+
+
+def _has_steps_of_integrator(run: RunTimes) -> bool:
+    """Return whether a solver minimised the steps of an integrator; others have no unconverged solves."""
+    return run.solve_share is not None
+
+
+def _integration_share(run: RunTimes) -> float:
+    """Return the share that the integrator dissipated, in an engine with its solves."""
+    return (run.integrator_share if run.engine_share is None else run.engine_share) or 0.0
 
 
 def _format_share(share: float) -> str:

@@ -46,7 +46,8 @@ class RunTimes(NamedTuple):
         max_stationarity_audit: largest stationarity that the reference evaluator measured, for a solver that does not
             minimise.
         provided_energy: energy provided in all frames [J].
-        damping_share, friction_share, integrator_share, solve_share: energy dissipated by each cause, relative to it.
+        damping_share, friction_share, integrator_share, solve_share, engine_share: energy dissipated by each cause,
+            relative to it.
     """
 
     run_id: str
@@ -90,12 +91,14 @@ class RunTimes(NamedTuple):
     friction_share: float | None
     integrator_share: float | None
     solve_share: float | None
+    engine_share: float | None
 
     @property
     def dissipation_shares(self) -> tuple[float, ...] | None:
         """Shares of the causes `DISSIPATION_CAUSES`; None where they are unknown or no energy was provided."""
         shares = tuple(getattr(self, f"{cause}_share") for cause in DISSIPATION_CAUSES)
-        return None if self.provided_energy is None or shares[2] is None else tuple(one or 0.0 for one in shares)
+        is_known = self.integrator_share is not None or self.engine_share is not None
+        return tuple(one or 0.0 for one in shares) if self.provided_energy is not None and is_known else None
 
 
 ROUNDOFF_RATIO = 1e-12
@@ -213,7 +216,9 @@ _MIN_NAME_WIDTH = 12
 PREEMPTED_NOTE = "! the process was interrupted while steps were timed: its least time is nearest to the truth"
 INCONSISTENT_NOTE = "~ local and global, timed alone, do not add up to an iteration within 15 %"
 STALE_MARK_NOTE = "† by other code than today's"
-DISSIPATION_NOTE = "d/f/i/s: energy lost to damping, friction, integrator and unconverged solves, of that provided"
+DISSIPATION_NOTE = (
+    "d/f/i/s: energy lost to damping, friction, integrator and unconverged solves, of that provided; engines: d/f/i+s"
+)
 """Meanings of the marks in the table."""
 SHARED_TIMING_NOTE = (
     "timed beside others, up to {} at once, each on cores of its own: slower than alone by what they share"
@@ -269,7 +274,7 @@ def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Tab
                 _format_number(strain, lambda strain: f"{100 * strain:.3g} %")
                 for strain in (run.max_strain, run.strain_p99)
             ),
-            *([_format_number(run.dissipation_shares, _format_shares)] if has_dissipation else []),
+            *([_format_dissipation(run)] if has_dissipation else []),
         )
     marks = {
         DISSIPATION_NOTE: has_dissipation,
@@ -315,9 +320,15 @@ def _describe_methods(table: pa.Table) -> list[str]:
     return [f"{', '.join(names)}: {format_citation(reference)}" for reference, names in solvers.items()]
 
 
-def _format_shares(shares: Sequence[float]) -> str:
-    """Format shares in whole percent, separated by slashes."""
-    return "/".join(f"{round(100 * share)}" if abs(share) < 10 else f"{100 * share:.0e}" for share in shares)
+def _format_dissipation(run: RunTimes) -> str:
+    """Format the shares of the causes in whole percent, separated by slashes; those of an engine are three."""
+    if (shares := run.dissipation_shares) is None:
+        return "–"
+    damping, friction, integrator, solve, engine = (
+        f"{round(100 * share)}" if abs(share) < 10 else f"{100 * share:.0e}" for share in shares
+    )
+    rest = (integrator, solve) if run.engine_share is None else (engine,)
+    return "/".join((damping, friction, *rest))
 
 
 def _format_number(value: Any, words: Callable[[Any], str]) -> str:

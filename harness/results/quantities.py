@@ -23,8 +23,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-DISSIPATION_CAUSES = ("damping", "friction", "integrator", "solve")
-"""Causes of dissipation: damping effects, friction, the time integrator, and unconverged solves."""
+DISSIPATION_CAUSES = ("damping", "friction", "integrator", "solve", "engine")
+"""Causes of dissipation: damping effects, friction, the time integrator, unconverged solves, and engines, in which the
+last two cannot be separated."""
 
 SQL_EXPRESSIONS = {
     "step": "1e3 * median(seconds) filter (phase = 'step')",

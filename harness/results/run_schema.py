@@ -269,8 +269,7 @@ RUN_COLUMNS = (
         "potential_energy",
         _REAL,
         "J",
-        "springs, loads, penalty pins and all other potentials after the step, loads relative to the start; null "
-        "where the solver integrates a frame itself and more than potentials acts",
+        "springs, loads, penalty pins and all other potentials after the step, loads relative to the start",
     ),
     ColumnSpec(
         "provided_energy",
@@ -288,27 +287,37 @@ RUN_COLUMNS = (
         "dissipation_damping",
         _REAL,
         "J",
-        "energy that damping effects dissipated in the step; null, like the next three, where the solver integrates a "
-        "frame itself and more than potentials acts",
+        "energy that damping effects dissipated in the step; in frames that the solver integrates itself, integrated "
+        "along the motion interpolated between their ends",
     ),
     ColumnSpec("dissipation_friction", _REAL, "J", "energy that friction dissipated in the step"),
     ColumnSpec(
         "dissipation_integrator",
         _REAL,
         "J",
-        "energy that the time integrator dissipated in the step beyond what the scene does; negative: it added energy",
+        "energy that the time integrator dissipated in the step beyond what the scene does; negative: it added energy; "
+        "null where `dissipation_engine` is not",
     ),
     ColumnSpec(
         "dissipation_solve",
         _REAL,
         "J",
-        "energy dissipated by the unconverged solve: minus the work of the residual force; negative: it added energy",
+        "energy dissipated by the unconverged solve: minus the work of the residual force; negative: it added energy; "
+        "null where the solver integrates frames itself",
+    ),
+    ColumnSpec(
+        "dissipation_engine",
+        _REAL,
+        "J",
+        "energy that an engine dissipated in the frame by its integrator and its solves, which the positions and "
+        "velocities of frames cannot separate; null for other solvers",
     ),
     ColumnSpec(
         "balance_error",
         _REAL,
         "J",
-        "change of the energy in the step that these terms do not explain: round-off",
+        "change of the energy in the step that these terms do not explain: round-off; in frames that the solver "
+        "integrates itself, the estimated error of source_work and dissipation_damping by quadrature",
     ),
     ColumnSpec("max_strain", _REAL, "", "maximum over the springs of |length / rest length - 1| after the step"),
     ColumnSpec(

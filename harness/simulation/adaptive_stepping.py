@@ -27,7 +27,13 @@ import numpy as np
 from springbench.harness.errors import RunFailed
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.step_stages import StageSequence, StepResult
-from springbench.harness.simulation.time_loop import INITIAL_GUESSES, build_initial_state, prepare
+from springbench.harness.simulation.time_loop import (
+    INITIAL_GUESSES,
+    MotionState,
+    SimulationStep,
+    build_initial_state,
+    prepare,
+)
 from springbench.solvers.model.integrators import Motion, RungeKutta
 from springbench.solvers.model.integrators.step_size_controller import (
     StepSizeController,
@@ -50,6 +56,10 @@ _STALL_FACTOR = 10.0
 """Factor on the requested residual up to which a stalled solve is accepted."""
 _MAX_LEVEL = 60
 """Maximum level: times are multiples of 2^-60 of the end time."""
+
+
+StepObserver = Callable[[Scene, SimulationStep, float], None]
+"""Called with the scene, each step and the time [s] of its end."""
 
 
 class TimeBudgetExceeded(Exception):
@@ -123,12 +133,15 @@ class Stepper(Protocol):
             return max(1.0, setting * ratio ** (-1.0 / order))
         return setting * ratio ** ((order + 1.0) / order)
 
-    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+    def integrate_motion(
+        self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
+    ) -> Trajectory:
         """Integrate the motion up to the end time.
 
         Args:
           setting: error tolerance [m] or number of steps relative to the smallest number.
           cpu_limit: limit on the processor time [s].
+          observe: called after each accepted step; after each frame that the solver integrates itself.
 
         Raises:
           TimeBudgetExceeded: the limit is exceeded.
@@ -189,18 +202,23 @@ class AdaptiveImplicitStepper(Stepper):
         """The order of convergence of the integrator."""
         return self.build_scene(self.t_end / self.frames).integrator.order
 
-    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+    def integrate_motion(
+        self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
+    ) -> Trajectory:
         """Integrate the motion; raises Unsupported for an integrator without an error estimate and for velocity
         filters.
         """
-        return _AdaptiveIntegration(self, setting, cpu_limit).run_to_end()
+        return _AdaptiveIntegration(self, setting, cpu_limit, observe).run_to_end()
 
 
 class _AdaptiveIntegration:
     """One motion with steps of the levels."""
 
-    def __init__(self, stepper: AdaptiveImplicitStepper, tolerance: float, limit: float) -> None:
+    def __init__(
+        self, stepper: AdaptiveImplicitStepper, tolerance: float, limit: float, observe: StepObserver | None
+    ) -> None:
         self._stepper, self._tolerance, self._limit, self._cpu = stepper, tolerance, limit, thread_time()
+        self._observe = observe
         self._ladder = _StepSizeLevels(stepper.build_scene, stepper.solver, stepper.t_end)
         self._span = stepper.t_end / stepper.frames
         self._level = ceil(log2(max(1.0, stepper.t_end / self._span)))
@@ -234,8 +252,9 @@ class _AdaptiveIntegration:
         """Try one step."""
         scene, prepared = self._ladder.prepare_level(self._level)
         h, time = scene.system.time_step, self._tick_time(self._ticks)
+        rule = self._build_stop_rule(h)
         done = StageSequence(scene, self._now, self._acceleration, time).solve_stages(
-            prepared, self._build_stop_rule(h), INITIAL_GUESSES["extrapolated"]
+            prepared, rule, INITIAL_GUESSES["extrapolated"]
         )
         self._iterations += sum(done.iteration_counts)
         ratio = self._error_ratio(done)
@@ -250,6 +269,10 @@ class _AdaptiveIntegration:
         self._lengths = min(self._lengths[0], h), max(self._lengths[1], h)
         self._ticks += 1 << (_MAX_LEVEL - self._level)
         self._add_frames(done.end.motion, time, h)
+        if self._observe:
+            state = MotionState(done.end.motion, self._now, self._accepted, done.end.acceleration)
+            step = SimulationStep(*done.stages[-1], state, done.iteration_counts, done.stages, rule)
+            self._observe(scene, step, self._tick_time(self._ticks))
         self._now, self._acceleration = done.end.motion, done.end.acceleration
         self._choose_step_size(ratio, h)
 

@@ -23,6 +23,11 @@ class DelegatingSolver:
         """The solver's statistics."""
         return self._prepared.stats
 
+    @property
+    def has_inner_solves(self) -> bool:
+        """Whether the solver iterates within the frames that it integrates itself."""
+        return getattr(self._prepared, "has_inner_solves", False)
+
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """Return the solver's iterates."""
         return self._prepared.iterates(problem)

@@ -39,11 +39,18 @@ Sources are changing forces, moving pins and obstacles, and energies whose param
 two ends. Exactly pinned vertices have no kinetic energy; penalty pins store none at the start.
 
 The terms are evaluated separately, so their sum tests them: it differs from the change of the energy by round-off.
+
+A solver that integrates frames itself gives motions at their ends only. Potentials are known there, and loads that it
+takes as constant do the work f . (p' - p). The work of damping energies and of moving pins is integrated by Boole's
+rule along cubic Hermite polynomials; its difference from Simpson's rule estimates the error. The rest is what the
+integrator dissipated or, where the solver iterates within frames, the integrator and the solves together.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from functools import reduce
+from math import ceil
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,8 +59,15 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.adaptive_stepping import interpolate_hermite
 from springbench.harness.simulation.step_stages import StageSequence
-from springbench.harness.simulation.time_loop import MotionState, SimulationStep, build_initial_state, build_problem
+from springbench.harness.simulation.time_loop import (
+    MotionState,
+    SimulationStep,
+    build_initial_state,
+    build_integrated_step,
+    build_problem,
+)
 from springbench.solvers.contact.contact_work import ContactEnergy
 from springbench.solvers.model.energies.augmented_lagrangian import (
     compute_penalty_stiffness,
@@ -66,9 +80,8 @@ from springbench.solvers.model.step_problem import (
     Energy,
     Positions,
     ProjectiveEnergy,
-    Solution,
     StepProblem,
-    StopRule,
+    StepStart,
     is_lagged,
 )
 from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
@@ -301,6 +314,15 @@ class EnergyBalance(_StepAccount):
         return _dot(gradient[self._free], moved[self._free])
 
 
+_NUM_STATES = 3
+"""Number of the first fields of StepDissipation, which are states; the others are sums over steps."""
+
+_QUADRATURE_NODES = (0.0, 0.25, 0.5, 0.75, 1.0)
+_BOOLE_WEIGHTS = (7 / 90, 32 / 90, 12 / 90, 32 / 90, 7 / 90)
+_SIMPSON_WEIGHTS = (1 / 6, 0.0, 4 / 6, 0.0, 1 / 6)
+"""Nodes within a frame as fractions of it, and the weights of both rules."""
+
+
 class StepDissipation(NamedTuple):
     """Energies after a step and its dissipation by cause, each [J]; None where the cause cannot be separated.
 
@@ -310,7 +332,9 @@ class StepDissipation(NamedTuple):
       provided_energy: energy of the start, released by loads, and positive work of sources, up to this step.
       source_work: work of sources in the step.
       dissipation_damping, dissipation_friction, dissipation_integrator, dissipation_solve: in the step.
-      balance_error: change of the energy in the step that these terms do not explain.
+      dissipation_engine: by integrator and solves together, where a solver iterates within the frames it integrates.
+      balance_error: change of the energy in the step that these terms do not explain; of frames that the solver
+        integrated, the error of the work by quadrature.
     """
 
     kinetic_energy: float
@@ -321,12 +345,27 @@ class StepDissipation(NamedTuple):
     dissipation_friction: float | None = None
     dissipation_integrator: float | None = None
     dissipation_solve: float | None = None
+    dissipation_engine: float | None = None
     balance_error: float | None = None
 
     @property
     def columns(self) -> dict[str, Any]:
         """Columns in the rows of a frame; a value that overflows is None."""
         return {k: value if value is None or np.isfinite(value) else None for k, value in self._asdict().items()}
+
+    @property
+    def dissipation(self) -> float:
+        """Energy [J] dissipated by all known causes."""
+        return sum(value or 0.0 for name, value in self._asdict().items() if name.startswith("dissipation_"))
+
+    def add_step(self, later: StepDissipation) -> StepDissipation:
+        """Return the dissipation of this step and the next one together."""
+        works = zip(self[_NUM_STATES:], later[_NUM_STATES:], strict=True)
+        return StepDissipation(*later[:_NUM_STATES], *(None if b is None else (a or 0.0) + b for a, b in works))
+
+    def at_rest(self) -> StepDissipation:
+        """Return the same energies without dissipation."""
+        return StepDissipation(*self[:_NUM_STATES], *(None if a is None else 0.0 for a in self[_NUM_STATES:]))
 
 
 class _StagePower(NamedTuple):
@@ -348,55 +387,33 @@ class _StagePower(NamedTuple):
 class DissipationBudget(_StepAccount):
     """Dissipation of one run, whose steps are added in order."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, *, has_inner_solves: bool = False) -> None:
+        """Start at the scene's start; `has_inner_solves` states that a solver iterates within frames."""
         super().__init__(scene, scene.system.mass)
         self._kinetic = self._kinetic_energy(self._motion.velocity)
+        self._has_inner_solves, self._time = has_inner_solves, 0.0
         self._begun: tuple[Energy, ...] = ()
         self._provided = 0.0
         self._last_power = _StagePower()
 
-    def add_step(self, step: SimulationStep) -> StepDissipation:
-        """Return the dissipation of the next step."""
+    def add_step(self, step: SimulationStep, end_time: float | None = None) -> StepDissipation:
+        """Return the dissipation of the next step, which ends at a time [s]; that of its index if omitted."""
+        end = self._scene.compute_time(step.index) if end_time is None else end_time
         with np.errstate(over="ignore", invalid="ignore"):
-            found = self._add_integrated(step) if step.solution.velocity is not None else self._add_stages(step)
-        self._motion, self._kinetic = step.state.motion, found.kinetic_energy
+            found = self._add_stages(step, end) if step.solution.velocity is None else self._add_integrated(step, end)
+        self._motion, self._kinetic, self._time = step.state.motion, found.kinetic_energy, end
         return found
 
-    def _add_integrated(self, step: SimulationStep) -> StepDissipation:
-        """Add a step that the solver integrated itself.
-
-        Its forces are known at its ends only, so that the causes are separable only where nothing acts but potentials.
-        """
-        scene, problem, p = self._scene, step.problem, step.positions
-        kinetic = self._kinetic_energy(step.state.motion.velocity)
-        driven = scene.varying_forces or scene.velocity_filters or scene.pin_motions or scene.system.length_constraints
-        if driven or any(map(is_lagged, problem.system.energies)):
-            return StepDissipation(kinetic)
-        if step.index == 1:
-            self._set_start(self._evaluate_potentials(problem, self._first, self._first, 0.0))
-        before, self._potentials = self._potentials, self._evaluate_potentials(problem, p, p, 0.0)
-        lost = self._kinetic - kinetic + float((before - self._potentials).sum())
-        return StepDissipation(
-            kinetic, float(self._potentials.sum()), self._update_provided(0.0), 0.0, 0.0, 0.0, lost, None, 0.0
-        )
-
-    def _add_stages(self, step: SimulationStep) -> StepDissipation:
-        problem, x, p = step.problem, step.solution.positions, step.positions
-        before = self._motion.positions
-        end, start = self._scene.compute_time(step.index), self._scene.compute_time(step.index - 1)
-        moved = self._scene.pin_targets_at(end) - self._scene.pin_targets_at(start)
+    def _add_stages(self, step: SimulationStep, end: float) -> StepDissipation:
+        """Add a step of an integrator, which ends at a time [s]."""
+        problem, moved = step.problem, self._scene.pin_targets_at(end) - self._scene.pin_targets_at(self._time)
         work = self._sum_work(step, moved)
-        after = self._evaluate_potentials(problem, x, p, end)
-        if step.index == 1:
-            at_start = self._evaluate_potentials(problem, self._first, self._first, 0.0)
-            self._set_start(np.where(np.isfinite(at_start), at_start, after))
-            self._begun = problem.energies
-        driven = self._parameter_work(problem, after, before, p)
+        before, after, driven = self._update_potentials(step, step.solution.positions, end)
         kinetic = self._kinetic_energy(step.state.motion.velocity)
         filtered = self._kinetic_energy(problem.step_start.velocity)
         removed = self._kinetic - filtered
         sources = work.sources + driven - min(0.0, removed)
-        changed = float((after - self._potentials).sum())
+        changed = float((after - before).sum())
         found = StepDissipation(
             kinetic_energy=kinetic,
             potential_energy=float(after.sum()),
@@ -407,10 +424,73 @@ class DissipationBudget(_StepAccount):
             - work.tensions,
             dissipation_solve=-work.residual,
         )  # fmt: skip
-        dissipated = sum(value or 0.0 for value in found[4:8])
-        self._potentials, self._begun = after, problem.energies
-        error = kinetic - self._kinetic + changed - (sources - dissipated)
+        error = kinetic - self._kinetic + changed - (sources - found.dissipation)
         return found._replace(provided_energy=self._update_provided(sources), balance_error=error)
+
+    def _update_potentials(
+        self, step: SimulationStep, x: Positions, end: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Return potentials before and after a step [J], and the work [J] of changing parameters in it.
+
+        x (n, 3) [m] is the last stage.
+        """
+        problem, p = step.problem, step.positions
+        after = self._evaluate_potentials(problem, x, p, end)
+        if step.index == 1:
+            first = problem.step_start.positions  # integrators of several stages place exact pins on their targets
+            at_start = self._evaluate_potentials(problem, first, first, 0.0)
+            self._set_start(np.where(np.isfinite(at_start), at_start, after))
+            self._begun = problem.energies
+        before, driven = self._potentials, self._parameter_work(problem, after, self._motion.positions, p)
+        self._potentials, self._begun = after, problem.energies
+        return before, after, driven
+
+    def _add_integrated(self, step: SimulationStep, end: float) -> StepDissipation:
+        """Add a step that the solver integrated itself."""
+        problem, v = step.problem, step.state.motion.velocity
+        pinned = problem.system.pins.vertices
+        led = step.positions[pinned] - problem.step_start.positions[pinned]
+        kinetic = self._kinetic_energy(v)
+        unknown = any(isinstance(energy, ContactEnergy) for energy in problem.energies)
+        if unknown or (led.any() and self._scene.system.length_constraints):
+            return StepDissipation(kinetic)
+        before, after, driven = self._update_potentials(step, step.positions, end)
+        works = self._integrate_work(step, led)
+        work, error = works[0], abs(works[0].damping - works[1].damping) + abs(works[0].sources - works[1].sources)
+        filtered = self._kinetic_energy(problem.step_start.velocity)
+        removed = self._kinetic - filtered
+        sources = work.sources + driven - min(0.0, removed)
+        if led.any():  # penalty pins also move the mass of their vertices, and store energy
+            soft = problem.system.penalty_pins[1]
+            was, now = (compute_kinetic_energy(problem.system.mass[soft], u[soft]) for u in (self._motion.velocity, v))
+            sources += now - was + float(after[-2] - before[-2])
+        damping = work.damping + max(0.0, removed)
+        lost = self._kinetic - kinetic - float((after - before).sum()) + sources - damping
+        own = (None, None, lost) if self._has_inner_solves else (lost, None, None)
+        return StepDissipation(
+            kinetic, float(after.sum()), self._update_provided(sources), sources, damping, 0.0, *own, error
+        )
+
+    def _integrate_work(self, step: SimulationStep, led: Positions) -> tuple[_StagePower, _StagePower]:
+        """Return the work [J] in a frame by Boole's and by Simpson's rule; pinned vertices move by `led` [m]."""
+        problem, system, start = step.problem, step.problem.system, step.problem.step_start
+        dt, pinned, rate = system.time_step, system.pins.vertices, system.velocity_rate
+        power = list[_StagePower]()
+        for part in _QUADRATURE_NODES:
+            p, v = interpolate_hermite(Motion(start.positions, start.velocity), step.state.motion, dt, part)
+            p, v = p.copy(), v.copy()
+            p[pinned], v[pinned] = step.positions[pinned] - (1.0 - part) * led, led / dt
+            time = start.time + part * dt
+            here = StepStart(p, v, time, p - v / rate, rate, time)
+            at_node = StepProblem(system, p, problem.external_force, p[pinned], p, p, here)
+            power.append(self._stage_power(at_node, p, np.zeros_like(led), start))
+        found = list[_StagePower]()
+        for weights in (_BOOLE_WEIGHTS, _SIMPSON_WEIGHTS):
+            work = _StagePower()
+            for weight, one in zip(weights, power, strict=True):
+                work = work.add_scaled(dt * weight, one)
+            found.append(work)
+        return found[0], found[1]
 
     def _sum_work(self, step: SimulationStep, moved: Positions) -> _StagePower:
         """Return the work [J] of each kind of force in a step, in which pin targets are displaced by `moved` [m]."""
@@ -433,8 +513,13 @@ class DissipationBudget(_StepAccount):
         power = self._stage_power(stages.build_start_problem(), self._first, np.zeros_like(scene.pin_targets))
         return power._replace(inertia=-power.residual, residual=0.0)
 
-    def _stage_power(self, problem: StepProblem, x: Positions, pin_velocity: Positions) -> _StagePower:
-        """Return the power at a stage x (n, 3) [m], with pin targets at a velocity (q, 3) [m/s]."""
+    def _stage_power(
+        self, problem: StepProblem, x: Positions, pin_velocity: Positions, frame: StepStart | None = None
+    ) -> _StagePower:
+        """Return the power at a stage x (n, 3) [m], with pin targets at a velocity (q, 3) [m/s].
+
+        With the start of a frame, forces that change are those of that start, and penalty pins act as exact ones.
+        """
         system, start, free, exact = problem.system, problem.step_start, self._free, self._exact
         v, total = start.velocity_at(x), np.zeros_like(x)
         potentials = damping = friction = sources = 0.0
@@ -461,11 +546,14 @@ class DissipationBudget(_StepAccount):
         sources += _dot((problem.external_force - self._scene.constant_force)[free], v[free])
         for force in self._scene.varying_forces:
             if getattr(force, "is_dissipative", False):
-                lost = -_dot(force(x, v, start.stage_time)[free], v[free])
+                at = (frame.positions, frame.velocity, frame.time) if frame else (x, v, start.stage_time)
+                lost = -_dot(force(*at)[free], v[free])
                 damping, sources = damping + lost, sources + lost
         residual = problem.gradient(x)
         tension = self._find_tensions(x, residual)
         sources += _dot((total - tension)[exact], v[exact])
+        if frame:
+            sources += _dot((total - problem.external_force)[vertices], v[vertices])
         inertia = system.inertia_diagonal[free, None] * (x - problem.inertial_target)[free]
         return _StagePower(
             _dot(inertia, v[free]),
@@ -544,6 +632,36 @@ class DissipationBudget(_StepAccount):
         return self._provided + self._update_released(self._potentials)
 
 
+class FrameDissipation:
+    """Dissipation of a motion by frames, from steps of other lengths, in order.
+
+    A step belongs to the frame in which it ends. A frame in which none ends has the energies of the one before it.
+
+    Attributes:
+      by_frame: dissipation of each frame, from 1.
+    """
+
+    def __init__(self, frame_seconds: float) -> None:
+        """Set the length of a frame [s]."""
+        self._frame_seconds, self._budget = frame_seconds, None
+        self.by_frame = dict[int, StepDissipation]()
+
+    def add_step(self, scene: Scene, step: SimulationStep, end_time: float) -> None:
+        """Add the next step, which ends at a time [s]; its scene differs from the others in the step size only."""
+        self._budget = self._budget or DissipationBudget(scene)
+        found, frame = self._budget.add_step(step, end_time), ceil(end_time / self._frame_seconds - 1e-6)
+        last = max(self.by_frame, default=0)
+        for empty in range(last + 1, frame):
+            self.by_frame[empty] = self.by_frame[last].at_rest()
+        before = self.by_frame.get(frame)
+        self.by_frame[frame] = before.add_step(found) if before else found
+
+
+def sum_dissipation(by_frame: Mapping[int, StepDissipation]) -> StepDissipation:
+    """Sum the dissipation of all frames, of which there is at least one; energies are those of the last."""
+    return reduce(StepDissipation.add_step, (by_frame[frame] for frame in sorted(by_frame)))
+
+
 def compute_kinetic_energy(mass: NDArray[np.float64], velocity: Positions) -> float:
     """Compute 1/2 v' M v [J] of masses (n,) [kg] and velocities (n, 3) [m/s]."""
     return 0.5 * float(mass @ np.einsum("ij,ij->i", velocity, velocity))
@@ -558,11 +676,8 @@ def compute_frame_balances(scene: Scene, motions: Iterable[Motion]) -> Iterator[
     """
     balance, state = EnergyBalance(scene), build_initial_state(scene)
     for motion in motions:
-        problem = build_problem(scene, state, "previous")
-        solution = Solution(motion.positions, 1, np.nan, np.nan, "max-iter", motion.velocity)
-        state = MotionState(motion, None, state.index + 1)
-        step = SimulationStep(problem, solution, state, (1,), ((problem, solution),), StopRule(1))
-        yield balance.add_step(step)
+        problem, state = build_problem(scene, state, "previous"), MotionState(motion, None, state.index + 1)
+        yield balance.add_step(build_integrated_step(problem, state))
 
 
 def _pair_energies(step_problem: StepProblem) -> zip[tuple[Energy, Energy]]:

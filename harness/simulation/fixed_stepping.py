@@ -11,6 +11,7 @@ from typing import ClassVar
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import (
     MAX_SOLVE_ITERATIONS,
+    StepObserver,
     Stepper,
     TimeBudgetExceeded,
     Trajectory,
@@ -45,7 +46,9 @@ class FixedImplicitStepper(Stepper):
         """The order of convergence of the integrator."""
         return self.build_scene(self.t_end / self.frames).integrator.order
 
-    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+    def integrate_motion(
+        self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
+    ) -> Trajectory:
         """Integrate the motion; raises Unsupported as the solver does."""
         cpu, parts = thread_time(), ceil(setting)
         scene = self.build_scene(self.t_end / (self.frames * parts))
@@ -60,6 +63,8 @@ class FixedImplicitStepper(Stepper):
             scene, ready, AutoTolerance(MAX_SOLVE_ITERATIONS), initial_guess="extrapolated", frames=steps
         ):
             iterations += step.num_iterations
+            if observe:
+                observe(scene, step, scene.compute_time(step.index))
             if step.index % parts == 0:
                 seen.append(step.state.motion)
                 reached.append(perf_counter() - began)

@@ -75,7 +75,8 @@ def observe_run(
       StepError: a step failed, or, caused by DivergenceError, the energy diverges.
     """
     found: dict[int, dict[str, Any]] = {}
-    energy, budget = EnergyBalance(scene), DissipationBudget(scene)
+    energy = EnergyBalance(scene)
+    budget = DissipationBudget(scene, has_inner_solves=getattr(prepared, "has_inner_solves", False))
 
     def look(step: SimulationStep, residual: float, balance: EnergyGain, dissipation: StepDissipation) -> None:
         terms = step.problem.evaluate_terms(step.solution.positions)

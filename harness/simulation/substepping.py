@@ -15,6 +15,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import (
+    StepObserver,
     Stepper,
     StepSizeUnderflow,
     TimeBudgetExceeded,
@@ -22,7 +23,12 @@ from springbench.harness.simulation.adaptive_stepping import (
     share_frame_seconds,
     stack_motions,
 )
-from springbench.harness.simulation.time_loop import MotionState, build_initial_state, build_problem
+from springbench.harness.simulation.time_loop import (
+    MotionState,
+    build_initial_state,
+    build_integrated_step,
+    build_problem,
+)
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, Unsupported
 
@@ -100,7 +106,9 @@ class AdaptiveSubstepper(Stepper):
     def _convergence_order(self) -> int:
         return self._prepare_pieces(1.0)[1].order
 
-    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+    def integrate_motion(
+        self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
+    ) -> Trajectory:
         """Integrate the motion.
 
         Raises Unsupported as the solver does, and for quantities that change within a frame where the error estimate
@@ -121,6 +129,8 @@ class AdaptiveSubstepper(Stepper):
                 ) from error
             step_stats[k] = each[:3]
             h, state = float(step_stats[k, 2]), MotionState(Motion(p, v), None, k + 1)
+            if observe:
+                observe(scene, build_integrated_step(stated, state), scene.compute_time(k + 1))
             if (k + 1) % pieces == 0:
                 seen.append(state.motion)
                 reached.append(perf_counter() - began)

@@ -155,6 +155,12 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
     return intersection_free_guess(guessed)
 
 
+def build_integrated_step(problem: StepProblem, state: MotionState) -> SimulationStep:
+    """Build the step of a solver that integrated a frame itself, from its problem and the state after it."""
+    solution = Solution(state.motion.positions, 1, np.nan, np.nan, "max-iter", state.motion.velocity)
+    return SimulationStep(problem, solution, state, (1,), ((problem, solution),), StopRule(1))
+
+
 def prepare(scene: Scene, solver: Solver) -> PreparedSolver:
     """Prepare the solver for all of the scene's steps.
 

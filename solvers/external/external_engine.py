@@ -227,6 +227,7 @@ class PreparedEngine(IterativeSolver):
     """An engine, prepared for a system; `engine_stepper` has the network."""
 
     residual_iterate: ClassVar[ResidualIterate] = "none"
+    has_inner_solves: ClassVar[bool] = True
 
     system: System
     engine_stepper: EngineStepper

@@ -7,9 +7,7 @@ from tests.mutations.base import Mutation
 _BALANCE, _TESTS = "harness/simulation/energy_balance.py", ("tests/unit/test_energy_balance.py",)
 
 ENERGY_BALANCE = (
-    Mutation(
-        "kinetic-energy-doubled", _BALANCE, "return 0.5 * float(self._mass @", "return float(self._mass @", _TESTS
-    ),
+    Mutation("kinetic-energy-doubled", _BALANCE, "return 0.5 * float(mass @", "return float(mass @", _TESTS),
     Mutation(
         "velocity-as-claimed",
         _BALANCE,

@@ -24,6 +24,7 @@ from springbench.harness.experiments.accuracy.accuracy_units import open_referen
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, format_method_name
 from springbench.harness.experiments.error_control.method_search import (
     SearchResult,
+    Trial,
     compute_predictability_horizon,
     search_cheapest_method,
 )
@@ -40,14 +41,19 @@ from springbench.harness.experiments.run_pipeline import save_positions
 from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth
+from springbench.harness.report.sweep_summary import describe_losses
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.folder_ownership import claim_folder
+from springbench.harness.results.quantities import DISSIPATION_CAUSES
 from springbench.harness.results.solver_metadata import read_solver_metadata
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.simulation.energy_balance import StepDissipation, sum_dissipation
 from springbench.solvers.model.step_problem import Positions
 
 PrintMessage = Callable[[str], None]
+_ENERGY_COLUMNS = ("provided_energy", *(f"dissipation_{cause}" for cause in DISSIPATION_CAUSES if cause != "engine"))
+"""Columns of the energies of the whole motion."""
 _SHARED_COLUMNS = ("sweep", "scene", "size", "vertices", "threads", "t_end", "error_requested")
 """Columns that the rows of third-party integrators share."""
 
@@ -140,9 +146,13 @@ def _execute_error_control(
     status = answer.build_status_columns(answer.compute_balances(motion_scene))
     if status["status"] != "ok":
         print_message(f"{status['status']}: {status['reason']}")
+    energies = sum_dissipation(best.measure_dissipation(error_target.frame_seconds))
+    if sentence := _describe_dissipation(best, error_target, energies):
+        print_message(sentence)
     measured = _verify_error(error_target, error, path.positions[-1], results, print_message) if verify else None
     label = f"{config.stem}-{error_target.size}-asked-{error:g}-{error_target.t_end:g}"
     row = _build_row(config.stem, error_target, error, answer, status) | {"error": measured}
+    row |= {name: value for name, value in energies.columns.items() if name in _ENERGY_COLUMNS}
     if RECORDINGS.is_installed():
         recording = _record_motion(
             folder / "recordings" / f"{label}.rrd", config.stem, error_target, motion_scene, answer, status
@@ -165,6 +175,15 @@ def _execute_error_control(
         save_positions(positions, path.positions[1:])
     print_message(f"the row is in {folder / 'accuracy'}")
     return status["status"] == "ok" and (not verify or (measured is not None and measured <= error))
+
+
+def _describe_dissipation(trial: Trial, error_target: ErrorTarget, energies: StepDissipation) -> str:
+    """Describe where the energy of the motion went; empty where it is unknown or none was provided."""
+    if not energies.provided_energy or energies.dissipation_integrator is None:
+        return ""
+    name = trial.method.solver if trial.method.integrator == "substepping" else trial.method.integrator
+    lost = energies.dissipation_integrator, energies.dissipation_damping, energies.dissipation_friction
+    return describe_losses(name, error_target.t_end, *((one or 0.0) / energies.provided_energy for one in lost))
 
 
 def _search_method(

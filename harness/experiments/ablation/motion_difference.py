@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.energy_balance import compute_kinetic_energy
 from springbench.solvers.model.energies.spring_energy import Springs
 
 MotionStates = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -45,4 +46,4 @@ def _compute_energy(scene: Scene, p: NDArray[np.float64], v: NDArray[np.float64]
     The same energies are evaluated for all motions.
     """
     elastic = sum(energy.value(p) for energy in scene.system.energies if isinstance(energy, Springs))
-    return 0.5 * float(scene.system.mass @ np.einsum("ij,ij->i", v, v)) + elastic
+    return compute_kinetic_energy(scene.system.mass, v) + elastic

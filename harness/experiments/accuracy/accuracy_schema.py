@@ -108,6 +108,16 @@ ACCURACY_COLUMNS = (
         "num_factorisations",
         "search_seconds",
     ),
+    ColumnSpec("provided_energy", _REAL, "J", "kind `error-control`: energy provided in the whole motion"),
+    *(
+        ColumnSpec(f"dissipation_{cause}", _REAL, "J", f"kind `error-control`: energy that {words} in the whole motion")
+        for cause, words in (
+            ("damping", "damping effects dissipated"),
+            ("friction", "friction dissipated"),
+            ("integrator", "the time integrator dissipated"),
+            ("solve", "unconverged solves dissipated"),
+        )
+    ),
     ColumnSpec(
         "predicted_seconds",
         _REAL,

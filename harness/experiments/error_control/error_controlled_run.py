@@ -21,7 +21,7 @@ from springbench.harness.experiments.error_control.method_search import (
 from springbench.harness.results.quantities import compute_ms_per_step
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import Trajectory
-from springbench.harness.simulation.energy_balance import EnergyGain
+from springbench.harness.simulation.energy_balance import EnergyGain, StepDissipation
 from springbench.harness.simulation.instrumentation_pass import compute_strain_columns, count_intersections
 from springbench.harness.simulation.timing_pass import hash_positions
 from springbench.solvers.model.step_problem import Positions
@@ -36,6 +36,7 @@ class ErrorControlledRun:
         search_result: method, setting and error estimate.
         error_requested: requested relative error.
         timed_trajectories: the same motion, timed again in each round.
+        dissipation: energies and dissipation by frame, from the method's own steps.
         messages: remarks, stored in the rows.
     """
 
@@ -43,6 +44,7 @@ class ErrorControlledRun:
     search_result: SearchResult
     error_requested: float
     timed_trajectories: tuple[Trajectory, ...]
+    dissipation: dict[int, StepDissipation]
     messages: list[str] = field(default_factory=list[str])
 
     @property
@@ -92,6 +94,7 @@ class ErrorControlledRun:
         return {
             "frame": frame,
             **balance.columns,
+            **self.dissipation[frame].columns,
             **compute_strain_columns(self.scene, p),
             "num_intersections": crossed,
             "positions_digest": hash_positions(p),
@@ -131,5 +134,10 @@ def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> 
         for _ in range(run.frames):
             tick("timed pass")
     return ErrorControlledRun(
-        error_target.build_scene(error_target.frame_seconds, "substepping"), answer, error, tuple(rounds), messages
+        error_target.build_scene(error_target.frame_seconds, "substepping"),
+        answer,
+        error,
+        tuple(rounds),
+        best.measure_dissipation(error_target.frame_seconds),
+        messages,
     )

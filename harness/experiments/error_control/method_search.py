@@ -28,8 +28,19 @@ from springbench.harness.experiments.error_control.candidate_methods import (
 )
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth, estimate_growth
 from springbench.harness.scenes.scene_builder import Scene
-from springbench.harness.simulation.adaptive_stepping import StepSizeUnderflow, TimeBudgetExceeded, Trajectory
-from springbench.harness.simulation.energy_balance import EnergyGain, EnergyGrowth, compute_frame_balances
+from springbench.harness.simulation.adaptive_stepping import (
+    StepObserver,
+    StepSizeUnderflow,
+    TimeBudgetExceeded,
+    Trajectory,
+)
+from springbench.harness.simulation.energy_balance import (
+    EnergyGain,
+    EnergyGrowth,
+    FrameDissipation,
+    StepDissipation,
+    compute_frame_balances,
+)
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import Positions
 
@@ -99,9 +110,15 @@ class Trial:
             "num_factorisations": self.trajectory.num_factorisations,
         }
 
-    def rerun_trial(self) -> Trajectory:
-        """Run the method again at the same setting."""
-        return self.method.stepper.integrate_motion(self.setting)
+    def rerun_trial(self, observe: StepObserver | None = None) -> Trajectory:
+        """Run the method again at the same setting; `observe` is called after each step."""
+        return self.method.stepper.integrate_motion(self.setting, observe=observe)
+
+    def measure_dissipation(self, frame_seconds: float) -> dict[int, StepDissipation]:
+        """Measure the dissipation of each frame from the method's own steps, in another run."""
+        found = FrameDissipation(frame_seconds)
+        self.rerun_trial(found.add_step)
+        return found.by_frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)

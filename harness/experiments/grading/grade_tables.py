@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from springbench.harness.errors import InputError
 from springbench.harness.experiments.grading.grading import PositionGrade, SceneGrader, format_fit
+from springbench.harness.experiments.grading.motion_error import SMALLEST_ERROR
 from springbench.harness.experiments.grading.position_files import is_submission
 from springbench.harness.experiments.grading.step_verdicts import spread_order
 
@@ -206,9 +207,10 @@ def format_grade(grade: PositionGrade) -> Iterator[str]:
 
 def _format_shares(grade: PositionGrade) -> Iterator[str]:
     for one in grade.shares:
+        known = f" (itself known to {100 * one.reference_error:.2g} %)" if one.reference_error > SMALLEST_ERROR else ""
         yield (
-            f"error against the integrated motion after {one.time:.4g} s: {100 * one.total:.3g} % of the displacement; "
-            f"the time step alone gives {100 * one.time_step_share:.3g} %, the solver "
+            f"error against the {one.reference_kind} motion{known} after {one.time:.4g} s: {100 * one.total:.3g} % of "
+            f"the displacement; the time step alone gives {100 * one.time_step_share:.3g} %, the solver "
             f"{100 * one.solver_share:.3g} %"
         )
     if grade.shares_note:

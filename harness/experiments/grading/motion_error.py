@@ -5,14 +5,18 @@
     solver    = |p - p~| / |q - p^0|
 
 Norms are Frobenius norms over the free vertices. All pins are exact in q and p~. total <= time step + solver.
+
+Contact has no equations of motion that can be integrated. There q is the motion of converged steps, which are halved
+until it no longer changes (`springbench.harness.reference.self_converged_trajectory`), and steps of p~ are solved to
+1e-6. The error of q is stated with each error. Where it is larger than LARGEST_REFERENCE_ERROR, nothing is measured.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import thread_time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,9 +24,15 @@ from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.grading.submission import SubmittedMotion
 from springbench.harness.reference.certified_minimum import UNLIMITED_STOP_RULE
 from springbench.harness.reference.reference_store import ReferenceStore
-from springbench.harness.reference.reference_trajectory import UnpredictableMotion
-from springbench.harness.reference.self_converged_trajectory import has_contact
+from springbench.harness.reference.reference_trajectory import ReferenceTrajectory, UnpredictableMotion
+from springbench.harness.reference.self_converged_trajectory import (
+    SOLVED_STOP_RULE,
+    SelfConvergedTrajectory,
+    compute_self_converged,
+    has_contact,
+)
 from springbench.harness.reference.step_snapshot import build_exact_scene
+from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
@@ -30,6 +40,10 @@ from springbench.solvers.model.step_problem import Positions, Unsupported
 
 SMALLEST_ERROR = 1e-3
 """Smallest relative error that is measured; a motion that is less predictable is measured for a shorter time."""
+LARGEST_REFERENCE_ERROR = 0.1
+"""Largest relative error of a reference with contact at a time at which errors are measured."""
+_SHORTEST_REFINEMENT = 0.5
+"""Processor time [s] below which no motion with contact is refined."""
 
 
 class ErrorShares(NamedTuple):
@@ -41,6 +55,8 @@ class ErrorShares(NamedTuple):
       total: error of the submission.
       time_step_share: error of implicit Euler itself.
       solver_share: distance from implicit Euler solved to round-off.
+      reference_error: bound on the error of the reference itself.
+      reference_kind: integrated, or self-converged where there is contact.
     """
 
     step: int
@@ -48,6 +64,8 @@ class ErrorShares(NamedTuple):
     total: float
     time_step_share: float
     solver_share: float
+    reference_error: float
+    reference_kind: str
 
 
 class MotionReference:
@@ -57,21 +75,23 @@ class MotionReference:
         """Set the scene, and the time limit [s] of each computation."""
         self._spec, self._size, self._seconds = spec, size, seconds
         self._scene = build_exact_scene(spec, size, show_warnings=False)
+        self._has_contact = has_contact(self._scene.system)
         self._converged: dict[int, Positions] = {}
-        self._known: dict[int, tuple[tuple[int, ...], Any, str]] = {}
+        self._known: dict[int, tuple[tuple[int, ...], ReferenceTrajectory | None, str]] = {}
 
     def measure_shares(self, submission: SubmittedMotion) -> tuple[list[ErrorShares], str]:
         """Measure the errors at some steps, and return a sentence on what could not be measured."""
-        if has_contact(self._scene.system):
-            return [], "no integrated motion to compare with: the scene has contact"
-        steps, trajectory, note = self._load_trajectory(submission.num_steps)
+        if submission.num_steps not in self._known:
+            load = self._converge_trajectory if self._has_contact else self._integrate_trajectory
+            self._known[submission.num_steps] = load(submission.num_steps)
+        steps, trajectory, note = self._known[submission.num_steps]
         if trajectory is None:
             return [], note
         self._extend_converged(max(steps))
         shares, free = list[ErrorShares](), trajectory.free_vertices
         for k, step in enumerate(steps):
             if step not in self._converged:
-                note = note or f"implicit Euler could not be solved to round-off in {self._seconds:g} s"
+                note = note or f"implicit Euler could not be solved in {self._seconds:g} s (--budget allows more)"
                 break
             p, exact = submission.position_after(step), self._converged[step]
             away = float(np.linalg.norm((p - exact)[free])) / float(trajectory.displacement[k])
@@ -83,20 +103,19 @@ class MotionReference:
                         trajectory.measure_error(k, p),
                         trajectory.measure_error(k, exact),
                         away,
+                        float(max(trajectory.disagreement[k], trajectory.growth[k])),
+                        trajectory.reference_kind,
                     )
                 )
         return shares, note
 
-    def _load_trajectory(self, num_steps: int) -> tuple[Sequence[int], Any, str]:
+    def _integrate_trajectory(self, num_steps: int) -> tuple[tuple[int, ...], ReferenceTrajectory | None, str]:
         """Integrate up to a step, or to the last one that can be predicted, and return the steps measured."""
-        if num_steps in self._known:
-            return self._known[num_steps]
         last, note, found = num_steps, "", None
         until = time.monotonic() + self._seconds
         steps: tuple[int, ...] = ()
         while last >= 1 and found is None:
-            steps = tuple(sorted({max(1, round(last * part)) for part in (0.25, 0.5, 0.75, 1.0)}))
-            times = [self._scene.compute_time(step) for step in steps]
+            steps, times = self._choose_steps(last)
             try:
                 with TemporaryDirectory() as folder:
                     found = ReferenceStore(Path(folder)).load_trajectory(
@@ -106,21 +125,63 @@ class MotionReference:
                 note, last = f"errors are measured up to a shorter time, because {error}", last // 2
             except (RunFailed, Unsupported) as error:
                 note, last = f"no integrated motion to compare with: {error}", 0
-        self._known[num_steps] = steps, found, note
-        return self._known[num_steps]
+        return steps, found, note
+
+    def _converge_trajectory(self, num_steps: int) -> tuple[tuple[int, ...], ReferenceTrajectory | None, str]:
+        """Halve the steps of a motion with contact, up to a step or to the last one at which it is known."""
+        last, left, reason = num_steps, self._seconds, "--budget allows no time for it"
+        while last >= 1 and left >= _SHORTEST_REFINEMENT:
+            steps, times = self._choose_steps(last)
+            began = thread_time()
+            try:
+                found = compute_self_converged(
+                    self._build_refined, times[0] / steps[0], times, SMALLEST_ERROR, 0.5 * left
+                )
+            except (RunFailed, Unsupported) as error:
+                reason = str(error)
+            else:
+                is_known = found.disagreement <= LARGEST_REFERENCE_ERROR
+                known = len(steps) if is_known.all() else int(is_known.argmin())
+                if known < len(steps):
+                    reason = _describe_uncertainty(found, known)
+                if known:
+                    words = f"errors are measured up to {times[known - 1]:.3g} s, because {reason}"
+                    return steps[:known], found, words if steps[known - 1] < num_steps else ""
+            left, last = left - (thread_time() - began), last // 2
+        return (), None, f"no motion with contact to compare with: {reason}"
+
+    def _build_refined(self, time_step: float, integrator: str) -> Scene:
+        """Build the scene with another time step [s] and integrator."""
+        spec = self._spec.with_time_step(time_step)
+        return build_exact_scene(spec, self._size, integrator, show_warnings=False)
+
+    def _choose_steps(self, last: int) -> tuple[tuple[int, ...], list[float]]:
+        """Choose the steps up to a last one at which errors are measured, and return their times [s] too."""
+        steps = tuple(sorted({max(1, round(last * part)) for part in (0.25, 0.5, 0.75, 1.0)}))
+        return steps, [self._scene.compute_time(step) for step in steps]
 
     def _extend_converged(self, num_steps: int) -> None:
-        """Simulate with steps solved to round-off up to a step, within the time limit."""
+        """Simulate with solved steps up to a step, within the time limit."""
         if num_steps in self._converged:
             return
-        until, solver = time.monotonic() + self._seconds, NewtonSolver()
+        until, prepared = time.monotonic() + self._seconds, prepare(self._scene, NewtonSolver())
+        rule = SOLVED_STOP_RULE if self._has_contact else UNLIMITED_STOP_RULE
         self._converged.clear()
-        for step in simulate_scene(
-            self._scene, prepare(self._scene, solver), UNLIMITED_STOP_RULE, initial_guess="previous", frames=num_steps
-        ):
+        for step in simulate_scene(self._scene, prepared, rule, initial_guess="previous", frames=num_steps):
             self._converged[step.index] = step.positions
             if time.monotonic() > until:
                 break
+
+
+def _describe_uncertainty(trajectory: SelfConvergedTrajectory, k: int) -> str:
+    """Describe why a motion with contact is not known at times[k]."""
+    why = (
+        "implicit Euler and BDF2 have other limits" if trajectory.has_disagreement else "--budget allows shorter steps"
+    )
+    return (
+        f"after {trajectory.times[k]:.3g} s steps of {trajectory.step:.2g} s know the motion with contact to "
+        f"{100.0 * float(trajectory.disagreement[k]):.2g} % of the displacement only ({why})"
+    )
 
 
 def _make_deadline(until: float) -> Any:

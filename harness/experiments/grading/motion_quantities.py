@@ -17,6 +17,7 @@ from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
 from springbench.harness.scenes.mesh.mesh_checks import build_edge_table
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.energy_balance import compute_kinetic_energy
 from springbench.solvers.model.step_problem import is_lagged
 
 MAX_CHECKED_FRAMES = 6
@@ -52,7 +53,7 @@ def measure_motion(scene: Scene, submission: SubmittedMotion) -> MotionQuantitie
     with np.errstate(all="ignore"):
         velocities = np.diff(p, axis=0) / system.time_step
         for step, q in enumerate(p[1:]):
-            kinetic.append(0.5 * float(mass @ np.einsum("ij,ij->i", velocities[step], velocities[step])))
+            kinetic.append(compute_kinetic_energy(mass, velocities[step]))
             away = q[vertices] - scene.pin_targets_at(scene.compute_time(step))[soft]
             near = np.abs(away) <= 4.0 * submission.precision.bound_error(
                 q

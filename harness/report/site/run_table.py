@@ -182,6 +182,7 @@ _PAGE_COLUMNS = (
         "friction_share",
         "integrator_share",
         "solve_share",
+        "engine_share",
         "penetration_depth",
         "preempted",
         "phases_consistent",

@@ -162,6 +162,7 @@ class PreparedXpbdSmallSteps(IterativeSolver):
     """XPBD with small steps, prepared; `coloured_constraints` are the springs by colour."""
 
     residual_iterate: ClassVar[ResidualIterate] = "none"
+    has_inner_solves: ClassVar[bool] = True
 
     system: System
     coloured_constraints: kernels.SpringConstraints
