@@ -354,7 +354,7 @@ class StepDissipation(NamedTuple):
         return {k: value if value is None or np.isfinite(value) else None for k, value in self._asdict().items()}
 
     @property
-    def dissipation(self) -> float:
+    def dissipated_energy(self) -> float:
         """Energy [J] dissipated by all known causes."""
         return sum(value or 0.0 for name, value in self._asdict().items() if name.startswith("dissipation_"))
 
@@ -424,7 +424,7 @@ class DissipationBudget(_StepAccount):
             - work.tensions,
             dissipation_solve=-work.residual,
         )  # fmt: skip
-        error = kinetic - self._kinetic + changed - (sources - found.dissipation)
+        error = kinetic - self._kinetic + changed - (sources - found.dissipated_energy)
         return found._replace(provided_energy=self._update_provided(sources), balance_error=error)
 
     def _update_potentials(

@@ -144,7 +144,7 @@ def test_energies_of_the_last_frame_are_those_of_the_start_plus_all_terms():
     scene = shipped("curtain")
     found = observe(scene, 8, "sparse", StopRule(3))
     last, start = found[-1][1], scene.mesh.rest_positions
-    dissipated = sum(now.dissipation for _, now in found)
+    dissipated = sum(now.dissipated_energy for _, now in found)
     p, v = found[-1][0].state.motion
     stored = sum(energy.value(p) - energy.value(start) for energy in scene.system.energies)
     kinetic = 0.5 * float(scene.system.mass @ np.sum(v**2, axis=1))
@@ -207,7 +207,7 @@ def test_damping_within_frames_is_that_of_small_steps():
     steps = [now for _, now in observe(scene, 60)]
     lost = [sum(now.dissipation_damping or 0.0 for now in found) for found in (frames, steps)]
     assert lost[0] == pytest.approx(lost[1], rel=0.1)  # of first order
-    assert sum(now.dissipation for now in frames) == pytest.approx(lost[0], rel=1e-3)
+    assert sum(now.dissipated_energy for now in frames) == pytest.approx(lost[0], rel=1e-3)
 
 
 def test_an_engine_takes_what_its_integrator_and_solves_take_together():
@@ -230,7 +230,7 @@ def test_frames_have_the_dissipation_of_the_steps_that_end_in_them(method: str, 
     by_frame = trial.measure_dissipation(target.frame_seconds)
     assert sorted(by_frame) == list(range(1, 11))
     total = sum_dissipation(by_frame)
-    assert total.kinetic_energy + (total.potential_energy or 0.0) == pytest.approx(-total.dissipation, rel=1e-9)
+    assert total.kinetic_energy + (total.potential_energy or 0.0) == pytest.approx(-total.dissipated_energy, rel=1e-9)
     assert (total.dissipation_damping or 0.0) > 0.0
     assert (total.dissipation_solve is None) == (solver == "rodas")
 

@@ -21,10 +21,14 @@ from springbench.harness.experiments.grading.grading import (
     SceneGrader,
 )
 from springbench.harness.experiments.grading.mistaken_programs import MISTAKES as KNOWN_MISTAKES
+from springbench.harness.experiments.grading.motion_error import LARGEST_REFERENCE_ERROR, SMALLEST_ERROR
 from springbench.harness.experiments.grading.position_files import PositionSequence, read_position_file
 from springbench.harness.experiments.grading.step_verdicts import spread_order
 from springbench.harness.experiments.grading.submission import align_submission, estimate_precision
 from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import StopRule
 from typer.testing import CliRunner
 
 from tests import mistaken_simulations
@@ -261,6 +265,45 @@ def test_momentum_of_a_scene_without_pins_is_balanced_and_a_lost_impulse_is_meas
     momentum_error: Any = grade_array(grader, p).quantities.momentum_error
     assert momentum_error.max() > 1e-3
     assert n == len(V)
+
+
+CONTACT = """
+mesh: {kind: grid}
+mass: 0.5
+time_step: 1/60
+frames: 20
+default_size: 3
+effects:
+  - {kind: springs, stretch: 400}
+  - {kind: gravity}
+  - {kind: contact, friction: %s, obstacles: [{kind: plane, point: [0, -0.3, 0], normal: [0.2, 1, 0]}]}
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("friction", [0.0, 0.5])
+def test_scenes_with_contact_are_graded_by_converged_steps_whose_error_is_stated(friction, tmp_path):
+    (tmp_path / "drop.yaml").write_text(CONTACT % friction)
+    grader = SceneGrader(GradeRequest(load_scene(tmp_path / "drop.yaml"), 3, None, 1, seconds=1.5))
+    scene = grader.scene
+    run = simulate_scene(
+        scene, prepare(scene, NewtonSolver()), StopRule(100, 1e-8), initial_guess="previous", frames=20
+    )
+    p = np.array([step.positions for step in run])
+    good = grade_array(grader, p)
+    assert good.kind == CORRECT
+    assert good.num_minima == 20
+    assert good.quantities.momentum_error is None  # the plane takes momentum
+    assert good.shares
+    for one in good.shares:
+        assert one.reference_kind == "self-converged"
+        assert SMALLEST_ERROR < one.reference_error <= LARGEST_REFERENCE_ERROR
+        assert one.solver_share < 1e-4
+        assert one.total == pytest.approx(one.time_step_share, rel=1e-3)
+    p[10:] += 0.01
+    bad = grade_array(grader, p)
+    assert bad.kind != CORRECT
+    assert bad.num_minima < 20
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ class ErrorControlledRun:
         search_result: method, setting and error estimate.
         error_requested: requested relative error.
         timed_trajectories: the same motion, timed again in each round.
-        dissipation: energies and dissipation by frame, from the method's own steps.
+        frame_dissipation: energies and dissipation by frame, from the method's own steps.
         messages: remarks, stored in the rows.
     """
 
@@ -44,7 +44,7 @@ class ErrorControlledRun:
     search_result: SearchResult
     error_requested: float
     timed_trajectories: tuple[Trajectory, ...]
-    dissipation: dict[int, StepDissipation]
+    frame_dissipation: dict[int, StepDissipation]
     messages: list[str] = field(default_factory=list[str])
 
     @property
@@ -94,7 +94,7 @@ class ErrorControlledRun:
         return {
             "frame": frame,
             **balance.columns,
-            **self.dissipation[frame].columns,
+            **self.frame_dissipation[frame].columns,
             **compute_strain_columns(self.scene, p),
             "num_intersections": crossed,
             "positions_digest": hash_positions(p),

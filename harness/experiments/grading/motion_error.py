@@ -44,6 +44,8 @@ LARGEST_REFERENCE_ERROR = 0.1
 """Largest relative error of a reference with contact at a time at which errors are measured."""
 _SHORTEST_REFINEMENT = 0.5
 """Processor time [s] below which no motion with contact is refined."""
+_TRIAL_SHARE = 0.6
+"""Share of the remaining time that a motion with contact is given, before one of a quarter of its length is tried."""
 
 
 class ErrorShares(NamedTuple):
@@ -135,7 +137,7 @@ class MotionReference:
             began = thread_time()
             try:
                 found = compute_self_converged(
-                    self._build_refined, times[0] / steps[0], times, SMALLEST_ERROR, 0.5 * left
+                    self._build_refined, times[0] / steps[0], times, SMALLEST_ERROR, _TRIAL_SHARE * left
                 )
             except (RunFailed, Unsupported) as error:
                 reason = str(error)
@@ -147,7 +149,7 @@ class MotionReference:
                 if known:
                     words = f"errors are measured up to {times[known - 1]:.3g} s, because {reason}"
                     return steps[:known], found, words if steps[known - 1] < num_steps else ""
-            left, last = left - (thread_time() - began), last // 2
+            left, last = left - (thread_time() - began), last // 4
         return (), None, f"no motion with contact to compare with: {reason}"
 
     def _build_refined(self, time_step: float, integrator: str) -> Scene:

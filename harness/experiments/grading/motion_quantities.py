@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.experiments.grading.submission import SubmittedMotion
 from springbench.harness.recording.strain_shading import compute_strains
+from springbench.harness.reference.self_converged_trajectory import has_contact
 from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
 from springbench.harness.scenes.mesh.mesh_checks import build_edge_table
 from springbench.harness.scenes.scene_builder import Scene
@@ -31,7 +32,7 @@ class MotionQuantities(NamedTuple):
       energy: kinetic and potential energy less the work of constant forces [J].
       kinetic_energy: [J].
       max_strain: largest magnitude of a spring's strain.
-      momentum_error: relative violation of the balance of momentum; None with pins, which take momentum.
+      momentum_error: relative violation of the balance of momentum; None with pins or obstacles, which take momentum.
       intersections: numbers of intersections of edges with triangles by step; empty without surfaces.
     """
 
@@ -73,8 +74,8 @@ def measure_motion(scene: Scene, submission: SubmittedMotion) -> MotionQuantitie
 
 
 def _measure_momentum(scene: Scene, velocities: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Measure the violation of the balance of linear momentum; None with forces that change or filters."""
-    if scene.varying_forces or scene.velocity_filters:
+    """Measure the violation of the balance of linear momentum; None with forces that change, filters or contact."""
+    if scene.varying_forces or scene.velocity_filters or has_contact(scene.system):
         return None
     mass, dt = scene.system.mass, scene.system.time_step
     momentum = np.einsum("i,tij->tj", mass, velocities)

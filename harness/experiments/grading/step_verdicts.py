@@ -8,13 +8,16 @@ g is the objective of implicit Euler whose p^t and p^(t-dt) are those of the sub
 do not count. The digits that a file stores limit all of them: `residual_floor` is the residual of a minimum with
 positions rounded as those of the file. Pins by penalty are placed where the minimum has them if the difference is
 round-off of the file.
+
+Friction has the normal forces at p itself, which is what lagged friction converges to. An iteration that ends as ours
+does (`springbench.solvers.contact.lagged_friction`) leaves a residual of FRICTION_RTOL times that of friction.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from springbench.harness.experiments.grading.spring_terms import build_step_problem
@@ -22,6 +25,7 @@ from springbench.harness.experiments.grading.submission import SubmittedMotion
 from springbench.harness.reference.certified_minimum import MinimumCertificate, refine_minimum
 from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.solvers.contact.lagged_friction import FRICTION_RTOL, has_friction
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.step_problem import Positions, StepProblem, Unsupported
 
@@ -38,7 +42,7 @@ class StepVerdict:
     Attributes:
       step: number of the step, from 1.
       residual: relative to the residual at the step's start.
-      residual_floor: residual that the stored digits allow.
+      residual_floor: residual that the stored digits, and the iteration of friction, allow.
       gap: energy gap relative to that of the step's start; None where no minimum was computed.
       distance: distance to the minimum relative to the mesh; None likewise.
       flaw: why the minimum is not certified; empty if it is.
@@ -68,9 +72,11 @@ class StepJudge:
 
     def build_problem(self, submission: SubmittedMotion, step: int) -> StepProblem:
         """Build the problem of a step from the two positions before it."""
-        return build_step_problem(
+        problem = build_step_problem(
             self._scene, submission.position_after(step - 1), submission.position_after(step - 2), step - 1
         )
+        begun = replace(problem.step_start, normal_force_positions=submission.position_after(step))
+        return replace(problem, step_start=begun)
 
     def judge_steps(self, submission: SubmittedMotion, seconds: float) -> list[StepVerdict]:
         """Judge all steps; certified minima are computed for as many of them as the time [s] allows."""
@@ -103,7 +109,12 @@ class StepJudge:
         moved = rng.uniform(-1.0, 1.0, (2, *p.shape)) * error
         change = problem.gradient(p + moved[0]) - problem.gradient(p)
         change += problem.system.inertia_diagonal[:, None] * 2.24 * moved[1]  # sqrt(1 + 4) for p^(t-dt) and 2 p^t
-        return self._evaluator.compute_energy_norm(change)
+        by_friction = sum(
+            self._evaluator.compute_energy_norm(FRICTION_RTOL * gradient)
+            for energy in problem.energies
+            if has_friction(energy) and (gradient := energy.friction_gradient(p)) is not None
+        )
+        return self._evaluator.compute_energy_norm(change) + by_friction
 
     def _judge_minimum(self, submission: SubmittedMotion, verdict: StepVerdict) -> StepVerdict:
         problem, p = self.build_problem(submission, verdict.step), submission.position_after(verdict.step)
