@@ -11,8 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 from numba import njit  # noqa: TID251
+from springbench.solvers.jit.compiler_savings import pause_garbage_collection, reduce_compiler_work
 from springbench.solvers.jit.inline_linking import LinkedCompiler
 from springbench.solvers.jit.kernel_cache import KernelCache
+
+reduce_compiler_work()
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -21,6 +24,13 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def compiling(function: Callable[..., Any]) -> Any:
         dispatcher: Any = njit(**options)(function)
         dispatcher._cache = KernelCache(function, options)
+        compile_code = dispatcher._compiler.compile
+
+        def compile_without_collecting(args: Any, return_type: Any) -> Any:
+            with pause_garbage_collection():
+                return compile_code(args, return_type)
+
+        dispatcher._compiler.compile = compile_without_collecting
         return dispatcher
 
     return compiling
