@@ -10,7 +10,9 @@ kernel and in whatever order.
 
     <folder>/<module>-<digest>/<kernel>-<digest of the key>.nbc
 
-The folder is `NUMBA_CACHE_DIR` if that is set, else `__pycache__` next to the source, else the user's cache folder.
+The folder is `NUMBA_CACHE_DIR` if that is set, else `kernels` in the user's cache folder, which serves all checkouts,
+else `__pycache__` next to the source. Processes that need the same code at the same time compile it once: the others
+wait.
 """
 
 from __future__ import annotations
@@ -21,10 +23,11 @@ import pickle
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import llvmlite
@@ -34,13 +37,23 @@ from numba.core import config
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
+from numba.core.sigutils import normalize_signature
 from numba.misc.appdirs import AppDirs
 from springbench.solvers.jit import source_digest
 from springbench.solvers.jit.inline_linking import rebuild_result
 
-_STALE_SECONDS = 3600.0
+try:
+    import fcntl
+except ImportError:  # on other systems than Unix processes do not wait for each other
+    fcntl = None
+
+_STALE_SECONDS = 7 * 86400.0
 """Age [s] of the last use after which the cache folder of other sources is removed; a process that still runs with such
 sources compiles and stores its kernels again."""
+
+_LOCK_POLL_SECONDS = 0.02
+_MAX_LOCK_POLLS = 3000
+"""Polls of a lock, after which a process compiles by itself: the other one may be stopped."""
 
 _CODEGEN_SETTINGS = ("OPT", "BOUNDSCHECK", "LOOP_VECTORIZE", "SLP_VECTORIZE", "DEBUGINFO_DEFAULT", "ENABLE_AVX")
 """Settings in Numba's environment that change the generated code."""
@@ -84,7 +97,7 @@ class KernelCache(_NUMBA_CACHE):
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         """Return the cached code of a signature, or None if there is none."""
         target_context.refresh()
-        key = (sig, target_context.codegen().magic_tuple(), self._fixed_key)
+        key = self._entry_key(sig, target_context)
         path = self._entry_path(key)
         try:
             there, compiled = pickle.loads(path.read_bytes())
@@ -94,19 +107,33 @@ class KernelCache(_NUMBA_CACHE):
             os.utime(path.parent)
         return rebuild_result(target_context, compiled) if there == key else None
 
+    def compile_once(self, sig: Any, target_context: Any, compile_code: Callable[[], CompileResult]) -> CompileResult:
+        """Compile the code of a signature and store it, or wait for another process that does so, and load it."""
+        path = self._entry_path(self._entry_key(sig, target_context))
+        with suppress(OSError):
+            if not path.parent.exists():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                _remove_stale(path.parent, self._module_name)
+        with _lock_entry(path):
+            if (loaded := self.load_overload(sig, target_context)) is not None:
+                target_context.insert_user_function(loaded.entry_point, loaded.fndesc, [loaded.library])
+                return loaded
+            compiled = compile_code()
+            self._store_code(sig, compiled)
+            return compiled
+
     def save_overload(self, sig: Any, data: CompileResult) -> None:
+        """Do nothing: `compile_once` has stored the code."""
+
+    def _store_code(self, sig: Any, data: CompileResult) -> None:
         """Store the code compiled for a signature, if it is cacheable and the disk has space."""
         if data.library.has_dynamic_globals or not all(lifted.can_cache for lifted in data.lifted):
             return
         for env in data._find_referenced_environments():  # of what it links in
             data.library.codegen.set_env(env.env_name, env)
-        key = (sig, data.target_context.codegen().magic_tuple(), self._fixed_key)
-        path = self._entry_path(key)
+        key = self._entry_key(sig, data.target_context)
         with suppress(OSError):
-            if not path.parent.exists():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                _remove_stale(path.parent, self._module_name)
-            _write_atomically(path, dumps((key, data._reduce())))
+            _write_atomically(self._entry_path(key), dumps((key, data._reduce())))
 
     def enable(self) -> None:
         """Do nothing: the cache is always enabled."""
@@ -117,6 +144,9 @@ class KernelCache(_NUMBA_CACHE):
     def flush(self) -> None:
         """Remove the cached code; `recompile` of a kernel calls this."""
         shutil.rmtree(self.cache_path, ignore_errors=True)
+
+    def _entry_key(self, sig: Any, target_context: Any) -> Any:
+        return (normalize_signature(sig), target_context.codegen().magic_tuple(), self._fixed_key)
 
     def _entry_path(self, key: Any) -> Path:
         name = self._kernel_name.replace("<", "").replace(">", "")
@@ -144,13 +174,14 @@ def _cache_folder(home: Path, module: str, digest: str) -> Path:
 @cache
 def _writable_root(source: str) -> Path:
     """Return the first writable cache folder; `source` is the folder of the source file."""
-    users = Path(AppDirs("springbench", appauthor=False).user_cache_dir)
-    for folder in (Path(_NUMBA_CONFIG.CACHE_DIR or os.path.join(source, "__pycache__")), users):
+    users = Path(AppDirs("springbench", appauthor=False).user_cache_dir) / "kernels"
+    beside = Path(source) / "__pycache__"
+    for folder in (Path(_NUMBA_CONFIG.CACHE_DIR or users), beside):
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
             return folder
-    return users
+    return beside
 
 
 def _remove_stale(made: Path, module: str) -> None:
@@ -159,6 +190,33 @@ def _remove_stale(made: Path, module: str) -> None:
         with suppress(OSError):
             if made.stat().st_mtime - other.stat().st_mtime > _STALE_SECONDS:
                 shutil.rmtree(other, ignore_errors=True)
+
+
+@contextmanager
+def _lock_entry(path: Path) -> Generator[None]:
+    """Wait until no other process compiles for this file, at most a minute, and lock out others inside the block.
+
+    A kernel is locked while those that it calls are compiled. Kernels do not call each other in a circle, so no two
+    processes wait for each other.
+    """
+    lock_path = path.with_name(f".{path.name}.lock")
+    try:
+        lock = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError:  # nothing can be stored either
+        yield
+        return
+    try:
+        if fcntl is not None:
+            for _ in range(_MAX_LOCK_POLLS):
+                with suppress(BlockingIOError, PermissionError):
+                    fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                Event().wait(_LOCK_POLL_SECONDS)
+        yield
+    finally:
+        with suppress(OSError):
+            lock_path.unlink()  # who waits for it looks for the code first
+        os.close(lock)
 
 
 def _write_atomically(path: Path, content: bytes) -> None:

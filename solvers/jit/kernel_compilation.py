@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from numba import njit  # noqa: TID251
+from numba.core.typing.templates import signature
 from springbench.solvers.jit.compiler_savings import pause_garbage_collection, reduce_compiler_work
 from springbench.solvers.jit.inline_linking import LinkedCompiler
 from springbench.solvers.jit.kernel_cache import KernelCache
@@ -23,14 +24,15 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiling(function: Callable[..., Any]) -> Any:
         dispatcher: Any = njit(**options)(function)
-        dispatcher._cache = KernelCache(function, options)
+        dispatcher._cache = kernel_cache = KernelCache(function, options)
         compile_code = dispatcher._compiler.compile
 
-        def compile_without_collecting(args: Any, return_type: Any) -> Any:
+        def compile_once(args: Any, return_type: Any) -> Any:
+            sig = args if return_type is None else signature(return_type, *args)
             with pause_garbage_collection():
-                return compile_code(args, return_type)
+                return kernel_cache.compile_once(sig, dispatcher.targetctx, lambda: compile_code(args, return_type))
 
-        dispatcher._compiler.compile = compile_without_collecting
+        dispatcher._compiler.compile = compile_once
         return dispatcher
 
     return compiling

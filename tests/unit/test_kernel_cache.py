@@ -8,7 +8,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 
 import pytest
 from springbench.solvers.jit import kernel_cache, source_digest
@@ -56,7 +58,13 @@ def run_code(checkout: Path, code: str, **environment: str) -> str:
         [sys.executable, "-c", code],
         cwd=checkout,
         # What is edited here may have one length, and one second: bytecode would be taken for today's.
-        env=saved | {"PYTHONPATH": str(checkout / ".src"), "PYTHONDONTWRITEBYTECODE": "1"} | environment,
+        env=saved
+        | {
+            "PYTHONPATH": str(checkout / ".src"),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "XDG_CACHE_HOME": str(checkout / "cache"),
+        }
+        | environment,
         capture_output=True,
         text=True,
     )
@@ -92,12 +100,56 @@ def test_options_of_the_compiler_have_code_of_their_own(checkout: Path):
     assert run_code(checkout, ASK) == "6.0 0"
 
 
-def test_one_folder_may_serve_many_checkouts(checkout: Path, tmp_path_factory: pytest.TempPathFactory):
+@pytest.mark.parametrize("variable", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME"])
+def test_one_folder_serves_many_checkouts(checkout: Path, tmp_path_factory: pytest.TempPathFactory, variable: str):
     shared, other = tmp_path_factory.mktemp("kernels"), tmp_path_factory.mktemp("other") / "checkout"
     shutil.copytree(checkout, other, symlinks=True)
-    assert run_code(checkout, ASK, NUMBA_CACHE_DIR=str(shared)) == "6.0 0"
-    assert run_code(other, ASK, NUMBA_CACHE_DIR=str(shared)) == "6.0 1"
+    assert run_code(checkout, ASK, **{variable: str(shared)}) == "6.0 0"
+    assert run_code(other, ASK, **{variable: str(shared)}) == "6.0 1"
     assert not [*checkout.rglob("*.nbc")]
+
+
+COMPILE_SLOWLY = """
+from pathlib import Path
+from threading import Event
+from springbench.solvers.kernels import kernel_of_test
+compile_code = kernel_of_test.times._compiler.compile
+def compile_slowly(args, return_type):
+    Path("compiling").touch()
+    while not Path("goes on").exists():
+        Event().wait(0.01)
+    return compile_code(args, return_type)
+kernel_of_test.times._compiler.compile = compile_slowly
+"""
+SHOW_WAITING = """
+from pathlib import Path
+from threading import Event
+from numba.core import compiler
+from springbench.solvers.jit import kernel_cache
+class ShownEvent(Event):
+    def wait(self, timeout):
+        Path("waiting").touch()
+        return super().wait(timeout)
+def refuse(*args, **options):
+    raise AssertionError("compiled twice")
+kernel_cache.Event, compiler.compile_extra = ShownEvent, refuse
+"""
+
+
+def test_processes_that_need_the_same_code_at_the_same_time_compile_it_once(checkout: Path):
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(run_code, checkout, COMPILE_SLOWLY + ASK)
+        while not (checkout / "compiling").exists():
+            assert not first.done()
+            Event().wait(0.01)
+        second = pool.submit(run_code, checkout, SHOW_WAITING + ASK)
+        while not (checkout / "waiting").exists():
+            assert not second.done()
+            Event().wait(0.01)
+        (checkout / "goes on").touch()
+        assert first.result() == "6.0 0"
+        assert second.result() == "6.0 0"
+    assert not [*checkout.rglob("*.lock")]
 
 
 DIGESTS_OF_MODULES = """
@@ -239,11 +291,11 @@ def test_unused_code_of_other_sources_is_removed_when_new_code_is_stored(home: P
     assert not (home / f"{__name__}-unused").exists()
 
 
-def test_a_source_folder_without_write_access_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    (tmp_path / "__pycache__").write_text("a file, where a folder would have to be")
+def test_a_cache_folder_without_write_access_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "users").write_text("a file, where a folder would have to be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
     monkeypatch.setattr(kernel_cache._NUMBA_CONFIG, "CACHE_DIR", "")
-    assert kernel_cache._writable_root(str(tmp_path)).is_relative_to(tmp_path / "users")
+    assert kernel_cache._writable_root(str(tmp_path)) == tmp_path / "__pycache__"
 
 
 DIGESTS = """
