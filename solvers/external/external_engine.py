@@ -166,6 +166,38 @@ def _concatenate_edges(parts: list[SpringDashpots], unpinned: NDArray[np.bool_])
     return SpringDashpots(ends[acts], *(array[acts] for array in rest))
 
 
+class ScriptFrames(NamedTuple):
+    """Frames that a script repeats.
+
+    Attributes:
+        num_frames: number of frames.
+        num_substeps: substeps of a frame.
+        velocity_factor: factor of all velocities before each frame but the first.
+        has_moving_pins: whether pins move.
+    """
+
+    num_frames: int
+    num_substeps: int
+    velocity_factor: float = 1.0
+    has_moving_pins: bool = False
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether the engine's state is changed between substeps or frames."""
+        return self.has_moving_pins or self.velocity_factor != 1.0
+
+    def format_loop(self, plain: str, driven: str) -> str:
+        """Format the loop of a script: plain, or with changes between frames.
+
+        Args:
+            plain: template of a loop with `steps`.
+            driven: template with `frames`, `substeps` and `factor`.
+        """
+        if not self.is_driven:
+            return plain.format(steps=self.num_frames * self.num_substeps, frames=self.num_frames)
+        return driven.format(frames=self.num_frames, substeps=self.num_substeps, factor=self.velocity_factor)
+
+
 class EngineStepper(Protocol):
     """Interface of an engine with a loaded network."""
 
@@ -202,7 +234,7 @@ class ExternalEngine(ABC):
 
     @abstractmethod
     def write_script(
-        self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
+        self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only.
 
@@ -210,12 +242,12 @@ class ExternalEngine(ABC):
             file_stem: NAME of the files.
             network: the network.
             problem: the step problem with the start.
-            num_substeps: substeps per frame.
-            num_frames: number of frames.
+            frames: frames and their substeps.
 
         Returns:
             Files by name: `NAME.py`, and the files that it reads except `NAME.npz`. The latter contains
-            `EngineNetwork.export_arrays` and the final positions, `end`.
+            `EngineNetwork.export_arrays`, the final positions, `end`, and for driven frames the targets of pins at
+            their starts and at the end, `pins` (frames + 1, q, 3).
 
         Raises:
             Unsupported: for features that the script cannot express.

@@ -17,7 +17,13 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.solvers.external.external_engine import EngineNetwork, EnginePackage, ExternalEngine, interpolate_pins
+from springbench.solvers.external.external_engine import (
+    EngineNetwork,
+    EnginePackage,
+    ExternalEngine,
+    ScriptFrames,
+    interpolate_pins,
+)
 from springbench.solvers.iteration.solver_info import ENGINE_FAMILY, Citation, SolverInfo
 from springbench.solvers.model.step_problem import Positions, StepProblem, Unsupported
 
@@ -35,9 +41,18 @@ model = mujoco.MjModel.from_xml_path("{name}.xml")
 data = mujoco.MjData(model)
 mujoco.mj_resetDataKeyframe(model, data, 0)
 {load}began = time.perf_counter()
-mujoco.mj_step(model, data, nstep={steps})
-seconds, p = time.perf_counter() - began, data.qpos.reshape(-1, 3)
+{loop}seconds, p = time.perf_counter() - began, data.qpos.reshape(-1, 3)
 print(f"{{seconds:.3g}} s; {{abs(p - known['end'][known['free']]).max():.3g}} m from the end of that run")
+"""
+
+_PLAIN_LOOP = "mujoco.mj_step(model, data, nstep={steps})\n"
+
+_DRIVEN_LOOP = """\
+for begin, end in zip(known["pins"], known["pins"][1:]):  # {frames} frames
+    for k in range({substeps}):
+        data.mocap_pos[:] = begin + k / {substeps} * (end - begin)
+        mujoco.mj_step(model, data)
+    data.qvel[:] *= {factor!r}  # drag
 """
 
 
@@ -77,7 +92,7 @@ class MujocoEngine(ExternalEngine):
         ), f"{self.mujoco_integrator}, stable with springs while omega h < {limit:.2g}"
 
     def write_script(
-        self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
+        self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         load = (
@@ -86,10 +101,10 @@ class MujocoEngine(ExternalEngine):
             else 'known["force"][known["free"]].ravel()'
         )
         load = f"data.qfrc_applied[:] = {load}\n" if load else ""
-        text = _SCRIPT_TEMPLATE.format(name=file_stem, load=load, steps=num_substeps * num_frames)
+        text = _SCRIPT_TEMPLATE.format(name=file_stem, load=load, loop=frames.format_loop(_PLAIN_LOOP, _DRIVEN_LOOP))
         return {
             f"{file_stem}.py": text,
-            f"{file_stem}.xml": build_mjcf(network, self.mujoco_integrator, problem, num_substeps),
+            f"{file_stem}.xml": build_mjcf(network, self.mujoco_integrator, problem, frames.num_substeps),
         }
 
 

@@ -29,6 +29,7 @@ from springbench.solvers.external.external_engine import (
     EnginePackage,
     ExternalEngine,
     PreparedEngine,
+    ScriptFrames,
     interpolate_pins,
 )
 from springbench.solvers.iteration.device_interface import DeviceOptions
@@ -52,14 +53,32 @@ for (i, j), k in zip(net["ends"].tolist(), net["stiffness"]):
     builder.add_spring(i, j, k, 0.0, control=0.0)
 builder.spring_rest_length = net["rest_length"].tolist()
 {colouring}model = builder.finalize(device="{device}")
-solver, now, then = newton.solvers.{solver}, model.state(), model.state()
+solver, now, then, h = newton.solvers.{solver}, model.state(), model.state(), {h!r}
 began = time.perf_counter()  # the first step compiles
+{loop}seconds, p = time.perf_counter() - began, now.particle_q.numpy()
+print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+_PLAIN_LOOP = """\
 for _ in range({steps}):
     now.particle_f.assign(net["force"].astype(np.float32))
-    solver.step(now, then, None, None, {h!r})
+    solver.step(now, then, None, None, h)
     now, then = then, now
-seconds, p = time.perf_counter() - began, now.particle_q.numpy()
-print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+_DRIVEN_LOOP = """\
+pinned = net["pinned"]
+for begin, end in zip(net["pins"], net["pins"][1:]):  # {frames} frames
+    for k in range({substeps}):
+        q = now.particle_q.numpy()
+        q[pinned] = begin + k / {substeps} * (end - begin)AHEAD
+        now.particle_q.assign(q), now.particle_f.assign(net["force"].astype(np.float32))
+        solver.step(now, then, None, None, h)
+        now, then = then, now
+    for state in (now, then):
+        v = {factor!r} * state.particle_qd.numpy().astype(float)  # drag
+        v[pinned] = 0.0
+        state.particle_qd.assign(v.astype(np.float32))
 """
 
 
@@ -142,7 +161,7 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
         )
 
     def write_script(
-        self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
+        self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         made = {
@@ -150,7 +169,7 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
             "xpbd": f"SolverXPBD(model, iterations={self.iterations_per_substep})",
             "semi-implicit": "SolverSemiImplicit(model)",
         }
-        colouring = ""
+        colouring, ahead = "", "" if self.newton_solver == "semi-implicit" else " + (end - begin) / {substeps}"
         if self.newton_solver == "vbd" and self.colouring_source == "newton":
             colouring = "builder.color()\n"
         elif self.newton_solver == "vbd":
@@ -162,8 +181,8 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
             colouring=colouring,
             device=self.device,
             solver=made[self.newton_solver],
-            steps=num_substeps * num_frames,
-            h=network.time_step / num_substeps,
+            h=network.time_step / frames.num_substeps,
+            loop=frames.format_loop(_PLAIN_LOOP, _DRIVEN_LOOP.replace("AHEAD", ahead)),
         )
         return {f"{file_stem}.py": text}
 

@@ -14,7 +14,13 @@ from typing import Any, ClassVar
 
 import numba
 import numpy as np
-from springbench.solvers.external.external_engine import EngineNetwork, EnginePackage, ExternalEngine, interpolate_pins
+from springbench.solvers.external.external_engine import (
+    EngineNetwork,
+    EnginePackage,
+    ExternalEngine,
+    ScriptFrames,
+    interpolate_pins,
+)
 from springbench.solvers.iteration.solver_info import ENGINE_FAMILY, Citation, SolverInfo
 from springbench.solvers.model.step_problem import Positions, StepProblem, Unsupported
 from threadpoolctl import ThreadpoolController  # pyright: ignore[reportMissingTypeStubs]
@@ -37,10 +43,23 @@ for (i, j), k, r in zip(net["ends"].tolist(), net["stiffness"], net["rest_length
     model.addDistanceConstraint_XPBD(i, j, k)
     model.getConstraints()[-1].restLength = r
 began = time.perf_counter()
+{loop}seconds, p = time.perf_counter() - began, np.array(particles.getVertices())
+print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+_PLAIN_LOOP = """\
 for _ in range({frames}):
     control.step(model)
-seconds, p = time.perf_counter() - began, np.array(particles.getVertices())
-print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+_DRIVEN_LOOP = """\
+for begin, end in zip(net["pins"], net["pins"][1:]):  # {frames} frames
+    for k in range({substeps}):  # each a step of one substep
+        for i, x in zip(net["pinned"].tolist(), begin + k / {substeps} * (end - begin) + (end - begin) / {substeps}):
+            particles.setPosition(i, x)
+        control.step(model)
+    for i in range(len(net["mass"])):
+        particles.setVelocity(i, {factor!r} * particles.getVelocity(i))  # drag
 """
 
 
@@ -78,15 +97,16 @@ class PyPbdEngine(ExternalEngine):
         return made, f"{self.iterations_per_substep} iterations a substep, in {made.precision}"
 
     def write_script(
-        self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
+        self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
         _require_gravity(network, problem)
+        pieces = frames.num_substeps if frames.is_driven else 1  # of a frame, in steps of their own
         given = {
-            "time_step": network.time_step,
-            "substeps": num_substeps,
+            "time_step": network.time_step / pieces,
+            "substeps": frames.num_substeps // pieces,
             "iterations": self.iterations_per_substep,
-            "frames": num_frames,
+            "loop": frames.format_loop(_PLAIN_LOOP, _DRIVEN_LOOP),
         }
         return {f"{file_stem}.py": _SCRIPT_TEMPLATE.format(name=file_stem, **given)}
 

@@ -18,6 +18,7 @@ from springbench.solvers.external.external_engine import (
     EnginePackage,
     ExternalEngine,
     PreparedEngine,
+    ScriptFrames,
     interpolate_pins,
 )
 from springbench.solvers.iteration.solver_info import ENGINE_FAMILY, Citation, SolverInfo
@@ -33,15 +34,28 @@ import taichi as ti
 net = np.load("{name}.npz")  # the network, and where springbench's run ended
 ti.init(arch=ti.cpu, cpu_max_num_threads=1, default_fp=ti.f64)
 arrays = (net[key] for key in ("mass", "pinned", "ends", "stiffness", "rest_length"))
-made = program(ti, *arrays, {tolerance!r})
+made = build_taichi_program(ti, *arrays, {tolerance!r})
 made.h[None], made.newton[None] = {h!r}, {newton}
 for field, key in ((made.x, "positions"), (made.v, "velocities"), (made.load, "force")):
     field.from_numpy(net[key])
 began = time.perf_counter()  # the first step compiles
+{loop}seconds, p = time.perf_counter() - began, made.x.to_numpy()
+print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+_PLAIN_LOOP = """\
 for _ in range({steps}):
     made.step()
-seconds, p = time.perf_counter() - began, made.x.to_numpy()
-print(f"{{seconds:.3g}} s; {{abs(p - net['end']).max():.3g}} m from the end of that run")
+"""
+
+_DRIVEN_LOOP = """\
+for begin, end in zip(net["pins"], net["pins"][1:]):  # {frames} frames
+    for k in range({substeps}):
+        x = made.x.to_numpy()
+        x[net["pinned"]] = begin + k / {substeps} * (end - begin) + (end - begin) / {substeps}
+        made.x.from_numpy(x)
+        made.step()
+    made.v.from_numpy({factor!r} * made.v.to_numpy())  # drag
 """
 
 
@@ -88,11 +102,12 @@ class TaichiNewtonEngine(ExternalEngine):
         return made, f"{self.iterations_per_substep} iterations of Newton's method a substep, in float64, on one thread"
 
     def write_script(
-        self, file_stem: str, network: EngineNetwork, problem: StepProblem, num_substeps: int, num_frames: int
+        self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
         """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
-        given = {"tolerance": self.cg_rtol, "newton": self.iterations_per_substep, "steps": num_substeps * num_frames}
-        driver = _SCRIPT_TEMPLATE.format(name=file_stem, h=network.time_step / num_substeps, **given)
+        given = {"tolerance": self.cg_rtol, "newton": self.iterations_per_substep}
+        given |= {"h": network.time_step / frames.num_substeps, "loop": frames.format_loop(_PLAIN_LOOP, _DRIVEN_LOOP)}
+        driver = _SCRIPT_TEMPLATE.format(name=file_stem, **given)
         return {f"{file_stem}.py": Path(taichi_program.__file__).read_text(encoding="utf-8") + driver}
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.cli.commands.export_script import write_engine_script
 from springbench.harness.cli.main import app
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.experiments.provenance import build_provenance_columns
@@ -291,6 +292,26 @@ def test_the_script_that_is_printed_ends_where_the_run_did(
     away = float(capsys.readouterr().out.split(" s; ")[1].split(" m ")[0])
     # 1/30 s in one piece of 20 substeps, or of 19 and of 1: the last digit of a substep's length.
     assert away < 1e-12
+
+
+@engines
+def test_a_script_moves_pins_and_slows_velocities_as_the_run_does(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    motion = {"key_frames": [{"time": 0.0}, {"time": 0.1, "offset": [0.1, 0.1, 0.0]}]}
+    pulled = PinsEffect.model_validate({"parts": ["top_corners"], "weight": "exact", "motion": motion})
+    scene = made(*HANGING[:2], pulled, EtherDragEffect(decay_rate=2.0), integrator="implicit-euler")
+    ready(name, scene.system)
+    engine = load_target(OPTIONAL_SOLVERS[name])()
+    script = write_engine_script("pulled", scene, engine, substeps=20, frames=4, folder=tmp_path)["pulled.py"]
+    assert "drag" in script
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    runpy.run_path("pulled.py")
+    away = float(capsys.readouterr().out.split(" s; ")[1].split(" m ")[0])
+    with np.load("pulled.npz") as stored:
+        assert np.abs(stored["end"] - scene.mesh.rest_positions).max() > 0.05
+    assert away < 1e-6
 
 
 def test_a_point_of_none_or_of_several_is_a_mistake(tmp_path: Path):

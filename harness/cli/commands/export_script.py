@@ -6,6 +6,7 @@ The simulation is a point of an accuracy config.
 from __future__ import annotations
 
 from functools import partial
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from springbench.harness.config.accuracy_config import WorkSpec
     from springbench.harness.execution.worker_process import ProgressCallback
     from springbench.harness.scenes.scene_builder import Scene
-    from springbench.solvers.external.external_engine import ExternalEngine
+    from springbench.solvers.external.external_engine import ExternalEngine, ScriptFrames
+    from springbench.solvers.model.step_problem import Positions
 
 
 def export_script(
@@ -81,7 +83,13 @@ def _write_script(name: str, spec: WorkSpec, folder: Path, tick: ProgressCallbac
 
 
 def write_engine_script(
-    name: str, scene: Scene, engine: ExternalEngine, substeps: int, frames: int, folder: Path
+    name: str,
+    scene: Scene,
+    engine: ExternalEngine,
+    substeps: int,
+    frames: int,
+    folder: Path,
+    end: Positions | None = None,
 ) -> dict[str, str]:
     """Write a script that repeats a simulation with an engine alone, and return the texts of its files by name.
 
@@ -92,9 +100,10 @@ def write_engine_script(
         substeps: substeps of a frame.
         frames: number of frames.
         folder: folder of the files, made if it is missing.
+        end: positions (n, 3) [m] in which the simulation ends; simulated if None.
 
     Raises:
-        RunFailed: springbench changes something between frames, or the engine does not support the scene.
+        RunFailed: the script cannot repeat what changes between frames, or the engine does not support the scene.
     """
     import numpy as np
     from springbench.harness.execution import machine_info
@@ -102,20 +111,21 @@ def write_engine_script(
     from springbench.solvers.external.external_engine import EngineNetwork
     from springbench.solvers.model.step_problem import StopRule, Unsupported
 
-    if acts := _list_external_changes(scene):
-        raise RunFailed(f"{name}: between frames springbench sets {' and '.join(acts)}; take another point")
+    driven = _describe_frames(name, scene, substeps, frames)
     begun = build_problem(scene, build_initial_state(scene), "previous")
     try:
         network = EngineNetwork.from_system(scene.system, engine.solver_name, supports_damping=engine.supports_damping)
-        texts = engine.write_script(name, network, begun, substeps, frames)
-        with machine_info.limit_threads(1):
-            run = simulate_scene(
-                scene, prepare(scene, engine), StopRule(substeps), initial_guess="previous", frames=frames
-            )
-            end = [step.positions for step in run][-1]
+        texts = engine.write_script(name, network, begun, driven)
+        if end is None:
+            with machine_info.limit_threads(1):
+                ready, stop = prepare(scene, engine), StopRule(substeps)
+                run = simulate_scene(scene, ready, stop, initial_guess="previous", frames=frames)
+                end = [step.positions for step in run][-1]
     except Unsupported as refused:
         raise RunFailed(str(refused)) from refused
     arrays: dict[str, Any] = {**network.export_arrays(begun), "end": end}
+    if driven.is_driven:
+        arrays["pins"] = np.array([scene.pin_targets_at(scene.compute_time(k)) for k in range(frames + 1)])
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / f"{name}.npz", **arrays)
     for file, text in texts.items():
@@ -123,14 +133,16 @@ def write_engine_script(
     return texts
 
 
-def _list_external_changes(scene: Scene) -> list[str]:
-    """List the quantities that springbench changes in the engine before each frame."""
+def _describe_frames(name: str, scene: Scene, substeps: int, frames: int) -> ScriptFrames:
+    """Describe what springbench changes between frames; raise RunFailed for what scripts cannot repeat."""
+    from springbench.solvers.external.external_engine import ScriptFrames
+    from springbench.solvers.model.velocity_filters import ExponentialDecay
+
+    decays = [one.decay_factor for one in scene.velocity_filters if isinstance(one, ExponentialDecay)]
     there = (
-        (
-            "velocities that drag has slowed (with the integrator own it is a force of the engine's)",
-            scene.velocity_filters,
-        ),
+        ("velocities that air drag has slowed", len(decays) < len(scene.velocity_filters)),
         ("forces that change", scene.varying_forces),
-        ("pins that move", scene.pin_motions),
     )
-    return [what for what, some in there if some]
+    if acts := [what for what, some in there if some]:
+        raise RunFailed(f"{name}: between frames springbench sets {' and '.join(acts)}; take another point")
+    return ScriptFrames(frames, substeps, prod(decays), bool(scene.pin_motions))
