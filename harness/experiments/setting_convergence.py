@@ -1,4 +1,4 @@
-"""Convergence of a given setting: substeps and iterations by powers of two around it, compared with a reference.
+"""Convergence of given settings: substeps and iterations around them, compared with a reference.
 
     error   = max_k |p(t_k) - q(t_k)| / max_k |q(t_k) - p(0)|         q: reference, Frobenius norms over free vertices
     change  = the same of two settings: how much the motion changes where one of the two numbers is doubled
@@ -7,7 +7,8 @@
 A frame is a time step of the scene. A setting divides it into substeps, each with a number of iterations: for a solver
 of ours the substep is its time step, for an outside engine both are its own. Solvers that choose steps or have no
 iterations get a row of settings. The reference is that of accuracy studies: an independent integration, or with contact
-a self-converged motion; where there is none, it is the finest setting.
+a self-converged motion, up to the time until which it is known accurately enough. A scene without equations of motion
+is compared with the finest setting.
 
 Effective stiffness: the mesh is hung by its highest vertices along its longest side, with its own material and a drag
 that lets it come to rest. The ratio of the true sag to that of the setting is how stiff the material seems: unconverged
@@ -16,11 +17,11 @@ constraints give way, and unconverged descent does not reach its sag in time.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from math import inf, isfinite
 from time import monotonic, process_time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,29 +30,41 @@ from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
 from springbench.harness.experiments.accuracy.method_recommendation import find_engine_integrator
 from springbench.harness.recording.strain_shading import compute_strains
+from springbench.harness.reference.equations_of_motion import NotIntegrable
 from springbench.harness.reference.reference_store import ReferenceStore
-from springbench.harness.reference.reference_trajectory import ReferenceTrajectory
+from springbench.harness.reference.reference_trajectory import REFERENCE_MARGIN, ReferenceTrajectory
+from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.results.setting_verdict import (
     ERROR_LEVELS,
     ConvergenceStudy,
+    SettingAssessment,
+    SettingChange,
     SettingResult,
     StepSetting,
     describe_percent,
+    find_doubled,
+    find_largest_difference,
     list_settings,
 )
 from springbench.harness.scenes.effects.bending_effect import BendingEffect
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
 from springbench.harness.scenes.effects.ether_drag_effect import EtherDragEffect
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.effects.pins_effect import PinsEffect
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.effects.strain_limits_effect import StrainLimitsEffect
+from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.scene_builder import Scene
-from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.scenes.scene_spec import MeshSource, SceneSpec
 from springbench.harness.simulation.energy_balance import compute_kinetic_energy
 from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, StopRule, Unsupported, is_lagged
 from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_engine, load_target
+
+DEFAULT_ITERATIONS = 50
+"""Iterations of a substep where no setting is given."""
 
 NUM_SAMPLES = 8
 """Number of times at which motions are compared."""
@@ -65,8 +78,40 @@ HANG_SECONDS, HANG_DECAY = 1.0, 5.0
 TRUE_SOLVER = "hybrid"
 """Solver of the true sag, to its tolerance."""
 
+_PROJECTION_FRAMES, _PROJECTION_MARGIN = 3, 1.3
+"""Frames after which the time of a simulation is projected, and how far that may exceed the limit."""
+
 _TRUE_STOP_RULE = StopRule(300, 1e-8)
 _TOP_RTOL = 1e-6
+
+
+def has_iterations_in_substep(solver: Any, name: str) -> bool:
+    """Return whether a solver or engine of this name iterates within a substep, so that a setting has two numbers."""
+    info = find_solver_info(solver, name)
+    if is_engine(solver):
+        return "iterations_per_substep" in [one.name for one in fields(solver)]
+    return not (info.is_substepping and info.supports_error_control)
+
+
+def complete_settings(settings: Sequence[StepSetting], solver: SolverSpec) -> list[StepSetting]:
+    """Return the given settings without repetitions, or the default one of a solver.
+
+    Args:
+      settings: given settings; 0 iterations where none were given.
+      solver: solver or engine with its parameters.
+
+    Raises:
+      InputError: a setting has iterations, and the solver has none; or the other way round.
+    """
+    iterates = has_iterations_in_substep(load_target(SOLVER_TABLE[solver.name])(**solver.parameters), solver.name)
+    for one in settings:
+        if bool(one.iterations) != iterates:
+            there = "iterates within a substep" if iterates else "has no iterations within a substep"
+            wanted = f"{one.substeps}x10" if iterates else str(one.substeps)
+            raise InputError(
+                InputMistake(f"came {one}; {solver.name} {there}: expected such as {wanted}", key="--setting")
+            )
+    return list(dict.fromkeys(settings)) or [StepSetting(1, DEFAULT_ITERATIONS if iterates else 0)]
 
 
 class SettingSimulator:
@@ -89,11 +134,15 @@ class SettingSimulator:
         own = info.is_substepping and info.supports_error_control
         usual = find_engine_integrator(self.solver) if self.is_engine else "substepping" if own else "implicit-euler"
         self.integrator = integrator or usual
-        names = [one.name for one in fields(self.solver)]
-        self.has_iterations = "iterations_per_substep" in names if self.is_engine else not own
+        self.has_iterations = has_iterations_in_substep(self.solver, solver.name)
         self.num_frames = max(1, round(t_end / spec.time_step))
         count = min(NUM_SAMPLES, self.num_frames)
         self.sample_frames = sorted({round(self.num_frames * (k + 1) / count) for k in range(count)})
+
+    def shorten_motion(self, num_samples: int) -> None:
+        """Simulate up to one of the sampled times only."""
+        self.sample_frames = self.sample_frames[:num_samples]
+        self.num_frames = self.sample_frames[-1]
 
     @property
     def sample_times(self) -> list[float]:
@@ -108,7 +157,7 @@ class SettingSimulator:
             return scene, replace(self.solver, **own), StopRule(setting.substeps), 1
         step = spec.time_step / setting.substeps
         scene = build_exact_scene(spec.with_time_step(step), self.size, self.integrator, show_warnings=False)
-        return scene, self.solver, StopRule(setting.iterations), setting.substeps
+        return scene, self.solver, StopRule(max(1, setting.iterations)), setting.substeps
 
     def simulate_setting(
         self, setting: StepSetting, reference: SampledReference | None, time_limit: float
@@ -118,7 +167,7 @@ class SettingSimulator:
         Args:
           setting: substeps and iterations.
           reference: reference; without one, errors and drift are NaN.
-          time_limit: wall time [s].
+          time_limit: processor time [s].
         """
         try:
             scene, solver, stop, pieces = self.build_step(self.spec, setting)
@@ -139,7 +188,7 @@ class SettingSimulator:
         next(simulate_scene(scene, prepared, stop, initial_guess=guess, frames=1))  # compiles
         run = simulate_scene(scene, prepared, stop, initial_guess=guess, frames=pieces * self.num_frames)
         samples, strains, seconds = list[Positions](), list[float](), list[float]()
-        springs, velocity, end = scene.all_springs, np.empty((0, 3)), monotonic() + time_limit
+        springs, velocity, started = scene.all_springs, np.empty((0, 3)), process_time()
         for frame in range(1, self.num_frames + 1):
             began = process_time()
             for _ in range(pieces):
@@ -152,13 +201,15 @@ class SettingSimulator:
             strains.append(float(np.abs(compute_strains(p, springs.edges, springs.rest_length)[0]).max(initial=0.0)))
             if frame in self.sample_frames:
                 samples.append(p.copy())
-            if monotonic() > end and frame < self.num_frames:
-                raise RunFailed(f"the limit of {time_limit:g} s was reached in frame {frame} of {self.num_frames}")
+            used = process_time() - started
+            projected = used * self.num_frames / frame  # known after a few frames, so that little time is wasted
+            if used > time_limit or (frame > _PROJECTION_FRAMES and projected > _PROJECTION_MARGIN * time_limit):
+                raise RunFailed(f"takes longer than {time_limit:g} s")
         return samples, strains, seconds, velocity
 
     def measure_sag(self, setting: StepSetting | None) -> float:
         """Return the sag of the hung mesh [m], by a setting, or the true one."""
-        hung, axis, bottom = build_hanging_scene(self.spec, self.size)
+        hung, bottom = build_hanging_scene(self.spec, self.size)
         frames = max(1, round(HANG_SECONDS / hung.time_step))
         if setting is None:
             scene = build_exact_scene(hung, self.size, show_warnings=False)
@@ -169,7 +220,7 @@ class SettingSimulator:
         p = scene.mesh.rest_positions
         for step in run:
             p = step.positions
-        return float(np.mean((scene.mesh.rest_positions - p)[bottom, axis]))
+        return float(np.mean((scene.mesh.rest_positions - p)[bottom, 1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,6 +234,7 @@ class SampledReference:
       positions: positions (k, n, 3) [m].
       end_energy: energy at the end [J]; None where velocities are unknown.
       kinetic_scale: largest kinetic energy at these times [J].
+      min_error: smallest relative error that can be measured against it.
     """
 
     description: str
@@ -191,19 +243,27 @@ class SampledReference:
     positions: Positions
     end_energy: float | None
     kinetic_scale: float
+    min_error: float
 
     @classmethod
     def from_trajectory(cls, scene: Scene, trajectory: ReferenceTrajectory) -> SampledReference:
         """Sample a reference trajectory of a scene."""
         kinetic = [_kinetic_energy(scene, v) for v in trajectory.velocities]
         energy = _compute_energy(scene, trajectory.positions[-1], trajectory.velocities[-1])
+        uncertainty = float(trajectory.disagreement.max())
         words = f"the {trajectory.reference_kind} motion"
+        words += f" (known to {describe_percent(uncertainty)})" if has_contact(scene.system) else ""
         start = build_initial_state(scene).motion.positions
-        return cls(words, trajectory.free_vertices, start, trajectory.positions, energy, max(kinetic))
+        smallest = uncertainty / REFERENCE_MARGIN
+        return cls(words, trajectory.free_vertices, start, trajectory.positions, energy, max(kinetic), smallest)
 
     def measure_distance(self, positions: Positions) -> float:
         """Return the largest distance (k, n, 3) from the reference, relative to its largest displacement."""
-        return measure_change(positions, self.positions, self.start, self.free_vertices)
+        return self.measure_change(positions, self.positions)
+
+    def measure_change(self, p: Positions, q: Positions) -> float:
+        """Return the largest distance of two motions (k, n, 3), relative to the largest displacement of q."""
+        return measure_change(p, q, self.start, self.free_vertices)
 
     def measure_drift(self, scene: Scene, p: Positions, v: Positions) -> float:
         """Return the difference of the energy at the end, over the largest kinetic energy; NaN if unknown."""
@@ -227,154 +287,224 @@ def measure_change(p: Positions, q: Positions, start: Positions, free_vertices: 
 
 def study_convergence(
     simulator: SettingSimulator,
-    given: StepSetting,
+    given: Sequence[StepSetting],
     store: ReferenceStore,
     error_requested: float,
     *,
     num_doublings: int,
-    time_limit: float,
-    search_time: float,
+    limits: StudyLimits,
     print_message: Callable[[str], None],
 ) -> ConvergenceStudy:
-    """Simulate the settings around a given one, and compare them with the reference.
+    """Simulate the settings around given ones, and compare them with the reference.
 
     Args:
       simulator: scene and solver.
-      given: the given setting.
+      given: the given settings, at least one.
       store: store of references.
       error_requested: relative error that counts as converged.
-      num_doublings: how often each number is doubled and halved.
-      time_limit: wall time of a setting [s].
-      search_time: wall time after which no further setting starts [s].
+      num_doublings: how often numbers are doubled and halved.
+      limits: limits of times.
       print_message: prints a remark.
 
     Raises:
-      RunFailed: the given setting failed.
+      RunFailed: the motion is unpredictable, or a given setting is not supported.
     """
     with machine_info.limit_threads(1):
-        reference = _find_reference(simulator, store, error_requested, print_message)
-        settings = list_settings(given, num_doublings, has_iterations=simulator.has_iterations)
-        settings.sort(key=lambda setting: setting != given)  # the given one first: what it cannot do ends the study
-        results, end = list[SettingResult](), monotonic() + search_time
+        reference = _find_reference(simulator, store, error_requested, limits, print_message)
+        settings = _order_settings(list_settings(given, num_doublings), given)
+        results, end, iteration_seconds = list[SettingResult](), monotonic() + limits.search_time, 0.0
         for k, setting in enumerate(settings):
-            if monotonic() > end and k:
-                results.append(SettingResult(setting, reason="the time for the search was used up"))
+            began = monotonic()
+            if began + iteration_seconds * setting.total_iterations > end and setting not in given:
+                results.append(SettingResult(setting, reason="no time left"))
                 continue
-            result = simulator.simulate_setting(setting, reference, time_limit)
-            if setting == given and result.reason and "diverged" not in result.reason:
-                raise RunFailed(f"{simulator.name} {given}: {result.reason}")
+            result = simulator.simulate_setting(setting, reference, limits.time_limit)
+            if setting in given and result.reason and "diverged" not in result.reason:
+                raise RunFailed(f"{simulator.name}, {setting}: {result.reason}")
             results.append(result)
+            if not result.reason:
+                iteration_seconds = (monotonic() - began) / setting.total_iterations
             words = result.reason or f"{1e3 * result.frame_seconds:.3g} ms a frame"
             error = f", error {describe_percent(result.error)}" if isfinite(result.error) else ""
             print_message(f"[{k + 1}/{len(settings)}] {setting}: {words}{error}")
         if reference is None:
             reference, results = _compare_with_finest(simulator, results)
-        substeps, iterations = (
-            _measure_doubling(results, given, twice, reference)
-            for twice in (given._replace(substeps=2 * given.substeps), given._replace(iterations=2 * given.iterations))
-        )
-        stiffness = _measure_stiffness(simulator, given, print_message)
+        assessments = _assess_settings(simulator, given, results, reference, print_message)
     results.sort(key=lambda result: result.setting)
     return ConvergenceStudy(
         simulator.name,
-        given,
         error_requested,
         reference.description,
         tuple(results),
-        substeps,
-        iterations if simulator.has_iterations else None,
-        stiffness,
+        assessments,
+        find_largest_difference([one for one in results if one.setting in given], reference.measure_change),
+        reference.min_error,
     )
 
 
-def build_hanging_scene(spec: SceneSpec, size: int) -> tuple[SceneSpec, int, NDArray[np.bool_]]:
-    """Build the scene that hangs a mesh by one end of its longest side.
+class StudyLimits(NamedTuple):
+    """Limits of times of a study.
+
+    Attributes:
+      time_limit: processor time of a setting [s].
+      search_time: wall time after which no further setting starts [s].
+      growth_end: time [s] up to which the growth of perturbations is known; None for that of the motion.
+      is_end_given: whether the end of the motion was requested, so that it must not be shortened.
+    """
+
+    time_limit: float
+    search_time: float
+    growth_end: float | None = None
+    is_end_given: bool = True
+
+
+def _order_settings(settings: Sequence[StepSetting], given: Sequence[StepSetting]) -> list[StepSetting]:
+    """Order settings: the given ones, since what they cannot do ends the study, those that they need, and others."""
+    doubled = [find_doubled(settings, one, name) for one in given for name in ("substeps", "iterations")]
+    return list(dict.fromkeys([*given, *filter(None, doubled), *settings]))
+
+
+def _assess_settings(
+    simulator: SettingSimulator,
+    given: Sequence[StepSetting],
+    results: Sequence[SettingResult],
+    reference: SampledReference,
+    print_message: Callable[[str], None],
+) -> tuple[SettingAssessment, ...]:
+    """Assess the given settings: what changes with more substeps or iterations, and how stiff the material seems."""
+    known = {result.setting: result for result in results if not result.reason}
+
+    def change(one: StepSetting, name: str) -> SettingChange | None:
+        more = find_doubled(known, one, name)
+        if one not in known or more is None:
+            return None
+        distance = reference.measure_change(known[one].positions, known[more].positions)
+        return SettingChange(getattr(more, name) / getattr(one, name), distance)
+
+    stiffness = _measure_stiffness(simulator, [one for one in given if one in known], print_message)
+    return tuple(
+        SettingAssessment(one, change(one, "substeps"), change(one, "iterations"), stiffness.get(one)) for one in given
+    )
+
+
+def build_hanging_scene(spec: SceneSpec, size: int) -> tuple[SceneSpec, NDArray[np.bool_]]:
+    """Build the scene that hangs a mesh by one end of its longest side, which is turned upright.
 
     Args:
       spec: scene with the mesh and its material.
       size: mesh size.
 
     Returns:
-      The scene, the axis along which it hangs, and a mask of its lowest vertices (n,).
+      The scene, and a mask of its lowest vertices (n,).
     """
-    rest = spec.mesh.build_mesh(size).rest_positions
-    axis = int(np.argmax(np.ptp(rest, axis=0)))
-    reach = _TOP_RTOL * float(np.ptp(rest, axis=0).max())
-    top, bottom = rest[:, axis] >= rest[:, axis].max() - reach, rest[:, axis] <= rest[:, axis].min() + reach
+    axis = int(np.argmax(np.ptp(spec.mesh.build_mesh(size).rest_positions, axis=0)))
+    mesh = _UprightMesh(spec.mesh, axis)
+    height = mesh.build_mesh(size).rest_positions[:, 1]
+    reach = _TOP_RTOL * float(np.ptp(height))
+    top, bottom = height >= height.max() - reach, height <= height.min() + reach
     strength = next((np.linalg.norm(e.acceleration) for e in spec.effects if isinstance(e, GravityEffect)), 9.81)
-    gravity = tuple(-float(strength) if k == axis else 0.0 for k in range(3))
     material = [k for k, effect in enumerate(spec.effects) if isinstance(effect, MATERIAL_EFFECTS)]
-    changes = spec.keep_effects(material)
+    changes: dict[str, Any] = {"mesh": mesh, "start": None, "velocity": (0.0, 0.0, 0.0), **spec.keep_effects(material)}
     changes["effects"] = (
-        *changes["effects"],
-        GravityEffect.model_validate({"acceleration": gravity}),
+        *(_turn_upright(effect, axis) for effect in changes["effects"]),
+        GravityEffect.model_validate({"acceleration": (0.0, -float(strength), 0.0)}),
         EtherDragEffect(decay_rate=HANG_DECAY),
         PinsEffect.model_validate({"indices": np.flatnonzero(top).tolist(), "weight": "exact"}),
     )
     values = {key: getattr(spec, key) for key in SceneSpec.model_fields}
-    return (
-        SceneSpec.model_construct(None, **values | changes | {"start": None, "velocity": (0.0, 0.0, 0.0)}),
-        axis,
-        bottom,
-    )
+    return SceneSpec.model_construct(None, **values | changes), bottom
+
+
+def _turn_upright(effect: SceneEffect, axis: int) -> SceneEffect:
+    """Return an effect with the warp of its woven cloth turned as the axes of `_UprightMesh` are."""
+    if not (isinstance(effect, SpringsEffect) and isinstance(effect.stretch, OrthotropicStiffness)):
+        return effect
+    direction = tuple(np.roll(effect.stretch.direction, 1 - axis).tolist())
+    return effect.model_copy(update={"stretch": effect.stretch.model_copy(update={"direction": direction})})
+
+
+@dataclass(frozen=True, slots=True)
+class _UprightMesh:
+    """A mesh whose axes are exchanged in cyclic order, so that one of them becomes y."""
+
+    source: MeshSource
+    axis: int
+
+    def build_mesh(self, size: int) -> Mesh:
+        mesh = self.source.build_mesh(size)
+        return replace(mesh, rest_positions=np.roll(mesh.rest_positions, 1 - self.axis, axis=1))
 
 
 def _find_reference(
-    simulator: SettingSimulator, store: ReferenceStore, error: float, print_message: Callable[[str], None]
+    simulator: SettingSimulator,
+    store: ReferenceStore,
+    error: float,
+    limits: StudyLimits,
+    print_message: Callable[[str], None],
 ) -> SampledReference | None:
-    """Return the reference of the motion; None, with a message, where there is none."""
-    scene = build_exact_scene(simulator.spec, simulator.size, show_warnings=False)
-    print_message(f"the reference first, the motion up to {simulator.sample_times[-1]:g} s, which is made once")
-    try:
-        times = simulator.sample_times
-        smallest = min(error, *ERROR_LEVELS)
-        trajectory = store.load_trajectory(simulator.spec, simulator.size, times, error=smallest)
-    except RunFailed as failed:
-        print_message(f"there is no reference, so that settings are compared with the finest one: {failed}")
-        return None
-    return SampledReference.from_trajectory(scene, trajectory)
+    """Return the reference of the motion, to which the simulation may be shortened; None, with a message, without one.
+
+    Raises:
+      RunFailed: the motion is unpredictable.
+    """
+    spec, size, times = simulator.spec, simulator.size, simulator.sample_times
+    scene = build_exact_scene(spec, size, show_warnings=False)
+    smallest = min(error, *ERROR_LEVELS)
+    print_message(f"the reference first, the motion up to {times[-1]:g} s, which is made once")
+    if not has_contact(scene.system):
+        try:
+            seen = store.load_trajectory(spec, size, times, error=smallest, growth_end=limits.growth_end)
+        except NotIntegrable as refused:
+            print_message(f"there is no reference, so that settings are compared with the finest one: {refused}")
+            return None
+        return SampledReference.from_trajectory(scene, seen)
+    print_message(describe_self_convergence(spec.path.stem))
+    trajectory = store.load_self_converged(spec, size, times, error=smallest)
+    num_known = trajectory.count_accurate_times(error)
+    if num_known < len(times):
+        if not num_known:
+            trajectory.require_accuracy(error)
+        until = times[num_known - 1]
+        if limits.is_end_given:
+            raise RunFailed(
+                f"with contact an error of {describe_percent(error)} can be measured up to {until:g} s, for later the "
+                f"self-converged motion is known to {trajectory.disagreement.max():.1e} of the displacement only; "
+                f"ask for --t-end {until:g}, or a larger --error"
+            )
+        print_message(f"the motion is known well enough up to {until:g} s, to which the comparison is limited")
+        simulator.shorten_motion(num_known)
+    return SampledReference.from_trajectory(scene, trajectory.select_times(num_known))
 
 
 def _compare_with_finest(
     simulator: SettingSimulator, results: Sequence[SettingResult]
 ) -> tuple[SampledReference, list[SettingResult]]:
     """Return the finest setting as reference, and the results with their errors against it; its own is unknown."""
-    fine = max((result for result in results if not result.reason), key=_number_of_iterations, default=None)
+    known = (result for result in results if not result.reason)
+    fine = max(known, key=lambda one: (one.setting.total_iterations, one.setting), default=None)
     if fine is None:
         raise RunFailed("all settings failed, and there is no reference")
     scene = build_exact_scene(simulator.spec, simulator.size, show_warnings=False)
     start = build_initial_state(scene).motion.positions
     words = f"the finest setting, {fine.setting}, for there is no reference"
-    reference = SampledReference(words, scene.system.free_vertices, start, fine.positions, None, 0.0)
+    reference = SampledReference(words, scene.system.free_vertices, start, fine.positions, None, 0.0, 0.0)
     errors = (inf if one.reason or one is fine else reference.measure_distance(one.positions) for one in results)
     return reference, [replace(one, error=error) for one, error in zip(results, errors, strict=True)]
 
 
-def _number_of_iterations(result: SettingResult) -> tuple[int, int]:
-    return result.setting.substeps * result.setting.iterations, result.setting.substeps
-
-
-def _measure_doubling(
-    results: Iterable[SettingResult], given: StepSetting, twice: StepSetting, reference: SampledReference
-) -> float | None:
-    """Return the change of the motion between two settings; None if one of them has none."""
-    known = {result.setting: result for result in results if not result.reason}
-    if given not in known or twice not in known:
-        return None
-    p, q = known[given].positions, known[twice].positions
-    return measure_change(p, q, reference.start, reference.free_vertices)
-
-
 def _measure_stiffness(
-    simulator: SettingSimulator, given: StepSetting, print_message: Callable[[str], None]
-) -> float | None:
-    """Return the ratio of the true sag to that of a setting; None, with a message, where it cannot be measured."""
+    simulator: SettingSimulator, settings: Sequence[StepSetting], print_message: Callable[[str], None]
+) -> dict[StepSetting, float]:
+    """Return the ratio of the true sag to that of each setting; none, with a message, where it cannot be measured."""
+    if not settings:
+        return {}
     try:
-        true, seen = simulator.measure_sag(None), simulator.measure_sag(given)
+        true = simulator.measure_sag(None)
+        sags = {setting: simulator.measure_sag(setting) for setting in settings}
     except (Unsupported, NotPositiveDefinite, RunFailed, RuntimeError, ArithmeticError, InputError) as error:
         print_message(f"the effective stiffness could not be measured: {error}")
-        return None
-    return true / seen if true > 0.0 and seen > 0.0 and isfinite(seen) else None
+        return {}
+    return {setting: true / sag for setting, sag in sags.items() if true > 0.0 and sag > 0.0 and isfinite(sag)}
 
 
 def _compute_energy(scene: Scene, p: Positions, v: Positions) -> float:
@@ -391,11 +521,3 @@ def _kinetic_energy(scene: Scene, v: Positions) -> float:
 def _measure_scene_scale(scene: Scene) -> float:
     """Return a length [m] of the scale of a scene; coordinates a thousand times as large mean divergence."""
     return 1.0 + float(np.abs(scene.mesh.rest_positions).max()) + scene.mesh.bounding_box_diagonal
-
-
-def require_setting(substeps: int, iterations: int) -> StepSetting:
-    """Return a setting; raise InputError if a number is not positive."""
-    for name, value in (("--substeps", substeps), ("--iterations", iterations)):
-        if value < 1:
-            raise InputError(InputMistake(f"came {value}; expected a whole number above 0", key=name))
-    return StepSetting(substeps, iterations)

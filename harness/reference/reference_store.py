@@ -158,6 +158,7 @@ class ReferenceStore:
         *,
         error: float,
         report_progress: ProgressFunction | None = None,
+        growth_end: float | None = None,
     ) -> ReferenceTrajectory:
         """Load or compute a reference trajectory at given times.
 
@@ -170,6 +171,7 @@ class ReferenceStore:
           times: ascending times [s].
           error: smallest relative error to be measured.
           report_progress: called with the progress of an integration.
+          growth_end: time [s] up to which the growth of a perturbation is estimated; the last time by default.
 
         Raises:
           InputError: the scene cannot be built.
@@ -178,8 +180,10 @@ class ReferenceStore:
         """
         name = _build_motion_name(spec, size, times)
         if has_contact(build_exact_scene(spec, size).system):
-            return self._load_self_converged(self.folder / f"converged-{name}.npz", spec, size, times, error)
-        seen = self.load_growth(spec, size, times[-1])
+            found = self.load_self_converged(spec, size, times, error=error)
+            found.require_accuracy(error)
+            return found
+        seen = self.load_growth(spec, size, growth_end or times[-1])
         seen.require_predictable(error, times)
         scene = build_ode_scene(spec, size)
         witness, path = OdeField(scene).evaluate_fingerprint(), self.folder / f"trajectory-{name}.npz"
@@ -214,13 +218,24 @@ class ReferenceStore:
         _write_arrays(path, arrays | {"fingerprint": witness})
         return found
 
-    def _load_self_converged(
-        self, path: Path, spec: SceneSpec, size: int, times: Sequence[float], error: float
+    def load_self_converged(
+        self, spec: SceneSpec, size: int, times: Sequence[float], *, error: float
     ) -> SelfConvergedTrajectory:
-        """Load the self-converged trajectory if stored for such an error, else compute it.
+        """Load the self-converged trajectory of a scene with contact, or compute it; it may be less accurate.
 
         Its fingerprint is its first step.
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          times: ascending times [s].
+          error: smallest relative error to be measured, if that takes no longer than a limit.
+
+        Raises:
+          InputError: the scene cannot be built.
+          NotConverged: not even two step sizes could be compared.
         """
+        path = self.folder / f"converged-{_build_motion_name(spec, size, times)}.npz"
         witness = next(iter(run_reference(build_exact_scene(spec, size), self.solver, 1, [1])[0].values())).positions
         stored = _read_arrays(path, [*_SELF_CONVERGED_FIELDS, "fingerprint", "error"])
         known = bool(stored) and is_equal_to_roundoff(stored.pop("fingerprint"), witness)
@@ -233,7 +248,6 @@ class ReferenceStore:
             )
             arrays = {name: np.asarray(getattr(found, name)) for name in _SELF_CONVERGED_FIELDS}
             _write_arrays(path, arrays | {"fingerprint": witness, "error": np.asarray(error)})
-        found.require_accuracy(error)
         return found
 
     def _load_known_snapshots(self, request: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:

@@ -1,8 +1,9 @@
 """Self-converged reference for scenes with contact: steps are halved until the motion no longer changes.
 
-    |p_h(T) - p_(h/2)(T)| and |p(T) - q(T)| <= REFERENCE_MARGIN error |q(T) - p(0)|
+    |q_h(T) - q_(h/2)(T)| and |2 p_(h/2)(T) - p_h(T) - q_(h/2)(T)| <= REFERENCE_MARGIN error |q(T) - p(0)|
 
-Here p is the motion by implicit Euler and q the one by BDF2. Norms are Frobenius norms over the free vertices; steps
+Here p is the motion by implicit Euler, of order 1, whose limit Richardson extrapolation estimates, and q the one by
+BDF2, which is the reference. Norms are Frobenius norms over the free vertices; steps
 are solved by Newton's method. Contact has no equation of motion that could be integrated instead, and its limit may
 depend on the integrator, which determines the restitution of an impact and the velocity that lagged friction opposes.
 Where the limits differ, there is no reference.
@@ -11,7 +12,7 @@ Where the limits differ, there is no reference.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import thread_time
 
 import numpy as np
@@ -56,9 +57,9 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
     """Self-converged reference trajectory.
 
     Attributes:
-      disagreement: difference (k,) of the two integrators, or the last change of either by step halving, if larger.
+      disagreement: difference (k,) of the two limits, or the last change of BDF2 by step halving, if larger.
       step: last step size [s].
-      last_change: last change by step halving alone, at the end, relative to the displacement.
+      last_change: last change of either integrator by step halving, at the end, relative to the displacement.
     """
 
     step: float
@@ -73,6 +74,16 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
     def has_disagreement(self) -> bool:
         """Whether the integrators differ by more than step halving explains."""
         return float(self.disagreement[-1]) > _DISAGREEMENT_FACTOR * self.last_change
+
+    def count_accurate_times(self, error: float) -> int:
+        """Return the number of times from the first one on at which a relative error can be measured."""
+        accurate = self.disagreement <= REFERENCE_MARGIN * error
+        return int(np.argmin(np.append(accurate, False)))
+
+    def select_times(self, count: int) -> SelfConvergedTrajectory:
+        """Return the trajectory at the first times only."""
+        arrays = ("times", "positions", "velocities", "displacement", "disagreement", "growth")
+        return replace(self, **{name: getattr(self, name)[:count] for name in arrays})
 
     def require_accuracy(self, error: float) -> None:
         """Raise NotConverged where a relative error cannot be measured at one of the times."""
@@ -181,8 +192,8 @@ def _compare_motions(
     if not moved.all():
         raise NotConverged("nothing moves, and errors are relative to what does")
     halved = [size(now[name].positions - before[name].positions) for name in LIMIT_INTEGRATORS]
-    apart = size(first.positions - second.positions)
-    most = np.max([*halved, apart], axis=0) / moved
+    extrapolated = 2.0 * first.positions - before[LIMIT_INTEGRATORS[0]].positions
+    most = np.maximum(halved[1], size(extrapolated - second.positions)) / moved
     return SelfConvergedTrajectory(
         times=np.array(times, float),
         free_vertices=free,

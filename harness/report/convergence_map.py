@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords.
-"""Heat map of a setting's convergence: error over substeps and iterations, with iso-error lines."""
+"""Heat map of the convergence of settings: error over substeps and iterations, with iso-error lines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from textwrap import wrap
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import BoundaryNorm
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from springbench.harness.report.accuracy.plot_sheet import (
@@ -28,6 +28,9 @@ from springbench.harness.results.setting_verdict import ERROR_LEVELS, Convergenc
 _COLOUR_BOUNDS = (1e-4, 1e-3, 3e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.3, 1.0, 10.0)
 """Bounds of the colours: relative errors, with the levels of the verdict among them."""
 
+_UNKNOWN_COLOURS = ListedColormap(["#ffffff00", "#ececea"])
+"""Colours of fields with an error, over which theirs are drawn, and of fields without."""
+
 _MAP_WIDTH, _TEXT_LEFT, _TEXT_LETTERS = 880, 1010, 72
 """Width of the map, and left edge of the verdict next to it [pixels]; letters of a line of the verdict."""
 
@@ -36,7 +39,7 @@ _LINE_STYLES = ("dotted", "solid", "dashed")
 
 
 def draw_convergence_map(stem: Path, study: ConvergenceStudy, title: str, facts: Sequence[str]) -> list[Path]:
-    """Draw a study's errors, with the given setting and the cheapest ones marked, and return the files.
+    """Draw a study's errors, with the given settings and the cheapest ones marked, and return the files.
 
     Args:
         stem: path of the files without suffix.
@@ -57,22 +60,26 @@ def draw_convergence_map(stem: Path, study: ConvergenceStudy, title: str, facts:
         x, y = np.arange(len(substeps)), np.arange(len(iterations))
         norm = BoundaryNorm(_COLOUR_BOUNDS, 256, extend="both")
         shown = np.where(np.isfinite(errors), errors, np.nan)
+        ax.pcolormesh(x, y, np.isnan(shown), cmap=_UNKNOWN_COLOURS, shading="nearest", edgecolors="white", lw=2)
         ax.pcolormesh(x, y, shown, cmap="RdYlBu_r", norm=norm, shading="nearest", alpha=0.75, edgecolors="white", lw=2)
+        lines, labels = list[Line2D](), list[str]()
         if len(x) > 1 and len(y) > 1 and np.isfinite(shown).sum() > 3:
-            levels = sorted({*ERROR_LEVELS, study.error_requested})
-            filled = np.log10(np.where(np.isfinite(errors), np.maximum(errors, 1e-12), 1e3))
+            levels = [one for one in sorted({*ERROR_LEVELS, study.error_requested}) if np.nanmin(shown) <= one]
+            logarithms = np.log10(np.maximum(np.ma.masked_invalid(shown), 1e-12))
             styles = [_LINE_STYLES[k % len(_LINE_STYLES)] for k in range(len(levels))]
-            ax.contour(x, y, filled, np.log10(levels), colors=TEXT_COLOUR, linewidths=1.8, linestyles=styles, alpha=0.6)
+            look: dict[str, Any] = {"colors": TEXT_COLOUR, "linewidths": 1.8, "alpha": 0.6}
+            if levels:
+                ax.contour(x, y, logarithms, np.log10(levels), linestyles=styles, **look)
             lines = [Line2D([], [], color=TEXT_COLOUR, ls=style, lw=1.8, alpha=0.6) for style in styles]
             labels = [f"an error of {100 * level:.3g} %" for level in levels]
-            place = ((_TEXT_LEFT - 8) / PAGE_WIDTH, 60 / PAGE_HEIGHT)
-            page.legend(lines, labels, loc="lower left", bbox_to_anchor=place, frameon=False, fontsize=9.5)
         for j, many in enumerate(iterations):
             for i, pieces in enumerate(substeps):
                 result = by_setting[StepSetting(pieces, many)]
                 cost = f"\n{1e3 * result.frame_seconds:.3g} ms" if np.isfinite(result.frame_seconds) else ""
-                label = f"{100 * result.error:.2g} %" if np.isfinite(result.error) else _shorten(result.reason)
-                ax.text(i, j - 0.02, label + cost, ha="center", va="center", fontsize=8.5, color=TEXT_COLOUR)
+                known = np.isfinite(result.error)
+                label = _format_error(result.error) if known else _shorten(result.reason)
+                colour = TEXT_COLOUR if known else MUTED_COLOUR
+                ax.text(i, j + 0.04, label + cost, ha="center", va="center", fontsize=8.5, color=colour)
         _mark_settings(ax, study, substeps, iterations)
         ax.set_xticks(x, [str(value) for value in substeps])
         ax.set_yticks(y, [str(value) for value in iterations])
@@ -84,27 +91,35 @@ def draw_convergence_map(stem: Path, study: ConvergenceStudy, title: str, facts:
                 draw_text(page, _TEXT_LEFT, y_text, line, size=10.5)
                 y_text += 20
             y_text += 10
+        if lines:
+            place = ((_TEXT_LEFT - 8) / PAGE_WIDTH, 1.0 - y_text / PAGE_HEIGHT)
+            page.legend(lines, labels, loc="upper left", bbox_to_anchor=place, frameon=False, fontsize=9.5)
     return sheet_paths(stem)
 
 
 def _mark_settings(ax: Any, study: ConvergenceStudy, substeps: Sequence[int], iterations: Sequence[int]) -> None:
-    """Mark the given setting with a thick frame, and the cheapest one of each level below its field."""
-    marks: dict[StepSetting, list[str]] = {study.given: ["given"]}
+    """Mark the given settings with a thick frame, and the cheapest one of each level below its field."""
+    marks: dict[StepSetting, list[str]] = {setting: ["given"] for setting in study.given_settings}
     for level in ERROR_LEVELS:
         if best := study.find_cheapest(level):
             marks.setdefault(best.setting, []).append(f"cheapest within {100 * level:.3g} %")
     for setting, names in marks.items():
         i, j = substeps.index(setting.substeps), iterations.index(setting.iterations)
-        is_given = setting == study.given
+        is_given = setting in study.given_settings
         frame: dict[str, Any] = {"fill": False, "ec": TEXT_COLOUR if is_given else MUTED_COLOUR, "zorder": 5}
         ax.add_patch(_rectangle(i, j, 2.6 if is_given else 1.4, frame))
-        ax.text(i, j - 0.4, "\n".join(names), ha="center", va="bottom", fontsize=8, color=TEXT_COLOUR, weight="bold")
+        ax.text(i, j - 0.43, "\n".join(names), ha="center", va="bottom", fontsize=8, color=TEXT_COLOUR, weight="bold")
 
 
 def _rectangle(i: int, j: int, line_width: float, style: dict[str, Any]) -> Any:
     return Rectangle((i - 0.47, j - 0.47), 0.94, 0.94, lw=line_width, **style)
 
 
+def _format_error(error: float) -> str:
+    return f"{100 * error:.2g} %" if error < 0.995 else f"{100 * error:.0f} %"
+
+
 def _shorten(reason: str) -> str:
+    """Shorten a reason to two lines of a field."""
     words = reason.split(":")[0] or "the finest"
-    return words if len(words) <= 16 else words[:15] + "…"
+    return "\n".join(wrap(words, 16, max_lines=2, placeholder="…"))

@@ -1,26 +1,67 @@
-"""Verdict on a given setting: whether substeps and iterations are converged, and which setting would be."""
+"""Verdict on given settings: whether substeps and iterations are converged, and which setting would be."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from itertools import combinations
+from math import ceil, inf, isfinite, log, log2
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from springbench.solvers.model.step_problem import Positions
 
 ERROR_LEVELS = (0.05, 0.01)
 """Relative errors for which the cheapest setting is found."""
 
 
+MAX_EXTRAPOLATION, MIN_ORDER = 16, 0.3
+"""Largest factor of an extrapolation beyond the map, and the least order of convergence for which there is one."""
+
+
 class StepSetting(NamedTuple):
-    """Substeps of a frame, and iterations in each."""
+    """Substeps of a frame, and iterations in each; 0 iterations where a method has none."""
 
     substeps: int
     iterations: int
 
     def __str__(self) -> str:
-        return f"{self.substeps} x {self.iterations}"
+        return f"{self.substeps} x {self.iterations}" if self.iterations else f"{self.substeps} substeps"
+
+    @property
+    def total_iterations(self) -> int:
+        """Number of iterations of a frame."""
+        return self.substeps * max(1, self.iterations)
+
+
+class SettingChange(NamedTuple):
+    """Change of the motion where substeps or iterations are multiplied by a factor."""
+
+    factor: float
+    change: float
+
+
+@dataclass(frozen=True, slots=True)
+class SettingAssessment:
+    """Assessment of a given setting.
+
+    Attributes:
+      setting: the given setting.
+      substep_change, iteration_change: change of the motion with at least twice the substeps or iterations; None where
+        that was not simulated, or does not apply.
+      effective_stiffness: ratio of the true sag to that of the setting; None where nothing sags.
+    """
+
+    setting: StepSetting
+    substep_change: SettingChange | None = None
+    iteration_change: SettingChange | None = None
+    effective_stiffness: float | None = None
+
+    @property
+    def known_changes(self) -> dict[str, SettingChange]:
+        """Known changes by what is multiplied."""
+        named = {"substeps": self.substep_change, "iterations": self.iteration_change}
+        return {name: change for name, change in named.items() if change is not None}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,100 +84,251 @@ class SettingResult:
     energy_drift: float = inf
     frame_seconds: float = inf
     reason: str = ""
-    positions: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0, 3)))
+    positions: Positions = field(default_factory=lambda: np.empty((0, 0, 3)))
 
     @property
     def columns(self) -> dict[str, Any]:
         """Columns of the table that is written."""
         numbers = {name: getattr(self, name) for name in ("error", "max_strain", "energy_drift", "frame_seconds")}
         values = {name: value if isfinite(value) else None for name, value in numbers.items()}
-        return {**self.setting._asdict(), **values, "reason": self.reason or None}
+        return {
+            "substeps": self.setting.substeps,
+            "iterations": self.setting.iterations or None,
+            **values,
+            "reason": self.reason or None,
+        }
+
+
+class SettingDifference(NamedTuple):
+    """Difference of the motions of two settings."""
+
+    first: StepSetting
+    second: StepSetting
+    change: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConvergenceStudy:
-    """Settings around a given one, with their errors.
+    """Settings around given ones, with their errors.
 
     Attributes:
       solver: name of the solver or engine.
-      given: the given setting.
       error_requested: relative error that counts as converged.
       reference: what the errors are measured against, in words.
       results: result of each setting.
-      substep_change, iteration_change: change of the motion where substeps or iterations are doubled; None where that
-        was not simulated, or does not apply.
-      effective_stiffness: ratio of the true sag to that of the given setting; None where nothing sags.
+      assessments: assessment of each given setting, in the order in which they were given.
+      largest_difference: largest difference of the motions of two given settings; None if fewer than two succeeded.
+      min_error: smallest error that can be measured against the reference.
     """
 
     solver: str
-    given: StepSetting
     error_requested: float
     reference: str
     results: tuple[SettingResult, ...]
-    substep_change: float | None
-    iteration_change: float | None
-    effective_stiffness: float | None
+    assessments: tuple[SettingAssessment, ...]
+    largest_difference: SettingDifference | None = None
+    min_error: float = 0.0
+
+    @property
+    def given_settings(self) -> tuple[StepSetting, ...]:
+        """The given settings."""
+        return tuple(one.setting for one in self.assessments)
 
     def find_result(self, setting: StepSetting) -> SettingResult:
         """Return the result of a setting; KeyError if there is none."""
         return {result.setting: result for result in self.results}[setting]
 
     def find_cheapest(self, max_error: float) -> SettingResult | None:
-        """Return the cheapest setting within a relative error; None if there is none."""
-        within = [result for result in self.results if result.error <= max_error]
+        """Return the cheapest setting within a relative error; None if there is none, or it cannot be measured."""
+        within = [result for result in self.results if result.error <= max_error and max_error >= self.min_error]
         return min(within, key=lambda result: result.frame_seconds, default=None)
+
+    def is_setting_converged(self, assessment: SettingAssessment) -> bool:
+        """Return whether the error, and the changes of the motion, are at most what is requested."""
+        changes = [one.change for one in assessment.known_changes.values()]
+        return max([self.find_result(assessment.setting).error, *changes]) <= self.error_requested
 
     @property
     def is_converged(self) -> bool:
-        """Whether the error, and the changes by doubling, are at most what is requested."""
-        changes = [change for change in (self.substep_change, self.iteration_change) if change is not None]
-        return max([self.find_result(self.given).error, *changes]) <= self.error_requested
+        """Whether all given settings are converged."""
+        return all(map(self.is_setting_converged, self.assessments))
+
+    def predict_setting(self, max_error: float) -> StepSetting | None:
+        """Predict a setting beyond the map that meets an error, by the trend of its finest row and column.
+
+        The error is taken to be proportional to a power of the number of substeps or iterations.
+
+        Args:
+          max_error: relative error.
+
+        Returns:
+          The cheaper one of more substeps and more iterations; None where errors fall too slowly to tell.
+        """
+        known = {result.setting: result.error for result in self.results if 0.0 < result.error < inf}
+        if not known:
+            return None
+        finest = max(known, key=lambda setting: (setting.total_iterations, setting.substeps))
+        found = list[StepSetting]()
+        for name in ("substeps", "iterations"):
+            number: int = getattr(finest, name)
+            fewer = [
+                one for one in known if one._replace(**{name: number}) == finest and 2 * getattr(one, name) <= number
+            ]
+            if not fewer:
+                continue
+            coarse = max(fewer)
+            order = log(known[coarse] / known[finest]) / log(number / getattr(coarse, name))
+            doublings = ceil(log2(known[finest] / max_error) / order) if order >= MIN_ORDER else inf
+            if 0 < doublings <= log2(MAX_EXTRAPOLATION):
+                found.append(finest._replace(**{name: number * 2 ** int(doublings)}))
+        return min(found, key=lambda setting: setting.total_iterations, default=None)
 
     def describe_verdict(self) -> list[str]:
-        """Describe the given setting and what to do, in sentences."""
-        given, names = self.find_result(self.given), {"substeps": self.substep_change}
-        if any(result.setting.iterations != self.given.iterations for result in self.results):
-            names["iterations"] = self.iteration_change
-        asked = f"{100 * self.error_requested:.3g} %"
-        if given.reason:
-            lines = [f"{self.given} failed: {given.reason}"]
-        else:
-            state = "converged" if self.is_converged else "not converged"
-            lines = [
-                f"{self.given} substeps x iterations is {state} to {asked}: "
-                f"its error is {describe_percent(given.error)}, against {self.reference}.",
-                f"Its largest strain is {describe_percent(given.max_strain)}{_describe_drift(given.energy_drift)}.",
-            ]
-        for what, change in names.items():
-            if change is not None:
-                still = "which is more than is asked" if change > self.error_requested else "less than is asked"
-                lines.append(f"Twice the {what} change the motion by {describe_percent(change)}, {still}.")
-        if self.effective_stiffness is not None:
-            lines.append(_describe_stiffness(self.effective_stiffness))
+        """Describe the given settings and what to do, in sentences."""
+        lines = self._describe_one(self.assessments[0]) if len(self.assessments) == 1 else self._describe_several()
         return lines + [self._describe_level(level) for level in sorted({*ERROR_LEVELS, self.error_requested})[::-1]]
 
+    def _describe_one(self, assessment: SettingAssessment) -> list[str]:
+        given = self.find_result(assessment.setting)
+        if given.reason:
+            return [f"{given.setting} failed: {given.reason}"]
+        what = "" if not given.setting.iterations else " substeps x iterations"
+        state = "converged" if self.is_setting_converged(assessment) else "not converged"
+        lines = [
+            f"{given.setting}{what}: {state} to {self._requested}. "
+            f"The error is {describe_percent(given.error)}, against {self.reference}.",
+            f"The largest strain is {describe_percent(given.max_strain)}{_describe_drift(given.energy_drift)}.",
+            *self._describe_changes(assessment),
+        ]
+        if assessment.effective_stiffness is not None:
+            lines.append(_describe_stiffness(assessment.effective_stiffness))
+        return lines
+
+    def _describe_several(self) -> list[str]:
+        """Describe several settings: what they have in common, a line for each, and what the nearest one lacks."""
+        good = [one for one in self.assessments if self.is_setting_converged(one)]
+        nearest = min(self.assessments, key=lambda one: self.find_result(one.setting).error)
+        count = f"{len(good)} of the {len(self.assessments)}" if good else f"None of the {len(self.assessments)}"
+        lines = [f"{count} settings {'is' if len(good) < 2 else 'are'} converged to {self._requested}."]
+        error = self.find_result(nearest.setting).error
+        if isfinite(error):
+            lines[0] += f" {nearest.setting} is the nearest to {self.reference}, with an error of "
+            lines[0] += f"{describe_percent(error)}."
+        lines += [self._describe_row(one) for one in self.assessments]
+        if apart := self.largest_difference:
+            verb = "need not hold" if apart.change > self.error_requested else "holds to that"
+            lines.append(
+                f"The motions of {apart.first} and {apart.second} differ by {describe_percent(apart.change)}: "
+                f"what is found with one {verb} with the other."
+            )
+        if isfinite(error) and nearest not in good:
+            lines += [f"{nearest.setting}: {one[0].lower()}{one[1:]}" for one in self._describe_changes(nearest)]
+        return lines
+
+    def _describe_row(self, assessment: SettingAssessment) -> str:
+        given = self.find_result(assessment.setting)
+        if given.reason:
+            return f"{given.setting} failed: {given.reason}."
+        parts = [f"error {describe_percent(given.error)}", f"largest strain {describe_percent(given.max_strain)}"]
+        if assessment.effective_stiffness is not None:
+            parts.append(f"hangs as if {assessment.effective_stiffness:.2g} times as stiff")
+        return f"{given.setting}: {', '.join(parts)}."
+
+    @property
+    def _requested(self) -> str:
+        return describe_percent(self.error_requested)
+
+    def _describe_changes(self, assessment: SettingAssessment) -> list[str]:
+        lines = list[str]()
+        for what, (factor, change) in assessment.known_changes.items():
+            still = "which is more than is asked" if change > self.error_requested else "less than is asked"
+            times = "Twice" if factor == 2.0 else f"{factor:.3g} times"
+            lines.append(f"{times} the {what} change the motion by {describe_percent(change)}, {still}.")
+        return lines
+
     def _describe_level(self, level: float) -> str:
-        best, given = self.find_cheapest(level), self.find_result(self.given)
+        within = f"Within {describe_percent(level)}"
+        if level < self.min_error:
+            return f"{within}: cannot be told, for the reference resolves errors of {describe_percent(self.min_error)}."
+        best = self.find_cheapest(level)
         if best is None:
             nearest = min(self.results, key=lambda result: result.error)
-            found = f"the nearest is {nearest.setting}, with {describe_percent(nearest.error)}"
-            found = found if isfinite(nearest.error) else "all failed"
-            return f"Within {100 * level:.3g} %: no setting of the map; {found}."
+            if not isfinite(nearest.error):
+                return f"{within}: no setting of the map; all failed."
+            found = f"{within}: no setting of the map; the nearest is {nearest.setting}, with "
+            found += describe_percent(nearest.error)
+            if predicted := self.predict_setting(level):
+                return f"{found}. By the trend about {predicted} would be within."
+            return f"{found}. Errors fall too slowly along the map to predict one that is."
         cost = f"{1e3 * best.frame_seconds:.3g} ms a frame"
-        if isfinite(given.frame_seconds) and best.setting != self.given:
-            cost += f", {best.frame_seconds / given.frame_seconds:.2g} times the given"
-        return f"Within {100 * level:.3g} %: {best.setting} is the cheapest, {cost}."
+        if len(self.given_settings) == 1 and isfinite(own := self.find_result(self.given_settings[0]).frame_seconds):
+            cost += (
+                f", {best.frame_seconds / own:.2g} times the given" if best.setting != self.given_settings[0] else ""
+            )
+        return f"{within}: {best.setting} is the cheapest, {cost}."
 
 
-def list_settings(given: StepSetting, num_doublings: int, *, has_iterations: bool) -> list[StepSetting]:
-    """Return the settings around a given one, by powers of two of each number, the cheapest first."""
-    factors = [2.0**k for k in range(-num_doublings, num_doublings + 1)]
-    substeps = sorted({max(1, round(given.substeps * factor)) for factor in factors})
-    iterations = sorted(
-        {max(1, round(given.iterations * factor)) for factor in factors if has_iterations or factor == 1}
-    )
+def list_settings(given: Sequence[StepSetting], num_doublings: int) -> list[StepSetting]:
+    """Return the settings around given ones, the cheapest first.
+
+    They combine all given numbers, and those by powers of two below the smallest and above the largest.
+
+    Args:
+      given: given settings.
+      num_doublings: how often the numbers are halved and doubled.
+    """
+    substeps, iterations = (_extend_numbers(numbers, num_doublings) for numbers in zip(*given, strict=True))
     found = [StepSetting(s, i) for s in substeps for i in iterations]
-    return sorted(found, key=lambda setting: (setting.substeps * setting.iterations, setting))
+    return sorted(found, key=lambda setting: (setting.total_iterations, setting))
+
+
+def find_doubled(settings: Iterable[StepSetting], given: StepSetting, name: str) -> StepSetting | None:
+    """Return the setting that differs in one number, which is at least twice that of a given one.
+
+    Args:
+      settings: settings of a map.
+      given: given setting.
+      name: `substeps` or `iterations`.
+
+    Returns:
+      The one with the smallest such number; None if there is none.
+    """
+    number: int = getattr(given, name)
+    more = [one for one in settings if getattr(one, name) >= 2 * number > 0 and one._replace(**{name: number}) == given]
+    return min(more, default=None)
+
+
+def find_largest_difference(
+    results: Sequence[SettingResult], measure: Callable[[Positions, Positions], float]
+) -> SettingDifference | None:
+    """Return the two settings whose motions differ most; None if fewer than two succeeded.
+
+    Args:
+      results: results of settings.
+      measure: relative difference of two motions (k, n, 3) [m].
+    """
+    pairs = combinations([result for result in results if not result.reason], 2)
+    found = [SettingDifference(a.setting, b.setting, measure(a.positions, b.positions)) for a, b in pairs]
+    return max(found, key=lambda one: one.change, default=None)
+
+
+def parse_setting(text: str) -> StepSetting:
+    """Parse a setting such as 2x5, or 8 for substeps alone; ValueError if it is none."""
+    substeps, cross, iterations = text.lower().replace("×", "x").replace(" ", "").partition("x")
+    found = StepSetting(int(substeps), int(iterations) if cross else 0)
+    if found.substeps < 1 or (cross and found.iterations < 1):
+        raise ValueError(text)
+    return found
+
+
+def _extend_numbers(numbers: Iterable[int], num_doublings: int) -> list[int]:
+    """Return numbers with those by powers of two below the smallest and above the largest; 0 stays alone."""
+    known = set(numbers)
+    if 0 in known:
+        return [0]
+    factors = [2**k for k in range(1, num_doublings + 1)]
+    fewer = {max(1, round(min(known) / factor)) for factor in factors}
+    return sorted(known | fewer | {max(known) * factor for factor in factors})
 
 
 SIMILAR_STIFFNESS = 0.02

@@ -1,8 +1,9 @@
-"""Command `springbench convergence`: is a given setting converged?"""
+"""Command `springbench convergence`: are given settings converged?"""
 
 from __future__ import annotations
 
 import csv
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,38 +21,46 @@ if TYPE_CHECKING:
     from springbench.harness.experiments.setting_convergence import SettingSimulator
     from springbench.harness.results.setting_verdict import ConvergenceStudy, StepSetting
     from springbench.harness.scenes.scene_spec import SceneSpec
+    from springbench.solvers.model.step_problem import Positions
 
 
 def convergence(
     scene: Annotated[Path, describe_config("SCENE", SCENE_HELP)],
     solver: Annotated[str, typer.Option(help="Solver, or outside engine such as mujoco or newton-physics.")],
-    substeps: Annotated[int, typer.Option(help="Substeps of a frame, which is a time step of the scene.")] = 1,
-    iterations: Annotated[int, typer.Option(help="Iterations of a substep.")] = 50,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Substeps of a frame x iterations of a substep, such as 2x5, or 8 where a method has no iterations; "
+            "repeatable. 1x50 by default."
+        ),
+    ] = None,
     parameter: Annotated[list[str] | None, typer.Option(help="Parameter of the solver, KEY=VALUE; repeatable.")] = None,
     integrator: Annotated[str | None, typer.Option(help="Integrator; the usual one of the solver by default.")] = None,
     error: Annotated[float, typer.Option(help="Relative error that counts as converged.")] = 0.05,
-    doublings: Annotated[int, typer.Option(min=1, max=4, help="Powers of two around the setting.")] = 2,
+    doublings: Annotated[
+        int | None,
+        typer.Option(min=1, max=4, help="Powers of two around settings; 2 around one, 1 around several."),
+    ] = None,
     size: Annotated[int | None, typer.Option(help="Mesh size; the scene's default size by default.")] = None,
     t_end: Annotated[
         float | None, typer.Option(help="Simulated time [s]; 1 by default, or less if the motion is unpredictable.")
     ] = None,
-    time_limit: Annotated[float, typer.Option(help="Limit of a setting's wall time [s].")] = 30.0,
+    time_limit: Annotated[float, typer.Option(help="Limit of a setting's processor time [s].")] = 30.0,
     search_time: Annotated[float, typer.Option(help="Wall time after which no further setting starts [s].")] = 200.0,
     results: ResultsOption = Path("results"),
 ) -> None:
     """Check whether substeps x iterations of a solver or engine are converged, and find what would be.
 
-    Settings are simulated by powers of two around the given one, and compared with the reference motion.
+    Settings around the given ones are simulated, and compared with the reference motion.
     """
     from springbench.harness.config.config_loader import load_scene
     from springbench.harness.execution.isolated_call import run_isolated
     from springbench.harness.execution.worker_process import TaskLimits
     from springbench.harness.experiments.accuracy.accuracy_units import EXTRA_WALL_SECONDS
-    from springbench.harness.experiments.setting_convergence import require_setting
     from springbench.harness.results.folder_ownership import claim_folder
     from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 
-    given = require_setting(substeps, iterations)
+    given = [_read_setting(text) for text in setting or ()]
     for key, value in (("--error", error), ("--time-limit", time_limit), ("--search-time", search_time)):
         if not 0.0 < value < 1e5:
             raise InputError(InputMistake(f"came {value:g}; expected a number above 0", key=key))
@@ -62,7 +71,8 @@ def convergence(
     made = read_solver_options(scene, solver, parameter or ())
     number = (size or spec.default_size or 0) if isinstance(spec.mesh, MeshGenerator) else 0
     folder = claim_folder(results / f"convergence-{scene.stem}", scene)
-    options = {"error": error, "doublings": doublings, "time_limit": time_limit, "search_time": search_time}
+    options = {"error": error, "time_limit": time_limit, "search_time": search_time}
+    options["doublings"] = doublings or (1 if len(given) > 1 else 2)
     study = run_isolated(
         partial(_study_setting, spec, scene.stem, number, made, integrator, t_end, given, results, folder, options),
         spec.find_plugins(),
@@ -72,6 +82,17 @@ def convergence(
     for line in study.describe_verdict():
         print_message(line)
     raise typer.Exit(0 if study.is_converged else 1)
+
+
+def _read_setting(text: str) -> StepSetting:
+    """Read a setting; raise InputError if it is none."""
+    from springbench.harness.results.setting_verdict import parse_setting
+
+    try:
+        return parse_setting(text)
+    except ValueError:
+        wanted = "substeps x iterations, such as 2x5, or substeps alone, such as 8"
+        raise InputError(InputMistake(f"came {text!r}; expected {wanted}", key="--setting")) from None
 
 
 def read_solver_options(path: Path, name: str, parameters: tuple[str, ...] | list[str]) -> SolverSpec:
@@ -113,7 +134,7 @@ def _study_setting(
     solver: SolverSpec,
     integrator: str | None,
     t_end: float | None,
-    given: StepSetting,
+    given: list[StepSetting],
     results: Path,
     folder: Path,
     options: dict[str, float],
@@ -122,49 +143,66 @@ def _study_setting(
     """Run the study, write its table, its picture and the setting in the engine's own words."""
     from springbench.harness.config.config_loader import find_scene_mistakes
     from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
-    from springbench.harness.experiments.accuracy.method_recommendation import find_default_t_end
-    from springbench.harness.experiments.setting_convergence import SettingSimulator, study_convergence
+    from springbench.harness.experiments.accuracy.method_recommendation import DEFAULT_T_END, find_default_t_end
+    from springbench.harness.experiments.setting_convergence import (
+        SettingSimulator,
+        StudyLimits,
+        complete_settings,
+        study_convergence,
+    )
+    from springbench.harness.reference.equations_of_motion import NotIntegrable
     from springbench.harness.report.convergence_map import draw_convergence_map
 
     spec = spec.load_plugins()
     if mistakes := find_scene_mistakes(spec, [size]):
         raise InputError(mistakes)
-    store = open_reference_store(results)
+    given = complete_settings(given, solver)
+    store, growth_end = open_reference_store(results), None
+    is_end_given = t_end is not None
     if t_end is None:
-        t_end = find_default_t_end(spec.path, spec, size, options["error"], store, print_message)
-    simulator = SettingSimulator(spec, size, solver, integrator, max(t_end, spec.time_step))
+        growth_end = DEFAULT_T_END
+        with suppress(NotIntegrable):  # there is no reference, which the study reports
+            t_end = find_default_t_end(spec.path, spec, size, options["error"], store, print_message)
+    simulator = SettingSimulator(spec, size, solver, integrator, max(t_end or DEFAULT_T_END, spec.time_step))
     study = study_convergence(
         simulator,
         given,
         store,
         options["error"],
         num_doublings=int(options["doublings"]),
-        time_limit=options["time_limit"],
-        search_time=options["search_time"],
+        limits=StudyLimits(options["time_limit"], options["search_time"], growth_end, is_end_given),
         print_message=print_message,
     )
-    stem = f"{name}-{size}-{solver.name}-{given.substeps}x{given.iterations}"
+    stem = f"{name}-{size}-{solver.name}-{'-'.join(map(_format_setting, given))}"
     folder.mkdir(parents=True, exist_ok=True)
     with atomic_write(folder / f"{stem}.csv") as partial_path, partial_path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(study.results[0].columns))
         writer.writeheader()
         writer.writerows(result.columns for result in study.results)
-    title = f"Is {given} converged? {name} {size or ''}".rstrip() + f", {solver.name}"
+    verb = "Is" if len(given) == 1 else "Are"
+    title = f"{verb} {', '.join(map(str, given))} converged? {name} {size or ''}".rstrip() + f", {solver.name}"
     frames = f"{simulator.num_frames} frames of {spec.time_step:.6g} s"
     facts = [frames, simulator.integrator, f"errors against {study.reference}"]
     picture, *_ = draw_convergence_map(folder / "pictures" / stem, study, title, facts)
     print_message(f"the map is {picture}, its numbers are in {folder / f'{stem}.csv'}")
     best = study.find_cheapest(options["error"])
-    for label, setting in (("given", given), ("cheapest", best.setting if best else None)):
-        if setting is not None and (label == "given" or setting != given):
-            lines = _export_setting(simulator, setting, name, folder / f"{stem}-{label}")
-            print_message(f"the {label} setting, {setting}, to run it:")
-            for line in lines:
-                print_message(f"  {line}")
+    for setting in given if best is None or best.setting in given else [*given, best.setting]:
+        label, end = "given" if setting in given else "cheapest", study.find_result(setting).positions
+        script_folder = folder / f"{name}-{size}-{solver.name}-{_format_setting(setting)}"
+        lines = _export_setting(simulator, setting, name, script_folder, end[-1] if len(end) else None)
+        print_message(f"the {label} setting, {setting}, to run it:")
+        for line in lines:
+            print_message(f"  {line}")
     return study
 
 
-def _export_setting(simulator: SettingSimulator, setting: StepSetting, name: str, folder: Path) -> list[str]:
+def _format_setting(setting: StepSetting) -> str:
+    return str(setting).replace(" ", "")
+
+
+def _export_setting(
+    simulator: SettingSimulator, setting: StepSetting, name: str, folder: Path, end: Positions | None
+) -> list[str]:
     """Return how to repeat a setting: the command of a solver of ours, or an engine's script, which is written."""
     import shlex
 
@@ -174,17 +212,17 @@ def _export_setting(simulator: SettingSimulator, setting: StepSetting, name: str
     if not simulator.is_engine:
         given: dict[str, Any] = {"size": simulator.size or None, "solver": simulator.name}
         given |= {"integrator": simulator.integrator, "time-step": repr(spec.time_step / setting.substeps)}
-        given |= {"frames": frames * setting.substeps, "max-iterations": setting.iterations}
+        given |= {"frames": frames * setting.substeps, "max-iterations": max(1, setting.iterations)}
         parts = [part for key, value in given.items() if value is not None for part in (f"--{key}", str(value))]
         return [shlex.join(["springbench", "run", str(spec.path), *parts])]
     scene, engine, _, _ = simulator.build_step(spec, setting)
     step = f"{simulator.name}: steps of {spec.time_step / setting.substeps:.9g} s"
     lines = [f"{step}, {setting.iterations} iterations each" if simulator.has_iterations else step]
+    if end is None:
+        return [*lines, "no script of it, for it failed"]
     try:
-        texts = write_engine_script(name, scene, engine, setting.substeps, frames, folder)
+        texts = write_engine_script(name, scene, engine, setting.substeps, frames, folder, end)
     except RunFailed as refused:
         return [*lines, f"no script of it: {refused}"]
-    return [
-        *lines,
-        f"cd {folder} && python {name}.py    # reads {', '.join(file for file in texts if file[-3:] != '.py')}",
-    ]
+    reads = [f"{name}.npz", *(file for file in texts if not file.endswith(".py"))]
+    return [*lines, f"cd {folder} && python {name}.py    # reads {', '.join(reads)}"]
