@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from springbench.harness.scenes.mesh.mesh import Mesh
 
+from tests.oracles.area_stiffness import compute_area_scale
 from tests.oracles.complex_step import ExtendedArray, ValueFunction, row_norms, to_extended
 from tests.oracles.scene_declaration import (
     Array,
@@ -40,6 +41,7 @@ def compute_edge_stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, be
       bend: constant of bend springs.
     """
     k, h = np.zeros(len(mesh.springs)), mesh.spacing
+    by_area = compute_area_scale(mesh) if effect.scaling_rule == "area" and mesh.dimension > 1 else k
     for family, given in {"stretch": stretch, "shear": shear, "bend": bend}.items():
         for e in mesh.spring_families[family]:
             constant = given if isinstance(given, float) else _woven_stiffness(mesh, given, *mesh.springs[e].tolist())
@@ -48,7 +50,7 @@ def compute_edge_stiffness(mesh: Mesh, effect: Any, stretch: Any, shear: Any, be
             elif effect.scaling_rule == "liu2013":
                 k[e] = constant * (mesh.resolution - 1) / (effect.reference_size - 1)
             elif effect.scaling_rule == "area" and mesh.dimension > 1:
-                raise NotImplementedError("stiffness by areas has patch tests, tests/unit/test_membrane_modulus.py")
+                k[e] = constant * by_area[e]
             elif family == "bend":
                 k[e] = 16 * constant / h**2
             elif mesh.dimension == 1:
