@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
+from dataclasses import dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Unpack, cast
+from typing import TYPE_CHECKING, Any, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,10 +44,14 @@ from springbench.solvers.model.step_problem import Positions, Solver, StopRule
 from springbench.solvers.plugins import plugin_discovery
 from springbench.solvers.registry import SOLVER_TABLE
 
+if TYPE_CHECKING:
+    from springbench.harness.recording.notebook_viewer import NotebookViewer
+
 __all__ = [
     "IntegratorName",
     "OptionKeys",
     "PngImage",
+    "RunRecording",
     "SceneKeys",
     "Simulation",
     "SolverName",
@@ -61,6 +63,7 @@ __all__ = [
     "make_scene",
     "open_recording",
     "run_config",
+    "view_recording",
 ]
 
 
@@ -251,7 +254,7 @@ def run_config(
         folder: folder of the scenes and the code that a mapping names.
         results: folder that contains a results folder for each sweep.
         rerun: whether to repeat runs that have results.
-    Returns: the rows, in the type that `load_rows` returns.
+    Returns: the rows, a pandas DataFrame.
     Raises:
         InputError: for any mistake in the config.
 
@@ -261,7 +264,7 @@ def run_config(
         >>> rows = springbench.run_config(sweep, name="small", folder="configs/scenes")
     """
     from springbench.harness.console import get_error_console
-    from springbench.harness.execution.progress_display import ProgressLines
+    from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.sweep_runner import run_sweep
     from springbench.harness.report.report_plugins import run_reports
     from springbench.harness.results.folder_ownership import claim_folder
@@ -276,7 +279,7 @@ def run_config(
         sweep = config_loader.load_config(path)
     place = claim_folder(Path(results) / sweep.name, path)
     table = run_sweep(
-        sweep.name, sweep.list_runs(), place, ProgressLines(get_error_console()), lambda line: None, rerun=rerun
+        sweep.name, sweep.list_runs(), place, create_display(get_error_console()), lambda line: None, rerun=rerun
     )
     run_reports(sweep.reports, table, place, sweep.options.time_limit)
     return _to_dataframe(table)
@@ -308,11 +311,11 @@ def _to_plain_data(value: Any, at: ConfigKey = ()) -> Any:
 def load_rows(folder: str | Path) -> Any:
     """Load the rows of a sweep's results folder, such as "results/quickstart"; raise InputError.
 
-    Returns: a polars DataFrame if polars is installed, else a pandas DataFrame, else a pyarrow table.
+    Returns: a pandas DataFrame; the columns are described in configs/reference/columns.md.
 
     Example:
         >>> rows = springbench.load_rows("results/small")
-        >>> sorted(set(rows["solver"].to_pylist()))
+        >>> sorted(set(rows["solver"]))
         ['newton', 'sparse']
     """
     from springbench.harness.results.parquet_rows import read_rows
@@ -322,13 +325,32 @@ def load_rows(folder: str | Path) -> Any:
 
 
 def _to_dataframe(table: Any) -> Any:
-    if find_spec("polars"):
-        return import_module("polars").from_arrow(table)
-    return table.to_pandas() if find_spec("pandas") else table
+    """Convert rows to a DataFrame in which columns of integers and truth values may lack some."""
+    import pandas as pd
+    import pyarrow as pa
+
+    return table.to_pandas(types_mapper={pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype()}.get)
 
 
-def open_recording(path: str | Path) -> RecordingReplay:
-    """Open a recording; raise InputError if it cannot be read.
+class RunRecording(RecordingReplay):
+    """A finished run, read from its recording, of which a notebook displays the picture."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        """Return the title and the numbers of frames and vertices."""
+        frames, vertices, _ = self.positions.shape
+        return f"RunRecording({self.title!r}, {frames} frames of {vertices} vertices)"
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the picture that a notebook displays; None where nothing can be drawn."""
+        from springbench.harness.report.opengl_probe import find_opengl_problem
+
+        return None if find_opengl_problem() else draw_picture(self).content
+
+
+def open_recording(path: str | Path) -> RunRecording:
+    """Open a recording, of which a notebook displays the picture; raise InputError if it cannot be read.
 
     Returns: times (k,) [s], positions (k, n, 3) [m] relative to `origin` (3,), springs and scalars. Its method
     `absolute_positions(k)` adds the origin in double precision.
@@ -340,7 +362,31 @@ def open_recording(path: str | Path) -> RecordingReplay:
     """
     from springbench.harness.recording.recording_reader import read_replay
 
-    return read_replay(Path(path))
+    replay = read_replay(Path(path))
+    return RunRecording(**{field.name: getattr(replay, field.name) for field in fields(replay)})
+
+
+def view_recording(path: str | Path, *, width: int = 960, height: int = 600) -> NotebookViewer:
+    """Show a recording in Rerun's viewer, in the output of a notebook cell.
+
+    Args:
+        path: path of the recording.
+        width: width in pixels.
+        height: height in pixels.
+    Returns: the viewer, which a notebook displays at the end of a cell.
+    Raises:
+        InputError: if the recording cannot be read, or the extra `notebook` is not installed.
+
+    Example:
+        >>> springbench.view_recording(path, height=480).height
+        480
+    """
+    from springbench.harness.recording.notebook_viewer import NotebookViewer
+    from springbench.harness.recording.recording_reader import open_recording_source
+
+    viewer = NotebookViewer(Path(path), width, height)
+    with open_recording_source(viewer.path):
+        return viewer
 
 
 @dataclass(frozen=True, slots=True)

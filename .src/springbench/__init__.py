@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         IntegratorName,
         OptionKeys,
         PngImage,
+        RunRecording,
         SceneKeys,
         Simulation,
         SolverName,
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
         make_scene,
         open_recording,
         run_config,
+        view_recording,
     )
     from springbench.harness.errors import (
         InputError,
@@ -92,6 +94,7 @@ _EXPORTS = {
         "IntegratorName",
         "OptionKeys",
         "PngImage",
+        "RunRecording",
         "SceneKeys",
         "Simulation",
         "SolverName",
@@ -103,6 +106,7 @@ _EXPORTS = {
         "make_scene",
         "open_recording",
         "run_config",
+        "view_recording",
     ],
     "springbench.harness.errors": ["InputError", "InputMistake", "RunFailed", "SpringbenchError"],
     "springbench.harness.scenes.effects.effect_interface": [
@@ -156,6 +160,7 @@ __all__ = [
     "PreparedSolver",
     "ProjectiveEnergy",
     "RunFailed",
+    "RunRecording",
     "SceneEffect",
     "SceneKeys",
     "Simulation",
@@ -180,6 +185,7 @@ __all__ = [
     "make_scene",
     "open_recording",
     "run_config",
+    "view_recording",
 ]
 
 

@@ -28,4 +28,4 @@ if __name__ == "__main__":
     }
     here = Path(globals().get("__file__", "configs/examples/own_solver.py")).parent  # a notebook is no file
     rows = springbench.run_config(sweep, name="heavy-ball", folder=here)
-    print(rows.select(["solver", "num_iterations"]))
+    print(rows[["solver", "num_iterations"]])

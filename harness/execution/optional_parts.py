@@ -38,6 +38,8 @@ class OptionalPart(NamedTuple):
 RECORDINGS = OptionalPart("record", "recordings", "Rerun", ("rerun", "rerun_bindings", "rerun_cli"))
 PICTURES = OptionalPart("pictures", "pictures of scenes", "PyVista and VTK", ("pyvista", "vtkmodules"))
 OPTIONAL_PARTS = (RECORDINGS, PICTURES)
+NOTEBOOKS = OptionalPart("notebook", "the viewer in a notebook", "rerun-notebook", ("rerun_notebook", "rerun"))
+"""No part of the complete installation, as programs without a notebook have no use for it."""
 
 
 def find_part(error: ModuleNotFoundError) -> OptionalPart | None:

@@ -1,4 +1,4 @@
-"""Progress of a sweep: bars with the remaining time on a terminal, plain lines elsewhere.
+"""Progress of a sweep: bars with the remaining time on a terminal and in a notebook, plain lines elsewhere.
 
 Nothing here runs concurrently with measurements: bars are redrawn between steps, while the clock is stopped.
 """
@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 from time import monotonic
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -105,8 +105,8 @@ class ProgressDisplay(Protocol):
 
 
 def create_display(console: Console) -> ProgressDisplay:
-    """Create bars for a terminal, or lines for any other output."""
-    return ProgressBars(console) if console.is_terminal else ProgressLines(console)
+    """Create bars for a terminal or a notebook, or lines for any other output."""
+    return ProgressBars(console) if console.is_terminal or console.is_jupyter else ProgressLines(console)
 
 
 class RemainingTime:
@@ -241,11 +241,32 @@ def _format_running(going: Sequence[_RunState]) -> str:
     return f"{run.title}: {run.status_text}, {100 * run.fraction_done:.0f} %{others}"
 
 
+class _NotebookProgress(Progress):
+    """Bars that a notebook redraws in place, by the update of an output, which needs no widgets."""
+
+    _drawn: Any = None
+
+    def start(self) -> None:
+        """Display the bars."""
+        from IPython.display import display
+
+        self._drawn = display(self, display_id=True)
+
+    def refresh(self) -> None:
+        """Redraw the bars."""
+        if self._drawn is not None:
+            self._drawn.update(self)
+
+    def stop(self) -> None:
+        """Redraw the bars for the last time."""
+        self.refresh()
+
+
 class ProgressBars:
     """One progress bar for the sweep and one for each started run."""
 
     def __init__(self, console: Console) -> None:
-        self._bars = Progress(
+        self._bars = (_NotebookProgress if console.is_jupyter else Progress)(
             TextColumn("{task.description}"),
             BarColumn(),
             TextColumn("{task.percentage:>3.0f} %"),
@@ -300,6 +321,7 @@ class ProgressBars:
 
     def finish_sweep(self) -> None:
         """Stop the bars."""
+        self._bars.update(self._sweep, phase="")
         self._bars.stop()
 
 

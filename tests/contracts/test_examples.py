@@ -26,7 +26,9 @@ PUBLIC_NAMES = {
         "make_scene",
         "open_recording",
         "run_config",
+        "view_recording",
         "PngImage",
+        "RunRecording",
     ),
     *("InputError", "InputMistake", "RunFailed", "SpringbenchError"),
     # types of names and keys

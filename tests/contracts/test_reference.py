@@ -78,7 +78,8 @@ def test_a_docstring_becomes_text_lists_and_code() -> None:
     assert build_anchor("The `dense` one: a-b") == "the-dense-one-a-b"
 
 
-EXAMPLES = ["load_scene", "make_scene", "Simulation", "run_config", "load_rows", "open_recording", "draw_picture"]
+EXAMPLES = ["load_scene", "make_scene", "Simulation", "run_config", "load_rows", "open_recording"]
+EXAMPLES += ["draw_picture", "view_recording"]
 
 
 def run_examples(names: list[str]) -> None:

@@ -1,13 +1,17 @@
-"""A notebook shows the picture of a simulation, and its text where nothing can be drawn."""
+"""A notebook shows pictures of simulations and runs, Rerun's viewer, tables and progress."""
 
 from __future__ import annotations
 
 import io
+from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 import springbench
+from nbclient import NotebookClient
 from PIL import Image
+from springbench.harness.execution.optional_parts import NOTEBOOKS, OptionalPart
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.report import opengl_probe
 
@@ -44,3 +48,48 @@ def test_nothing_is_shown_where_nothing_can_be_drawn(
 ):
     monkeypatch.setattr(opengl_probe, "find_opengl_problem", lambda: "no OpenGL")
     assert simulation._repr_png_() is None
+
+
+CELLS = (
+    """
+import springbench
+sweep = {"scenes": ["chain"], "sizes": [5], "solvers": ["sparse"],
+         "options": {"frames": 2, "rounds": 1, "pictures": False}}
+springbench.run_config(sweep, name="small")
+""",
+    """
+from pathlib import Path
+(path,) = Path("results/small/recordings").glob("*.rrd")
+springbench.view_recording(path)
+""",
+    "springbench.open_recording(path)",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not NOTEBOOKS.is_installed(), reason=NOTEBOOKS.describe_absence())
+@pytest.mark.skipif(opengl_probe.find_opengl_problem() is not None, reason="needs OpenGL")
+def test_a_notebook_shows_progress_rows_the_viewer_and_the_picture_of_a_run(tmp_path: Path):
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in CELLS])
+    NotebookClient(
+        notebook, timeout=120, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    sweep, viewer, picture = ([dict(output.get("data", {})) for output in cell.outputs] for cell in notebook.cells)
+    bars, line, rows = sweep
+    assert "100 %" in bars["text/plain"], "the bar is redrawn in place"
+    assert "sweep" in bars["text/html"]
+    assert "chain 5 sparse" in line["text/plain"]
+    assert "<table" in rows["text/html"]
+    assert any("rerun_notebook.Viewer" in output["text/plain"] for output in viewer)
+    assert all("application/vnd.jupyter.widget-view+json" in output for output in viewer)
+    assert picture[0]["text/plain"] == "RunRecording('chain 5 - sparse', 3 frames of 5 vertices)"
+    assert len(picture[0]["image/png"]) > 10_000
+
+
+def test_the_viewer_names_what_it_needs_and_reads_recordings_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(OptionalPart, "is_installed", lambda part: False)
+    with pytest.raises(springbench.InputError, match=r'pip install "springbench\[notebook\]"'):
+        springbench.view_recording(tmp_path / "a.rrd")
+    monkeypatch.setattr(OptionalPart, "is_installed", lambda part: True)
+    with pytest.raises(springbench.InputError, match="there is no such file"):
+        springbench.view_recording(tmp_path / "a.rrd")
