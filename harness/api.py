@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Unpack, cast
+from typing import TYPE_CHECKING, Any, Literal, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -366,12 +366,12 @@ def open_recording(path: str | Path) -> RunRecording:
     return RunRecording(**{field.name: getattr(replay, field.name) for field in fields(replay)})
 
 
-def view_recording(path: str | Path, *, width: int = 960, height: int = 600) -> NotebookViewer:
+def view_recording(path: str | Path, *, width: int | Literal["auto"] = "auto", height: int = 600) -> NotebookViewer:
     """Show a recording in Rerun's viewer, in the output of a notebook cell.
 
     Args:
         path: path of the recording.
-        width: width in pixels.
+        width: width in pixels, or "auto" for that of the cell.
         height: height in pixels.
     Returns: the viewer, which a notebook displays at the end of a cell.
     Raises:

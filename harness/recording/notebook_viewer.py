@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from springbench.harness.errors import InputError
 from springbench.harness.execution.optional_parts import NOTEBOOKS
@@ -17,12 +18,12 @@ class NotebookViewer:
 
     Attributes:
       path: path of the recording.
-      width: width in pixels.
+      width: width in pixels, or "auto" for that of the cell.
       height: height in pixels.
     """
 
     path: Path
-    width: int
+    width: int | Literal["auto"]
     height: int
 
     def __post_init__(self) -> None:

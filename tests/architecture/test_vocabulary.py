@@ -47,7 +47,7 @@ COMMANDS = _split_words(
 """Commands of the command line."""
 REQUIRED = _split_words(
     "invoke emit filter finalize codegen enable disable flush load store shuffle save again search "
-    "dot3 cross3 subtract3"
+    "dot3 cross3 subtract3 start stop refresh"
 )
 """Methods whose names a base class of a library prescribes, and operations of vector registers and of LLVM."""
 NOUN_PROPERTIES = _split_words("verdict scene rows columns kill info speedup motion")
