@@ -28,10 +28,9 @@ LIMITS = """What springs cannot do:
 
 * A network of springs has no Poisson's ratio of its own. On square cells the diagonals alone resist shear, and they add
   to the stiffness along the threads.
-* Bending is that of an isotropic sheet. It lacks the friction and hysteresis of yarns, and the loss of stiffness that
-  fabrics show with curvature.
-* Compressed cells resist until the mesh buckles, where yarns give way at once. Drape is therefore stiffer than that of
-  a fabric, the more so on coarse meshes."""
+* Bending is that of an isotropic sheet with one rigidity, of the least curvature. Folds bend fabrics further, where
+  they are softer: drape is therefore stiffer than that of a fabric. Friction and hysteresis of yarns are missing.
+* Compressed cells resist until the mesh buckles, where yarns give way at once; so drape is stiffer on coarse meshes."""
 """Statement of the model's limits, on every page."""
 
 
