@@ -1,4 +1,4 @@
-"""The command line: plants lies, says who found them out, and keeps what it has found."""
+"""The command line: plants errors, reports which tests catch them, and stores the outcomes."""
 
 from __future__ import annotations
 
@@ -11,69 +11,89 @@ from queue import SimpleQueue
 from tempfile import TemporaryDirectory
 
 from tests.mutations import runner
-from tests.mutations.base import ROOT, Mutation, Stale
+from tests.mutations.base import ROOT, Mutation, StaleMutation
 from tests.mutations.planted import TABLE
-from tests.mutations.runner import Copy, Outcome, examine
+from tests.mutations.runner import Outcome, SourceCopy
 
 
-def arguments() -> argparse.Namespace:
-    """What was asked for."""
-    parser = argparse.ArgumentParser(prog="python -m tests.mutations", description="Plants lies and runs tests.")
-    parser.add_argument("names", nargs="*", metavar="NAME", help="lies to plant; all where none is named")
+def parse_arguments() -> argparse.Namespace:
+    """The options of the command line."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutations", description="Plants errors and runs tests.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="errors to plant (default: all)")
     parser.add_argument("--again", action="store_true", help="also those whose outcome is known")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="how many at once (2)")
     parser.add_argument("--whole", type=int, default=0, metavar="N", help="N of them, with all tests instead")
     options = parser.parse_args()
-    unknown = set(options.names) - {lie.name for lie in TABLE}
+    unknown = set(options.names) - {mutation.name for mutation in TABLE}
     if unknown:
-        parser.error(f"there is no lie {', '.join(sorted(unknown))}; there are {', '.join(lie.name for lie in TABLE)}")
+        names = ", ".join(mutation.name for mutation in TABLE)
+        parser.error(f"no planted error has the name {', '.join(sorted(unknown))}; the names are {names}")
     if options.jobs < 1 or not 0 <= options.whole <= len(TABLE):
         parser.error(f"--jobs should be at least 1, and --whole from 0 to {len(TABLE)}")
     return options
 
 
 def main() -> int:
-    """Exit code 0 where all were found out, 1 where not, 2 where the sources do not fit the table any more."""
-    options = arguments()
-    chosen = [lie for lie in TABLE if not options.names or lie.name in options.names]
+    """Plant the errors. Exit code 0 if all are caught, 1 if one is not, 2 if the table does not fit the sources, 3 if a
+    time-out leaves one undecided."""
+    options = parse_arguments()
+    chosen = [mutation for mutation in TABLE if not options.names or mutation.name in options.names]
     if options.whole:
         chosen = random.Random(0).sample(chosen, min(options.whole, len(chosen)))
     try:
-        for lie in chosen:
-            lie.applied(ROOT)
-    except Stale as error:
+        for mutation in chosen:
+            mutation.apply(ROOT)
+    except StaleMutation as error:
         print(error, file=sys.stderr)
         return 2
-    suffix = " whole" if options.whole else ""
-    today, saved = runner.sources(), runner.known()
+    whole = bool(options.whole)
+    suffix = " whole" if whole else ""
+    stored = runner.read_outcomes()
 
-    def done(lie: Mutation) -> bool:
-        found = saved.get(lie.name + suffix)
-        return bool(found and (found.entry, found.sources) == (lie.digest, today) and not options.again)
+    def is_known(mutation: Mutation) -> bool:
+        known = stored.get(mutation.name + suffix)
+        digests = (mutation.digest, runner.digest_sources(mutation, whole=whole))
+        return bool(known and known.decided and (known.entry, known.sources) == digests and not options.again)
 
-    outcomes = [saved[lie.name + suffix] for lie in chosen if done(lie)]
+    def last_seconds(mutation: Mutation) -> float:
+        known = stored.get(mutation.name + suffix)
+        return known.seconds if known else 0.0
+
+    outcomes = [stored[mutation.name + suffix] for mutation in chosen if is_known(mutation)]
+    missing = sorted((mutation for mutation in chosen if not is_known(mutation)), key=last_seconds)
     if outcomes:
         print(f"{len(outcomes)} of {len(chosen)} are known already")
     with TemporaryDirectory() as folder, ThreadPoolExecutor(options.jobs) as workers:
-        copies: SimpleQueue[Copy] = SimpleQueue()
+        digests = {mutation.name: runner.digest_sources(mutation, whole=whole) for mutation in missing}
+        copies: SimpleQueue[SourceCopy] = SimpleQueue()
         for job in range(options.jobs):
-            copies.put(Copy(Path(folder) / str(job)))
+            copies.put(SourceCopy(Path(folder) / str(job)))
 
-        def one(lie: Mutation) -> Outcome:
+        def examine_next(mutation: Mutation) -> Outcome:
             copy = copies.get()
             try:
-                return examine(copy, lie, whole=bool(options.whole))
+                return runner.examine(copy, mutation, digests[mutation.name], whole=whole)
             finally:
                 copies.put(copy)
 
-        for outcome in workers.map(one, [lie for lie in chosen if not done(lie)]):
-            runner.keep(outcome.name + suffix, outcome)
+        for outcome in workers.map(examine_next, missing):
+            runner.store_outcome(outcome.name + suffix, outcome)
             outcomes.append(outcome)
             product = f", by the product {outcome.product}" if outcome.product else ""
             print(f"{outcome.name}: {outcome.tests}{product} ({outcome.seconds:.0f} s) {outcome.failed}", flush=True)
-    left = [outcome.name for outcome in outcomes if not outcome.found_out]
-    print(f"{len(outcomes) - len(left)} of {len(outcomes)} found out" + (f"; not: {', '.join(left)}" if left else ""))
-    return 1 if left else 0
+    return summarise_outcomes(outcomes)
+
+
+def summarise_outcomes(outcomes: list[Outcome]) -> int:
+    """Print how many are caught, and which are not. Returns the exit code."""
+    undecided = [outcome.name for outcome in outcomes if not outcome.decided]
+    missed = [outcome.name for outcome in outcomes if outcome.decided and not outcome.caught]
+    print(
+        f"{sum(outcome.caught for outcome in outcomes)} of {len(outcomes)} caught"
+        + (f"; not caught: {', '.join(missed)}" if missed else "")
+        + (f"; undecided, run again: {', '.join(undecided)}" if undecided else "")
+    )
+    return 1 if missed else 3 if undecided else 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Lies in how results are read together, packed, merged, published and verified, and in locks."""
+"""Planted errors in how results are read together, packed, merged, published and verified, and in locks."""
 
 from __future__ import annotations
 

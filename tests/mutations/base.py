@@ -1,4 +1,4 @@
-"""What a planted lie is, and how it is planted."""
+"""What a planted error is, and how it is planted."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 
 
-class Stale(Exception):
-    """The sources have changed, and a fragment is not there exactly once; the message says which and what to do."""
+class StaleMutation(Exception):
+    """A fragment does not stand in today's sources exactly once; the message names it and says what to do."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mutation:
-    """A lie: `fragment`, which stands in the file exactly once, becomes `replacement`.
+    """A planted error: `fragment`, which stands in the file exactly once, becomes `replacement`.
 
-    file: relative to the root; tests: as pytest takes them, of which at least one must fail; product: of a lie that a
-    run must find out by itself, the solver to run and a word of the reason in its row.
+    file: relative to the root; tests: as pytest takes them, of which at least one must fail; product: for an error that
+    a run must detect by itself, the solver to run and a word of the reason in its row.
     """
 
     name: str
@@ -28,15 +28,15 @@ class Mutation:
     tests: tuple[str, ...]
     product: tuple[str, str] | None = None
 
-    def applied(self, root: Path) -> str:
-        """The file's text with the lie in it. Raises Stale."""
+    def apply(self, root: Path) -> str:
+        """The file's text with the error in it. Raises StaleMutation."""
         path = root / self.file
         if not path.is_file():
-            raise Stale(f"{self.name}: there is no {self.file}; say in tests/mutations where it is now")
+            raise StaleMutation(f"{self.name}: there is no {self.file}; say in tests/mutations where it is now")
         text = path.read_text()
         found = text.count(self.fragment)
         if found != 1:
-            raise Stale(
+            raise StaleMutation(
                 f"{self.name}: {self.fragment!r} stands {found} times in {self.file}, and should stand there once; "
                 "mend the fragment in tests/mutations"
             )
@@ -44,10 +44,5 @@ class Mutation:
 
     @property
     def digest(self) -> str:
-        """Of all that the table says of it."""
+        """Digest of this entry of the table."""
         return hashlib.sha256(repr(self).encode()).hexdigest()[:12]
-
-    @property
-    def compiled(self) -> bool:
-        """Whether compiled code may hold what it changes, so that none from before will do."""
-        return self.file.startswith("solvers/") or self.file == "harness/recording/strain_shading.py"

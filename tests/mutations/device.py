@@ -1,4 +1,4 @@
-"""Lies in what runs on a device; their tests run in Numba's simulator."""
+"""Planted errors in what runs on a device; their tests run in Numba's simulator."""
 
 from __future__ import annotations
 

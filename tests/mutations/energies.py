@@ -1,4 +1,4 @@
-"""Lies in energies, contact and effects: name, file, fragment, replacement, tests."""
+"""Planted errors in energies, contact and effects: name, file, fragment, replacement, tests."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""Lies in measuring, recordings and pictures. Those with a third part are found out by the product as well: by a run of
-that solver, whose row gives the reason."""
+"""Planted errors in measuring, recordings and pictures.
+
+The product must detect those with a third part too: by a run of that solver, whose row gives the reason.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lies in what tables, pictures, figures and the page state of runs."""
+"""Planted errors in what tables, pictures, figures and the page state of runs."""
 
 from __future__ import annotations
 

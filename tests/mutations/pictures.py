@@ -1,4 +1,4 @@
-"""Lies in recordings, pictures and the page, as `tests.mutations.measuring` has others."""
+"""Planted errors in recordings, pictures and the page."""
 
 from __future__ import annotations
 

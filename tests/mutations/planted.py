@@ -1,4 +1,4 @@
-"""All planted lies."""
+"""All planted errors."""
 
 from __future__ import annotations
 

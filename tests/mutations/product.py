@@ -1,4 +1,4 @@
-"""A run of one solver, whose row is printed: whether the product finds a lie out by itself.
+"""A run of one solver, whose row is printed: whether the product detects an error by itself.
 
 python -m tests.mutations.product SOLVER
 """

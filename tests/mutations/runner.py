@@ -1,7 +1,6 @@
-"""Plants one lie after the other in a copy of the sources and runs the tests that must fail.
+"""Plants one error after the other in a copy of the sources and runs the tests of which one must fail.
 
-The copy stays in one place, so that code which a lie cannot have changed is compiled once; where it can have, compiled
-code goes to a folder of the lie's own.
+Compiled code is cached by the content of its sources, so only the kernels that an error changes are compiled again.
 """
 
 from __future__ import annotations
@@ -10,11 +9,13 @@ import hashlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from time import monotonic
 
@@ -23,23 +24,27 @@ from tests.mutations.base import ROOT, Mutation
 FOLDERS = (".src", "harness", "solvers", "configs", "tests", "results", ".github")
 SOURCES = (*FOLDERS, "pyproject.toml", "README.md", "CITATION.cff")
 OUTCOMES = Path(__file__).with_name("outcomes.json")
-LONGEST = 600.0
-"""Seconds after which tests count as hanging, which is noticed too."""
-WHOLE = 3600.0
+TEST_SECONDS, SUITE_SECONDS = 900.0, 3600.0
+"""Wall-clock limits [s] of an error's own tests and of the whole suite. A time-out decides nothing: a busy machine is
+slow too."""
 PYTEST = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
-ROOMS = ("architecture", "unit", "oracles", "contracts", "stability", "bench")
-"""All tests, the short ones first: the suite ends with the first that the lie makes fail."""
-OF_THE_TABLE = "--ignore=tests/unit/test_mutations.py"
-"""Its tests fail where any lie is planted, for its entry then fits no more: they find nothing out."""
-FEW = 5
-"""Failures after which the whole suite ends: chance is behind some of them, and each start over costs minutes."""
-CAUGHT, SURVIVED, BROKEN = "caught", "survived", "broken"
+TEST_FOLDERS = ("architecture", "unit", "oracles", "contracts", "stability", "bench")
+"""All tests, the short ones first: the suite ends with the first that the error makes fail."""
+IGNORED_TESTS = "--ignore=tests/unit/test_mutations.py"
+"""Tests of the table fail for any planted error, because its entry no longer fits: they catch nothing."""
+MAX_FAILURES = 5
+"""Failures after which the whole suite ends: some are by chance, and each restart costs minutes."""
+CAUGHT, SURVIVED, BROKEN, TIMED_OUT = "caught", "survived", "broken", "timed out"
+_TIME_OUT_CODE = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of a lie: by its tests, or by all of them; by the product, empty where it need not; seconds; the
-    digests of the table's entry and of the sources; the first test that failed."""
+    """What became of an error.
+
+    tests, product: how its tests and the run of the product ended, `product` empty if none is needed; seconds: of
+    both; entry, sources: digests of the table's entry and of the sources; failed: the first test that failed.
+    """
 
     name: str
     tests: str
@@ -50,43 +55,60 @@ class Outcome:
     failed: str = ""
 
     @property
-    def found_out(self) -> bool:
-        """Whether all who must have found it out have."""
+    def caught(self) -> bool:
+        """Whether a test failed, and the product detected it if it must."""
         return self.tests == CAUGHT and self.product in ("", CAUGHT)
 
+    @property
+    def decided(self) -> bool:
+        """Whether nothing timed out."""
+        return TIMED_OUT not in (self.tests, self.product)
 
-def sources() -> str:
-    """A digest of what is planted in, and of the tests; not of this table, whose entries have their own."""
+
+def digest_sources(mutation: Mutation, *, whole: bool = False) -> str:
+    """A digest of all that an outcome depends on: the product, the helpers of tests, and the error's own test files.
+
+    whole: all test files instead. The table is left out; its entries have digests of their own.
+    """
+    own = {ROOT / test.partition("::")[0] for test in mutation.tests}
     digest = hashlib.sha256()
-    for part in ("harness", "solvers", "tests"):
-        for path in sorted((ROOT / part).rglob("*.py")):
-            if path.parent != OUTCOMES.parent:
-                digest.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
+    for path, content in _read_sources():
+        if whole or path in own or not path.name.startswith("test_"):
+            digest.update(content)
     return digest.hexdigest()[:12]
 
 
-def known() -> dict[str, Outcome]:
-    """The outcomes that are kept, by `name`, with ` whole` behind it for those of the whole suite."""
+@cache
+def _read_sources() -> list[tuple[Path, bytes]]:
+    """All Python files but the table's, with the digests of their names and contents."""
+    paths = (path for part in ("harness", "solvers", "tests") for path in sorted((ROOT / part).rglob("*.py")))
+    return [
+        (path, hashlib.sha256(path.relative_to(ROOT).as_posix().encode() + path.read_bytes()).digest())
+        for path in paths
+        if path.parent != OUTCOMES.parent
+    ]
+
+
+def read_outcomes() -> dict[str, Outcome]:
+    """The stored outcomes by name, with ` whole` appended for those of the whole suite."""
     if not OUTCOMES.exists():
         return {}
-    return {key: Outcome(**found) for key, found in json.loads(OUTCOMES.read_text()).items()}
+    return {key: Outcome(**fields) for key, fields in json.loads(OUTCOMES.read_text()).items()}
 
 
-def keep(key: str, outcome: Outcome) -> None:
-    """Add one to those that are kept; a kill leaves the file as it was, or with it."""
-    fields = {name: getattr(outcome, name) for name in Outcome.__slots__}
-    found = {name: {field: getattr(o, field) for field in Outcome.__slots__} for name, o in known().items()}
+def store_outcome(key: str, outcome: Outcome) -> None:
+    """Add one outcome to the stored ones; the file is replaced at once, so a kill cannot damage it."""
+    outcomes = {name: asdict(known) for name, known in (read_outcomes() | {key: outcome}).items()}
     partial = OUTCOMES.with_name(f".{OUTCOMES.name}.partial")
-    partial.write_text(json.dumps(dict(sorted((found | {key: fields}).items())), indent=1) + "\n")
+    partial.write_text(json.dumps(dict(sorted(outcomes.items())), indent=1) + "\n")
     os.replace(partial, OUTCOMES)
 
 
-class Copy:
-    """A copy of the sources in a folder; lies are planted there."""
+class SourceCopy:
+    """A copy of the sources in a folder, in which errors are planted."""
 
     def __init__(self, folder: Path) -> None:
         self._root, self._compiled = folder / "sources", folder / "compiled"
-        self._own = folder / "own"
         self._root.mkdir(parents=True)
         ignored = shutil.ignore_patterns("__pycache__", ".*", "*.rrd", "*.parquet")
         for name in SOURCES:
@@ -97,85 +119,96 @@ class Copy:
                 shutil.copy2(source, self._root / name)
 
     @contextmanager
-    def planted(self, lie: Mutation) -> Iterator[None]:
-        """With the lie in its file, which is then as it was, its time included. Raises Stale."""
-        path = self._root / lie.file
+    def planted(self, mutation: Mutation) -> Iterator[None]:
+        """Plant an error; afterwards its file is as before, its times included. Raises StaleMutation."""
+        path = self._root / mutation.file
         text, times = path.read_bytes(), path.stat()
-        path.write_text(lie.applied(self._root))
+        path.write_text(mutation.apply(self._root))
         try:
             yield
         finally:
             path.write_bytes(text)
             os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
-            shutil.rmtree(self._own, ignore_errors=True)
 
-    def run_command(self, lie: Mutation, command: list[str], limit: float) -> tuple[int, str]:
-        """The exit code of a Python command in the copy, and what it printed; -1 where it takes too long."""
-        cache = self._own if lie.compiled else self._compiled
-        environment = os.environ | {
+    def run_command(self, mutation: Mutation, command: list[str], limit: float) -> tuple[int, str]:
+        """Run a Python command in the copy; returns its exit code and output, or -1 after `limit` seconds."""
+        environment = {"NUMBA_CACHE_DIR": str(self._compiled)} | os.environ
+        environment |= {
             "PYTHONPATH": os.pathsep.join((str(self._root / ".src"), str(self._root))),
-            "NUMBA_CACHE_DIR": str(cache),
-            "PYTHONDONTWRITEBYTECODE": "1",  # a lie and the truth may have one length, and one second
+            "PYTHONDONTWRITEBYTECODE": "1",  # the file may have the same length and time with the error as without
         }
-        if any(test.startswith("tests/cuda/") for test in lie.tests):
+        if any(test.startswith("tests/cuda/") for test in mutation.tests):
             environment["NUMBA_ENABLE_CUDASIM"] = "1"
+        process = subprocess.Popen(
+            [sys.executable, *command],
+            cwd=self._root,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
         try:
-            done = subprocess.run(
-                [sys.executable, *command],
-                cwd=self._root,
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=limit,
-            )
+            output, _ = process.communicate(timeout=limit)
         except subprocess.TimeoutExpired:
-            return -1, ""
-        return done.returncode, done.stdout + done.stderr
+            os.killpg(process.pid, signal.SIGKILL)  # workers of a hanging test too
+            process.communicate()
+            return _TIME_OUT_CODE, ""
+        return process.returncode, output
 
 
-def _run(copy: Copy, lie: Mutation, chosen: Iterable[str], limit: float, most: int = 1) -> tuple[int, list[str]]:
-    """The exit code of the tests with a lie in place, which end at so many failures, and the tests that failed, or what
-    was said last."""
-    with copy.planted(lie):
-        code, output = copy.run_command(lie, [*PYTEST, f"--maxfail={most}", *chosen], limit)
+def _run_tests(
+    copy: SourceCopy, mutation: Mutation, tests: Iterable[str], limit: float, max_failures: int = 1
+) -> tuple[int, list[str]]:
+    """Run tests with an error planted; returns the exit code and the tests that failed, or the last line of output."""
+    with copy.planted(mutation):
+        code, output = copy.run_command(mutation, [*PYTEST, f"--maxfail={max_failures}", *tests], limit)
     lines = output.splitlines()
     failures = [line.removeprefix("FAILED ").split(" - ")[0] for line in lines if line.startswith("FAILED ")]
     return code, failures or lines[-1:] or [""]
 
 
-def _by_the_lie(copy: Copy, lie: Mutation, test: str) -> bool:
-    """Whether a test fails with the lie once more, and does not without: else chance found out what it did."""
-    again, _ = _run(copy, lie, [test], LONGEST)
-    truth, _ = copy.run_command(lie, [*PYTEST, test], LONGEST)
-    return again != 0 and truth == 0
+def _fails_by_error(copy: SourceCopy, mutation: Mutation, test: str) -> bool:
+    """Whether a test fails with the error once more, and passes without it: otherwise it failed by chance."""
+    with_error, _ = _run_tests(copy, mutation, [test], TEST_SECONDS)
+    without, _ = copy.run_command(mutation, [*PYTEST, test], TEST_SECONDS)
+    return with_error == 1 and without == 0
 
 
-def _run_all(copy: Copy, lie: Mutation) -> tuple[int, str]:
-    """The exit code of the whole suite and the first test that the lie makes fail."""
+def _run_suite(copy: SourceCopy, mutation: Mutation) -> tuple[int, str]:
+    """The exit code of the whole suite and the first test that the error makes fail."""
     by_chance: list[str] = []
     while True:
-        others = [OF_THE_TABLE, *(f"--deselect={test}" for test in by_chance)]
-        code, failed = _run(copy, lie, [*(f"tests/{room}" for room in ROOMS), *others], WHOLE, FEW)
+        others = [IGNORED_TESTS, *(f"--deselect={test}" for test in by_chance)]
+        chosen = [*(f"tests/{folder}" for folder in TEST_FOLDERS), *others]
+        code, failed = _run_tests(copy, mutation, chosen, SUITE_SECONDS, MAX_FAILURES)
         if code != 1:
             return code, failed[0]
         for test in failed:
-            if _by_the_lie(copy, lie, test):
+            if _fails_by_error(copy, mutation, test):
                 return code, test
         by_chance += failed
 
 
-def examine(copy: Copy, lie: Mutation, *, whole: bool = False) -> Outcome:
-    """Plant a lie, and see who finds it out. Raises Stale."""
+def examine(copy: SourceCopy, mutation: Mutation, sources: str, *, whole: bool = False) -> Outcome:
+    """Plant an error, and find out whether tests and product catch it. Raises StaleMutation."""
     began = monotonic()
     if whole:
-        code, failed = _run_all(copy, lie)
+        code, failed = _run_suite(copy, mutation)
     else:
-        code, (failed, *_) = _run(copy, lie, lie.tests, LONGEST)
-    tests = {0: SURVIVED, 1: CAUGHT, -1: CAUGHT}.get(code, BROKEN)
-    product = ""
-    if lie.product and not whole:
-        solver, reason = lie.product
-        with copy.planted(lie):
-            _, said = copy.run_command(lie, ["-m", "tests.mutations.product", solver], LONGEST)
-        product = CAUGHT if "failed:" in said and reason in said else SURVIVED
-    return Outcome(lie.name, tests, product, round(monotonic() - began, 1), lie.digest, sources(), failed)
+        code, (failed, *_) = _run_tests(copy, mutation, mutation.tests, TEST_SECONDS)
+    tests = {0: SURVIVED, 1: CAUGHT, _TIME_OUT_CODE: TIMED_OUT}.get(code, BROKEN)
+    product = "" if whole else _examine_product(copy, mutation)
+    return Outcome(mutation.name, tests, product, round(monotonic() - began, 1), mutation.digest, sources, failed)
+
+
+def _examine_product(copy: SourceCopy, mutation: Mutation) -> str:
+    """Whether a run of the product detects an error by itself; empty if it need not."""
+    if not mutation.product:
+        return ""
+    solver, reason = mutation.product
+    with copy.planted(mutation):
+        code, output = copy.run_command(mutation, ["-m", "tests.mutations.product", solver], TEST_SECONDS)
+    if code == _TIME_OUT_CODE:
+        return TIMED_OUT
+    return CAUGHT if "failed:" in output and reason in output else SURVIVED

@@ -1,4 +1,4 @@
-"""Lies in integrators, steps, matrices and methods: name, file, fragment, replacement, tests."""
+"""Planted errors in integrators, steps, matrices and methods: name, file, fragment, replacement, tests."""
 
 from __future__ import annotations
 

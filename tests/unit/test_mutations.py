@@ -1,4 +1,4 @@
-"""The table of planted lies fits the sources as they are; `python -m tests.mutations` plants them."""
+"""The table of planted errors fits the sources as they are; `python -m tests.mutations` plants them."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from pathlib import Path
 
 import pytest
 
-from tests.mutations.base import ROOT, Mutation, Stale
+from tests.mutations.__main__ import summarise_outcomes
+from tests.mutations.base import ROOT, Mutation, StaleMutation
 from tests.mutations.planted import TABLE
-from tests.mutations.runner import PYTEST, Copy, examine
+from tests.mutations.runner import PYTEST, SourceCopy, examine
 
 
 def test_there_are_sixty_of_them_and_each_has_a_name_of_its_own():
     assert len(TABLE) >= 60
-    assert len({lie.name for lie in TABLE}) == len(TABLE)
-    assert len({(lie.file, lie.fragment, lie.replacement, lie.tests) for lie in TABLE}) == len(TABLE)
+    assert len({mutation.name for mutation in TABLE}) == len(TABLE)
+    assert len({(mutation.file, mutation.fragment, mutation.replacement, mutation.tests) for mutation in TABLE}) == len(
+        TABLE
+    )
 
 
-@pytest.mark.parametrize("lie", TABLE, ids=lambda lie: lie.name)
-def test_each_can_be_planted_and_names_tests_that_exist(lie: Mutation):
-    changed = lie.applied(ROOT)
-    if lie.file.endswith(".py"):
+@pytest.mark.parametrize("mutation", TABLE, ids=lambda mutation: mutation.name)
+def test_each_can_be_planted_and_names_tests_that_exist(mutation: Mutation):
+    changed = mutation.apply(ROOT)
+    if mutation.file.endswith(".py"):
         ast.parse(changed)
-    assert changed != (ROOT / lie.file).read_text()
-    for test in lie.tests:
+    assert changed != (ROOT / mutation.file).read_text()
+    for test in mutation.tests:
         path, _, name = test.partition("::")
         assert f"def {name or 'test_'}" in (ROOT / path).read_text()
 
@@ -41,28 +44,28 @@ def test_the_command_that_runs_them_is_one_that_pytest_knows():
 
 
 def test_what_stands_elsewhere_or_twice_is_refused(tmp_path: Path):
-    lie = replace(TABLE[0], file="here.py", fragment="x = 1")
-    with pytest.raises(Stale, match=r"there is no here\.py"):
-        lie.applied(tmp_path)
+    mutation = replace(TABLE[0], file="here.py", fragment="x = 1")
+    with pytest.raises(StaleMutation, match=r"there is no here\.py"):
+        mutation.apply(tmp_path)
     for text, times in (("y = 1\n", 0), ("x = 1\nx = 1\n", 2)):
         (tmp_path / "here.py").write_text(text)
-        with pytest.raises(Stale, match=f"stands {times} times in here.py"):
-            lie.applied(tmp_path)
+        with pytest.raises(StaleMutation, match=f"stands {times} times in here.py"):
+            mutation.apply(tmp_path)
 
 
-class ByChance(Copy):
-    """Tests that are known beforehand: the first failure is chance's, the second the lie's."""
+class ChanceFailures(SourceCopy):
+    """Tests with known results: the first failure is by chance, the second by the error."""
 
     def __init__(self) -> None:
         self.planted_now, self.whole = False, 0
 
     @contextmanager
-    def planted(self, lie: Mutation) -> Iterator[None]:
+    def planted(self, mutation: Mutation) -> Iterator[None]:
         self.planted_now = True
         yield
         self.planted_now = False
 
-    def run_command(self, lie: Mutation, command: list[str], limit: float) -> tuple[int, str]:
+    def run_command(self, mutation: Mutation, command: list[str], limit: float) -> tuple[int, str]:
         if "tests/unit" in command:
             self.whole += 1
             failed = "test_found" if "--deselect=test_chance[a b]" in command else "test_chance[a b]"
@@ -70,7 +73,32 @@ class ByChance(Copy):
         return int(self.planted_now and "test_found" in command), "1 passed"
 
 
-def test_a_test_of_the_whole_suite_that_failed_by_chance_finds_nothing_out():
-    copy = ByChance()
-    found = examine(copy, TABLE[0], whole=True)
+def test_a_test_of_the_whole_suite_that_fails_by_chance_catches_nothing():
+    copy = ChanceFailures()
+    found = examine(copy, TABLE[0], "", whole=True)
     assert (found.tests, found.failed, copy.whole) == ("caught", "test_found", 2)
+
+
+def test_a_time_out_catches_nothing_and_is_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """A busy machine is slow too, so a time-out says nothing about the error."""
+    for path, text in (("waits.py", "import time\ntime.sleep(600)\n"), ("ends.py", "raise SystemExit(1)\n")):
+        (tmp_path / path).write_text(text)
+
+    class Waiting(SourceCopy):
+        def __init__(self) -> None:
+            self._root, self._compiled = tmp_path, tmp_path
+
+        @contextmanager
+        def planted(self, mutation: Mutation) -> Iterator[None]:
+            yield
+
+        def run_command(self, mutation: Mutation, command: list[str], limit: float) -> tuple[int, str]:
+            return super().run_command(mutation, ["waits.py" if "pytest" in command else "ends.py"], 0.5)
+
+    found = examine(Waiting(), TABLE[0], "")
+    assert (found.tests, found.decided, found.caught) == ("timed out", False, False)
+    caught = replace(found, tests="caught")
+    assert (caught.decided, caught.caught) == (True, True)
+    missed = replace(found, tests="survived")
+    assert [summarise_outcomes(some) for some in ([caught], [found, missed], [caught, found])] == [0, 1, 3]
+    assert f"1 of 2 caught; undecided, run again: {found.name}" in capsys.readouterr().out
