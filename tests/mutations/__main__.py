@@ -70,9 +70,10 @@ def main() -> int:
             copies.put(SourceCopy(Path(folder) / str(job)))
 
         def examine_next(mutation: Mutation) -> Outcome:
-            copy = copies.get()
+            copy, known = copies.get(), stored.get(mutation.name)
+            before = known.failed if known else ""
             try:
-                return runner.examine(copy, mutation, digests[mutation.name], whole=whole)
+                return runner.examine(copy, mutation, digests[mutation.name], whole=whole, failed_before=before)
             finally:
                 copies.put(copy)
 

@@ -190,16 +190,31 @@ def _run_suite(copy: SourceCopy, mutation: Mutation) -> tuple[int, str]:
         by_chance += failed
 
 
-def examine(copy: SourceCopy, mutation: Mutation, sources: str, *, whole: bool = False) -> Outcome:
-    """Plant an error, and find out whether tests and product catch it. Raises StaleMutation."""
+def examine(
+    copy: SourceCopy, mutation: Mutation, sources: str, *, whole: bool = False, failed_before: str = ""
+) -> Outcome:
+    """Plant an error, and find out whether tests and product catch it. Raises StaleMutation.
+
+    failed_before: the test that caught it last time; of the error's own tests it is run first.
+    """
     began = monotonic()
     if whole:
         code, failed = _run_suite(copy, mutation)
     else:
-        code, (failed, *_) = _run_tests(copy, mutation, mutation.tests, TEST_SECONDS)
+        code, failed = _run_own_tests(copy, mutation, failed_before)
     tests = {0: SURVIVED, 1: CAUGHT, _TIME_OUT_CODE: TIMED_OUT}.get(code, BROKEN)
     product = "" if whole else _examine_product(copy, mutation)
     return Outcome(mutation.name, tests, product, round(monotonic() - began, 1), mutation.digest, sources, failed)
+
+
+def _run_own_tests(copy: SourceCopy, mutation: Mutation, failed_before: str) -> tuple[int, str]:
+    """The exit code of an error's own tests and the first that failed."""
+    if failed_before.startswith(mutation.tests):
+        code, failed = _run_tests(copy, mutation, [failed_before], TEST_SECONDS)
+        if code == 1:
+            return code, failed[0]
+    code, failed = _run_tests(copy, mutation, mutation.tests, TEST_SECONDS)
+    return code, failed[0]
 
 
 def _examine_product(copy: SourceCopy, mutation: Mutation) -> str:

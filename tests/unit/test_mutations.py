@@ -79,6 +79,24 @@ def test_a_test_of_the_whole_suite_that_fails_by_chance_catches_nothing():
     assert (found.tests, found.failed, copy.whole) == ("caught", "test_found", 2)
 
 
+def test_the_test_that_caught_it_last_time_is_run_first():
+    class Recorded(ChanceFailures):
+        def __init__(self) -> None:
+            super().__init__()
+            self.commands: list[str] = []
+
+        def run_command(self, mutation: Mutation, command: list[str], limit: float) -> tuple[int, str]:
+            self.commands.append(command[-1])
+            return int(len(self.commands) != 2), f"FAILED {command[-1]} - why"
+
+    mutation, copy = TABLE[0], Recorded()
+    before = f"{mutation.tests[0]}::test_before"
+    assert examine(copy, mutation, "", failed_before=before).failed == before
+    assert examine(copy, mutation, "", failed_before=before).failed == mutation.tests[-1], "it no longer catches it"
+    assert examine(copy, mutation, "", failed_before="tests/other.py::test_other").failed == mutation.tests[-1]
+    assert copy.commands == [before, before, mutation.tests[-1], mutation.tests[-1]]
+
+
 def test_a_time_out_catches_nothing_and_is_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A busy machine is slow too, so a time-out says nothing about the error."""
     for path, text in (("waits.py", "import time\ntime.sleep(600)\n"), ("ends.py", "raise SystemExit(1)\n")):
