@@ -14,6 +14,7 @@ def main() -> None:
     interrupts.install_handler()
     try:
         _prepare_environment()
+        _announce_start()
         from springbench.harness.cli.main import main as run_command
 
         run_command()
@@ -42,6 +43,13 @@ def _prepare_environment() -> None:
             file=sys.stderr,
         )
         sys.exit(2)
+
+
+def _announce_start() -> None:
+    """Show on a terminal that the command is being loaded; its first line of output replaces the words."""
+    if len(sys.argv) > 1 and sys.stderr is not None and sys.stderr.isatty():
+        sys.stderr.write("loading ...\r")
+        sys.stderr.flush()
 
 
 if __name__ == "__main__":

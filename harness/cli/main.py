@@ -6,7 +6,6 @@ test, 130 stopped by Ctrl-C.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from copy import copy
@@ -314,9 +313,9 @@ def query(
 @app.command()
 def schema() -> None:
     """Print the JSON Schema of scenes and sweeps."""
-    from springbench.harness.config.json_schema import build_json_schema as config_schema
+    from springbench.harness.config.schema_cache import read_config_schema
 
-    print(json.dumps(config_schema(), indent=2))
+    print(read_config_schema())
 
 
 @app.command()

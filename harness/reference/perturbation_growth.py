@@ -17,7 +17,6 @@ from math import ceil, floor, log10
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 from springbench.harness.reference.equations_of_motion import OdeField, OdeState, build_ode_scene
 from springbench.harness.reference.reference_trajectory import CHECK_PERTURBATION as ROUND_OFF
 from springbench.harness.reference.reference_trajectory import REFERENCE_MARGIN, UnpredictableMotion
@@ -170,6 +169,8 @@ def _build_motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, O
                 return np.concatenate(ends)
 
             return scene, field.initial_state, composed
+    from scipy.integrate import solve_ivp  # takes a third of a second to import
+
     scene = build_ode_scene(spec, size)
     field = OdeField(scene)
     atol = _RTOL * (scene.mesh.bounding_box_diagonal or 1.0)

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import ode, solve_ivp
 from springbench.harness.errors import RunFailed
 from springbench.harness.reference.equations_of_motion import OdeField, OdeState
 from springbench.harness.scenes.scene_builder import Scene
@@ -132,6 +131,8 @@ def _integrate_dop853(
     field: Callable[[float, OdeState], OdeState], y: OdeState, times: Sequence[float], atol: float
 ) -> OdeState:
     """Integrate the states (k, 6 f); steps end at each time, without interpolation."""
+    from scipy.integrate import solve_ivp  # takes a third of a second to import
+
     path, begin = list[OdeState](), 0.0
     for end in times:
         solved = solve_ivp(field, (begin, end), y, "DOP853", [end], rtol=INTEGRATION_RTOL, atol=atol)
@@ -146,6 +147,8 @@ def _integrate_adams(
     field: Callable[[float, OdeState], OdeState], y: OdeState, times: Sequence[float], atol: float
 ) -> OdeState:
     """Integrate the states (k, 6 f) by Adams methods."""
+    from scipy.integrate import ode
+
     solver = ode(field).set_integrator("vode", method="adams", rtol=INTEGRATION_RTOL, atol=atol, order=12, nsteps=10**8)
     solver.set_initial_value(y, 0.0)
     path = list[OdeState]()

@@ -106,6 +106,14 @@ def digest_package(package: str) -> str:
     return digest.hexdigest()
 
 
+def stamp_sources(*others: str) -> str:
+    """Return the SHA-256 digest, in hexadecimal digits, of path, time and size of each source, and of other text.
+
+    It identifies the state of a checkout or an installation in a tenth of the time of `digest_sources`.
+    """
+    return hashlib.sha256(repr((sorted(_FIRST_STAMPS.items()), others)).encode()).hexdigest()
+
+
 @cache
 def find_class_sources(made: type) -> frozenset[Path]:
     """Return the source files of a class and of its base classes, without those of libraries."""

@@ -20,7 +20,6 @@ from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.execution.worker_process import TaskLimits
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
-from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, format_method_name
 from springbench.harness.experiments.error_control.method_search import (
     SearchResult,
@@ -35,7 +34,6 @@ from springbench.harness.experiments.error_control.stored_trials import (
     read_stored_trials,
     select_promising_methods,
 )
-from springbench.harness.experiments.error_control.third_party_comparison import compare_third_party as peers_of
 from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.experiments.run_pipeline import save_positions
 from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
@@ -128,6 +126,7 @@ def _execute_error_control(
     rerun: bool,
     print_message: PrintMessage,
 ) -> bool:
+    print_message("estimating how far ahead the motion can be predicted")
     error_target = ErrorTarget.from_scene(scene, size, t_end, print_message)
     folder = claim_folder(results / config.stem, config)
     with machine_info.limit_threads(1):
@@ -216,6 +215,8 @@ def _verify_error(
 
     The result is None if there is none.
     """
+    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
+
     try:
         trajectory = open_reference_store(results).load_trajectory(
             error_target.scene, error_target.size, [error_target.t_end], error=error
@@ -284,6 +285,8 @@ def _build_third_party_rows(
     print_message: PrintMessage,
 ) -> list[dict[str, Any]]:
     """Build the rows of third-party integrators, and print their relative times."""
+    from springbench.harness.experiments.error_control.third_party_comparison import compare_third_party as peers_of
+
     shared = {name: row[name] for name in _SHARED_COLUMNS} | build_provenance_columns()
     found = list[dict[str, Any]]()
     print_message("third-party integrators, in the same process, to the same error:")

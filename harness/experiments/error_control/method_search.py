@@ -66,8 +66,10 @@ _MIN_REFERENCE_REFINEMENT = 10.0
 _MAX_SETTING_CHANGES, _MAX_STALLS, _MAX_REFERENCE_TRIALS = 6, 2, 3
 _MIN_TIMED_SECONDS = 0.05
 """CPU time below which a trial is run twice, and the smaller time counts [s]."""
-_INITIAL_TIME_LIMIT, _TIME_LIMIT_FACTOR = 1.0, 4.0
-"""First time limit of a method [s of CPU time]; factor on the limit if no method finishes, and on the cheapest time."""
+_INITIAL_TIME_LIMIT, _TIME_LIMIT_GROWTH = 1.0, 4.0
+"""Time limit of a method until one has finished [s of CPU time], and its growth if none has."""
+_MIN_TIME_LIMIT, _TIME_LIMIT_FACTOR = 0.02, 3.0
+"""Least time limit of the other methods [s of CPU time]: a few interruptions; and its factor on the cheapest time."""
 _MAX_COST_RATIO = 2.0
 """Factor on the predicted cost of the next method, above which that method is tried first."""
 _MIN_ORDER = 0.5
@@ -264,14 +266,13 @@ class _MethodSearch:
             for way in methods:
                 try:
                     found.append(self._run_trial(way, way.stepper.initial_setting(step_atol), limit))
-                    limit = max(
-                        _INITIAL_TIME_LIMIT, _TIME_LIMIT_FACTOR * min(one.trajectory.cpu_seconds for one in found)
-                    )
+                    cheapest = min(one.trajectory.cpu_seconds for one in found)
+                    limit = max(_MIN_TIME_LIMIT, _TIME_LIMIT_FACTOR * cheapest)
                 except StepSizeUnderflow as error:
                     stuck.append(error)
                 except TimeBudgetExceeded:
                     late.append((way, limit))
-            methods, limit = [way for way, _ in late], _TIME_LIMIT_FACTOR * limit
+            methods, limit = [way for way, _ in late], _TIME_LIMIT_GROWTH * limit
             for way, given in late if found else ():
                 self._print_message(f"  {way}: given up after {given:.3g} s, for it is slower than others")
         if not found:

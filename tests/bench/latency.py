@@ -1,0 +1,377 @@
+"""Measure how long a user waits for each command.
+
+    python -m tests.bench.latency [--repeats 5] [--only WORD ...] [--publish results/published/latency]
+
+Each measurement is a process of its own. Its wall time counts, its processor time (user and system, with all its child
+processes), and the wall time until its first output. A table shows the medians. Commands that take minutes are measured
+only where `--only` names them. A row states what was cold; bytecode and the file cache of the system are warm unless
+it says otherwise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from time import perf_counter, process_time
+from typing import Any
+
+import pyarrow as pa
+from rich.table import Table
+from springbench.harness.console import get_output_console
+from springbench.harness.experiments.archive.study_publication import (
+    summarise_provenance,
+    write_published_table,
+    write_study_file,
+)
+from springbench.harness.experiments.provenance import build_provenance_columns
+from springbench.harness.results import parquet_rows, run_schema
+from springbench.harness.results.published_set import TABLE_FILES, compute_file_digest
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+QUICKSTART = CHECKOUT / "configs" / "quickstart.yaml"
+NUM_STORED_RUNS = 3000
+"""Number of runs that the query reads."""
+Command = Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyRow:
+    """A command that a user waits for.
+
+    Attributes:
+        description: what the user does.
+        wanted_seconds: target of the measured value [s].
+        command: arguments of `springbench`; or of Python, if the first is `-m`. RESULTS stands for a fresh folder.
+        setup: the same commands, done once before each measurement.
+        cold: what is cold.
+        environment: variables of the process; FOLDER stands for an empty folder.
+        is_long: whether it takes minutes.
+        value_key: key of the measured value in the JSON output; the wall time if empty.
+        prepare: fills the folder of results before all repeats.
+    """
+
+    description: str
+    wanted_seconds: float
+    command: Command
+    setup: Sequence[Command] = ()
+    cold: str = "nothing"
+    environment: Mapping[str, str] | None = None
+    is_long: bool = False
+    value_key: str = ""
+    prepare: Callable[[Path], None] | None = None
+
+
+def _copy_runs(results: Path) -> None:
+    """Fill a folder of results with NUM_STORED_RUNS files of rows, from the runs of the quick start."""
+    template = results / "quickstart" / "rows"
+    files = sorted(template.glob("*.parquet"))
+    target = results / "many" / "rows"
+    shutil.rmtree(target, ignore_errors=True)
+    target.mkdir(parents=True)
+    for k in range(NUM_STORED_RUNS):
+        source = files[k % len(files)]
+        shutil.copyfile(source, target / f"{source.stem[:-12]}{k:012x}.parquet")
+
+
+_AGAIN = ("run", "hanging-cloth", "--size", "8", "--frames", "10", "--results", "RESULTS", "--rerun")
+_AGAIN_NUMBA, _AGAIN_HYBRID = (*_AGAIN, "--solver", "numba"), (*_AGAIN, "--solver", "hybrid")
+_TO_ERROR = ("run", "hanging-cloth", "--size", "17", "--error", "1e-4", "--t-end", "0.1", "--results", "RESULTS")
+_CHAIN = ("run", "chain", "--size", "9", "--error", "1e-4", "--t-end", "0.5", "--results", "RESULTS")
+_SWEEP = ("run", str(QUICKSTART), "--results", "RESULTS")
+_IN_PROCESS = ("-m", "tests.bench.latency", "--in-process")
+
+LATENCY_ROWS = {
+    "sweep-again": LatencyRow("the same sweep again, all of it done", 0.7, _SWEEP, (_SWEEP,)),
+    "again-numba": LatencyRow("--rerun of a small run, numba", 2.5, _AGAIN_NUMBA, (_AGAIN_NUMBA,)),
+    "again-hybrid": LatencyRow("--rerun of a small run, hybrid", 3.5, _AGAIN_HYBRID, (_AGAIN_HYBRID,)),
+    "list": LatencyRow("list", 0.3, ("list",)),
+    "schema": LatencyRow("schema", 0.5, ("schema",)),
+    "query": LatencyRow(
+        f"query on {NUM_STORED_RUNS:,} runs",
+        0.8,
+        ("query", "select solver, count(*) from rows group by solver", "--results", "RESULTS"),
+        (_SWEEP,),
+        prepare=_copy_runs,
+    ),
+    "figure": LatencyRow("figure", 1.5, ("figure", "timing", "RESULTS/quickstart", "-o", "RESULTS/figures"), (_SWEEP,)),
+    "preview": LatencyRow("preview", 1.5, ("preview", "hanging-cloth", "-o", "RESULTS/p.png"), cold="the picture"),
+    "error-search": LatencyRow("run --error 1e-4, hanging cloth of 17", 1.5, (*_TO_ERROR, "--rerun"), (_TO_ERROR,)),
+    "recommend-chain": LatencyRow(
+        "recommend, chain", 12.0, ("recommend", "chain", "--error", "1e-2", "--results", "RESULTS"), cold="results"
+    ),
+    "recommend-cloth": LatencyRow(
+        "recommend, hanging cloth of 16",
+        12.0,
+        ("recommend", "hanging-cloth", "--size", "16", "--error", "1e-2", "--results", "RESULTS"),
+        cold="results",
+    ),
+    "chain-motion": LatencyRow(
+        "chain of 9, 0.5 s to 1e-4, the chosen motion", 0.3e-3, (*_IN_PROCESS, "chain-motion"), value_key="seconds"
+    ),
+    "verlet-substep": LatencyRow(
+        "velocity Verlet, cloth of 17 a side, a substep", 4e-6, (*_IN_PROCESS, "verlet-substep"), value_key="seconds"
+    ),
+    "useful-share": LatencyRow(
+        "share of processor time beside timed passes, 100 short runs",
+        0.4,
+        (*_IN_PROCESS, "useful-share"),
+        value_key="share",
+        is_long=True,
+    ),
+    "first-run-numba": LatencyRow(
+        "first run, numba",
+        8.0,
+        _AGAIN_NUMBA,
+        cold="compiled kernels",
+        environment={"NUMBA_CACHE_DIR": "FOLDER"},
+        is_long=True,
+    ),
+    "first-run-hybrid": LatencyRow(
+        "first run, hybrid",
+        12.0,
+        _AGAIN_HYBRID,
+        cold="compiled kernels",
+        environment={"NUMBA_CACHE_DIR": "FOLDER"},
+        is_long=True,
+    ),
+    "first-error-search": LatencyRow(
+        "first run --error 1e-4, hanging cloth of 17",
+        12.0,
+        _TO_ERROR,
+        cold="compiled kernels",
+        environment={"NUMBA_CACHE_DIR": "FOLDER"},
+        is_long=True,
+    ),
+    "gates": LatencyRow(
+        "the default gates", 240.0, ("-m", "pytest", "-q", "tests/bench", "--benchmark-only"), is_long=True
+    ),
+    "regress": LatencyRow("regress against a revision", 180.0, ("regress", "--baseline", "HEAD"), is_long=True),
+    "setup": LatencyRow(
+        "README's first command in an empty clone",
+        60.0,
+        (*_IN_PROCESS, "setup"),
+        cold="the clone and its kernels, not the cache of packages",
+        value_key="seconds",
+        is_long=True,
+    ),
+    "tests": LatencyRow(
+        "README's second command, the tests alone",
+        180.0,
+        ("-m", "pytest", "-q", "-n", "2", "--dist", "loadfile"),
+        is_long=True,
+    ),
+}
+"""Rows by name."""
+
+MEASUREMENT_SCHEMA = run_schema.build_schema(
+    (
+        run_schema.ColumnSpec("row", pa.string(), "", "name of the row"),
+        run_schema.ColumnSpec("description", pa.string(), "", "what the user does"),
+        run_schema.ColumnSpec("cold", pa.string(), "", "what was cold"),
+        run_schema.ColumnSpec("repeat", pa.int64(), "", "number of the measurement, from 0"),
+        run_schema.ColumnSpec("wanted_seconds", pa.float64(), "s", "target of the value"),
+        run_schema.ColumnSpec("value", pa.float64(), "s", "wall time, or what the row measures"),
+        run_schema.ColumnSpec("wall_seconds", pa.float64(), "s", "wall time of the process"),
+        run_schema.ColumnSpec("cpu_seconds", pa.float64(), "s", "processor time of the process and its children"),
+        run_schema.ColumnSpec("first_output_seconds", pa.float64(), "s", "wall time until the first output"),
+    )
+)
+
+
+def measure_command(
+    command: Command, folder: Path, environment: Mapping[str, str] | None = None, *, checked: bool = True
+) -> dict[str, Any]:
+    """Run a command in a process of its own, and return its times [s] and its output.
+
+    Args:
+        command: command of a row.
+        folder: what RESULTS stands for.
+        environment: variables of the process; FOLDER stands for a new empty folder.
+        checked: whether a failure raises.
+
+    Raises:
+        RuntimeError: the command failed.
+    """
+    arguments = [word.replace("RESULTS", str(folder)) for word in command]
+    arguments = [sys.executable, *arguments] if arguments[0] == "-m" else [_find_console_script(), *arguments]
+    with TemporaryDirectory() as empty:
+        variables = {key: value.replace("FOLDER", empty) for key, value in (environment or {}).items()}
+        began = perf_counter()
+        process = subprocess.Popen(
+            arguments,
+            cwd=CHECKOUT,
+            env=os.environ | variables,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+        assert process.stdout is not None
+        output = os.read(process.stdout.fileno(), 1 << 16)
+        first = perf_counter() - began
+        output += process.stdout.read()
+        _, status, used = os.wait4(process.pid, 0)  # with all children that the process has waited for
+        wall = perf_counter() - began
+        process.returncode = os.waitstatus_to_exitcode(status)
+    text = output.decode(errors="replace")
+    if checked and process.returncode:
+        raise RuntimeError(f"{' '.join(arguments)} ended with exit code {process.returncode}:\n{text[-2000:]}")
+    cpu = used.ru_utime + used.ru_stime
+    return {"wall_seconds": wall, "cpu_seconds": cpu, "first_output_seconds": first, "output": text}
+
+
+def measure_row(name: str, repeats: int, warm: Path) -> list[dict[str, Any]]:
+    """Measure a row, and return one measurement for each repeat.
+
+    Args:
+        name: name of the row.
+        repeats: number of measurements.
+        warm: folder of results for all rows; what the setup finds there is not done again.
+    """
+    row, found = LATENCY_ROWS[name], list[dict[str, Any]]()
+    for command in row.setup:
+        measure_command(command, warm)
+    if row.prepare:
+        row.prepare(warm)
+    with TemporaryDirectory() as temporary:
+        for repeat in range(repeats):
+            folder = Path(temporary) / f"cold-{repeat}" if "results" in row.cold else warm
+            folder.mkdir(exist_ok=True)
+            measured = measure_command(row.command, folder, row.environment, checked=not row.is_long)
+            output = measured.pop("output")
+            value = json.loads(output.splitlines()[-1])[row.value_key] if row.value_key else measured["wall_seconds"]
+            stated = {"row": name, "description": row.description, "cold": row.cold, "repeat": repeat}
+            found.append(stated | {"wanted_seconds": row.wanted_seconds, "value": value} | measured)
+    return found
+
+
+def _find_console_script() -> str:
+    return str(Path(sys.executable).with_name("springbench"))
+
+
+def measure_chain_motion() -> dict[str, float]:
+    """Return the wall time [s] of the motion that `run chain --error 1e-4` chooses."""
+    with TemporaryDirectory() as temporary:
+        measure_command(_CHAIN, Path(temporary))
+        (path,) = Path(temporary).glob("*/accuracy/*.parquet")
+        rows = parquet_rows.read_rows([path], pa.schema([])).to_pylist()
+    return {"seconds": next(row["seconds"][0] for row in rows if row["kind"] == "error-control")}
+
+
+def measure_verlet_substep() -> dict[str, float]:
+    """Return the processor time [s] of a substep of velocity Verlet, the least of several motions."""
+    from springbench.harness.config.config_loader import load_scene_in_process
+    from springbench.harness.execution.machine_info import limit_threads
+    from springbench.harness.scenes.scene_builder import build_scene
+    from springbench.harness.simulation.time_loop import prepare, simulate_scene
+    from springbench.solvers.methods.time_stepping.explicit_integrators import VelocityVerlet
+    from springbench.solvers.model.step_problem import StopRule
+
+    with limit_threads(1):
+        scene = build_scene(
+            load_scene_in_process(CHECKOUT / "configs" / "scenes" / "hanging-cloth.yaml"), 17, "substepping"
+        )
+        prepared = prepare(scene, VelocityVerlet())
+        times = list[float]()
+        for _ in range(7):
+            began, substeps = process_time(), 0
+            for step in simulate_scene(scene, prepared, StopRule(1), initial_guess="previous", frames=40):
+                substeps += step.solution.num_iterations
+            times.append((process_time() - began) / substeps)
+    return {"seconds": min(times)}
+
+
+def measure_useful_share() -> dict[str, float]:
+    """Return the share of the processor time of 100 short runs that is not spent in their timed passes."""
+    from tests.sweep_overhead import measure_short_runs
+
+    with TemporaryDirectory() as temporary:
+        found = measure_short_runs(100, Path(temporary))
+    return {"share": 1.0 - found["timed_cpu_seconds"] / found["cpu_seconds"]}
+
+
+def measure_setup() -> dict[str, float]:
+    """Return the wall time [s] of README's first command in an empty clone."""
+    with TemporaryDirectory() as folder:
+        subprocess.run(["git", "clone", "-q", str(CHECKOUT), folder], check=True)
+        command = "bash .ci/setup && .venv/bin/springbench run configs/quickstart.yaml"
+        variables = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+        began = perf_counter()
+        subprocess.run(["bash", "-c", command], cwd=folder, env=variables, stdout=sys.stderr, check=True)
+        return {"seconds": perf_counter() - began}
+
+
+IN_PROCESS = {
+    "setup": measure_setup,
+    "chain-motion": measure_chain_motion,
+    "verlet-substep": measure_verlet_substep,
+    "useful-share": measure_useful_share,
+}
+
+
+def print_medians(measurements: Sequence[Mapping[str, Any]]) -> None:
+    """Print the medians of each row."""
+    table = Table("row", "cold", "wanted", "value", "wall s", "processor s", "first output s")
+    for name in dict.fromkeys(one["row"] for one in measurements):
+        some = [one for one in measurements if one["row"] == name]
+        middle = {key: median(one[key] for one in some) for key in _NUMBERS}
+        table.add_row(name, some[0]["cold"], f"{some[0]['wanted_seconds']:.3g}", *(f"{v:.3g}" for v in middle.values()))
+    get_output_console().print(table)
+
+
+_NUMBERS = ("value", "wall_seconds", "cpu_seconds", "first_output_seconds")
+
+
+def publish_measurements(measurements: Sequence[Mapping[str, Any]], folder: Path) -> None:
+    """Write the measurements as a study of the published set; rows that were not measured now stay as they were."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / TABLE_FILES["measurements"]
+    known = parquet_rows.read_rows([path], MEASUREMENT_SCHEMA).to_pylist() if path.exists() else []
+    now = {one["row"] for one in measurements}
+    kept = [one for one in known if one["row"] not in now and one["row"] in LATENCY_ROWS]
+    rows = sorted([*kept, *measurements], key=lambda one: (list(LATENCY_ROWS).index(one["row"]), one["repeat"]))
+    write_published_table(path, pa.Table.from_pylist([dict(one) for one in rows], MEASUREMENT_SCHEMA))
+    metadata = {
+        "config": os.path.relpath(QUICKSTART, folder.resolve()),
+        "config_digest": compute_file_digest(QUICKSTART),
+        "command": "python -m tests.bench.latency",
+        "is_timed": True,
+        **summarise_provenance([build_provenance_columns()]),
+        "runs": len(rows),
+    }
+    write_study_file(folder, metadata)
+
+
+def main() -> None:
+    """Measure the rows that the arguments name."""
+    parser = argparse.ArgumentParser(description="Measure how long a user waits for each command.")
+    parser.add_argument("--repeats", type=int, default=5, help="measurements of a row")
+    parser.add_argument("--only", nargs="*", choices=LATENCY_ROWS, metavar="ROW", help=", ".join(LATENCY_ROWS))
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    parser.add_argument("--results", type=Path, help="results of an earlier call, which the setup does not repeat")
+    parser.add_argument("--in-process", choices=IN_PROCESS, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.in_process:
+        print(json.dumps(IN_PROCESS[options.in_process]()))
+        return
+    names = options.only or [name for name, row in LATENCY_ROWS.items() if not row.is_long]
+    measurements = list[dict[str, Any]]()
+    with TemporaryDirectory() as temporary:
+        warm = (options.results or Path(temporary)).resolve()
+        for number, name in enumerate(names):
+            print(f"[{number + 1}/{len(names)}] {name}: {LATENCY_ROWS[name].description}", file=sys.stderr, flush=True)
+            measurements += measure_row(name, options.repeats, warm)
+            if options.publish:
+                publish_measurements(measurements, options.publish)
+    print_medians(measurements)
+
+
+if __name__ == "__main__":
+    main()
