@@ -6,6 +6,7 @@ test, 130 stopped by Ctrl-C.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from copy import copy
@@ -313,9 +314,15 @@ def query(
 @app.command()
 def schema() -> None:
     """Print the JSON Schema of scenes and sweeps."""
-    from springbench.harness.config.schema_cache import read_config_schema
+    from springbench.harness.execution.source_cache import read_cached_text
 
-    print(read_config_schema())
+    print(read_cached_text("schema", _build_schema_text))
+
+
+def _build_schema_text() -> str:
+    from springbench.harness.config.json_schema import build_json_schema as config_schema
+
+    return json.dumps(config_schema(), indent=2)
 
 
 @app.command()

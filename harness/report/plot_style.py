@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
 from functools import cache
 from hashlib import sha256
 from typing import Any, NamedTuple
 
 from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgb
+from springbench.harness.execution.source_cache import read_cached_text
 from springbench.harness.recording.strain_scale import STRAIN_COLOURS
 from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, load_target
 
@@ -171,10 +173,13 @@ def _shipped_solver_styles(names: tuple[str, ...]) -> dict[str, SeriesStyle]:
     the shades of their family, get no style here.
     """
     families: dict[str, list[str]] = {}
-    for name in names:
-        families.setdefault(find_solver_info(load_target((SOLVERS | OPTIONAL_SOLVERS)[name]), name).family, []).append(
-            name
-        )
+    targets = {name: (SOLVERS | OPTIONAL_SOLVERS)[name] for name in names}
+
+    def find_families() -> str:
+        return json.dumps({name: find_solver_info(load_target(of), name).family for name, of in targets.items()})
+
+    for name, family in json.loads(read_cached_text("families", find_families, json.dumps(targets))).items():
+        families.setdefault(family, []).append(name)
     markers = dict(zip(names, _ALL_MARKERS, strict=False))
     return {
         name: SeriesStyle(shade_colour(color, by), markers[name], dash)

@@ -106,12 +106,12 @@ def digest_package(package: str) -> str:
     return digest.hexdigest()
 
 
-def stamp_sources(*others: str) -> str:
-    """Return the SHA-256 digest, in hexadecimal digits, of path, time and size of each source, and of other text.
+def stamp_sources() -> str:
+    """Return the SHA-256 digest, in hexadecimal digits, of path, time and size of each source.
 
     It identifies the state of a checkout or an installation in a tenth of the time of `digest_sources`.
     """
-    return hashlib.sha256(repr((sorted(_FIRST_STAMPS.items()), others)).encode()).hexdigest()
+    return hashlib.sha256(repr(sorted(_FIRST_STAMPS.items())).encode()).hexdigest()
 
 
 @cache

@@ -1,19 +1,61 @@
-"""`pytest tests/bench --benchmark-only` runs the gates, prints their ratios and stores their times under results/bench.
-`-k accuracy` runs the goals of accuracy alone."""
+"""`pytest tests/bench --benchmark-only` runs the short gates, prints their ratios and stores their times.
+
+They are stored under results/bench. `--all-gates` runs all gates, `-k accuracy` the goals of accuracy alone."""
 
 import os
+from time import monotonic
 from typing import Any
 
 import pytest
 from springbench.harness.execution.machine_info import collect_versions
+from springbench.harness.experiments.regression.pytest_plugin import DEFAULT_BUDGET
 from threadpoolctl import threadpool_info
 
 from tests.bench.gates import THREADS
+
+SHORT_BUDGET = 30.0
+"""Seconds that a gate of the short set may take: six of them, with their scenes, take four minutes."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all-gates", action="store_true", help="With --benchmark-only: run all gates; takes hours.")
+
+
+def is_short_set(config: pytest.Config) -> bool:
+    """Whether a timed session names no gates, so that the short ones are run."""
+    given = config.invocation_params.args
+    named = any(str(word).startswith(("-k", "-m", "--last-failed")) or "::" in str(word) for word in given)
+    return config.option.benchmark_only and not named
+
+
+class RemainingTime:
+    """Prints after each gate how many there are, and about how long they will take."""
+
+    def __init__(self, config: pytest.Config, count: int, budget: float) -> None:
+        self.reporter: Any = config.pluginmanager.get_plugin("terminalreporter")
+        self.count, self.done, self.start = count, 0, monotonic()
+        self.print_line(f"{count} gates, at most {budget:g} s each and a start of some seconds")
+
+    def print_line(self, words: str) -> None:
+        self.reporter.ensure_newline()
+        self.reporter.write_line(words)
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.when == "teardown":
+            self.done += 1
+            left = (monotonic() - self.start) / self.done * (self.count - self.done)
+            self.print_line(f" {self.done} of {self.count} gates, about {left:.0f} s left")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     # This runs before pytest-benchmark reads its options.
     if config.option.benchmark_only:
+        if config.getoption("--all-gates", default=False):
+            config.option.markexpr = ""
+        elif is_short_set(config):
+            config.option.markexpr = "short"
+            if config.option.paired_benchmark_budget == DEFAULT_BUDGET:
+                config.option.paired_benchmark_budget = SHORT_BUDGET
         config.option.benchmark_enable = True
         config.option.benchmark_storage = f"file://{config.rootpath / 'results' / 'bench'}"
         config.option.benchmark_save = config.option.benchmark_save or "gates"
@@ -33,6 +75,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
             f"{one.name.removeprefix('test_the_gate_holds'):48} {ratio['median']:9.3g} [{ratio['low']:.3g}, "
             f"{ratio['high']:.3g}], target {target:.3g}: {verdict}{and_limit}"
         )
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    config = session.config
+    if config.option.benchmark_only and session.items and not hasattr(config, "workerinput"):
+        remaining = RemainingTime(config, len(session.items), config.option.paired_benchmark_budget)
+        config.pluginmanager.register(remaining, "remaining-time")
 
 
 def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:

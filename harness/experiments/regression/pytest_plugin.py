@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 INCONCLUSIVE_KEY = pytest.StashKey[bool]()
 EXIT_INCONCLUSIVE = 13
+DEFAULT_BUDGET = 60.0
+"""Seconds that a paired benchmark may take."""
 MAX_ROUNDS = 10**9
 """Number of rounds requested from pytest-benchmark; the benchmark ends earlier."""
 
@@ -180,7 +182,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the plugin's command-line options."""
     group = parser.getgroup("springbench")
     group.addoption(
-        "--paired-benchmark-budget", type=float, default=60.0, help="Seconds that a paired benchmark may take; 60."
+        "--paired-benchmark-budget",
+        type=float,
+        default=DEFAULT_BUDGET,
+        help=f"Seconds that a paired benchmark may take; {DEFAULT_BUDGET:g}.",
     )
 
 

@@ -14,6 +14,7 @@ from functools import cache, partial
 from math import ceil
 from pathlib import Path
 from random import sample
+from time import monotonic
 from typing import Any
 
 from springbench.harness.errors import InputError
@@ -32,9 +33,13 @@ from springbench.harness.experiments.regression.revision_process import (
     describe_changes,
     start_workers,
 )
+from springbench.harness.results.regression_verdict import RegressionVerdict
 
 DEFAULT_MAX_RATIO = 1.03
 """Default of the ratio of times from which a program counts as slower."""
+
+FIRST_PASS_SHARE = 1 / 6
+"""Part of the time budget that each of several tests has at first; equal code is clear in less (gate statistics)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,24 +132,45 @@ def compare_revisions(
 ) -> list[tuple[WorkRequest, BenchmarkResult]]:
     """Benchmark this checkout against the revision, and print each result at once.
 
+    Several requests are compared in two passes: the first one decides the clear ones in a part of their time. The error
+    probability is divided among all tests of both passes.
+
     Args:
         revisions: this checkout, then the revision.
         requests: work to compare.
         options: limits of the comparison.
-        print_message: receives one line per result.
+        print_message: receives one line per result, and estimates of the remaining time.
     Raises:
         InputError: if the work fails, or if the answers differ.
     """
-    rule = SequentialTest(options.max_ratio, options.alpha / len(requests))
-    found: list[tuple[WorkRequest, BenchmarkResult]] = []
+    budgets = [options.budget] if len(requests) == 1 else [FIRST_PASS_SHARE * options.budget, options.budget]
+    rule = SequentialTest(options.max_ratio, options.alpha / (len(requests) * len(budgets)))
+    found: dict[int, BenchmarkResult] = {}
     print_once = cache(print_message)  # differences are found at each start
-    for request in requests:
-        result = run_confirmed_benchmark(
-            partial(start_revisions, revisions, request, options, print_once), rule, time_budget=options.budget
-        )
-        print_message(f"{request.title}: {result}")
-        found.append((request, result))
-    return found
+    todo = list(range(len(requests)))
+    for budget in budgets:
+        most = _format_minutes(len(todo) * budget)
+        print_message(f"{len(todo)} comparisons, each for at most {budget:g} s: at most {most}, and their starts")
+        began = monotonic()
+        for done, index in enumerate(todo, start=1):
+            request = requests[index]
+            result = run_confirmed_benchmark(
+                partial(start_revisions, revisions, request, options, print_once), rule, time_budget=budget
+            )
+            found[index] = result
+            is_final = budget == budgets[-1] or result.verdict is not RegressionVerdict.INCONCLUSIVE
+            print_message(f"{request.title}: {result if is_final else 'not clear yet'}")
+            if done < len(todo):
+                left = _format_minutes((monotonic() - began) / done * (len(todo) - done))
+                print_message(f"{done} of {len(todo)}, about {left} left in this pass")
+        todo = [index for index in todo if found[index].verdict is RegressionVerdict.INCONCLUSIVE]
+        if not todo:
+            break
+    return [(request, found[index]) for index, request in enumerate(requests)]
+
+
+def _format_minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
 
 
 @contextmanager

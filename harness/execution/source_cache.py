@@ -1,0 +1,40 @@
+"""Text that follows from the sources of this project, cached for the user until one of them changes.
+
+Such text is derived by importing all solvers, which takes a second or more.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.metadata import version
+
+from springbench.harness.atomic_files import WriteError, atomic_write, user_cache_dir
+from springbench.solvers.jit import source_digest
+
+_LIBRARIES = ("pydantic",)
+"""Libraries that the text depends on."""
+
+
+def read_cached_text(name: str, build_text: Callable[[], str], *inputs: str) -> str:
+    """Return a text from the cache, or build it and store it if possible.
+
+    Args:
+        name: name of the text; a new one replaces the old one of this name.
+        build_text: builds it.
+        inputs: what it depends on, besides the sources.
+    """
+    state = [source_digest.stamp_sources(), sys.version, *map(version, _LIBRARIES), *inputs]
+    path = user_cache_dir("derived") / f"{name}-{hashlib.sha256(repr(state).encode()).hexdigest()[:16]}.txt"
+    with suppress(OSError, UnicodeDecodeError):
+        return path.read_text(encoding="utf-8")
+    text = build_text()
+    with suppress(OSError, WriteError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for older in path.parent.glob(f"{name}-*.txt"):
+            older.unlink(missing_ok=True)
+        with atomic_write(path) as partial:
+            partial.write_text(text, encoding="utf-8")
+    return text
