@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from heapq import heapify, heappop, heappush
 from itertools import groupby
 from math import inf
+from sys import float_info
 from time import monotonic
 from typing import Any
 
@@ -156,6 +157,11 @@ def search(
     return SearchSummary(measured, settings, {reason: count for reason, count in reasons.items() if count})
 
 
+def is_measured(row: Mapping[str, Any]) -> bool:
+    """Return whether a simulation ended well: its error is known, or too small for the reference."""
+    return row["status"] == "ok" or (row["status"] == "uncertified" and row["seconds_per_simulated_second"] is not None)
+
+
 def _slow(error: float) -> str:
     if not error:
         return "they or their faster neighbours take longer than the budget allows"
@@ -163,8 +169,9 @@ def _slow(error: float) -> str:
 
 
 def _outcome(row: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the error and the cost of a row, infinite if there are none."""
-    return (row["error"], row["seconds_per_simulated_second"]) if row["status"] == "ok" else (inf, inf)
+    """Return the error and the cost of a row, infinite if there are none; an unmeasurably small error is almost 0."""
+    cost = row["seconds_per_simulated_second"] if is_measured(row) else inf
+    return row["error"] if row["status"] == "ok" else inf if cost == inf else float_info.min, cost
 
 
 def _limited(spec: WorkSpec, best: float) -> WorkSpec:

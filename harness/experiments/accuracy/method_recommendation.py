@@ -39,7 +39,7 @@ from springbench.harness.experiments.accuracy.accuracy_units import (
     load_reference_trajectory,
     open_reference_store,
 )
-from springbench.harness.experiments.accuracy.best_first import SLOWER, SearchSummary, search
+from springbench.harness.experiments.accuracy.best_first import SLOWER, SearchSummary, is_measured, search
 from springbench.harness.experiments.accuracy.work_precision import build_work_rows
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
@@ -347,7 +347,7 @@ def recommend_method(
     t_end, frame = study.work[0].t_end, scene.time_step
 
     def read_methods() -> tuple[list[MeasuredMethod], list[dict[str, Any]]]:
-        methods, failed_rows = _read_measured_methods(path.stem, scene, size, t_end, results)
+        methods, failed_rows = _read_measured_methods(path.stem, scene, size, t_end, results, goal.reference_error)
         return [one for one in methods if engine in (None, one.work_spec.solver.name)], failed_rows
 
     methods, failed_rows = read_methods()
@@ -360,9 +360,8 @@ def recommend_method(
     within = goal.select_methods(methods, frame)
     if not within:
         raise RunFailed(_explain_no_method(methods, failed_rows, goal, frame, t_end, summary))
-    return MethodRecommendation(
-        goal, frame, tuple(methods), within[0], isolated(partial(_check_method, within[0], store))
-    )
+    checked = isolated(partial(_check_method, within[0], goal.reference_error, store))
+    return MethodRecommendation(goal, frame, tuple(methods), within[0], checked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -403,6 +402,7 @@ def _plan_study(
 ) -> AccuracyPlan:
     """Return the study that may be measured, and compute its reference. Raises InputError, RunFailed."""
     max_error = goal.reference_error
+    print_message("estimating how far ahead the motion can be predicted")
     if t_end is None:
         t_end = find_default_t_end(path, scene, size, max_error, reference_store, print_message)
     try:
@@ -523,7 +523,7 @@ def _convert_to_option(mistake: InputMistake) -> InputMistake:
 
 
 def _read_measured_methods(
-    name: str, scene: SceneSpec, size: int, t_end: float, results: Path
+    name: str, scene: SceneSpec, size: int, t_end: float, results: Path, reference_error: float
 ) -> tuple[list[MeasuredMethod], list[dict[str, Any]]]:
     """Read the rows of this scene on this machine.
 
@@ -540,8 +540,8 @@ def _read_measured_methods(
         spec = _build_work_spec(row, name, scene)
         if path.stem != spec.build_file_stem() or row["machine_id"] != here or row["t_end"] != t_end:
             continue  # the scene was another then, or the machine, or the question
-        if row["status"] == "ok":
-            ways.append(_build_measured_method(spec, row))
+        if is_measured(row):
+            ways.append(_build_measured_method(spec, row, reference_error))
         else:
             without.append(row)
     return sorted(ways, key=lambda way: way.seconds_per_simulated_second), without
@@ -556,20 +556,21 @@ def _build_work_spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSp
 
 
 def _check_method(
-    best: MeasuredMethod, reference_store: ReferenceStore, print_message: Callable[[str], None]
+    best: MeasuredMethod, reference_error: float, reference_store: ReferenceStore, print_message: Callable[[str], None]
 ) -> MeasuredMethod:
     """Repeat the measurement of a method."""
     print_message(f"checking {best}")
     row = build_work_rows(best.work_spec, load_reference_trajectory(best.work_spec, reference_store), lambda: None)[0]
-    if row["status"] != "ok":
+    if not is_measured(row):
         raise RunFailed(f"the check of {best} ended otherwise than before: {row['status']}: {row['reason']}")
-    return _build_measured_method(best.work_spec, row)
+    return _build_measured_method(best.work_spec, row, reference_error)
 
 
-def _build_measured_method(spec: WorkSpec, row: dict[str, Any]) -> MeasuredMethod:
+def _build_measured_method(spec: WorkSpec, row: dict[str, Any], reference_error: float) -> MeasuredMethod:
+    """Build the method of a row; an error that is too small for the reference is at most the one that it resolves."""
     return MeasuredMethod(
         spec,
-        row["error"],
+        row["error"] if row["status"] == "ok" else reference_error,
         row["seconds_per_simulated_second"],
         row["reference_kind"] or "integrated",
         row["solver_description"] or "",

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from springbench.harness.config.config_loader import find_scene_mistakes
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.execution.progress_display import ThrottledMessages
 from springbench.harness.experiments.error_control.step_doubling import estimate_by_step_doubling
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.scenes.scene_builder import Scene
@@ -161,14 +162,16 @@ def prepare_candidate_methods(
 
     Args:
         error_target: the scene and its end time.
-        print_message: prints the methods that do not support the scene, with the reason.
+        print_message: prints progress, and the methods that do not support the scene, with the reason.
         candidates: integrators and solvers; `list_candidate_methods` if empty.
 
     Raises:
         RunFailed: no method supports the scene.
     """
     found, reasons = list[Method](), list[str]()
-    for integrator, solver in candidates or list_candidate_methods():
+    pairs, remark = list(candidates or list_candidate_methods()), ThrottledMessages(print_message)
+    for number, (integrator, solver) in enumerate(pairs):
+        remark(f"  {number} of {len(pairs)} ways are prepared")
         way = Method(integrator, solver.name, _build_stepper(error_target, integrator, solver))
         try:
             _warm_up(error_target, integrator, solver)

@@ -258,7 +258,8 @@ class _MethodSearch:
     def _run_first_trials(self, methods: list[Method], step_atol: float) -> list[Trial]:
         """Run all methods and return the trials that are fast enough.
 
-        The time limit is a multiple of the fastest time.
+        The time limit is a multiple of the fastest time among methods that choose their steps by the error. The first
+        trial of fixed steps may be far from it, and then its time limits nothing.
         """
         found, stuck, limit = list[Trial](), list[StepSizeUnderflow](), _INITIAL_TIME_LIMIT
         while methods and not found:
@@ -266,8 +267,10 @@ class _MethodSearch:
             for way in methods:
                 try:
                     found.append(self._run_trial(way, way.stepper.initial_setting(step_atol), limit))
-                    cheapest = min(one.trajectory.cpu_seconds for one in found)
-                    limit = max(_MIN_TIME_LIMIT, _TIME_LIMIT_FACTOR * cheapest)
+                    comparable = [one for one in found if not one.method.stepper.has_fixed_step]
+                    if comparable:
+                        cheapest = min(one.trajectory.cpu_seconds for one in comparable)
+                        limit = max(_MIN_TIME_LIMIT, _TIME_LIMIT_FACTOR * cheapest)
                 except StepSizeUnderflow as error:
                     stuck.append(error)
                 except TimeBudgetExceeded:
