@@ -101,10 +101,10 @@ def build_candidate_grid() -> list[dict[str, Any]]:
     fixed = [
         name for name, solver in first.items() if not is_minimiser(solver) or infos[name].family == LOCAL_GLOBAL_FAMILY
     ]
-    return [
-        {"solver": implicit, "rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
-        {"solver": fixed, "max_iterations": FIXED_ITERATIONS},
+    return [  # those with the fewest kernels first, for their cost limits the time of all others
         {"solver": own, "max_iterations": 1, "integrator": ["substepping"]},
+        {"solver": fixed, "max_iterations": FIXED_ITERATIONS},
+        {"solver": implicit, "rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
     ]
 
 

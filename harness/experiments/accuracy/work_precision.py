@@ -3,7 +3,7 @@
     error = |p(T) - reference(T)| / |reference(T) - p(0)|        Frobenius norms over the vertices that are not pinned
 
 The error combines time stepping and solver, which is what a user gets. Pins are exact here, as they are in the
-reference. Where the error is smaller than the reference's own error, the row is `uncertified`: it has a time and no error.
+reference. Where the error is smaller than the reference's own, the row is `uncertified`: it has a time and no error.
 """
 
 from __future__ import annotations
