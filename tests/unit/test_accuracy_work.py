@@ -115,6 +115,7 @@ def test_an_error_below_the_reference_s_own_is_no_error(trajectory: ReferenceTra
     doubtful = replace(trajectory, growth=np.array([10.0]))
     found = row(UNIT, doubtful)
     assert (found["status"], "error" in found) == ("uncertified", False)
+    assert found["seconds_per_simulated_second"] > 0.0, "the time is known"
 
 
 def test_without_a_reference_nothing_is_simulated() -> None:

@@ -95,6 +95,15 @@ def test_one_known_to_be_cheap_leaves_out_the_methods_that_are_slower_at_once():
     assert "take 1.5 times as long" in str(omitted)
 
 
+def test_an_error_too_small_to_measure_meets_the_target_and_limits_the_others():
+    exact = {"status": "uncertified", "error": None, "seconds_per_simulated_second": 1.0}
+    slow = {"status": "ok", "error": 1.0, "seconds_per_simulated_second": 10.0}
+    measure = Measured({key(one): exact if one.solver.name == "a" else slow for one in specs()})
+    search(specs(), 1e-2, inf, measure, 60.0)
+    assert {at[2] for at in measure.found if at[0] == "a"} == {0.1}, "smaller tolerances are left out"
+    assert {at for at in measure.found if at[0] != "a"} == {(solver, 0.4, 0.1) for solver in SOLVERS[1:]}
+
+
 @pytest.mark.parametrize(("best", "limit"), [(1.0, SLOWER), (1e-3, LEAST_LIMIT), (inf, 1e3)])
 def test_a_simulation_may_take_little_more_than_the_best(best: float, limit: float):
     given = list[float]()

@@ -92,7 +92,8 @@ def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: C
     try:
         trajectory.require_accuracy(row["error"])
     except UnpredictableMotion as doubt:
-        row |= {"error": None, "end_error_rms_m": None} | build_accuracy_failure_columns(doubt)
+        del row["error"], row["end_error_rms_m"]
+        row |= build_accuracy_failure_columns(doubt)
     return row
 
 
