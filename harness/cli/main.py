@@ -45,6 +45,7 @@ from springbench.harness.cli.shared_options import (
     RowsOption,
     VerifyOption,
     describe_config,
+    require_output_file,
 )
 from springbench.harness.config.cli_options import build_command_class
 from springbench.harness.console import get_error_console, get_output_console, split_wide_table
@@ -122,7 +123,7 @@ def run(
     from springbench.harness.experiments.sweep_runner import run_sweep
     from springbench.harness.results.folder_ownership import claim_folder
 
-    _check_positions_path(positions)
+    require_output_file(positions, ".npz", "--positions")
     with_error = {"t_end": t_end, "verify": verify, "compare": compare}
     if max_error is not None:
         from springbench.harness.cli.commands.error_control import run_error_control
@@ -359,11 +360,6 @@ def view(recordings: RecordingsArgument) -> None:
     from springbench.harness.report.recording_inspection import view_recordings as view_recordings
 
     view_recordings(recordings)
-
-
-def _check_positions_path(path: Path | None) -> None:
-    if path and (path.suffix != ".npz" or not path.parent.is_dir() or (path.exists() and not path.is_file())):
-        raise InputError(f"--positions: came {path}; wanted a file that ends in .npz, in a folder that exists")
 
 
 def main() -> None:

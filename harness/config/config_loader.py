@@ -166,6 +166,16 @@ def load_config(
     return _load_sweep_checked(load) if imports_code else load(SKIP_USER_CODE)
 
 
+def load_scene_run(path: Path, size: int | None = None) -> RunSpec:
+    """Load a scene as one run, at a mesh size or its default one, like `load_config`.
+
+    Raises:
+        InputError: for all mistakes, and for a sweep.
+    """
+    read_config(path, SCENE, policy=UserCodePolicy(imports_code=False, uses_cache=True))
+    return load_config(path, sizes=() if size is None else (size,)).list_runs()[0]
+
+
 def _load_any(
     path: Path, solvers: Sequence[str], sizes: Sequence[int], options: dict[str, Any], policy: UserCodePolicy
 ) -> SweepPlan:

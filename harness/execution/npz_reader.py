@@ -36,7 +36,7 @@ def read_npz_array(path: Path, name: str, *, allows_nonfinite: bool = False) -> 
     Raises:
         InputError: if the file or the array is invalid; it names the file.
     """
-    _check_file(path, ".npz")
+    check_data_file(path, ".npz")
     try:
         return sandbox.call_in_sandbox(_extract_array, path, name, allows_nonfinite, limits=_build_limits())
     except sandbox.SandboxError as error:
@@ -47,15 +47,15 @@ def read_npz_array(path: Path, name: str, *, allows_nonfinite: bool = False) -> 
 
 def read_npy_array(path: Path, *, allows_nonfinite: bool = False) -> NDArray[np.float64]:
     """Read the array of an .npy file as float64, like `read_npz_array`."""
-    _check_file(path, ".npy")
+    check_data_file(path, ".npy")
     try:
         return sandbox.call_in_sandbox(_read_npy, path, allows_nonfinite, limits=_build_limits())
     except sandbox.SandboxError as error:
         raise InputError(InputMistake(f"cannot be read as an .npy file: {error}", path)) from None
 
 
-def _check_file(path: Path, suffix: str) -> None:
-    """Raise InputError for a file that is missing, misnamed or too large."""
+def check_data_file(path: Path, suffix: str) -> None:
+    """Raise InputError for what is no regular file, has the name of another kind, or is too large."""
     try:
         if not path.is_file():
             raise InputError(InputMistake(f"is no file; give the path of an {suffix} file", path))

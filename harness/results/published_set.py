@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
+from springbench.harness.atomic_files import describe_cause, is_file_name
 from springbench.harness.errors import InputError, InputMistake, suggest_name
 
 if TYPE_CHECKING:
@@ -130,14 +132,47 @@ def read_study(folder: Path) -> PublishedStudy:
     """Read `study.json` of a folder. Raises InputError if it is damaged."""
     path = folder / STUDY_FILE
     try:
+        if not path.is_file():
+            raise ValueError("it is no file")
+        if path.stat().st_size > _MAX_STUDY_FILE_BYTES:
+            raise ValueError(f"it has more than {_MAX_STUDY_FILE_BYTES:,} bytes")
         metadata = json.loads(path.read_text(encoding="utf-8"))
-        study = PublishedStudy(folder, metadata)
-        if not isinstance(metadata["files"], dict) or not study.config_path.name:
-            raise ValueError("its keys are not those of a study")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        why = f"describes no study ({error!r}); restore it, or write it again by `springbench publish-study`"
-        raise InputError(InputMistake(why, path)) from error
-    return study
+        if wrong := _find_wrong_key(metadata):
+            raise ValueError(f"its key {wrong!r} is missing or wrong")
+    except (OSError, ValueError, RecursionError) as error:
+        problem = "its lists are too deep" if isinstance(error, RecursionError) else describe_cause(error)
+        why = f"describes no study ({problem}); restore it, or write it again by `springbench publish-study`"
+        raise InputError(InputMistake(why, path)) from None
+    return PublishedStudy(folder, metadata)
+
+
+_MAX_STUDY_FILE_BYTES = 2**20
+_MAX_CONFIG_PATH = 1000
+
+
+def _find_wrong_key(metadata: Any) -> str:
+    """Return the first key of `study.json` that commands need and that is missing or has a wrong value."""
+    if not isinstance(metadata, dict):
+        return "config"
+    keys = cast("dict[str, Any]", metadata)
+    config, duration = keys.get("config"), keys.get("duration_seconds")
+    files, machines = keys.get("files"), keys.get("machines")
+    is_right = {
+        "config": isinstance(config, str) and 0 < len(config) <= _MAX_CONFIG_PATH and "\0" not in config,
+        "is_timed": isinstance(keys.get("is_timed"), bool),
+        "runs": isinstance(keys.get("runs"), int),
+        "duration_seconds": "duration_seconds" in keys
+        and (duration is None or (isinstance(duration, int | float) and 0.0 <= duration < math.inf)),
+        "command": isinstance(keys.get("command"), str),
+        "machines": isinstance(machines, list)
+        and bool(machines)
+        and all(isinstance(one, dict) for one in cast("list[object]", machines)),
+        "files": isinstance(files, dict)
+        and all(
+            is_file_name(name) and isinstance(digest, str) for name, digest in cast("dict[str, object]", files).items()
+        ),
+    }
+    return next((key for key, right in is_right.items() if not right), "")
 
 
 def compute_file_digest(path: Path) -> str:

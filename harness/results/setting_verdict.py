@@ -312,11 +312,15 @@ def find_largest_difference(
     return max(found, key=lambda one: one.change, default=None)
 
 
+MAX_SETTING = 1_000_000
+"""Largest number of substeps, and of iterations."""
+
+
 def parse_setting(text: str) -> StepSetting:
-    """Parse a setting such as 2x5, or 8 for substeps alone; ValueError if it is none."""
+    """Parse a setting such as 2x5, or 8 for substeps alone; ValueError if it is none, or beyond MAX_SETTING."""
     substeps, cross, iterations = text.lower().replace("×", "x").replace(" ", "").partition("x")
     found = StepSetting(int(substeps), int(iterations) if cross else 0)
-    if found.substeps < 1 or (cross and found.iterations < 1):
+    if not 1 <= found.substeps <= MAX_SETTING or (cross and not 1 <= found.iterations <= MAX_SETTING):
         raise ValueError(text)
     return found
 

@@ -132,7 +132,12 @@ def test_every_format_gives_the_same_positions(form, tmp_path):
         ("p.csv", "0,0,0,0,0,0,0,0,0,0,0,0\n1,two\n", "p.csv:2: is not all numbers"),
         ("p.csv", "frame,vertex,x,y,z\n1,1,0,0,0\n", "each of 4 vertices once"),
         ("p.csv", "frame,x,y,z\n1,0,0,0\n", "wanted `vertex` too"),
-        ("p.csv", "", "has no frames"),
+        ("p.csv", "", "is empty"),
+        ("p.csv", "frame,vertex,x,y,z\n1,0.5,0,0,0\n", "its column vertex has 0.5; wanted whole numbers"),
+        ("p.csv", "frame,vertex,x,y,z\nnan,1,0,0,0\n", "its column frame has nan; wanted whole numbers"),
+        ("p.csv", "time,vertex,x,y,z\ninf,1,0,0,0\n", "its column time has inf; wanted seconds"),
+        ("p.csv", "x,x\n0,0\n", "names the column 'x' twice"),
+        ("p.csv", "0," * 1000, "p.csv:1: has a line of more than 896 characters; wanted at most 14 numbers"),
         ("p.stl", "", "has the suffix '.stl'"),
         ("p.npz", "no zip", "p.npz"),
         ("p.npy", "no array", "p.npy"),
@@ -261,9 +266,17 @@ def test_momentum_of_a_scene_without_pins_is_balanced_and_a_lost_impulse_is_meas
     moved = np.linalg.norm(exact - V)
     assert good.shares[-1].total == pytest.approx(np.linalg.norm(p[-1] - exact) / moved, rel=1e-6)
     assert good.shares[-1].solver_share < 1e-9
+    mass, fallen = scene.system.mass.sum(), p[:, 0, 1] - V[0, 1]
+    speed = np.linalg.norm(v0 + dt * np.arange(1, 9)[:, None] * g, axis=1)
+    energy = 0.5 * mass * speed**2 + 9.81 * mass * fallen
+    assert good.quantities.energy[1:] == pytest.approx(energy, rel=1e-9), "kinetic energy and height"
     p[4:] += 0.01
-    momentum_error: Any = grade_array(grader, p).quantities.momentum_error
+    bad = grade_array(grader, p)
+    momentum_error: Any = bad.quantities.momentum_error
     assert momentum_error.max() > 1e-3
+    assert bad.shares[-1].time_step_share == pytest.approx(good.shares[-1].time_step_share, rel=1e-6)
+    away = np.linalg.norm(p[-1] - exact) / moved
+    assert bad.shares[-1].total == pytest.approx(away, rel=1e-6)
     assert n == len(V)
 
 

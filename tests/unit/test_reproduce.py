@@ -8,12 +8,19 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from springbench.harness.cli.commands.published import report_agreement
 from springbench.harness.cli.main import app
 from springbench.harness.experiments.archive.study_publication import write_published_table, write_study_file
 from springbench.harness.experiments.archive.study_reproduction import draw_sample
 from springbench.harness.report.published_comparison import compare_with_published
 from springbench.harness.results.published_set import read_study
-from springbench.harness.results.study_comparison import AgreementLevel, compare_repeated_run
+from springbench.harness.results.study_comparison import (
+    AgreementLevel,
+    RunAgreement,
+    compare_repeated_run,
+    compare_time_ratios,
+)
+from springbench.harness.results.time_ratios import MethodTimeRatio
 from typer.testing import CliRunner, Result
 
 from tests.contracts.hostile import scene
@@ -114,7 +121,7 @@ def test_a_changed_table_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "published" / "study"
     folder.mkdir(parents=True)
     write_published_table(folder / "runs.parquet", pa.table({"run_id": ["a"]}))
-    metadata = {"config": "sweep.yaml", "is_timed": False, "runs": 1, "duration_seconds": 1, "machines": [{}]}
+    metadata = {"config": "sweep.yaml", "is_timed": False, "runs": 1, "duration_seconds": 1, "command": "run"}
     write_study_file(folder, metadata | {"machines": [{"cpu": "a", "cores": 1}]})
     pq.write_table(pa.table({"run_id": ["b"]}), folder / "runs.parquet")
     result = command("reproduce", "study", "--published", folder.parent)
@@ -125,7 +132,9 @@ def test_a_changed_table_is_refused(tmp_path: Path) -> None:
 def test_an_unknown_study_is_answered_by_the_known_ones(tmp_path: Path) -> None:
     folder = tmp_path / "hard"
     folder.mkdir()
-    (folder / "study.json").write_text(json.dumps({"config": "hard.yaml", "is_timed": False, "files": {}}))
+    metadata = {"config": "hard.yaml", "command": "springbench run hard.yaml", "is_timed": False, "runs": 1}
+    metadata |= {"duration_seconds": 1, "machines": [{}], "files": {}}
+    (folder / "study.json").write_text(json.dumps(metadata))
     result = command("reproduce", "hart", "--published", tmp_path)
     assert result.exit_code == 2
     assert "did you mean 'hard'?" in result.output
@@ -163,6 +172,8 @@ ROW: dict[str, Any] = {
         ({"num_iterations": 46}, AgreementLevel.DIFFERENT),
         ({"residual": 1.5e-3}, AgreementLevel.CLOSE),
         ({"residual": 2.5e-3}, AgreementLevel.DIFFERENT),
+        ({"residual": 0.6e-3}, AgreementLevel.CLOSE),
+        ({"residual": 0.4e-3}, AgreementLevel.DIFFERENT),
         ({"residual": 1e-7, "termination_reason": "converged"}, AgreementLevel.CLOSE),
     ],
 )
@@ -175,3 +186,25 @@ def test_another_outcome_differs() -> None:
     found = compare_repeated_run([ROW], [ROW], lambda run: next(outcomes))
     assert found.level is AgreementLevel.DIFFERENT
     assert found.explanation == "published as 'right', here 'not converged'"
+
+
+@pytest.mark.parametrize(("ratio", "agrees"), [(0.89, False), (0.9, True), (1.2, True), (1.21, False)])
+def test_a_ratio_agrees_within_the_published_interval(ratio: float, agrees: bool) -> None:
+    published = MethodTimeRatio("cloth", 8, ("newton",), ("sparse",), 1.0, 0.9, 1.2)
+    (found,) = compare_time_ratios([published], [published._replace(ratio=ratio)])
+    assert (found.level is AgreementLevel.CLOSE) is agrees
+    assert compare_time_ratios([published], [published._replace(size=9)]) == []
+
+
+@pytest.mark.parametrize(("different", "agrees"), [(0, True), (2, True), (3, False)])
+def test_two_in_a_hundred_runs_may_differ(different: int, agrees: bool) -> None:
+    levels = [AgreementLevel.DIFFERENT] * different + [AgreementLevel.CLOSE] * (100 - different)
+    assert report_agreement("study", [RunAgreement("run", level) for level in levels], []) is agrees
+    assert report_agreement("study", [], []) is False
+
+
+@pytest.mark.slow
+def test_an_untimed_study_publishes_no_times(untimed: Path) -> None:
+    columns = set(read_study(untimed / "sweep").read_table("rows").column_names)
+    assert {"num_iterations", "residual"} <= columns
+    assert not columns & {"seconds", "cpu_seconds", "load_average", "cold_seconds"}

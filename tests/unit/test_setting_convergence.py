@@ -16,8 +16,10 @@ from springbench.harness.cli.main import app
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.experiments import setting_convergence
 from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
 from springbench.harness.experiments.setting_convergence import (
+    SampledReference,
     SettingSimulator,
     StudyLimits,
     measure_change,
@@ -37,6 +39,7 @@ from springbench.harness.results.setting_verdict import (
     list_settings,
     parse_setting,
 )
+from springbench.harness.scenes.scene_builder import build_scene
 from typer.testing import CliRunner
 
 SCENE = """
@@ -106,7 +109,7 @@ def test_several_settings_share_a_map_of_all_their_numbers():
 
 def test_a_setting_is_read_from_two_numbers_or_one():
     assert [parse_setting(text) for text in ("2x5", "10 X 15", "8")] == [(2, 5), (10, 15), (8, 0)]
-    for text in ("", "x", "2x", "0x5", "2x0", "2x5x3", "1.5"):
+    for text in ("", "x", "2x", "0x5", "2x0", "2x5x3", "1.5", "1000001", "1x1000001"):
         with pytest.raises(ValueError):
             parse_setting(text)
 
@@ -174,6 +177,27 @@ def test_the_change_of_two_motions_is_relative_to_the_largest_displacement():
     p = q.copy()
     p[2, 1, 1], p[0, 0, 0] = 0.4, 9.0  # the first vertex is pinned, and does not count
     assert measure_change(p, q, start, np.array([1])) == pytest.approx(0.1)
+
+
+def test_the_effective_stiffness_is_the_true_sag_over_that_of_the_setting(monkeypatch: pytest.MonkeyPatch, scene: Path):
+    sags = {None: 0.1, GIVEN: 0.4}
+    monkeypatch.setattr(SettingSimulator, "measure_sag", lambda self, setting: sags[setting])
+    monkeypatch.setattr(setting_convergence, "_find_reference", lambda *given: None)
+    (assessment,) = study(scene).assessments
+    assert assessment.effective_stiffness == pytest.approx(0.25)
+
+
+def test_the_drift_is_the_energy_above_the_reference_over_its_largest_kinetic_energy(scene: Path):
+    """A chain of mass m that falls 0.5 m and reaches 2 m/s gains 2 m J of kinetic energy and loses 0.5 g m J."""
+    scene.write_text(SCENE.replace("{kind: springs, stretch: 200}, ", "").replace(", {kind: pins, parts: [ends]}", ""))
+    built = build_scene(load_scene(scene), 6)
+    start, mass = built.mesh.rest_positions, float(built.system.mass.sum())
+    down, speed = np.array([0.0, -0.5, 0.0]), np.array([0.0, -2.0, 0.0])
+    height = 9.81 * float(start[:, 1] @ built.system.mass)
+    reference = SampledReference("", np.arange(6), start, start[None], height - 1.0, 4.0, 0.0)
+    found = reference.measure_drift(built, start + down, np.tile(speed, (6, 1)))
+    assert found == pytest.approx((2.0 * mass - 0.5 * 9.81 * mass + 1.0) / 4.0)
+    assert np.isnan(replace(reference, end_energy=None).measure_drift(built, start, start))
 
 
 def test_a_study_finds_that_a_setting_is_not_converged_and_what_would_be(scene: Path):

@@ -54,11 +54,13 @@ def convergence(
     Settings around the given ones are simulated, and compared with the reference motion.
     """
     from springbench.harness.config.config_loader import load_scene
+    from springbench.harness.errors import suggest_name
     from springbench.harness.execution.isolated_call import run_isolated
     from springbench.harness.execution.worker_process import TaskLimits
     from springbench.harness.experiments.accuracy.accuracy_units import EXTRA_WALL_SECONDS
     from springbench.harness.results.folder_ownership import claim_folder
     from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
+    from springbench.solvers.model.integrators import INTEGRATOR_TABLE
 
     given = [_read_setting(text) for text in setting or ()]
     for key, value in (("--error", error), ("--time-limit", time_limit), ("--search-time", search_time)):
@@ -66,6 +68,9 @@ def convergence(
             raise InputError(InputMistake(f"came {value:g}; expected a number above 0", key=key))
     if t_end is not None and not 0.0 < t_end <= 1e4:
         raise InputError(InputMistake(f"came {t_end:g}; expected seconds above 0, at most 10,000", key="--t-end"))
+    if integrator is not None and integrator not in INTEGRATOR_TABLE:
+        problem = f"came {integrator!r}; expected {suggest_name(integrator, INTEGRATOR_TABLE)}"
+        raise InputError(InputMistake(problem, key="--integrator"))
     spec = load_scene(scene)
     spec.require_fixed_time_step()
     made = read_solver_options(scene, solver, parameter or ())
@@ -86,13 +91,14 @@ def convergence(
 
 def _read_setting(text: str) -> StepSetting:
     """Read a setting; raise InputError if it is none."""
-    from springbench.harness.results.setting_verdict import parse_setting
+    from springbench.harness.results.setting_verdict import MAX_SETTING, parse_setting
 
     try:
         return parse_setting(text)
     except ValueError:
         wanted = "substeps x iterations, such as 2x5, or substeps alone, such as 8"
-        raise InputError(InputMistake(f"came {text!r}; expected {wanted}", key="--setting")) from None
+        problem = f"came {text[:40]!r}; expected {wanted}, up to {MAX_SETTING:,} each"
+        raise InputError(InputMistake(problem, key="--setting")) from None
 
 
 def read_solver_options(path: Path, name: str, parameters: tuple[str, ...] | list[str]) -> SolverSpec:

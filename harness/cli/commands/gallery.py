@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from springbench.harness.cli.shared_options import describe_config
+from springbench.harness.cli.shared_options import describe_config, require_output_file
 from springbench.harness.console import print_message
-from springbench.harness.errors import InputError
 from springbench.harness.execution.isolated_call import run_isolated
 
 if TYPE_CHECKING:
@@ -28,8 +27,7 @@ def gallery(
     """Draw a sheet of scenes, each at its default size and last frame."""
     from springbench.harness.report.gallery_sheet import draw_gallery_sheet
 
-    if output.suffix != ".png" or not output.parent.is_dir() or output.is_dir():
-        raise InputError(f"--output: came {output}; wanted a file that ends in .png, in a folder that exists")
+    require_output_file(output, ".png", "--output")
     tiles: list[Any] = []
     for path in scenes:
         tiles.append(_build_tile(path))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv as csv_format
 import sys
 from functools import partial
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from springbench.harness.cli.shared_options import SCENE_HELP, describe_config
+from springbench.harness.cli.shared_options import SCENE_HELP, describe_config, require_output_file
 from springbench.harness.console import format_plain_table, get_output_console, print_message, split_wide_table
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.isolated_call import run_isolated
@@ -40,24 +41,25 @@ def grade(
     ] = None,
     array: Annotated[str, typer.Option(help="Name of the array in .npz files.")] = "positions",
     budget: Annotated[
-        float, typer.Option(min=0.0, help="Time limit [s] of the minima, and of the integrated motion.")
+        float, typer.Option(min=0.0, max=1e5, help="Time limit [s] of the minima, and of the integrated motion.")
     ] = 30.0,
     csv: Annotated[Path | None, typer.Option(help="File (.csv) for all steps, or for all students.")] = None,
 ) -> None:
     """Grade positions: does each step minimise its objective, how large is the error, which mistake explains it."""
-    if csv and (csv.suffix != ".csv" or not csv.resolve().parent.is_dir() or csv.is_dir()):
-        raise InputError(f"--csv: came {csv}; wanted a file that ends in .csv, in a folder that exists")
+    require_output_file(csv, ".csv", "--csv")
+    if isnan(budget):
+        raise InputError("--budget: came nan; wanted seconds")
     if students and not positions.is_dir():
         raise InputError(
             InputMistake("is no folder; --students needs one with a submission of each student", positions)
         )
 
-    from springbench.harness.config.config_loader import is_assignment_file, load_config
+    from springbench.harness.config.config_loader import is_assignment_file, load_scene_run
     from springbench.harness.execution.worker_process import TaskLimits
     from springbench.harness.experiments.grading.grading import GradeRequest
     from springbench.harness.scenes.assignment_scene import ASSIGNMENT_ITERATIONS
 
-    run = load_config(scene, sizes=() if size is None else (size,)).list_runs()[0]
+    run = load_scene_run(scene, size)
     required = iterations or (ASSIGNMENT_ITERATIONS if is_assignment_file(scene) else None)
     request = GradeRequest(run.scene, run.size, required, first_frame, rest, array, budget)
     work = partial(_grade_students if students else _grade_one, request, positions)

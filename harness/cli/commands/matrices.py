@@ -36,11 +36,11 @@ def matrices(
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output: came {folder}, a file; wanted a folder, which is made if it is missing")
 
-    from springbench.harness.config.config_loader import load_config
+    from springbench.harness.config.config_loader import load_scene_run
     from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
     from springbench.harness.execution.worker_process import TaskLimits
 
-    run = load_config(scene, sizes=() if size is None else (size,)).list_runs()[0]
+    run = load_scene_run(scene, size)
     text, messages = run_isolated(
         partial(_write_matrices, run.scene, run.size, run.scene_name, frame, folder, compare or []),
         run.scene.find_plugins(),

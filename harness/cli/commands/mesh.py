@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from springbench.harness.cli.shared_options import require_output_file
 from springbench.harness.console import get_output_console, print_message
 from springbench.harness.errors import InputError, InputMistake
 
@@ -35,8 +36,7 @@ def mesh(
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 if anything is suspicious.")] = False,
 ) -> None:
     """Report on a mesh file: contents, extent, parts, seams, faults of faces and edges, what can be selected."""
-    if output and (output.suffix != ".png" or not output.parent.is_dir() or output.is_dir()):
-        raise InputError(f"--output: came {output}; wanted a file that ends in .png, in a folder that exists")
+    require_output_file(output, ".png", "--output")
     from springbench.harness.scenes.mesh.mesh_report import build_mesh_report
 
     given = {"scale": scale, "units": units, "up": up, "weld": weld, "unused": unused, "faces": faces}

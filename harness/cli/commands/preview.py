@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from springbench.harness.cli.shared_options import SCENE_HELP, describe_config
+from springbench.harness.cli.shared_options import SCENE_HELP, describe_config, require_output_file
 from springbench.harness.console import print_message
-from springbench.harness.errors import InputError
 from springbench.harness.execution.isolated_call import run_isolated
 
 if TYPE_CHECKING:
@@ -26,14 +25,13 @@ def preview(
 ) -> None:
     """Draw a scene at its start, and list selected vertices and possible selectors."""
     path = output or Path(f"{scene.stem}.png")
-    if path.suffix != ".png" or not path.parent.is_dir() or path.is_dir():
-        raise InputError(f"--output: came {path}; wanted a file that ends in .png, in a folder that exists")
+    require_output_file(path, ".png", "--output")
 
-    from springbench.harness.config.config_loader import load_config
+    from springbench.harness.config.config_loader import load_scene_run
     from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS
     from springbench.harness.execution.worker_process import TaskLimits
 
-    run = load_config(scene, sizes=() if size is None else (size,)).list_runs()[0]
+    run = load_scene_run(scene, size)
     for line in run_isolated(partial(_draw_preview, run, path), run.find_plugins(), TaskLimits(*DEFAULT_LOAD_LIMITS)):
         print_message(line)
 

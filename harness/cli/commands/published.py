@@ -83,7 +83,7 @@ def reproduce(
     found = published_set.list_studies(published) if study == ALL_STUDIES else ()
     studies = [one for one in found if one.is_repeatable] or [published_set.find_study(published, study)]
     chance = (randbelow(10**6) if seed is None else seed) if quick else None
-    durations = [(QUICK_SHARE if quick else 1.0) * one.metadata["duration_seconds"] for one in studies]
+    durations = [(QUICK_SHARE if quick else 1.0) * (one.metadata["duration_seconds"] or 0.0) for one in studies]
     if len(studies) > 1:
         print_message(f"{len(studies)} studies, which took {_format_duration(sum(durations))} when they were published")
     agrees = [_reproduce_one(one, took, results, chance, workers) for one, took in zip(studies, durations, strict=True)]
@@ -101,14 +101,14 @@ def _reproduce_one(
         raise InputError(InputMistake("differs from its checksum in study.json; restore it", changed[0]))
     machine, count = study.metadata["machines"][0], study.metadata["runs"]
     drawn = f"{count} runs" if seed is None else f"a tenth of {count} runs, drawn by --seed {seed}"
-    took = f"{_format_duration(duration)} on {machine['cpu']}, {machine['cores']} cores"
+    took = f"{_format_duration(duration)} on {machine.get('cpu')}, {machine.get('cores')} cores"
     print_message(f"{study.study_name}: {drawn}; when it was published this took {took}")
     display = create_display(get_error_console())
     found = reproduce_study(study, results / study.study_name, display, print_message, seed=seed, num_workers=workers)
-    return _report_agreement(study.study_name, found.runs, found.ratios)
+    return report_agreement(study.study_name, found.runs, found.ratios)
 
 
-def _report_agreement(name: str, runs: Sequence[RunAgreement], ratios: Sequence[RunAgreement]) -> bool:
+def report_agreement(name: str, runs: Sequence[RunAgreement], ratios: Sequence[RunAgreement]) -> bool:
     """Print the counts and all differences, and return whether the repetition agrees."""
     from springbench.harness.results.study_comparison import MAX_DIFFERING_SHARE, AgreementLevel
 

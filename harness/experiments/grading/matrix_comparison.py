@@ -80,9 +80,15 @@ def _list_mistakes(matrices: LocalGlobalMatrices, name: str) -> dict[str, Any]:
 
 
 def _read_matrix(path: Path) -> Any:
-    """Read a Matrix Market file in the sandbox, with its stored zeros."""
+    """Read a Matrix Market file of finite real numbers in the sandbox, with its stored zeros."""
     found: Any = mmread(path)
-    return found if isinstance(found, np.ndarray) else coo_array(found)
+    found = found if isinstance(found, np.ndarray) else coo_array(found)
+    values: Any = found if isinstance(found, np.ndarray) else found.data
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"it holds values of type {values.dtype}; wanted real numbers")
+    if not np.isfinite(values).all():
+        raise ValueError("it holds numbers that are not finite")
+    return found
 
 
 def _square(matrix: Any) -> Any:

@@ -12,6 +12,7 @@ What is in the file decides nothing about its frame numbers and vertex order: se
 from __future__ import annotations
 
 import re
+from array import array as array_type
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from springbench.harness.atomic_files import describe_cause
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import sandbox
-from springbench.harness.execution.npz_reader import MAX_NPZ_BYTES, read_npy_array, read_npz_array
+from springbench.harness.execution.npz_reader import check_data_file, read_npy_array, read_npz_array
 from springbench.harness.scenes.mesh import ply_reader
 from springbench.harness.scenes.mesh.obj_reader import read_obj
 
@@ -34,6 +35,8 @@ POSITION_SUFFIXES = (".npz", ".npy", ".csv", ".txt", ".rrd")
 MAX_MESH_FILES = 100_000
 _PLY_LIMITS = sandbox.CallLimits(60.0, 2**31)
 _LONG_COLUMNS = ("x", "y", "z")
+_MAX_CELL_LENGTH = 64
+"""Characters of a number in a table, with its separators."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,6 +93,8 @@ def read_rest_positions(path: Path, num_vertices: int) -> NDArray[np.float64]:
     found = read_position_file(path, num_vertices)
     if len(found.positions) != 1:
         raise InputError(InputMistake(f"has {len(found.positions)} frames; wanted one, the rest positions", path))
+    if not np.isfinite(found.positions).all():
+        raise InputError(InputMistake("has rest positions that are not finite", path))
     return found.positions[0]
 
 
@@ -126,32 +131,38 @@ def _to_frames(values: NDArray[np.float64], n: int, path: Path) -> NDArray[np.fl
 
 def _read_table(path: Path, n: int, array: str) -> PositionSequence:
     """Read a text table, with or without names of the columns."""
-    if path.stat().st_size > MAX_NPZ_BYTES:
-        raise InputError(InputMistake(f"has more than {MAX_NPZ_BYTES:,} bytes; store an .npy file instead", path))
-    names, lines, numbers = list[str](), list[list[float]](), list[int]()
+    check_data_file(path, path.suffix)
+    names, values, numbers = list[str](), array_type("d"), array_type("q")
+    width, longest = 0, _MAX_CELL_LENGTH * (3 * n + 2)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        with path.open(encoding="utf-8-sig") as file:
+            for number, line in enumerate(iter(lambda: file.readline(longest + 1), ""), 1):
+                if len(line) > longest:
+                    problem = f"has a line of more than {longest:,} characters; wanted at most {3 * n + 2} numbers"
+                    raise InputError(InputMistake(problem, path, number))
+                cells = [cell for cell in re.split(r"[,;\s]+", line.strip()) if cell]
+                if not cells or cells[0].startswith("#"):
+                    continue
+                try:
+                    row = [float(cell) for cell in cells]
+                except ValueError:
+                    if numbers or names:
+                        raise InputError(InputMistake(f"is not all numbers: {line[:60]!r}", path, number)) from None
+                    names = [cell.strip("\"'").lower() for cell in cells]
+                    continue
+                width = width or len(names) or len(row)
+                if len(row) != width:
+                    problem = f"has {len(row)} columns; wanted {width}, as the first line has"
+                    raise InputError(InputMistake(problem, path, number))
+                values.extend(row)
+                numbers.append(number)
     except (OSError, ValueError) as error:
         raise InputError(InputMistake(f"cannot be read as text: {describe_cause(error)}", path)) from None
-    for number, line in enumerate(text.splitlines(), 1):
-        cells = [cell for cell in re.split(r"[,;\s]+", line.strip()) if cell]
-        if not cells or cells[0].startswith("#"):
-            continue
-        try:
-            lines.append([float(cell) for cell in cells])
-            numbers.append(number)
-        except ValueError:
-            if lines or names:
-                raise InputError(InputMistake(f"is not all numbers: {line[:60]!r}", path, number)) from None
-            names = [cell.strip("\"'").lower() for cell in cells]
-    widths = [len(line) for line in lines]
-    odd = next((k for k, width in enumerate(widths) if width != (len(names) or widths[0])), None)
-    if odd is not None:
-        problem = f"has {widths[odd]} columns; wanted {len(names) or widths[0]}, as the first line has"
-        raise InputError(InputMistake(problem, path, numbers[odd]))
-    if not lines:
+    if not numbers:
         raise InputError(InputMistake("has no frames", path))
-    table = np.array(lines, float)
+    if repeated := [name for name in names if names.count(name) > 1]:
+        raise InputError(InputMistake(f"names the column {repeated[0]!r} twice", path, numbers[0] - 1))
+    table = np.frombuffer(values, float).reshape(-1, width)
     if set(_LONG_COLUMNS) <= set(names):
         return _read_long_table(path, n, names, table)
     leading = {name: table[:, names.index(name)] for name in ("frame", "time") if name in names}
@@ -159,8 +170,9 @@ def _read_table(path: Path, n: int, array: str) -> PositionSequence:
     if len(coordinates) != 3 * n:
         wanted = f"one line a frame of {3 * n} numbers, or the columns frame, vertex, x, y, z"
         raise InputError(InputMistake(f"has {len(coordinates)} columns; wanted {wanted}", path, numbers[0]))
-    frames = leading["frame"].astype(np.int64) if "frame" in leading else None
-    return PositionSequence(path, table[:, coordinates].reshape(-1, n, 3), frames, leading.get("time"))
+    frames = _to_whole_numbers(leading["frame"], "frame", path) if "frame" in leading else None
+    times = _to_times(leading["time"], path) if "time" in leading else None
+    return PositionSequence(path, table[:, coordinates].reshape(-1, n, 3), frames, times)
 
 
 def _read_long_table(path: Path, n: int, names: list[str], table: NDArray[np.float64]) -> PositionSequence:
@@ -169,8 +181,10 @@ def _read_long_table(path: Path, n: int, names: list[str], table: NDArray[np.flo
     if key is None or "vertex" not in names:
         missing = "frame" if key is None else "vertex"
         raise InputError(InputMistake(f"has the columns {', '.join(names)}; wanted `{missing}` too", path, 1))
-    values, rows = np.unique(table[:, names.index(key)], return_inverse=True)
-    vertices = table[:, names.index("vertex")].astype(np.int64)
+    column = table[:, names.index(key)]
+    frames, times = (_to_whole_numbers(column, key, path), None) if key == "frame" else (None, _to_times(column, path))
+    values, rows = np.unique(column, return_inverse=True)
+    vertices = _to_whole_numbers(table[:, names.index("vertex")], "vertex", path)
     first = int(vertices.min(initial=0)) if len(vertices) and vertices.min() == 0 else 1
     vertices = vertices - first
     expected = len(values) * n
@@ -184,9 +198,24 @@ def _read_long_table(path: Path, n: int, names: list[str], table: NDArray[np.flo
         raise InputError(InputMistake(problem, path))
     p = np.empty((len(values), n, 3))
     p[rows, vertices] = table[:, [names.index(axis) for axis in _LONG_COLUMNS]]
-    return PositionSequence(
-        path, p, values.astype(np.int64) if key == "frame" else None, values if key == "time" else None
-    )
+    return PositionSequence(path, p, None if frames is None else np.unique(frames), None if times is None else values)
+
+
+def _to_whole_numbers(column: NDArray[np.float64], name: str, path: Path) -> NDArray[np.int64]:
+    """Return a column of frame or vertex numbers as integers."""
+    is_wrong = ~(np.abs(column) < 2.0**53) | (column != np.trunc(column))
+    if is_wrong.any():
+        problem = f"its column {name} has {column[is_wrong][0]:g}; wanted whole numbers"
+        raise InputError(InputMistake(problem, path))
+    return column.astype(np.int64)
+
+
+def _to_times(column: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+    """Return a column of times [s], which must be finite."""
+    if not np.isfinite(column).all():
+        wrong = column[~np.isfinite(column)][0]
+        raise InputError(InputMistake(f"its column time has {wrong:g}; wanted seconds", path))
+    return column
 
 
 def _read_folder(folder: Path, n: int, array: str) -> PositionSequence:
