@@ -172,7 +172,7 @@ def load_scene_run(path: Path, size: int | None = None) -> RunSpec:
     Raises:
         InputError: for all mistakes, and for a sweep.
     """
-    read_config(path, SCENE, policy=UserCodePolicy(imports_code=False, uses_cache=True))
+    read_config(path, SCENE, policy=SKIP_USER_CODE)
     return load_config(path, sizes=() if size is None else (size,)).list_runs()[0]
 
 

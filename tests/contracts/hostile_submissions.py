@@ -168,11 +168,8 @@ FILES: dict[str, str | bytes | Callable[[], str | bytes]] = {
     + "".join(f"f {k} {k + 1} {k + 2}\n" for k in range(1, 2999)),
     "a-fan.obj": "v 0 0 0\nv 0 0 1\n"
     + "".join(f"v {np.cos(a):.9f} {np.sin(a):.9f} 0\nf 1 2 {k + 3}\n" for k, a in enumerate(np.linspace(0, 6, 3000))),
-    "a-pencil.obj": "".join(
-        f"v {np.cos(a):.9f} {np.sin(a):.9f} 0\nv {-np.cos(a):.9f} {-np.sin(a):.9f} 0.1\nv 0 0 {k + 1}\n"
-        f"f {3 * k + 1} {3 * k + 2} {3 * k + 3}\n"
-        for k, a in enumerate(np.linspace(0, 3, 1500))
-    ),
+    "tangled.obj": "".join(f"v {x:.9f} {y:.9f} {z:.9f}\n" for x, y, z in np.random.default_rng(0).random((1200, 3)))
+    + "".join(f"f {3 * k + 1} {3 * k + 2} {3 * k + 3}\n" for k in range(400)),
     "on-one-edge.obj": "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
     + "".join(f"v {(k + 1) / 20_001:.12f} 0 0\n" for k in range(20_000)),
     "tiny.obj": "v 0 0 0\nv 1e-300 0 0\nv 0 1e-300 0\nf 1 2 3\n",
@@ -364,8 +361,8 @@ OPTIONS = {
     "40000 points in one place": CommandCase("mesh one-place.obj --json", None, "one-place.obj"),
     "faces in a line": CommandCase("mesh a-line.obj --json", None, "flat"),
     "a fan of 3000 faces": CommandCase("mesh a-fan.obj --json", None, "non-manifold"),
-    "1500 faces through each other": CommandCase("mesh a-pencil.obj --json", None, "self-intersections"),
-    "20000 points on one edge": CommandCase("mesh on-one-edge.obj --json", None, "t-junctions"),
+    "400 faces through each other": CommandCase("mesh tangled.obj --json", None, "self-intersections"),
+    "20000 points on one edge": CommandCase("mesh on-one-edge.obj --json", None, "unused-vertices"),
     "a mesh of 1e-300 m": CommandCase("mesh tiny.obj --json", None, "tiny.obj"),
     "a mesh of 1e12 m": CommandCase("mesh vast.obj --json", None, "vast.obj"),
     "a mesh without area": CommandCase("mesh flat.obj --json", None, "flat.obj"),
