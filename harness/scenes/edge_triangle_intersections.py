@@ -2,9 +2,9 @@
 
 Two convex bodies are disjoint if an axis separates them. For an edge and a triangle the candidate axes are the normal,
 the cross products of the edge with the sides, and in the plane the normals of the sides and of the edge. If one of them
-shows a gap beyond round-off, the bodies are disjoint. The remaining pairs are decided in rational arithmetic, by signs
-of determinants (Guigue and Devillers 2003); contact without overlap counts as an intersection. Pairs that share a
-vertex are excluded.
+shows a gap beyond round-off, the bodies are disjoint. The remaining pairs are decided by signs of determinants (Guigue
+and Devillers 2003), in rational arithmetic where round-off could change one (Shewchuk 1997); contact without overlap
+counts as an intersection. Pairs that share a vertex are excluded.
 """
 
 from __future__ import annotations
@@ -25,6 +25,12 @@ Intersection = tuple[tuple[int, int], tuple[int, int, int]]
 
 _ROUNDOFF = 64.0 * np.finfo(np.float64).eps
 """Round-off relative to the coordinates of the pair: a larger gap along a unit axis is significant."""
+
+_DETERMINANT_ROUNDOFF = 16.0 * np.finfo(np.float64).eps
+"""Round-off of a determinant relative to the sum of its products' magnitudes; Shewchuk proves 3.5."""
+
+_SMALLEST_VOLUME = 1e-250
+"""Volume [m^3] below which products may underflow."""
 
 _PAIRS_PER_CHUNK = 200_000
 """Number of pairs tested per chunk."""
@@ -72,10 +78,13 @@ def find_edge_triangle_intersections(p: FloatArray, edges: IndexArray, triangles
     if not np.isfinite(p).all():
         raise ValueError("positions should be finite to tell whether they intersect")
     for e, t in _overlapping_box_pairs(p, edges, triangles):
-        open_ = np.flatnonzero(~_has_separating_axis(p, edges[e], triangles[t]))
-        for k in open_.tolist():
+        is_open = ~_has_separating_axis(p, edges[e], triangles[t])
+        e, t = e[is_open], t[is_open]
+        for k, is_certain in enumerate(_intersects_certainly(p, edges[e], triangles[t]).tolist()):
             edge, corners = edges[e[k]].tolist(), triangles[t[k]].tolist()
-            if edge_intersects_triangle([_to_fractions(p[i]) for i in edge], [_to_fractions(p[i]) for i in corners]):
+            if is_certain or edge_intersects_triangle(
+                [_to_fractions(p[i]) for i in edge], [_to_fractions(p[i]) for i in corners]
+            ):
                 found.append(((edge[0], edge[1]), (corners[0], corners[1], corners[2])))
     return sorted(found)
 
@@ -121,6 +130,24 @@ def _has_separating_axis(p: FloatArray, edges: IndexArray, triangles: IndexArray
         gap = np.maximum(one.min(axis=1) - two.max(axis=1), two.min(axis=1) - one.max(axis=1))
         apart |= gap > _ROUNDOFF * size
     return apart
+
+
+def _intersects_certainly(p: FloatArray, edges: IndexArray, triangles: IndexArray) -> NDArray[np.bool_]:
+    """Return which pairs (k, 2) and (k, 3) intersect inside of both, whatever the round-off."""
+    a, b = p[edges[:, 0]], p[edges[:, 1]]
+    u, v, w = (p[triangles[:, k]] for k in range(3))
+    sides = _certain_sign(u, v, w, a) * _certain_sign(u, v, w, b)
+    turns = [_certain_sign(a, b, one, two) for one, two in ((u, v), (v, w), (w, u))]
+    return (sides < 0.0) & (np.abs(sum(turns)) == 3.0)
+
+
+def _certain_sign(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
+    """Return the signs (k,) of the volumes of tetrahedra (k, 3) each; 0 where round-off could change one."""
+    u, v, w = b - a, c - a, d - a
+    volume = np.einsum("ij,ij->i", u, np.cross(v, w))
+    products = np.abs(v[:, [1, 2, 0]] * w[:, [2, 0, 1]]) + np.abs(v[:, [2, 0, 1]] * w[:, [1, 2, 0]])
+    bound = _DETERMINANT_ROUNDOFF * np.einsum("ij,ij->i", np.abs(u), products) + _SMALLEST_VOLUME
+    return np.where(np.abs(volume) > bound, np.sign(volume), 0.0)
 
 
 ExactPoint = tuple[Fraction, Fraction, Fraction]

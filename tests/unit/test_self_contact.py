@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from springbench.harness.scenes import edge_triangle_intersections
 from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
 from springbench.solvers.contact.broad_phase.candidate_cache import CACHE_INFLATION
 from springbench.solvers.contact.collision_mesh import CollisionMesh
@@ -323,6 +324,27 @@ def test_crossings_are_found_exactly_and_touching_counts():
     flat = np.concatenate([square, [[0.25, 0.25, 0], [2, 2, 0], [1.0, 1.0, 0], [2, 1, 0]]])
     assert find_edge_triangle_intersections(flat, np.array([[3, 4], [5, 6]]), one) == [((3, 4), (0, 1, 2))]
     assert not find_edge_triangle_intersections(flat, np.array([[0, 4]]), one)  # they share a vertex
+
+
+def test_rational_arithmetic_decides_what_round_off_leaves_open_and_nothing_else(monkeypatch: pytest.MonkeyPatch):
+    rng, triangles = np.random.default_rng(0), np.arange(120).reshape(40, 3)
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
+    clear = rng.random((120, 3))
+    touching = rng.integers(0, 3, (120, 3)).astype(float)  # on a lattice: most pairs touch or are degenerate
+    found = [find_edge_triangle_intersections(p, edges, triangles) for p in (clear, touching)]
+    assert all(len(one) > 100 for one in found)
+    with monkeypatch.context() as patched:
+        patched.setattr(edge_triangle_intersections, "_intersects_certainly", lambda p, e, t: np.zeros(len(e), bool))
+        assert [find_edge_triangle_intersections(p, edges, triangles) for p in (clear, touching)] == found
+    asked = list[bool]()
+    exact = edge_triangle_intersections.edge_intersects_triangle
+    monkeypatch.setattr(
+        edge_triangle_intersections,
+        "edge_intersects_triangle",
+        lambda edge, triangle: asked.append(exact(edge, triangle)) or asked[-1],
+    )
+    assert find_edge_triangle_intersections(clear, edges, triangles) == found[0]
+    assert not asked
 
 
 def test_crossings_agree_with_the_intersection_test_of_ipctk():
