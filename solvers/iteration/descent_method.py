@@ -199,7 +199,7 @@ class PreparedDescent(IterativeSolver):
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
         step, start = self._build_step(problem, initial_guess)
-        return _DescentState(
+        return DescentState(
             self, step, pick_lower_start(step, start) if has_active_barrier(step, start.positions) else start
         )
 
@@ -221,7 +221,7 @@ class PreparedDescent(IterativeSolver):
         return step, DescentPoint(p, step.gradient(p))
 
 
-class _DescentState(SolverState):
+class DescentState(SolverState):
     """The state of a solve; a stalled point has the previous positions."""
 
     def __init__(self, prepared: PreparedDescent, step: StepObjective, start: DescentPoint) -> None:

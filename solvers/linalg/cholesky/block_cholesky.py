@@ -25,6 +25,9 @@ from springbench.solvers.simd.front_tiles import TILE_COLUMNS, TILE_ROWS
 
 _NO_RIGHT_HAND_SIDE = np.empty((0, 3))
 
+_MIN_FACTORISATION = 0.2
+"""Cost of assembling a matrix whose factorisation fails at once, as a fraction of a factorisation."""
+
 
 class BlockCholesky:
     """Cholesky factorisation of H for one pattern of blocks.
@@ -34,6 +37,7 @@ class BlockCholesky:
     Attributes:
         nonzeros: entries of L, including the diagonal.
         flops: multiplications and additions of a factorisation, without padding.
+        num_factorisations: factorisations so far; one that fails counts by the operations before it fails.
     """
 
     def __init__(self, graph: csr_array) -> None:
@@ -52,7 +56,9 @@ class BlockCholesky:
         f = self._frontal_structure
         below = np.diff(f.member_start) - f.num_columns
         w, h = 3.0 * f.num_columns, 3.0 * below
-        self.flops = float((w * (w * w / 3.0 + w * h + h * h)).sum())
+        self._cumulative_flops = np.cumsum(w * (w * w / 3.0 + w * h + h * h))
+        self.flops = float(self._cumulative_flops[-1]) if len(w) else 0.0
+        self.num_factorisations = 0.0
         room = _required_stack_size(f, 3 * below * round_up_rows(3 * below))
         n, supernodes = len(pointers) - 1, len(f.num_columns)
         needs, free = 8.0 * (f.panel_start[-1] + 2 * room), memory.compute_memory_limit()
@@ -63,7 +69,7 @@ class BlockCholesky:
                 f"where {memory.format_bytes(free)} may be taken; take numba or newton-cg, or a coarser mesh"
             )
         self._panels = np.zeros(f.panel_start[-1] + TILE_ROWS)
-        waiting, filled, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 2, (2, n + 1)))
+        waiting, filled, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 3, (2, n + 1)))
         front = np.zeros(int((round_up_rows(3 * f.num_columns) + round_up_rows(3 * below)).max(initial=0)) + TILE_ROWS)
         stacks, triangles = np.zeros((2, room)), np.zeros((PANEL_DEPTH // TILE_COLUMNS, TILE_COLUMNS, TILE_COLUMNS))
         self._scratch = FactorisationScratch(front, stacks, waiting, filled, np.zeros(TILE_COLUMNS), triangles, runs)
@@ -74,7 +80,16 @@ class BlockCholesky:
         Returns:
             Whether H is positive definite.
         """
-        return factorise_blocks(self._frontal_structure, values, self._panels, _NO_RIGHT_HAND_SIDE, self._scratch)
+        return self._factorise(values, _NO_RIGHT_HAND_SIDE)
+
+    def _factorise(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> bool:
+        found = factorise_blocks(self._frontal_structure, values, self._panels, x, self._scratch)
+        done = 1.0
+        if not found:
+            fronts = int(self._scratch.stack_sizes[2])
+            done = float(self._cumulative_flops[fronts - 1]) / self.flops if fronts else 0.0
+        self.num_factorisations += max(_MIN_FACTORISATION, done)
+        return found
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return H^-1 b, both (n, 3), with the last factorisation."""
@@ -93,7 +108,7 @@ class BlockCholesky:
             Solution (n, 3); None if H is not positive definite.
         """
         x = np.array(b, order="C")
-        if not factorise_blocks(self._frontal_structure, values, self._panels, x, self._scratch):
+        if not self._factorise(values, x):
             return None
         solve_blocks(self._frontal_structure, self._panels, x, self._scratch.front, True)
         return x

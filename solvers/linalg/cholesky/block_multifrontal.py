@@ -69,7 +69,7 @@ class FactorisationScratch(NamedTuple):
         front: one vector longer than the largest front.
         stacks: updates, (2, size).
         pending_supernodes: supernodes on each stack, preceded by their number, (2, s + 1).
-        stack_sizes: number of entries in use on each stack, (2,).
+        stack_sizes: number of entries in use on each stack, and the number of fronts eliminated, (3,).
         min_pivots: thresholds, (TILE_COLUMNS,).
         triangles: factors of the tiles of a panel block, (., TILE_COLUMNS, TILE_COLUMNS).
         runs: (2, n + 1).
@@ -117,6 +117,7 @@ def factorise_blocks(fronts, values, panels, x, scratch):
             _extend_add(fronts, c, stacks[other], filled[other], to, scratch.runs)
         if not eliminate_front(fronts, s, values, panels, stride, scratch.min_pivots, scratch.triangles):
             return False
+        filled[2] = s + 1
         if len(x) > 0:
             _forward_substitution(fronts, s, panels, x, scratch.front)
         subtract_front_update(to, 3 * below)

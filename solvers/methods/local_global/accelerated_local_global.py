@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
+from operator import attrgetter, methodcaller
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.iteration.iterative_solver import SolverState
-from springbench.solvers.kernels import accelerated_descent
+from springbench.solvers.kernels import accelerated_descent, descent_rounds
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
+from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
 from springbench.solvers.model.step_problem import Positions, StepProblem
@@ -52,6 +54,23 @@ class AcceleratedState(SolverState):
     @abstractmethod
     def gradient(self) -> Positions:
         """Return the gradient of the objective [N], (n, 3), at the iterate."""
+
+    def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
+        """Run rounds of iterations.
+
+        Args:
+            rounds: state of the rounds (1,), see `springbench.solvers.kernels.descent_rounds`; updated.
+            limits: limits, in rounds.
+
+        Returns:
+            Number of rounds, last residual [J^(1/2)] and termination reason.
+        """
+        return _interpreted_rounds(self, rounds.view(np.recarray), limits)
+
+
+_interpreted_rounds = descent_rounds.build_rounds(
+    lambda state, count: state.run_unchecked(count), methodcaller("residual"), attrgetter("objective_decrease")
+)
 
 
 class AccelerationEngine(Protocol):

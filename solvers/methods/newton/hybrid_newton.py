@@ -14,13 +14,21 @@ one is added: along unstable directions the step is longer, the closer that mult
 Sorensen 1983).
 
 L-BFGS runs first, with a factor of Q in float32: its iterations are limited by memory bandwidth, and its directions
-need no more digits. One step with the true tensions follows when L-BFGS converges slowly, or when the remaining
-decrease is so small that a saddle is as likely as a minimum. If the curvature there is negative, the step leaves along
-that direction: symmetric initial guesses lead to saddles, near which all methods are slow. If the objective decreased
-as the quadratic model predicted, these tensions become the prediction. Then the method with the larger decrease per
-cost in its last run continues. The exact method takes over once the unmodified Hessian is positive definite and the
-slope decreases as in the quadratic convergence of Newton's method. The start is the better of the initial guess and
-the inertial prediction.
+need no more digits. The start is the better of the initial guess and the inertial prediction.
+
+One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
+last run. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
+last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it has
+no Cholesky factor, predicted tensions follow, and the exact method is tried again after a cost that doubles with each
+attempt that decreases the objective less than the others did meanwhile. A step of the exact method delivers if the
+Hessian is unmodified and the decrease agrees with the quadratic model; then the next step promises more than any other
+method, and the exact method continues until a step does not deliver. Costs are counted, not measured by a clock: in
+groups of L-BFGS iterations, from the numbers of springs, entries and operations of the factors and from the
+factorisations made. Equal solves so make equal decisions and have bitwise equal results, on any machine and under any
+load. `Solution.phases` explains them.
+
+If a point that satisfies the tolerance has an indefinite Hessian, the step leaves along a direction of negative
+curvature: symmetric initial guesses lead to saddles.
 
 With active contacts the exact method does all iterations. Contact is not part of Q, so L-BFGS would restart at each
 newly active vertex, and the contact stiffness is beyond what tensions predict. L-BFGS ignores self-contact: if the
@@ -31,51 +39,59 @@ continues.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.iteration.descent_method import (
     DescentPoint,
+    DescentState,
     PreparedDescent,
     ResidualMetric,
     has_active_barrier,
+    inner_product,
     pick_lower_start,
 )
+from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
-from springbench.solvers.kernels.iteration_loop import REASON_STALLED, RESIDUAL_NEVER, LoopLimits, iteration_limit
+from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, init_rounds
+from springbench.solvers.kernels.iteration_loop import (
+    ONE_ITERATION,
+    REASON_ITERATIONS,
+    REASON_STALLED,
+    RESIDUAL_EACH,
+    RESIDUAL_LAST,
+    RESIDUAL_NEVER,
+    LoopLimits,
+    check_residual,
+)
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import cache_symbolic_analysis
 from springbench.solvers.methods.local_global.accelerated_local_global import AcceleratedState
+from springbench.solvers.methods.newton.hessian_regularisation import ShiftScheduleRule
+from springbench.solvers.methods.newton.negative_curvature import escape_saddle, probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration
 from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, objective_decrease
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
 from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated
 from springbench.solvers.model.barrier_energy import without_barriers
-from springbench.solvers.model.step_problem import Positions, System
+from springbench.solvers.model.step_problem import Positions, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
-from springbench.solvers.objective.step_objective import StepObjective
+from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
-_ROUND_ITERATIONS, _FIRST_ROUNDS = 10, ((2, 2, 3, 3), (5, 5))
-"""Iterations per round of L-BFGS, and between the iterates of the first rounds: an easy step needs few iterations, of
-which at most a third are then superfluous."""
+_RELAXATION_ITERATIONS = 5
+"""L-BFGS iterations after a Newton step with predicted tensions."""
 
-_PROBE_ITERATIONS, _RELAXATION_ITERATIONS = 4, 5
-"""Iterations before the suitability of L-BFGS is assessed, and L-BFGS iterations after a Newton step."""
+_FIRST_PATIENCE = 4.0
+"""Newton steps' cost after which the exact method is tried again, at first."""
 
-_FAST_RESIDUAL_RATIO = 0.5
-"""Largest ratio of residuals after the very first iterations at which L-BFGS is considered suitable."""
+_MODEL_RANGE = (0.3, 0.7)
+"""Range of the decrease, as a fraction of the slope, in which a step agrees with the quadratic model: half of it for a
+full step on a quadratic function, three quarters for half a step."""
 
-_SLOW_DECREASE_RATIO = 0.7
-"""Convergence counts as slow, and a Newton step is tried, if a round still decreases the objective by more than this
-fraction of the decrease of the previous round."""
-
-_NEGLIGIBLE_DECREASE = 2e-6
-"""Fraction of the decrease since the start: a round below it leaves about a millionth, to a saddle or a minimum."""
-
-_FLOPS_PER_ENTRY = 270.0
-"""Flops of a factorisation that cost as much time as one entry of Q's factor in a round of L-BFGS; both were measured
-with all overheads."""
+_LBFGS_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), (2e5, 0.023, 20.0)
+"""Costs of an L-BFGS iteration (constant, per spring, per entry of the factor) and of a Newton step (constant, per
+flop, per entry), fitted to 16 scenes of 6 to 4096 vertices on one core with AVX-512; their ratio alone matters."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +113,7 @@ class HybridNewton:
         cost="1 L-BFGS iteration or 1 Newton step",
     )
 
-    def prepare(self, system: System) -> PreparedDescent:
+    def prepare(self, system: System) -> PreparedHybrid:
         """Prepare the method for a system.
 
         Raises:
@@ -111,86 +127,155 @@ class HybridNewton:
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.description}"
         choice += objective.interpreted_energies
-        return PreparedDescent(objective, metric, method, choice, facts)
+        return PreparedHybrid(objective, metric, method, choice, facts)
+
+
+class PreparedHybrid(PreparedDescent):
+    """The hybrid after the setup for a system."""
+
+    def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
+        """Start a solve from an initial guess (n, 3) [m]."""
+        return _HybridState(self, *self._build_step(problem, initial_guess))
+
+
+@dataclass
+class SolveControl:
+    """What a solve and its loop exchange.
+
+    Attributes:
+        limits: limits of the next iterations, in rounds of L-BFGS or Newton steps.
+        num_iterations: number of iterations that led to the last point.
+        must_escape: whether the last point is a saddle point, to be left.
+        phases: iterations and cost in Newton steps of each method so far.
+    """
+
+    limits: LoopLimits = ONE_ITERATION
+    num_iterations: int = 1
+    must_escape: bool = False
+    phases: dict[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
+
+    def add_phase(self, name: str, num_iterations: int, cost: float) -> None:
+        """Record iterations and the cost of a method, and set `num_iterations`."""
+        count, spent = self.phases.get(name, (0, 0.0))
+        self.phases[name] = count + num_iterations, spent + cost
+        self.num_iterations = num_iterations
+
+
+class _HybridState(DescentState):
+    """The state of a solve, which does many rounds of L-BFGS at once."""
+
+    def __init__(self, prepared: PreparedDescent, step: StepObjective, start: DescentPoint) -> None:
+        super().__init__(prepared, step, start)
+        self._control = SolveControl()
+        self._points = cast(HybridIteration, prepared.method).iterate_points(step, start, self._control)
+
+    def step_state(self) -> bool:
+        return self._advance(ONE_ITERATION)
+
+    def _advance(self, limits: LoopLimits) -> bool:
+        self._control.limits = limits
+        return super().step_state()
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        count, found, ended = 0, np.nan, REASON_ITERATIONS
+        while ended == REASON_ITERATIONS and count < limits.max_iterations:
+            moved = self._advance(limits._replace(max_iterations=limits.max_iterations - count))
+            count += self._control.num_iterations if moved else 0
+            if limits.residual_mode == RESIDUAL_EACH:
+                found = self.residual()
+                ended = check_residual(found, limits)
+            if ended == REASON_ITERATIONS and not moved:
+                ended = REASON_STALLED
+        if limits.residual_mode == RESIDUAL_LAST or (limits.residual_mode == RESIDUAL_EACH and count == 0):
+            found = self.residual()
+        return count, found, ended
+
+    def can_terminate(self) -> bool:
+        self._control.must_escape = not super().can_terminate()
+        return not self._control.must_escape
+
+    @property
+    def phases(self) -> dict[str, tuple[int, float]]:
+        """Iterations and cost of each method so far."""
+        return self._control.phases
+
+
+class _MeasuredRule(ShiftScheduleRule):
+    """The shift schedule, which also measures the step of the exact method.
+
+    Attributes:
+        is_delivered: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
+        is_exact_only: whether only the unmodified Hessian may be factorised.
+    """
+
+    def __init__(self) -> None:
+        self._level: int | None = None
+        self.is_delivered = self.is_exact_only = False
+
+    def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
+        self.is_delivered = False
+        if self.is_exact_only:
+            self._level = 0 if hessian.factorise() else None
+        else:
+            self._level = super().factorise_hessian(hessian, at, diagonal)
+        return self._level
+
+    def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
+        slope = inner_product(at.gradient, at.positions - to.positions)
+        fall, (low, high) = objective_decrease(step, at, to), _MODEL_RANGE
+        self.is_delivered = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
 
 
 class HybridIteration:
-    """The iteration for one system: a round of L-BFGS, or a step of one of the Newton methods."""
+    """The iteration for one system: a round of L-BFGS, or a step of one of the Newton methods.
+
+    Attributes:
+        metric: norm of residuals.
+        newton: the exact method.
+        factor: factor of the Hessian.
+        newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
+    """
 
     def __init__(self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated) -> None:
-        self.metric, self._newton, self._lbfgs = metric, NewtonIteration(metric), lbfgs
+        self.metric, self.newton, self._lbfgs = metric, NewtonIteration(metric), lbfgs
         self.system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
         self.inertia_diagonal: NDArray[np.float64] = np.repeat(
             objective.system.inertia_diagonal[objective.system.free_vertices], 3
         )
-        factor = objective.hessian_matrix.factor
-        self._newton_step_cost = 9.0 * max(1.0, factor.flops) / (_FLOPS_PER_ENTRY * max(1, factor.nonzeros))
+        self.factor = factor = objective.hessian_matrix.factor
+        constant, per_spring, per_entry = _LBFGS_NANOSECONDS
+        springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
+        lbfgs_cost = GROUP_ITERATIONS * (constant + per_spring * springs + per_entry * entries)
+        constant, per_flop, per_entry = _NEWTON_NANOSECONDS
+        self.newton_cost = (constant + per_flop * factor.flops + per_entry * factor.nonzeros) / lbfgs_cost
 
-    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
+    def iterate_points(
+        self, step: StepObjective, start: DescentPoint, control: SolveControl | None = None
+    ) -> Iterator[DescentPoint]:
         """Yield the points after `start`; restarts after an escape from a saddle."""
+        control = control or SolveControl()
         point = pick_lower_start(step, start)
         while not point.is_stalled:
-            for following in (
-                ()
-                if step.has_contact_elements or has_active_barrier(step, point.positions)
-                else self._iterate_approach(step, point)
-            ):
-                if not _is_collision_free(step, point, following):
-                    break
-                point = following
-                yield point
-            for following in self._newton.iterate_points(step, point):
-                point = following
+            if not (step.has_contact_elements or has_active_barrier(step, point.positions)):
+                for following in _Approach(self, step, point, control).iterate_points():
+                    if not _is_collision_free(step, point, following):
+                        break
+                    point = following
+                    yield point
+                    if point.is_past_saddle:
+                        break
+                if point.is_past_saddle or point.is_stalled:
+                    continue
+            before = self.factor.num_factorisations
+            for following in self.newton.iterate_points(step, point):
+                point, done = following, self.factor.num_factorisations
+                control.add_phase("newton", 1, done - before)
+                before = done
                 yield point
                 if point.is_past_saddle:
                     break
 
-    def _iterate_approach(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
-        """Yield the points after `start`, until the exact method becomes faster."""
-        point, rounds = start, iter(_FIRST_ROUNDS)
-        predicting: PredictedTensionNewton | None = None
-        run: AcceleratedState | None = self._start_lbfgs(step, point.positions)
-        before, done = run.residual(), 0
-        gain, newton_gain, fallen = np.inf, 0.0, 0.0
-        ended = unsuited = False
-        while not ended:
-            if gain > newton_gain:
-                last, began = gain, point
-                if run is None:
-                    run, fallen = self._start_lbfgs(step, point.positions), 0.0
-                for count in next(rounds, (_ROUND_ITERATIONS,)):
-                    _, residual, verdict = run.run_iterations(iteration_limit(count))
-                    point, done = _current_point(run), done + count
-                    yield point
-                    ended = verdict == REASON_STALLED or residual**2 <= self.metric.energy_roundoff(point.positions)
-                    unsuited = done == _PROBE_ITERATIONS and residual > _FAST_RESIDUAL_RATIO * before
-                    if ended or unsuited:
-                        break
-                gain, fallen = (
-                    run.objective_decrease - fallen or objective_decrease(step, began, point),
-                    run.objective_decrease,
-                )
-                if unsuited:
-                    predicting, gain = PredictedTensionNewton(self, step, start), 0.0
-                little = _NEGLIGIBLE_DECREASE * fallen if predicting is None else 0.0
-                if newton_gain == 0.0 and (gain <= little or gain > _SLOW_DECREASE_RATIO * last or unsuited):
-                    newton_gain = np.inf
-            else:
-                run = None
-                if predicting is None:
-                    predicting = PredictedTensionNewton(self, step, start)
-                    following, fall, curvature = predicting.compute_first_step(point)
-                    gain = np.inf if curvature else gain
-                    fall = 0.0 if curvature else fall
-                else:
-                    following, fall, ended = predicting.compute_next_step(point)
-                newton_gain = fall / self._newton_step_cost
-                gain = gain or newton_gain
-                if following is not point:
-                    point = following
-                    yield point
-
-    def _start_lbfgs(self, step: StepObjective, p: Positions) -> AcceleratedState:
+    def start_lbfgs(self, step: StepObjective, p: Positions) -> AcceleratedState:
         """Start L-BFGS at p, without surface contact."""
         problem = step.problem
         if step.barrier_energies:
@@ -199,17 +284,138 @@ class HybridIteration:
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
-        return self._newton.can_terminate(step, at)
+        return self.newton.can_terminate(step, at)
 
     def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
         """Return the phases of Newton's method, and a round of L-BFGS, as callables."""
-        return self._newton.iteration_phases(step, at) | {"lbfgs": lambda: self.relax_point(step, at.positions)}
+        return self.newton.iteration_phases(step, at) | {"lbfgs": lambda: self.relax_point(step, at.positions)}
 
     def relax_point(self, step: StepObjective, p: Positions) -> DescentPoint:
         """Return the point after a few iterations of L-BFGS from p."""
-        run = self._start_lbfgs(step, p)
+        run = self.start_lbfgs(step, p)
         run.run_iterations(LoopLimits(_RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
         return _current_point(run)
+
+
+class _Approach:
+    """The choice between the methods in one solve, without active contacts."""
+
+    def __init__(
+        self, method: HybridIteration, step: StepObjective, start: DescentPoint, control: SolveControl
+    ) -> None:
+        self._method, self._step, self._start, self._point, self._control = method, step, start, start, control
+        self._run: AcceleratedState | None = method.start_lbfgs(step, start.positions)
+        self._rounds = init_rounds(self._run.residual(), method.newton_cost)
+        self._rule, self._steepest = _MeasuredRule(), 0.0
+        self._predicting: PredictedTensionNewton | None = None
+        self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
+        self._is_trial_due, self._patience, self._spent, self._fallen = False, _FIRST_PATIENCE, 0.0, 0.0
+
+    def iterate_points(self) -> Iterator[DescentPoint]:
+        """Yield the points of the method that promises most, up to a stalled one or an escape from a saddle."""
+        while True:
+            point = self._escape() if self._control.must_escape else None
+            if point is None:
+                name = self._choose_method()
+                if name == "lbfgs":
+                    point = self._run_lbfgs()
+                else:
+                    self._run, before = None, self._method.factor.num_factorisations
+                    point = self._take_newton_step() if name == "newton" else self._take_predicted_step()
+                    self._record_step(name, point, self._method.factor.num_factorisations - before)
+            if point is not self._point:
+                self._point = point
+                yield point
+
+    def _choose_method(self) -> str:
+        if self._rule.is_delivered or self._is_trial_due or not any(self._gains.values()):
+            return "newton"
+        return max(self._gains, key=lambda name: self._gains[name])
+
+    def _run_lbfgs(self) -> DescentPoint:
+        """Do rounds of L-BFGS until another method promises more, or the limits are reached."""
+        rounds, step, limits = self._rounds, self._step, self._control.limits
+        if self._run is None:
+            self._run = self._method.start_lbfgs(step, self._point.positions)
+            rounds["group_start"], rounds["group_end"] = 0.0, rounds["num_iterations"] + GROUP_ITERATIONS
+            rounds["gain"] = np.inf
+        if step.barrier_energies:  # each round is checked for collisions
+            limits = limits._replace(max_iterations=1)
+        before, floor = (
+            int(rounds["num_iterations"][0]),
+            self._method.metric.energy_roundoff(self._point.positions) ** 0.5,
+        )
+        limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
+        limits = LoopLimits(limits.max_iterations, limit, max(floor, limits.residual_floor), RESIDUAL_EACH)
+        rounds["rival_gain"] = max(self._gains["predicted tensions"], self._gains["newton"])
+        count, residual, ended = self._run.run_rounds(rounds, limits)
+        cost = (int(rounds["num_iterations"][0]) - before) / GROUP_ITERATIONS
+        self._control.add_phase("lbfgs", count, cost / self._method.newton_cost)
+        point, gain = _current_point(self._run), float(rounds["gain"][0])
+        self._spent += cost
+        if ended == REASON_SWITCH and rounds["is_unsuited"]:
+            self._predicting = PredictedTensionNewton(self._method, step, self._start)
+            self._gains |= {"lbfgs": 0.0, "predicted tensions": np.inf}
+            rounds["is_unsuited"], rounds["initial_residual"] = 0, 0.0
+        elif ended == REASON_SWITCH:
+            self._gains["lbfgs"] = max(gain, 0.0)
+            self._is_trial_due = gain >= float(rounds["rival_gain"][0])
+        elif ended == REASON_STALLED or residual <= floor:
+            self._gains["lbfgs"], self._is_trial_due = 0.0, True
+        return point
+
+    def _take_newton_step(self) -> DescentPoint:
+        """Return the point after a step of the exact method; without a factor the first attempt is none."""
+        self._rule.is_exact_only = self._predicting is None and any(self._gains.values())
+        point, self._steepest = self._method.newton.next_point(self._step, self._point, self._steepest, self._rule)
+        if point.is_stalled and self._rule.is_exact_only:
+            self._gains["predicted tensions"] = np.inf
+            return self._point
+        return point
+
+    def _take_predicted_step(self) -> DescentPoint:
+        """Return the point after a step with predicted tensions."""
+        step, point = self._step, self._point
+        if self._predicting is None:
+            self._predicting = PredictedTensionNewton(self._method, step, self._start)
+            following, _, is_past_saddle = self._predicting.compute_first_step(point)
+            if is_past_saddle:
+                self._gains["lbfgs"] = np.inf
+            return following
+        following, _, self._is_trial_due = self._predicting.compute_next_step(point)
+        return following
+
+    def _record_step(self, name: str, to: DescentPoint, num_factorisations: float) -> None:
+        """Record the decrease per cost of a Newton step, and when the exact method is tried next."""
+        fall = objective_decrease(self._step, self._point, to)
+        cost = self._method.newton_cost * num_factorisations
+        self._control.add_phase(name, 1, num_factorisations)
+        if not (name == "newton" and self._gains["predicted tensions"] == np.inf):
+            self._gains[name] = fall / cost if cost > 0.0 else 0.0
+        if name == "newton":
+            others = self._fallen / self._spent if self._spent > 0.0 else 0.0
+            is_better = self._rule.is_delivered or self._gains["newton"] > others
+            self._patience = _FIRST_PATIENCE if is_better else 2.0 * self._patience
+            self._is_trial_due, self._spent, self._fallen = False, 0.0, 0.0
+            rounds = self._rounds
+            rounds["trial_iteration"] = rounds["num_iterations"] + int(
+                GROUP_ITERATIONS * self._patience * self._method.newton_cost
+            )
+        else:
+            self._spent, self._fallen = self._spent + cost, self._fallen + fall
+            self._is_trial_due |= self._spent >= self._patience * self._method.newton_cost
+
+    def _escape(self) -> DescentPoint | None:
+        """Return a lower point next to the saddle point at which the iteration is, or None."""
+        self._control.must_escape = False
+        step, at, diagonal = self._step, self._point, self._method.system_diagonal
+        hessian = step.hessian(at.positions)
+        if not hessian.factorise(0.0):
+            return None
+        before = self._method.factor.num_factorisations
+        found = probe_negative_curvature(step, at, hessian, diagonal) or escape_saddle(step, at, hessian, diagonal)
+        self._control.add_phase("escape", 1, self._method.factor.num_factorisations - before)
+        return found and found._replace(is_past_saddle=True)
 
 
 def _is_collision_free(step: StepObjective, before: DescentPoint, after: DescentPoint) -> bool:

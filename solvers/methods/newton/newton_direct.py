@@ -115,7 +115,7 @@ class NewtonIteration:
         if self._friction_search and step.has_contact_elements:
             point = self._friction_search.relax_initial_point(step, point)
         while not point.is_stalled:
-            point, steepest = self._next_point(step, point, steepest, rule)
+            point, steepest = self.next_point(step, point, steepest, rule)
             yield point
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
@@ -135,10 +135,17 @@ class NewtonIteration:
             "solve": lambda: hessian.solve(at.gradient),
         }
 
-    def _next_point(
+    def next_point(
         self, step: StepObjective, at: DescentPoint, steepest: float, rule: RegularisationRule
     ) -> tuple[DescentPoint, float]:
-        """Return the next point, and the steepest slope so far [J]."""
+        """Return the next point and the steepest slope so far [J].
+
+        Args:
+            step: the objective.
+            at: current point.
+            steepest: steepest slope of the solve before this step [J].
+            rule: regularisation in the solve.
+        """
         hessian = step.hessian(at.positions)
         level = rule.factorise_hessian(hessian, at, self._system_diagonal)
         if level is None:
@@ -149,7 +156,7 @@ class NewtonIteration:
         known = fall > self._metric.energy_roundoff(at.positions)
         slight = fall <= _SADDLE_SLOPE_RATIO * steepest
         if level > 0 and (slight or not known) and type(rule) is not ShiftScheduleRule:
-            return self._next_point(step, at, steepest, ShiftScheduleRule())
+            return self.next_point(step, at, steepest, ShiftScheduleRule())
         found = None
         if known and not (slight and level > 0):
             found = self._search_direction(step, at, direction, level == 0)

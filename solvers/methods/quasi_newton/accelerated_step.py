@@ -20,6 +20,7 @@ from springbench.solvers.kernels.accelerated_descent import (
     judge_trial,
     propose_trial,
 )
+from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
 from springbench.solvers.kernels.edge_elements import add_edge_descent
 from springbench.solvers.kernels.iteration_loop import build_compiled_loop
 from springbench.solvers.kernels.local_global_iteration import IterationPlan
@@ -126,6 +127,23 @@ def run_solve(step: AcceleratedStep, edges, window: AccelerationWindow, limits, 
     """Run the iteration loop (see `springbench.solvers.kernels.iteration_loop`) and write the positions to `out` (n,
     3)."""
     answer = _iterate_loop((step, edges, window), limits)
+    read_positions(step.vertex_rows, window.position, out)
+    return answer
+
+
+@jit_inner
+def _objective_decrease(state):
+    return state[2].window_state[0].objective_decrease
+
+
+_iterate_rounds = build_compiled_rounds(_step_state, _residual, _objective_decrease)
+
+
+@jit_kernel
+def run_solve_rounds(step: AcceleratedStep, edges, window: AccelerationWindow, rounds, limits, out):
+    """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions to `out` (n,
+    3)."""
+    answer = _iterate_rounds((step, edges, window), rounds, limits)
     read_positions(step.vertex_rows, window.position, out)
     return answer
 

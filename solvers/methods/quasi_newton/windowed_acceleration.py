@@ -14,9 +14,10 @@ the solve terminates as "stalled" and its iterate stays unchanged.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, compute_max_coordinate
 from springbench.solvers.kernels import step_setup
@@ -202,6 +203,10 @@ class _CompiledAccelerationState(AcceleratedState):
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return their number, the residual and the reason of the end."""
         return accelerated_step.run_solve(*self._state, limits, self.positions)
+
+    def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
+        """Run rounds of iterations within the limits, compiled."""
+        return accelerated_step.run_solve_rounds(*self._state, rounds, limits, self.positions)
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""

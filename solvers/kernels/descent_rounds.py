@@ -1,0 +1,139 @@
+"""Rounds of a first-order method, and the rule that ends them when Newton's method promises more.
+
+    q = D_k / D_(k-1),   remaining decrease = q D_k + q^2 D_k + ... = D_k q / (1 - q)
+    switch if that per cost of a Newton step exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of a Newton step
+
+D_k is the decrease of the objective in the k-th group of rounds. Costs are counted in groups, from the numbers of
+entries and operations, and not measured by a clock: equal solves then make equal decisions. Once a Newton step has been
+measured, its decrease per cost replaces the promise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba.extending import register_jitable
+from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner_options
+from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, REASON_STALLED, check_residual
+
+REASON_SWITCH = 4
+"""The termination reason of rounds after which another method promises more."""
+
+GROUP_ITERATIONS = 10
+"""Iterations of a group of rounds, whose decrease is measured."""
+
+PROBE_ITERATIONS = 4
+"""Iterations before the suitability of the method is assessed."""
+
+_FAST_RESIDUAL_RATIO = 0.5
+"""Largest ratio of residuals after the very first iterations at which the method is considered suitable."""
+
+ROUND_STATE_DTYPE = np.dtype(
+    [
+        ("num_iterations", np.int64),  # since the start
+        ("group_end", np.int64),  # iterations at the end of the group
+        ("is_unsuited", np.int64),  # whether the residual hardly decreased in the first iterations
+        ("initial_residual", np.float64),  # [J^(1/2)]; 0: suitability is not assessed
+        ("group_start", np.float64),  # decrease of the objective before the group [J]
+        ("gain", np.float64),  # decrease in the last group [J]; infinite before the first
+        ("rival_gain", np.float64),  # decrease of the other methods per cost of a group [J]; 0: not measured
+        ("trial_iteration", np.int64),  # iterations from which on a promise counts
+        ("newton_cost", np.float64),  # cost of a Newton step in groups
+    ]
+)
+"""The state of the rounds of a solve."""
+
+
+@register_jitable(**jit_inner_options)
+def round_size(num_iterations):
+    """Return the number of iterations of the next round.
+
+    An easy step needs few iterations, of which the last round makes at most a third superfluous.
+    """
+    if num_iterations < 4:
+        return 2
+    if num_iterations < GROUP_ITERATIONS:
+        return 3
+    return 5 if num_iterations < 5 * GROUP_ITERATIONS else GROUP_ITERATIONS
+
+
+@register_jitable(**jit_inner_options)
+def _judge_round(now, decrease, residual):
+    """Return SWITCH if another method promises more, else ITERATIONS."""
+    if (
+        now.num_iterations == PROBE_ITERATIONS
+        and now.initial_residual > 0.0
+        and residual > _FAST_RESIDUAL_RATIO * now.initial_residual
+    ):
+        now.is_unsuited = 1
+        return REASON_SWITCH
+    if now.num_iterations < now.group_end:
+        return REASON_ITERATIONS
+    before, gain = now.gain, decrease - now.group_start
+    now.gain, now.group_start = gain, decrease
+    now.group_end = now.num_iterations + GROUP_ITERATIONS
+    if gain <= 0.0 or gain < now.rival_gain:
+        return REASON_SWITCH
+    promises = now.num_iterations >= now.trial_iteration and now.newton_cost * (before - gain) < before
+    return REASON_SWITCH if promises else REASON_ITERATIONS
+
+
+def build_rounds(
+    run_unchecked: Callable[..., Any], residual: Callable[..., Any], decrease: Callable[..., Any]
+) -> Callable[..., Any]:
+    """Build the loop over rounds of a state.
+
+    Args:
+        run_unchecked: function of the state and a number of iterations that does them and returns how many succeeded.
+        residual: function of the state that returns the residual [J^(1/2)].
+        decrease: function of the state that returns the decrease of the objective since the start [J].
+
+    Returns:
+        A function (state, rounds, limits), `rounds` of `ROUND_STATE_DTYPE` (1,) and limits in rounds. It returns the
+        number of rounds, the last residual and the termination reason.
+    """
+
+    def iterate(state: Any, rounds: Any, limits: Any) -> Any:
+        now, count, found, ended = rounds[0], 0, np.nan, REASON_ITERATIONS
+        while ended == REASON_ITERATIONS and count < limits.max_iterations:
+            size = round_size(now.num_iterations)
+            done = run_unchecked(state, size)
+            now.num_iterations += size
+            count += 1
+            found = residual(state)
+            ended = check_residual(found, limits)
+            if ended == REASON_ITERATIONS:
+                ended = _judge_round(now, decrease(state), found) if done == size else REASON_STALLED
+        return count, found, ended
+
+    return iterate
+
+
+def build_compiled_rounds(
+    step_state: Callable[..., Any], residual: Callable[..., Any], decrease: Callable[..., Any]
+) -> Any:
+    """Build the loop for kernels from inner functions of the state; `step_state` returns whether it succeeded."""
+
+    @jit_closure
+    def run_unchecked(state, num_iterations):
+        for count in range(num_iterations):
+            if not step_state(state):
+                return count
+        return num_iterations
+
+    return jit_closure(build_rounds(run_unchecked, residual, decrease))
+
+
+def init_rounds(initial_residual: float, newton_cost: float) -> Any:
+    """Return the state of rounds at their start, (1,).
+
+    Args:
+        initial_residual: residual at the start [J^(1/2)]; 0 if the suitability is not to be assessed.
+        newton_cost: cost of a Newton step in groups.
+    """
+    rounds = np.zeros(1, ROUND_STATE_DTYPE)
+    rounds["group_end"], rounds["gain"] = GROUP_ITERATIONS, np.inf
+    rounds["initial_residual"], rounds["newton_cost"] = initial_residual, newton_cost
+    return rounds
