@@ -106,12 +106,18 @@ def backtracking_line_search(
     return None
 
 
-def pick_lower_start(step: StepObjective, start: DescentPoint) -> DescentPoint:
-    """Return the lower one of a point and the inertial prediction, if the path to the latter is free of collisions."""
+def lower_start_positions(step: StepObjective, p: Positions) -> Positions:
+    """Return p or the inertial prediction, if that is lower and the path to it is free of collisions."""
     fall = step.inertial_prediction()
-    if step.barrier_energies and step.max_step_size(start.positions, fall - start.positions) < 1.0:
-        return start
-    return DescentPoint(fall, step.gradient(fall)) if step.objective_change(start.positions, fall)[0] < 0.0 else start
+    if step.barrier_energies and step.max_step_size(p, fall - p) < 1.0:
+        return p
+    return fall if step.objective_change(p, fall)[0] < 0.0 else p
+
+
+def pick_lower_start(step: StepObjective, start: DescentPoint) -> DescentPoint:
+    """Return the lower one of a point and the inertial prediction, as `lower_start_positions` does."""
+    p = lower_start_positions(step, start.positions)
+    return start if p is start.positions else DescentPoint(p, step.gradient(p))
 
 
 def has_active_barrier(step: StepObjective, p: Positions) -> bool:
@@ -199,7 +205,7 @@ class PreparedDescent(IterativeSolver):
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
         step, start = self._build_step(problem, initial_guess)
-        return DescentState(
+        return _DescentState(
             self, step, pick_lower_start(step, start) if has_active_barrier(step, start.positions) else start
         )
 
@@ -221,7 +227,7 @@ class PreparedDescent(IterativeSolver):
         return step, DescentPoint(p, step.gradient(p))
 
 
-class DescentState(SolverState):
+class _DescentState(SolverState):
     """The state of a solve; a stalled point has the previous positions."""
 
     def __init__(self, prepared: PreparedDescent, step: StepObjective, start: DescentPoint) -> None:

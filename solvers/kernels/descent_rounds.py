@@ -35,7 +35,7 @@ ROUND_STATE_DTYPE = np.dtype(
         ("num_iterations", np.int64),  # since the start
         ("group_end", np.int64),  # iterations at the end of the group
         ("is_unsuited", np.int64),  # whether the residual hardly decreased in the first iterations
-        ("initial_residual", np.float64),  # [J^(1/2)]; 0: suitability is not assessed
+        ("initial_residual", np.float64),  # [J^(1/2)]; negative: not yet known
         ("group_start", np.float64),  # decrease of the objective before the group [J]
         ("gain", np.float64),  # decrease in the last group [J]; infinite before the first
         ("rival_gain", np.float64),  # decrease of the other methods per cost of a group [J]; 0: not measured
@@ -62,11 +62,7 @@ def round_size(num_iterations):
 @register_jitable(**jit_inner_options)
 def _judge_round(now, decrease, residual):
     """Return SWITCH if another method promises more, else ITERATIONS."""
-    if (
-        now.num_iterations == PROBE_ITERATIONS
-        and now.initial_residual > 0.0
-        and residual > _FAST_RESIDUAL_RATIO * now.initial_residual
-    ):
+    if now.num_iterations == PROBE_ITERATIONS and residual > _FAST_RESIDUAL_RATIO * now.initial_residual:
         now.is_unsuited = 1
         return REASON_SWITCH
     if now.num_iterations < now.group_end:
@@ -97,6 +93,8 @@ def build_rounds(
 
     def iterate(state: Any, rounds: Any, limits: Any) -> Any:
         now, count, found, ended = rounds[0], 0, np.nan, REASON_ITERATIONS
+        if now.initial_residual < 0.0:
+            now.initial_residual = residual(state)
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
             size = round_size(now.num_iterations)
             done = run_unchecked(state, size)
@@ -126,14 +124,14 @@ def build_compiled_rounds(
     return jit_closure(build_rounds(run_unchecked, residual, decrease))
 
 
-def init_rounds(initial_residual: float, newton_cost: float) -> Any:
-    """Return the state of rounds at their start, (1,).
-
-    Args:
-        initial_residual: residual at the start [J^(1/2)]; 0 if the suitability is not to be assessed.
-        newton_cost: cost of a Newton step in groups.
-    """
+def init_rounds(newton_cost: float) -> Any:
+    """Return the state of rounds at their start, (1,); the cost of a Newton step is in groups."""
     rounds = np.zeros(1, ROUND_STATE_DTYPE)
-    rounds["group_end"], rounds["gain"] = GROUP_ITERATIONS, np.inf
-    rounds["initial_residual"], rounds["newton_cost"] = initial_residual, newton_cost
+    now = rounds[0]
+    now["group_end"], now["gain"], now["initial_residual"], now["newton_cost"] = (
+        GROUP_ITERATIONS,
+        np.inf,
+        -1.0,
+        newton_cost,
+    )
     return rounds

@@ -13,14 +13,14 @@ positions at the end of the previous step. If H(t) has no Cholesky factor, the s
 one is added: along unstable directions the step is longer, the closer that multiple is to the minimum (More and
 Sorensen 1983).
 
-L-BFGS runs first, with a factor of Q in float32: its iterations are limited by memory bandwidth, and its directions
-need no more digits. The start is the better of the initial guess and the inertial prediction.
+L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32: the iterations are then limited by memory
+bandwidth, and directions need no more digits. The start is the better of the initial guess and the inertial prediction.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last run. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
-last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it has
-no Cholesky factor, predicted tensions follow, and the exact method is tried again after a cost that doubles with each
-attempt that decreases the objective less than the others did meanwhile. A step of the exact method delivers if the
+last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it
+has no Cholesky factor, predicted tensions follow, and the exact method is tried again after a cost that doubles with
+each attempt that decreases the objective less than the others did meanwhile. A step of the exact method delivers if the
 Hessian is unmodified and the decrease agrees with the quadratic model; then the next step promises more than any other
 method, and the exact method continues until a step does not deliver. Costs are counted, not measured by a clock: in
 groups of L-BFGS iterations, from the numbers of springs, entries and operations of the factors and from the
@@ -44,14 +44,14 @@ from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.descent_method import (
     DescentPoint,
-    DescentState,
     PreparedDescent,
     ResidualMetric,
     has_active_barrier,
     inner_product,
-    pick_lower_start,
+    lower_start_positions,
 )
 from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
@@ -69,7 +69,11 @@ from springbench.solvers.kernels.iteration_loop import (
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import cache_symbolic_analysis
 from springbench.solvers.methods.local_global.accelerated_local_global import AcceleratedState
 from springbench.solvers.methods.newton.hessian_regularisation import ShiftScheduleRule
-from springbench.solvers.methods.newton.negative_curvature import escape_saddle, probe_negative_curvature
+from springbench.solvers.methods.newton.negative_curvature import (
+    escape_saddle,
+    is_positive_definite,
+    probe_negative_curvature,
+)
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration
 from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, objective_decrease
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
@@ -82,8 +86,12 @@ from springbench.solvers.objective.step_objective import Hessian, StepObjective
 _RELAXATION_ITERATIONS = 5
 """L-BFGS iterations after a Newton step with predicted tensions."""
 
-_FIRST_PATIENCE = 4.0
-"""Newton steps' cost after which the exact method is tried again, at first."""
+_CACHED_ENTRIES = 2**15
+"""Entries of a factor of Q that fit in a core's second-level cache, 256 KiB: there float64 costs as much as float32,
+and the residuals of L-BFGS are exact."""
+
+_FIRST_PATIENCE = 10.0
+"""Cost in Newton steps after which the exact method is tried again, at first: attempts take a tenth of the cost."""
 
 _MODEL_RANGE = (0.3, 0.7)
 """Range of the decrease, as a fraction of the slope, in which a step agrees with the quadratic model: half of it for a
@@ -122,8 +130,9 @@ class HybridNewton:
         """
         with cache_symbolic_analysis():
             metric, objective = ResidualMetric(system), FixedObjective(system)
-            lbfgs = Lbfgs(precision="float32").prepare_with_factor(without_barriers(system))
-            method, factor = HybridIteration(objective, metric, lbfgs), objective.hessian_matrix.factor
+            is_small = metric.stats.get("nnz_factor", np.inf) <= _CACHED_ENTRIES
+            lbfgs = Lbfgs(precision="float64" if is_small else "float32").prepare_with_factor(without_barriers(system))
+            method, factor = HybridIteration(objective, metric, lbfgs, is_small), objective.hessian_matrix.factor
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.description}"
         choice += objective.interpreted_energies
@@ -133,9 +142,19 @@ class HybridNewton:
 class PreparedHybrid(PreparedDescent):
     """The hybrid after the setup for a system."""
 
+    @property
+    def hybrid(self) -> HybridIteration:
+        """The method."""
+        return cast(HybridIteration, self.method)
+
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        return _HybridState(self, *self._build_step(problem, initial_guess))
+        return _HybridState(self, StepObjective(self.fixed_objective, problem), initial_guess)
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """Return the residual [J^(1/2)] at p (n, 3) [m]."""
+        lbfgs = self.hybrid.exact_lbfgs
+        return lbfgs.residual_at(problem, p) if lbfgs else super().residual_at(problem, p)
 
 
 @dataclass
@@ -146,12 +165,16 @@ class SolveControl:
         limits: limits of the next iterations, in rounds of L-BFGS or Newton steps.
         num_iterations: number of iterations that led to the last point.
         must_escape: whether the last point is a saddle point, to be left.
+        is_minimum: whether the last point was reached by an unmodified Newton step that agrees with its model.
+        residual: residual at the last point [J^(1/2)], None if it is not known.
         phases: iterations and cost in Newton steps of each method so far.
     """
 
     limits: LoopLimits = ONE_ITERATION
     num_iterations: int = 1
     must_escape: bool = False
+    is_minimum: bool = False
+    residual: float | None = None
     phases: dict[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
 
     def add_phase(self, name: str, num_iterations: int, cost: float) -> None:
@@ -161,20 +184,33 @@ class SolveControl:
         self.num_iterations = num_iterations
 
 
-class _HybridState(DescentState):
+class _HybridState(SolverState):
     """The state of a solve, which does many rounds of L-BFGS at once."""
 
-    def __init__(self, prepared: PreparedDescent, step: StepObjective, start: DescentPoint) -> None:
-        super().__init__(prepared, step, start)
-        self._control = SolveControl()
-        self._points = cast(HybridIteration, prepared.method).iterate_points(step, start, self._control)
+    def __init__(self, prepared: PreparedHybrid, step: StepObjective, guess: Positions) -> None:
+        self._metric, self._step, self._control = prepared.metric, step, SolveControl()
+        self.positions = step.apply_exact_pins(guess)
+        self._points = prepared.hybrid.iterate_from(step, self.positions, self._control)
+        self._point: DescentPoint | None = None
 
     def step_state(self) -> bool:
         return self._advance(ONE_ITERATION)
 
     def _advance(self, limits: LoopLimits) -> bool:
-        self._control.limits = limits
-        return super().step_state()
+        """Do iterations within the limits; return False if the positions do not change."""
+        before, self._control.limits, self._control.residual = self.positions, limits, None
+        self._point = next(self._points, self._point)
+        if self._point is not None:
+            self.positions = self._point.positions
+        return self.positions is not before
+
+    def residual(self) -> float:
+        if self._control.residual is not None:
+            return self._control.residual
+        return self._metric.residual(self._current_point().gradient)
+
+    def _current_point(self) -> DescentPoint:
+        return self._point or DescentPoint(self.positions, self._step.gradient(self.positions))
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         count, found, ended = 0, np.nan, REASON_ITERATIONS
@@ -191,8 +227,9 @@ class _HybridState(DescentState):
         return count, found, ended
 
     def can_terminate(self) -> bool:
-        self._control.must_escape = not super().can_terminate()
-        return not self._control.must_escape
+        control = self._control
+        control.must_escape = not (control.is_minimum or is_positive_definite(self._step, self.positions))
+        return not control.must_escape
 
     @property
     def phases(self) -> dict[str, tuple[int, float]]:
@@ -233,42 +270,48 @@ class HybridIteration:
         metric: norm of residuals.
         newton: the exact method.
         factor: factor of the Hessian.
+        exact_lbfgs: L-BFGS, if its residuals are those of the metric and its start is that of a solve; else None.
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
     """
 
-    def __init__(self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated) -> None:
+    def __init__(
+        self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated, is_small: bool
+    ) -> None:
         self.metric, self.newton, self._lbfgs = metric, NewtonIteration(metric), lbfgs
         self.system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
         self.inertia_diagonal: NDArray[np.float64] = np.repeat(
             objective.system.inertia_diagonal[objective.system.free_vertices], 3
         )
         self.factor = factor = objective.hessian_matrix.factor
+        is_exact = is_small and objective.system is without_vertex_contact(without_barriers(objective.system))
+        self.exact_lbfgs = lbfgs if is_exact else None
         constant, per_spring, per_entry = _LBFGS_NANOSECONDS
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
         lbfgs_cost = GROUP_ITERATIONS * (constant + per_spring * springs + per_entry * entries)
         constant, per_flop, per_entry = _NEWTON_NANOSECONDS
         self.newton_cost = (constant + per_flop * factor.flops + per_entry * factor.nonzeros) / lbfgs_cost
 
-    def iterate_points(
-        self, step: StepObjective, start: DescentPoint, control: SolveControl | None = None
-    ) -> Iterator[DescentPoint]:
-        """Yield the points after `start`; restarts after an escape from a saddle."""
-        control = control or SolveControl()
-        point = pick_lower_start(step, start)
-        while not point.is_stalled:
-            if not (step.has_contact_elements or has_active_barrier(step, point.positions)):
-                for following in _Approach(self, step, point, control).iterate_points():
-                    if not _is_collision_free(step, point, following):
+    def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
+        """Yield the points after `start`."""
+        return self.iterate_from(step, start.positions, SolveControl())
+
+    def iterate_from(self, step: StepObjective, p: Positions, control: SolveControl) -> Iterator[DescentPoint]:
+        """Yield the points after the positions p, (n, 3) [m]; restarts after an escape from a saddle."""
+        p, point = lower_start_positions(step, p), None
+        while point is None or not point.is_stalled:
+            if not (step.has_contact_elements or has_active_barrier(step, p)):
+                for following in _Approach(self, step, p, control).iterate_points():
+                    if not _is_collision_free(step, p, following.positions):
                         break
-                    point = following
+                    p, point = following.positions, following
                     yield point
                     if point.is_past_saddle:
                         break
-                if point.is_past_saddle or point.is_stalled:
+                if point and (point.is_past_saddle or point.is_stalled):
                     continue
             before = self.factor.num_factorisations
-            for following in self.newton.iterate_points(step, point):
-                point, done = following, self.factor.num_factorisations
+            for following in self.newton.iterate_points(step, point or DescentPoint(p, step.gradient(p))):
+                p, point, done = following.positions, following, self.factor.num_factorisations
                 control.add_phase("newton", 1, done - before)
                 before = done
                 yield point
@@ -300,12 +343,10 @@ class HybridIteration:
 class _Approach:
     """The choice between the methods in one solve, without active contacts."""
 
-    def __init__(
-        self, method: HybridIteration, step: StepObjective, start: DescentPoint, control: SolveControl
-    ) -> None:
-        self._method, self._step, self._start, self._point, self._control = method, step, start, start, control
-        self._run: AcceleratedState | None = method.start_lbfgs(step, start.positions)
-        self._rounds = init_rounds(self._run.residual(), method.newton_cost)
+    def __init__(self, method: HybridIteration, step: StepObjective, start: Positions, control: SolveControl) -> None:
+        self._method, self._step, self._start, self._control = method, step, start, control
+        self._run: AcceleratedState | None = method.start_lbfgs(step, start)
+        self._point, self._rounds = DescentPoint(start, start), init_rounds(method.newton_cost)
         self._rule, self._steepest = _MeasuredRule(), 0.0
         self._predicting: PredictedTensionNewton | None = None
         self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
@@ -324,7 +365,7 @@ class _Approach:
                     point = self._take_newton_step() if name == "newton" else self._take_predicted_step()
                     self._record_step(name, point, self._method.factor.num_factorisations - before)
             if point is not self._point:
-                self._point = point
+                self._point, self._control.is_minimum = point, self._rule.is_delivered
                 yield point
 
     def _choose_method(self) -> str:
@@ -352,11 +393,12 @@ class _Approach:
         cost = (int(rounds["num_iterations"][0]) - before) / GROUP_ITERATIONS
         self._control.add_phase("lbfgs", count, cost / self._method.newton_cost)
         point, gain = _current_point(self._run), float(rounds["gain"][0])
+        self._control.residual = residual if self._method.exact_lbfgs else None
         self._spent += cost
         if ended == REASON_SWITCH and rounds["is_unsuited"]:
-            self._predicting = PredictedTensionNewton(self._method, step, self._start)
+            self._predicting = PredictedTensionNewton(self._method, step, self._origin())
             self._gains |= {"lbfgs": 0.0, "predicted tensions": np.inf}
-            rounds["is_unsuited"], rounds["initial_residual"] = 0, 0.0
+            rounds["is_unsuited"], rounds["initial_residual"] = 0, np.inf
         elif ended == REASON_SWITCH:
             self._gains["lbfgs"] = max(gain, 0.0)
             self._is_trial_due = gain >= float(rounds["rival_gain"][0])
@@ -377,7 +419,7 @@ class _Approach:
         """Return the point after a step with predicted tensions."""
         step, point = self._step, self._point
         if self._predicting is None:
-            self._predicting = PredictedTensionNewton(self._method, step, self._start)
+            self._predicting = PredictedTensionNewton(self._method, step, self._origin())
             following, _, is_past_saddle = self._predicting.compute_first_step(point)
             if is_past_saddle:
                 self._gains["lbfgs"] = np.inf
@@ -385,12 +427,16 @@ class _Approach:
         following, _, self._is_trial_due = self._predicting.compute_next_step(point)
         return following
 
+    def _origin(self) -> DescentPoint:
+        """Return the point at which the solve started."""
+        return DescentPoint(self._start, self._step.gradient(self._start))
+
     def _record_step(self, name: str, to: DescentPoint, num_factorisations: float) -> None:
         """Record the decrease per cost of a Newton step, and when the exact method is tried next."""
         fall = objective_decrease(self._step, self._point, to)
         cost = self._method.newton_cost * num_factorisations
         self._control.add_phase(name, 1, num_factorisations)
-        if not (name == "newton" and self._gains["predicted tensions"] == np.inf):
+        if fall > 0.0 or name == "newton" or self._is_trial_due:
             self._gains[name] = fall / cost if cost > 0.0 else 0.0
         if name == "newton":
             others = self._fallen / self._spent if self._spent > 0.0 else 0.0
@@ -418,12 +464,11 @@ class _Approach:
         return found and found._replace(is_past_saddle=True)
 
 
-def _is_collision_free(step: StepObjective, before: DescentPoint, after: DescentPoint) -> bool:
-    """Return whether the displacement between two points is collision-free and ends without active contacts."""
+def _is_collision_free(step: StepObjective, before: Positions, after: Positions) -> bool:
+    """Return whether the displacement between positions (n, 3) is collision-free and ends without active contacts."""
     if not step.barrier_energies:
         return True
-    way = after.positions - before.positions
-    return step.max_step_size(before.positions, way) == 1.0 and not has_active_barrier(step, after.positions)
+    return step.max_step_size(before, after - before) == 1.0 and not has_active_barrier(step, after)
 
 
 def _current_point(run: AcceleratedState) -> DescentPoint:
