@@ -100,7 +100,7 @@ def test_soft_springs_are_left_to_lbfgs():
     fall = given.inertial_target + given.external_force / given.system.inertia_diagonal[:, None]
     fall[given.system.pins.vertices] = given.pin_targets
     assert given.value(fall) < given.value(given.current_positions)
-    prepared = Lbfgs(precision="float32").prepare(given.system)
+    prepared = Lbfgs().prepare(given.system)
     lbfgs = [p.copy() for p in islice(prepared.iterates(replace(given, initial_guess=fall)), 20)]
     np.testing.assert_array_equal(hybrid, [lbfgs[number - 1] for number in numbers])
 
