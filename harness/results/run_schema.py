@@ -159,6 +159,13 @@ RUN_COLUMNS = (
         "why the step's iteration ended: max-iter, stalled, converged or roundoff; the least favourable of its stages",
     ),
     ColumnSpec(
+        "solver_phases",
+        _TEXT,
+        "",
+        "methods that the solver switched between in the step, each with its iterations and its share of the cost, "
+        "counted in operations; null for a solver of one method",
+    ),
+    ColumnSpec(
         "residual",
         _REAL,
         "J^(1/2)",

@@ -146,6 +146,7 @@ def build_solution_columns(
         "friction_iterations": step.friction_rounds.num_iterations if step.friction_rounds else None,
         "friction_relative_change": step.friction_rounds.relative_change if step.friction_rounds else None,
         "termination_reason": find_termination_reason(step),
+        "solver_phases": describe_phases(step),
         "residual": residual,
         "residual_last": s.residual,
         "residual_iterate": s.residual_iterate,
@@ -211,6 +212,20 @@ def compute_returned_residual(prepared: PreparedSolver, step: SimulationStep) ->
 def find_termination_reason(step: SimulationStep) -> str:
     """Return the termination reason of the least converged stage."""
     return min((solution.termination_reason for _, solution in step.stages), key=_REASON_ORDER.index)
+
+
+def describe_phases(step: SimulationStep) -> str | None:
+    """Describe the methods that a step's solves switched between; None for a solver of one method.
+
+    Each has its iterations and its share of the counted cost, summed over the stages.
+    """
+    counts: dict[str, int] = {}
+    costs: dict[str, float] = {}
+    for _, solution in step.stages:
+        for name, (count, cost) in (solution.phases or {}).items():
+            counts[name], costs[name] = counts.get(name, 0) + count, costs.get(name, 0.0) + cost
+    whole = sum(costs.values()) or 1.0
+    return "; ".join(f"{name} {count} ({costs[name] / whole:.0%})" for name, count in counts.items()) or None
 
 
 def compute_strain_columns(scene: Scene, p: Positions) -> dict[str, float]:

@@ -10,7 +10,7 @@ overrides `run_iterations` and uses the kernel version in `springbench.solvers.k
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from operator import methodcaller
 from typing import ClassVar
 
@@ -67,6 +67,11 @@ class SolverState(ABC):
     @property
     def warm_start(self) -> NDArray[np.float64] | None:
         """Data for the next solve, see `springbench.solvers.model.step_problem.Solution`."""
+        return None
+
+    @property
+    def phases(self) -> Mapping[str, tuple[int, float]] | None:
+        """Iterations and counted cost of each method so far, for a solver that switches between several."""
         return None
 
     @abstractmethod
@@ -160,7 +165,7 @@ class IterativeSolver(ABC):
                 ended = iteration_loop.REASON_STALLED
         ended = _TERMINATION_REASONS[ended]
         found = Solution(
-            run.positions, count, residual, yardstick, ended, run.velocity, self.residual_iterate, run.warm_start
+            run.positions, count, residual, yardstick, ended, run.velocity, self.residual_iterate, run.warm_start, run.phases
         )
         self.release_state(run)
         return found

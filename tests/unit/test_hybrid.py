@@ -133,3 +133,40 @@ def test_no_iterate_is_higher_than_the_one_before():
     values = [given.value(p) for p in (given.initial_guess, *path)]
     # Sums of a thousand terms, each good to round-off over the strain of its spring.
     assert (np.diff(values) <= 1e-12 * given.value_scale(path[0])).all()
+
+
+@pytest.mark.parametrize(("ratio", "names"), [(0.1, {"lbfgs"}), (1e6, {"lbfgs", "predicted tensions", "newton"})])
+def test_the_phases_of_a_solve_add_up_to_its_iterations(ratio, names):
+    """Soft springs are left to L-BFGS; for stiff ones all three methods are measured. Two solves decide alike."""
+    given, prepared = stiff(ratio), HybridNewton().prepare(stiff(ratio).system)
+    one, two = (prepared.solve(given, StopRule(300, 1e-4)) for _ in range(2))
+    assert one.phases is not None
+    assert set(one.phases) == names
+    assert sum(count for count, _ in one.phases.values()) == one.num_iterations
+    assert all(cost > 0.0 for _, cost in one.phases.values())
+    assert one.phases == two.phases
+    np.testing.assert_array_equal(one.positions, two.positions)
+
+
+def test_a_solve_ends_at_the_first_of_its_iterates_that_satisfies_the_tolerance():
+    """Rounds of L-BFGS are done many at a time, and the rule looks at each."""
+    given, prepared = stiff(1.0), HybridNewton().prepare(stiff(1.0).system)
+    found = prepared.solve(given, StopRule(300, 1e-6))
+    path = [p.copy() for p in islice(prepared.iterates(given), found.num_iterations)]
+    np.testing.assert_array_equal(path[-1], found.positions)
+    residuals = [prepared.residual_at(given, p) for p in path]
+    limit = 1e-6 * found.initial_residual
+    assert residuals[-1] <= 1.001 * limit  # a factor of Q in another order of operations
+    assert min(residuals[:-1]) > 0.999 * limit
+
+
+def test_a_failed_factorisation_counts_by_the_operations_before_it_fails():
+    graph = HybridNewton().prepare(stiff(1.0).system).hybrid.factor
+    n = graph._frontal_structure.diagonal_block  # pyright: ignore[reportPrivateUsage]
+    blocks = np.zeros((graph._frontal_structure.block_index.max() + 1, 3, 3))  # pyright: ignore[reportPrivateUsage]
+    assert not graph.factorise(blocks)
+    least = graph.num_factorisations
+    assert 0.0 < least < 1.0
+    blocks[n] = np.eye(3)
+    assert graph.factorise(blocks)
+    assert graph.num_factorisations == least + 1.0

@@ -311,9 +311,9 @@ class HybridIteration:
                     continue
             before = self.factor.num_factorisations
             for following in self.newton.iterate_points(step, point or DescentPoint(p, step.gradient(p))):
-                p, point, done = following.positions, following, self.factor.num_factorisations
-                control.add_phase("newton", 1, done - before)
-                before = done
+                moved, done = following.positions is not p, self.factor.num_factorisations
+                control.add_phase("newton", int(moved), done - before)
+                p, point, before = following.positions, following, done
                 yield point
                 if point.is_past_saddle:
                     break
@@ -435,7 +435,7 @@ class _Approach:
         """Record the decrease per cost of a Newton step, and when the exact method is tried next."""
         fall = objective_decrease(self._step, self._point, to)
         cost = self._method.newton_cost * num_factorisations
-        self._control.add_phase(name, 1, num_factorisations)
+        self._control.add_phase(name, int(to.positions is not self._point.positions), num_factorisations)
         if fall > 0.0 or name == "newton" or self._is_trial_due:
             self._gains[name] = fall / cost if cost > 0.0 else 0.0
         if name == "newton":
