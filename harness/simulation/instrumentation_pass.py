@@ -222,7 +222,7 @@ def describe_phases(step: SimulationStep) -> str | None:
     counts: dict[str, int] = {}
     costs: dict[str, float] = {}
     for _, solution in step.stages:
-        for name, (count, cost) in (solution.phases or {}).items():
+        for name, (count, cost) in (solution.solver_phases or {}).items():
             counts[name], costs[name] = counts.get(name, 0) + count, costs.get(name, 0.0) + cost
     whole = sum(costs.values()) or 1.0
     return "; ".join(f"{name} {count} ({costs[name] / whole:.0%})" for name, count in counts.items()) or None

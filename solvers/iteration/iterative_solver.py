@@ -70,7 +70,7 @@ class SolverState(ABC):
         return None
 
     @property
-    def phases(self) -> Mapping[str, tuple[int, float]] | None:
+    def solver_phases(self) -> Mapping[str, tuple[int, float]] | None:
         """Iterations and counted cost of each method so far, for a solver that switches between several."""
         return None
 
@@ -165,7 +165,15 @@ class IterativeSolver(ABC):
                 ended = iteration_loop.REASON_STALLED
         ended = _TERMINATION_REASONS[ended]
         found = Solution(
-            run.positions, count, residual, yardstick, ended, run.velocity, self.residual_iterate, run.warm_start, run.phases
+            run.positions,
+            count,
+            residual,
+            yardstick,
+            ended,
+            run.velocity,
+            self.residual_iterate,
+            run.warm_start,
+            run.solver_phases,
         )
         self.release_state(run)
         return found

@@ -294,8 +294,8 @@ class Solution:
         velocity: (n, 3) [m/s], for a method that computes its own.
         residual_iterate: the iterate of the residual.
         warm_start: warm start of the next solve, of any shape.
-        phases: iterations and counted cost of each method that a solve switched between, in the order of their first
-            use; None for a solver of one method.
+        solver_phases: iterations and counted cost of each method that a solve switched between, by the order of use;
+            None for a solver of one method.
     """
 
     positions: Positions
@@ -306,7 +306,7 @@ class Solution:
     velocity: Positions | None = None
     residual_iterate: ResidualIterate = "returned"
     warm_start: NDArray[np.float64] | None = None
-    phases: Mapping[str, tuple[int, float]] | None = None
+    solver_phases: Mapping[str, tuple[int, float]] | None = None
 
 
 class PreparedSolver(Protocol):

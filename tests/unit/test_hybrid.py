@@ -140,11 +140,11 @@ def test_the_phases_of_a_solve_add_up_to_its_iterations(ratio, names):
     """Soft springs are left to L-BFGS; for stiff ones all three methods are measured. Two solves decide alike."""
     given, prepared = stiff(ratio), HybridNewton().prepare(stiff(ratio).system)
     one, two = (prepared.solve(given, StopRule(300, 1e-4)) for _ in range(2))
-    assert one.phases is not None
-    assert set(one.phases) == names
-    assert sum(count for count, _ in one.phases.values()) == one.num_iterations
-    assert all(cost > 0.0 for _, cost in one.phases.values())
-    assert one.phases == two.phases
+    assert one.solver_phases is not None
+    assert set(one.solver_phases) == names
+    assert sum(count for count, _ in one.solver_phases.values()) == one.num_iterations
+    assert all(cost > 0.0 for _, cost in one.solver_phases.values())
+    assert one.solver_phases == two.solver_phases
     np.testing.assert_array_equal(one.positions, two.positions)
 
 
@@ -161,7 +161,7 @@ def test_a_solve_ends_at_the_first_of_its_iterates_that_satisfies_the_tolerance(
 
 
 def test_a_failed_factorisation_counts_by_the_operations_before_it_fails():
-    graph = HybridNewton().prepare(stiff(1.0).system).hybrid.factor
+    graph = HybridNewton().prepare(stiff(1.0).system).hybrid_iteration.factor
     n = graph._frontal_structure.diagonal_block  # pyright: ignore[reportPrivateUsage]
     blocks = np.zeros((graph._frontal_structure.block_index.max() + 1, 3, 3))  # pyright: ignore[reportPrivateUsage]
     assert not graph.factorise(blocks)

@@ -25,7 +25,7 @@ Hessian is unmodified and the decrease agrees with the quadratic model; then the
 method, and the exact method continues until a step does not deliver. Costs are counted, not measured by a clock: in
 groups of L-BFGS iterations, from the numbers of springs, entries and operations of the factors and from the
 factorisations made. Equal solves so make equal decisions and have bitwise equal results, on any machine and under any
-load. `Solution.phases` explains them.
+load. `Solution.solver_phases` explains them.
 
 If a point that satisfies the tolerance has an indefinite Hessian, the step leaves along a direction of negative
 curvature: symmetric initial guesses lead to saddles.
@@ -143,7 +143,7 @@ class PreparedHybrid(PreparedDescent):
     """The hybrid after the setup for a system."""
 
     @property
-    def hybrid(self) -> HybridIteration:
+    def hybrid_iteration(self) -> HybridIteration:
         """The method."""
         return cast(HybridIteration, self.method)
 
@@ -153,7 +153,7 @@ class PreparedHybrid(PreparedDescent):
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)] at p (n, 3) [m]."""
-        lbfgs = self.hybrid.exact_lbfgs
+        lbfgs = self.hybrid_iteration.exact_lbfgs
         return lbfgs.residual_at(problem, p) if lbfgs else super().residual_at(problem, p)
 
 
@@ -167,7 +167,7 @@ class SolveControl:
         must_escape: whether the last point is a saddle point, to be left.
         is_minimum: whether the last point was reached by an unmodified Newton step that agrees with its model.
         residual: residual at the last point [J^(1/2)], None if it is not known.
-        phases: iterations and cost in Newton steps of each method so far.
+        solver_phases: iterations and cost in Newton steps of each method so far.
     """
 
     limits: LoopLimits = ONE_ITERATION
@@ -175,12 +175,12 @@ class SolveControl:
     must_escape: bool = False
     is_minimum: bool = False
     residual: float | None = None
-    phases: dict[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
+    solver_phases: dict[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
 
     def add_phase(self, name: str, num_iterations: int, cost: float) -> None:
         """Record iterations and the cost of a method, and set `num_iterations`."""
-        count, spent = self.phases.get(name, (0, 0.0))
-        self.phases[name] = count + num_iterations, spent + cost
+        count, spent = self.solver_phases.get(name, (0, 0.0))
+        self.solver_phases[name] = count + num_iterations, spent + cost
         self.num_iterations = num_iterations
 
 
@@ -190,7 +190,7 @@ class _HybridState(SolverState):
     def __init__(self, prepared: PreparedHybrid, step: StepObjective, guess: Positions) -> None:
         self._metric, self._step, self._control = prepared.metric, step, SolveControl()
         self.positions = step.apply_exact_pins(guess)
-        self._points = prepared.hybrid.iterate_from(step, self.positions, self._control)
+        self._points = prepared.hybrid_iteration.iterate_from(step, self.positions, self._control)
         self._point: DescentPoint | None = None
 
     def step_state(self) -> bool:
@@ -232,9 +232,9 @@ class _HybridState(SolverState):
         return not control.must_escape
 
     @property
-    def phases(self) -> dict[str, tuple[int, float]]:
+    def solver_phases(self) -> dict[str, tuple[int, float]]:
         """Iterations and cost of each method so far."""
-        return self._control.phases
+        return self._control.solver_phases
 
 
 class _MeasuredRule(ShiftScheduleRule):
