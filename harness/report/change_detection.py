@@ -1,5 +1,3 @@
-# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false
-# ruptures has no types.
 """Detection of changes in the stored results of benchmarks over time.
 
 The results of a benchmark on one kind of machine, in the order of their commits, are logarithms y of its ratio to the
@@ -8,8 +6,9 @@ change at some commits. The changes minimise the penalised negative log-likeliho
 
     sum over results of (y - mean of its segment)^2 / sigma^2 + 5 log(n) per change,
 
-found exactly by PELT (Killick, Fearnhead and Eckley 2012; the library ruptures). Sigma is estimated from differences of
-neighbours, which a change hardly affects, and is at least as large as the results' own intervals imply.
+found exactly by dynamic programming over the last change (optimal partitioning, Jackson et al. 2005), in O(n^2). Sigma
+is estimated from differences of neighbours, which a change hardly affects, and is at least as large as the results' own
+intervals imply.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,13 +150,32 @@ def detect_changes(points: Sequence[BenchmarkPoint]) -> tuple[int, ...]:
     """
     if len(points) < MIN_RESULTS:
         return (0,)
-    from ruptures import Pelt
-
     y: FloatArray = np.log([p.value for p in points])
     sigma = max(estimate_noise(y), float(np.median([math.log(p.high / p.low) for p in points])) / _INTERVAL_SIGMAS)
-    fitted: Any = Pelt(model="l2", min_size=MIN_SEGMENT_RESULTS, jump=1).fit(y / sigma)
-    found: list[int] = fitted.predict(pen=CHANGE_PENALTY * math.log(len(y)))
-    return (0, *found[:-1])
+    return partition_series(y / sigma, CHANGE_PENALTY * math.log(len(y)))
+
+
+def partition_series(y: FloatArray, penalty: float) -> tuple[int, ...]:
+    """Return the starts of the segments that minimise squared deviations plus a penalty per change.
+
+    Args:
+        y: at least MIN_SEGMENT_RESULTS values (n,).
+        penalty: cost of a change.
+    """
+    n, y = len(y), y - y.mean()
+    sums, squares = (np.concatenate([[0.0], np.cumsum(values)]) for values in (y, y * y))
+    least, last = np.full(n + 1, np.inf), np.zeros(n + 1, np.int64)
+    least[0] = -penalty  # the first segment begins without a change
+    for end in range(MIN_SEGMENT_RESULTS, n + 1):
+        start = np.arange(end - MIN_SEGMENT_RESULTS + 1)
+        cost = squares[end] - squares[start] - (sums[end] - sums[start]) ** 2 / (end - start)
+        total = least[start] + cost + penalty
+        last[end] = np.argmin(total)
+        least[end] = total[last[end]]
+    starts = [int(last[n])]
+    while starts[0]:
+        starts.insert(0, int(last[starts[0]]))
+    return tuple(starts)
 
 
 def estimate_noise(y: FloatArray) -> float:

@@ -44,7 +44,10 @@ def test_the_wheel_is_checked_and_used_on_three_platforms_by_every_python():
     assert [name.partition("-")[0] for name in matrix["os"]] == ["ubuntu", "macos", "windows"]
     pythons = {*matrix["python"], *(entry["python"] for entry in matrix["include"])}
     assert pythons == {"3.11", "3.12", "3.13", "3.14"}
-    assert PROJECT["requires-python"] == f">={min(pythons)}"
+    next_minor = int(max(pythons).partition(".")[2]) + 1
+    assert PROJECT["requires-python"] == f">={min(pythons)},<3.{next_minor}"
+    named = [line.rpartition(" ")[2] for line in PROJECT["classifiers"] if line.startswith("Programming Language")]
+    assert named == sorted(pythons)
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)

@@ -1,5 +1,6 @@
 """`springbench regress --history`: changes of level over commits."""
 
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from springbench.harness.report.change_detection import (
     BenchmarkPoint,
     detect_changes,
     find_stored_files,
+    partition_series,
     read_histories,
 )
 from typer.testing import CliRunner
@@ -83,3 +85,18 @@ def test_a_mistake_is_one_message(tmp_path: Path):
     ):
         code, output = find_history(*arguments)
         assert (code, message in output) == (2, True), output
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_partition_is_the_best_of_all(seed: int):
+    rng = np.random.default_rng(seed)
+    y, penalty = rng.normal(size=10), 2.0
+    y[4:] += 4 * rng.normal()
+
+    def cost(starts: tuple[int, ...]) -> float:
+        pairs = zip(starts, (*starts[1:], len(y)), strict=True)
+        return sum(float(((y[a:b] - y[a:b].mean()) ** 2).sum()) for a, b in pairs) + penalty * (len(starts) - 1)
+
+    every = [(0, *some) for count in range(5) for some in combinations(range(2, 9), count)]
+    allowed = [starts for starts in every if min(np.diff((*starts, len(y)))) >= 2]
+    assert cost(partition_series(y, penalty)) == pytest.approx(min(map(cost, allowed)), abs=1e-12)  # round-off
