@@ -190,11 +190,16 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
     if any(row["stationarity"] is not None and row["stationarity_above_roundoff"] is None for row in table):
         raise InputError(f"{folder}: holds runs that another version judged; run the sweep again")
     firsts = [run[0] for run in runs.values()]
+    of_scene: dict[str, list[Mapping[str, Any]]] = {}
+    of_solver: dict[str, list[Mapping[str, Any]]] = {}
+    for first in firsts:
+        of_scene.setdefault(first["scene"], []).append(first)
+        of_solver.setdefault(first["solver"], []).append(first)
     cells: dict[tuple[str, str], VerifiedRun] = {}
     energies: dict[str, dict[str, float]] = {}
     for run in sorted(runs.values(), key=lambda run: run[0]["started_at"]):
-        case, solver = _case_name(run[0], firsts), _solver_label(run[0], firsts)
         first = run[0]
+        case, solver = _case_name(first, of_scene[first["scene"]]), _solver_label(first, of_solver[first["solver"]])
         cells[case, solver] = VerifiedRun(
             case,
             solver,
@@ -283,15 +288,14 @@ _OPTION_COLUMNS = ("size", *(option.column for option in RUN_OPTIONS.values() if
 
 
 def _case_name(row: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
-    """Return the scene with the options in which the runs of that scene differ."""
-    own = [other for other in runs if other["scene"] == row["scene"]]
-    varied = [str(row[key]) for key in _OPTION_COLUMNS if any(other[key] != row[key] for other in own)]
+    """Return the scene with the options in which its runs differ."""
+    varied = [str(row[key]) for key in _OPTION_COLUMNS if any(other[key] != row[key] for other in runs)]
     return " ".join([row["scene"], *varied])
 
 
 def _solver_label(row: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     """Return the solver's name with the parameters in which its runs differ."""
-    stated = {run["parameters"] or "{}" for run in runs if run["solver"] == row["solver"]}
+    stated = {run["parameters"] or "{}" for run in runs}
     others = [json.loads(text) for text in stated]
     own = json.loads(row["parameters"] or "{}")  # what a solver from outside was not given is not among them
     varied = [str(v) for key, v in own.items() if any(other.get(key) != v for other in others)]

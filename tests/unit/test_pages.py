@@ -59,6 +59,16 @@ def test_a_study_states_what_made_it(checkout: Path) -> None:
     assert "positions_digest" not in table.column_names
 
 
+def test_a_study_gains_the_runs_of_its_parts(checkout: Path) -> None:
+    study = checkout / "results" / "published" / "dummy"
+    write_dummy_runs(checkout / "more", 3, first_number=10)
+    arguments = ["publish-study", str(study), str(checkout / "more"), "--config", str(checkout / "configs/dummy.yaml")]
+    for _ in range(2):  # a run that is published already is published once
+        result = CliRunner().invoke(app, [*arguments, "--published", str(study.parent)])
+        assert result.exit_code == 0, result.output
+        assert read_study(study).metadata["runs"] == 13
+
+
 def test_equal_data_give_equal_bytes(checkout: Path) -> None:
     page, picture = (checkout / "results" / "findings" / name for name in ("runs.md", "pictures/iterations.png"))
     assert set(write_pages(checkout)) == {page, picture}

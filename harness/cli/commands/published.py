@@ -23,7 +23,11 @@ ALL_STUDIES, ENTRIES = "all", "entries"
 
 def publish_study(
     results: Annotated[
-        Path, typer.Argument(help="Results of one config, such as results/hard; or measurements (.parquet).")
+        list[Path],
+        typer.Argument(
+            help="Results of one config, such as results/hard; or measurements (.parquet). Several: parts of the "
+            "study, such as the published one and its missing runs."
+        ),
     ],
     config: Annotated[Path | None, typer.Option(help="Config of these results; the owner of the folder.")] = None,
     provenance: Annotated[
@@ -38,10 +42,10 @@ def publish_study(
     from springbench.harness.experiments.archive.study_publication import write_study
     from springbench.harness.results.folder_ownership import read_owner
 
-    owner = config or (read_owner(results) if results.is_dir() else None)
+    owner = config or (read_owner(results[0]) if results[0].is_dir() else None)
     if owner is None:
-        raise InputError(InputMistake("does not state its config; give --config", results))
-    for path in (results, provenance):
+        raise InputError(InputMistake("does not state its config; give --config", results[0]))
+    for path in (*results, provenance):
         if path and not path.exists():
             raise InputError(InputMistake("is not there; wanted results, or a Parquet file of measurements", path))
     write_study(results, owner, published, print_message, provenance)

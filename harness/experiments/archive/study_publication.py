@@ -37,7 +37,7 @@ DROPPED_COLUMNS = frozenset(
 """
 
 _TIME_COLUMNS = frozenset(("seconds", "cpu_seconds", "preempted", "load_average", "cold_seconds", "search_seconds"))
-"""Columns that mean nothing where the steps were not timed."""
+"""Columns that mean nothing where the steps were not timed, and several runs shared the machine."""
 
 _TABLES = ("rows", "accuracy", "ablation")
 
@@ -49,16 +49,17 @@ MAX_PUBLISHED_BYTES = 8 * 2**20
 
 
 def write_study(
-    results: Path,
+    parts: Sequence[Path],
     config: Path,
     published: Path,
     print_message: Callable[[str], None],
     provenance: Path | None = None,
 ) -> published_set.PublishedStudy:
-    """Write the study of a folder of results to the published set, and return it.
+    """Write the study of folders of results to the published set, and return it.
 
     Args:
-        results: results of one config; or a Parquet file of measurements by a script.
+        parts: results of one config, of which each folder was written by one command; a published study gains the
+            runs of the others. Or one Parquet file of measurements by a script.
         config: the config; its stem is the name of the study.
         published: folder of the published set.
         print_message: prints a remark.
@@ -69,21 +70,22 @@ def write_study(
     """
     if not config.is_file():
         raise InputError(InputMistake("is not there; wanted the config of these results", config, key="--config"))
-    if results.suffix == ".parquet":
-        tables: dict[str, pa.Table | None] = {"measurements": _read_measurements(results)}
-    else:
-        tables = {table: _read_table(results / table) for table in _TABLES}
+    by_part = [_read_part(part) for part in parts]
     made = _read_measurements(provenance) if provenance else None
-    found = {table: _drop_missing_software(rows) for table, rows in tables.items() if rows is not None}
+    found = {
+        table: _drop_missing_software(_keep_newest_runs(pa.concat_tables(several, promote_options="permissive")))
+        for table in ("measurements", *_TABLES)
+        if (several := [tables[table] for tables in by_part if table in tables])
+    }
     if not found:
-        raise InputError(InputMistake("holds no rows; wanted the folder of one sweep, such as results/hard", results))
+        raise InputError(InputMistake("holds no rows; wanted the folder of one sweep, such as results/hard", parts[0]))
     is_timed = any(_is_timed(rows) for rows in found.values())
     folder = published / config.stem
     folder.mkdir(parents=True, exist_ok=True)
     for path in folder.glob("*.parquet"):
         path.unlink()
     for table, rows in found.items():
-        left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed else _TIME_COLUMNS)
+        left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed or _ran_alone(rows) else _TIME_COLUMNS)
         write_published_table(folder / published_set.TABLE_FILES[table], _drop_columns(rows, left_out))
     metadata = {
         "config": os.path.relpath(config.resolve(), folder.resolve()),
@@ -95,6 +97,9 @@ def write_study(
             [row for rows in ([made] if made else found.values()) for row in _select_provenance(rows)]
         ),
     }
+    metadata["duration_seconds"] = round(
+        sum(_measure_duration(_select_provenance(rows)) for tables in by_part for rows in tables.values())
+    )
     if made:
         metadata |= {"runs": sum(map(len, found.values())), "duration_seconds": None}
     study = write_study_file(folder, metadata)
@@ -149,6 +154,28 @@ def summarise_provenance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
+def _read_part(part: Path) -> dict[str, pa.Table]:
+    """Read the tables of a part of a study by name: a folder of results, a published study, or a file."""
+    if part.suffix == ".parquet":
+        return {"measurements": _read_measurements(part)}
+    if (part / published_set.STUDY_FILE).is_file():
+        with published_set.open_study_folder(published_set.read_study(part)) as folder:
+            return _read_part(folder)
+    return {table: rows for table in _TABLES if (rows := _read_table(part / table)) is not None}
+
+
+def _keep_newest_runs(rows: pa.Table) -> pa.Table:
+    """Keep the newest rows of each run that was executed several times, by its key on any machine."""
+    names = [name for name in (*published_set.RUN_KEYS, "run_id", "started_at") if name in rows.column_names]
+    if "run_id" not in names:
+        return rows
+    newest: dict[tuple[Any, ...], tuple[str, str]] = {}
+    for row in rows.select(names).to_pylist():
+        key = tuple(row.get(name) for name in published_set.RUN_KEYS)
+        newest[key] = max(newest.get(key, ("", "")), (str(row.get("started_at")), row["run_id"]))
+    return rows.filter(pc.is_in(rows["run_id"], pa.array([run for _, run in newest.values()])))
+
+
 def _read_table(folder: Path) -> pa.Table | None:
     """Read the rows of a folder with the names of their units, or None if there are none."""
     units = row_store.list_units(folder)
@@ -177,6 +204,10 @@ def _drop_missing_software(rows: pa.Table) -> pa.Table:
 
 def _is_timed(rows: pa.Table) -> bool:
     return "timing" not in rows.column_names or "none" not in pc.unique(rows["timing"]).to_pylist()
+
+
+def _ran_alone(rows: pa.Table) -> bool:
+    return "num_concurrent_runs" in rows.column_names and set(rows["num_concurrent_runs"].to_pylist()) <= {1, None}
 
 
 def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:

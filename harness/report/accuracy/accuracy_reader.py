@@ -51,9 +51,12 @@ def read_accuracy(
     if not units:
         raise InputError(InputMistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_ResultRow]] = defaultdict(list)
-    # Columns that older rows do not have.
+    # Columns that older rows and published ones do not have.
     missing = dict.fromkeys(
-        ("family", "citation", "is_minimiser", "is_substepping", "source_fingerprint", "started_at", "commit")
+        (
+            *("family", "citation", "is_minimiser", "is_substepping", "source_fingerprint", "started_at", "commit"),
+            *("recording_path", "reason", "preempted", "cold_seconds", "minimum_index", "minimum_id"),
+        )
     )
     table = read_rows(units, pa.schema([]), required_columns=("kind",), promote="permissive", on_invalid=on_invalid)
     for row in table.to_pylist():
@@ -61,7 +64,7 @@ def read_accuracy(
     for rows in kinds.values():  # files come by their names, 122 before 22
         rows.sort(key=lambda row: (row["scene"], row["size"]))
     label = _build_row_labeller(kinds["curve"] + kinds["work"])
-    problems = _build_snapshots(kinds)
+    problems = _build_snapshots(kinds, folder.name)
     return AccuracyData(
         tuple(problems.values()),
         tuple(_build_curves(kinds, problems, label)),
@@ -74,10 +77,10 @@ def read_accuracy(
     )
 
 
-def _build_snapshots(kinds: dict[str, list[_ResultRow]]) -> dict[str, SnapshotProblem]:
+def _build_snapshots(kinds: dict[str, list[_ResultRow]], study: str) -> dict[str, SnapshotProblem]:
     """Build the snapshots by digest.
 
-    An energy below all certified minima shows that they are not the lowest.
+    An energy below all certified minima shows that they are not the lowest. Rows of a published study state no sweep.
     """
     lowest: dict[str, float] = {}
     for row in kinds["curve"]:
@@ -104,7 +107,7 @@ def _build_snapshots(kinds: dict[str, list[_ResultRow]]) -> dict[str, SnapshotPr
         if doubt and seen < (energies or [np.inf])[0] - noise:
             energies.insert(0, seen)
             names.insert(0, "")
-        paper = row["sweep"] == LIU2013_SWEEP
+        paper = row.get("sweep", study) == LIU2013_SWEEP
         found[digest] = SnapshotProblem(
             scene=row["scene"],
             size=row["size"],

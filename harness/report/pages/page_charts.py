@@ -189,7 +189,7 @@ def _set_plain_ticks(ax: Axes, places: Sequence[float]) -> None:
     """Write numbers instead of powers at those places of the x axis that lie within its limits."""
     low, high = ax.get_xlim()
     inside = [place for place in places if low <= place <= high]
-    ax.set_xticks(inside, [f"{place:,.0f}" if place >= 1.0 else f"{place:g}" for place in inside])
+    ax.set_xticks(inside, [f"{place:,.0f}" if place == int(place) else f"{place:g}" for place in inside])
     ax.xaxis.set_minor_formatter(NullFormatter())
 
 

@@ -114,10 +114,12 @@ class _PageFields:
 
     def describe_study(self, study: str) -> str:
         about = self.queries.studies[study].metadata
-        machine, started = about["machines"][0], about["started"]
+        started = about["started"]
         date = started[-1][:10] if started else "undated"
         commits = ", ".join(commit[:9] for commit in about["commits"]) or "unknown"
-        where = f"{machine['cpu']}, {machine['cores']} core{'s' * (machine['cores'] != 1)}"
+        where = " and ".join(
+            f"{machine['cpu']}, {machine['cores']} core{'s' * (machine['cores'] != 1)}" for machine in about["machines"]
+        )
         requested = about.get("requested_runs")
         count = f"{about['runs']:,}" + (f" of {requested:,}" if requested else "")
         return f"Data: `{about['command']}`, {count} runs, {where}, {date}, commit {commits}."
@@ -198,7 +200,7 @@ def _format_percent(value: float, digits: int = 0) -> str:
 
 
 def _format_significant(value: float, digits: int = 3) -> str:
-    return f"{value:.{digits}g}"
+    return f"{float(f'{value:.{digits}g}'):g}"  # 250 instead of 2.5e+02
 
 
 def _format_count(value: int) -> str:

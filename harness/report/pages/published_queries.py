@@ -1,19 +1,27 @@
 """SQL over the published set, for templates of pages.
 
 Each study is a view: `hard` has its runs, `winners` its units of work and precision. Tables with names of their own are
-`<study>_blocks` and `<study>_rates`. A study of verified runs has `<study>_outcomes`, one row per run, classified by
-`springbench.harness.report.robustness`. Hyphens in names of studies become underscores.
+`<study>_blocks` and `<study>_rates`. Hyphens in names of studies become underscores. Views that reports compute are
+made when a query names them:
+
+    <study>_outcomes   verified runs, one row each, classified by `springbench.harness.report.robustness`
+    <study>_times      time and iteration of each curve to each gap of GAP_TARGETS, on steps with a certified minimum
+    <study>_costs      cheapest simulation of each family of methods for each error, by mesh and stiffness number
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import duckdb
 import pyarrow as pa
 from springbench.harness.errors import InputError
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy.time_to_accuracy import GAP_TARGETS, find_time_to_accuracy, is_solvable
+from springbench.harness.report.accuracy.winner_map import build_winner_cells
 from springbench.harness.report.robustness import CORRECT, UNSUPPORTED, read_verified_runs
 from springbench.harness.results.published_set import (
     TABLE_FILES,
@@ -29,12 +37,19 @@ class PublishedQueries:
 
     def __init__(self, published: Path) -> None:
         self.studies = {study.study_name: study for study in list_studies(published)}
+        self._names = {name.replace("-", "_"): study for name, study in self.studies.items()}
+        self._computed: set[str] = set()
         self._connection = duckdb.connect(config={"threads": 1})
         for study in self.studies.values():
             self._create_views(study)
 
     def query_records(self, sql: str) -> list[dict[str, Any]]:
         """Return the rows of a query as dictionaries. Raises InputError if the query fails."""
+        for name, study, build in re.findall(r"\b((\w+)_(outcomes|times|costs))\b", sql):
+            if name not in self._computed and study in self._names:
+                self._computed.add(name)
+                rows = COMPUTED_VIEWS[build](self._names[study])
+                self._connection.register(name, pa.Table.from_pylist(list(rows)))
         try:
             done = self._connection.execute(sql)
             names = [column[0] for column in done.description or ()]
@@ -50,8 +65,6 @@ class PublishedQueries:
             if study.find_table(table):
                 suffix = f"_{table}" if table in ("blocks", "rates") else ""
                 self._connection.register(f"{name}{suffix}", study.read_table(table))
-        if study.find_table("rows") and "stationarity" in study.read_table("rows").column_names:
-            self._connection.register(f"{name}_outcomes", pa.Table.from_pylist(list_outcomes(study)))
 
 
 def list_outcomes(study: PublishedStudy) -> Sequence[dict[str, Any]]:
@@ -75,3 +88,60 @@ def list_outcomes(study: PublishedStudy) -> Sequence[dict[str, Any]]:
         }
         for cell in cells
     ]
+
+
+def list_times(study: PublishedStudy) -> Sequence[dict[str, Any]]:
+    """List the times to GAP_TARGETS of all curves of a study [s]; None where a curve does not reach the gap."""
+    with open_study_folder(study) as folder:
+        curves = read_accuracy(folder).curves
+    return [
+        {
+            "study": study.study_name,
+            "step": curve.problem.problem_label,
+            "scene": curve.problem.scene,
+            "size": curve.problem.size,
+            "stiffness_number": curve.problem.stiffness_ratio,
+            "initial_guess": curve.initial_guess,
+            "solver": curve.label,
+            "gap": gap,
+            "seconds": reached.seconds if reached else None,
+            "iteration": reached.iteration if reached else None,
+        }
+        for curve in curves
+        for gap in GAP_TARGETS
+        if is_solvable(curve.problem, gap)
+        for reached in (find_time_to_accuracy(curve, gap),)
+    ]
+
+
+def list_costs(study: PublishedStudy) -> Sequence[dict[str, Any]]:
+    """List the processor seconds per simulated second of the cheapest simulation of each family for each error.
+
+    The rank of the cheapest family of a mesh and an error is 1.
+    """
+    with open_study_folder(study) as folder:
+        cells = build_winner_cells(read_accuracy(folder).work_points)
+    return [
+        {
+            "vertices": cell.vertices,
+            "stiffness_number": cell.stiffness_number,
+            "error": cell.error,
+            "family": family,
+            "solver": work.solver,
+            "setting": work.setting_label,
+            "cpu_seconds": work.cpu_seconds_per_simulated_second,
+            "rank": rank,
+        }
+        for cell in cells
+        for rank, (family, work) in enumerate(
+            sorted(cell.cheapest_by_family.items(), key=lambda item: item[1].cpu_seconds_per_simulated_second), 1
+        )
+    ]
+
+
+COMPUTED_VIEWS: dict[str, Callable[[PublishedStudy], Sequence[dict[str, Any]]]] = {
+    "outcomes": list_outcomes,
+    "times": list_times,
+    "costs": list_costs,
+}
+"""Functions that compute the rows of views, by the ends of their names."""
