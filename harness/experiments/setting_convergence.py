@@ -69,6 +69,9 @@ DEFAULT_ITERATIONS = 50
 NUM_SAMPLES = 8
 """Number of times at which motions are compared."""
 
+CONTACT_MARGIN = 0.3
+"""Largest uncertainty of a self-converged motion, relative to an error that is claimed; the verdict states it."""
+
 MATERIAL_EFFECTS = (SpringsEffect, BendingEffect, StrainLimitsEffect)
 """Effects that belong to the material, which hangs with them."""
 
@@ -254,7 +257,7 @@ class SampledReference:
         words = f"the {trajectory.reference_kind} motion"
         words += f" (known to {describe_percent(uncertainty)})" if has_contact(scene.system) else ""
         start = build_initial_state(scene).motion.positions
-        smallest = uncertainty / REFERENCE_MARGIN
+        smallest = uncertainty / (CONTACT_MARGIN if has_contact(scene.system) else REFERENCE_MARGIN)
         return cls(words, trajectory.free_vertices, start, trajectory.positions, energy, max(kinetic), smallest)
 
     def measure_distance(self, positions: Positions) -> float:
@@ -460,7 +463,7 @@ def _find_reference(
         return SampledReference.from_trajectory(scene, seen)
     print_message(describe_self_convergence(spec.path.stem))
     trajectory = store.load_self_converged(spec, size, times, error=smallest)
-    num_known = trajectory.count_accurate_times(error)
+    num_known = trajectory.count_known_times(CONTACT_MARGIN * error)
     if num_known < len(times):
         if not num_known:
             trajectory.require_accuracy(error)

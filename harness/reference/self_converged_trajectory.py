@@ -75,10 +75,9 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
         """Whether the integrators differ by more than step halving explains."""
         return float(self.disagreement[-1]) > _DISAGREEMENT_FACTOR * self.last_change
 
-    def count_accurate_times(self, error: float) -> int:
-        """Return the number of times from the first one on at which a relative error can be measured."""
-        accurate = self.disagreement <= REFERENCE_MARGIN * error
-        return int(np.argmin(np.append(accurate, False)))
+    def count_known_times(self, max_disagreement: float) -> int:
+        """Return the number of times, from the first one on, at which the limits disagree by no more than this."""
+        return int(np.argmin(np.append(self.disagreement <= max_disagreement, False)))
 
     def select_times(self, count: int) -> SelfConvergedTrajectory:
         """Return the trajectory at the first times only."""

@@ -25,6 +25,7 @@ from springbench.harness.experiments.setting_convergence import (
     measure_change,
     study_convergence,
 )
+from springbench.harness.reference import self_converged_trajectory
 from springbench.harness.reference.equations_of_motion import NotIntegrable
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.report.convergence_map import draw_convergence_map
@@ -234,6 +235,44 @@ def test_without_a_reference_settings_are_compared_with_the_finest(scene: Path, 
     assert found.reference == "the finest setting, 4 x 8, for there is no reference"
     assert found.find_result(StepSetting(4, 8)).error == inf
     assert "energy" not in found.describe_verdict()[1]
+
+
+def touching(scene: Path, monkeypatch: pytest.MonkeyPatch, disagreement: list[float]) -> SettingSimulator:
+    """The chain above a floor, with a self-converged motion of this uncertainty at its six frames."""
+    contact = "{kind: contact, obstacles: [{kind: plane, point: [0, -9, 0]}]}]"
+    scene.write_text(SCENE.replace("parts: [ends]}]", f"parts: [ends]}}, {contact}"))
+    monkeypatch.setattr(self_converged_trajectory, "MAX_RELATIVE_ERROR", 2.0)  # two step sizes are enough
+    load = ReferenceStore.load_self_converged
+    monkeypatch.setattr(
+        ReferenceStore,
+        "load_self_converged",
+        lambda *given, **how: replace(load(*given, **{**how, "error": 2.0}), disagreement=np.array(disagreement)),
+    )
+    return simulate(scene, "sparse")
+
+
+@pytest.mark.slow
+def test_with_contact_motions_are_compared_up_to_the_time_until_which_theirs_is_known(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+):
+    simulator = touching(scene, monkeypatch, [0.001, 0.002, 0.01, 0.012, 0.016, 0.001])
+    found = study_simulator(simulator, scene, [GIVEN], 0.05, is_end_given=False)
+    assert simulator.num_frames == 4
+    assert found.reference == "the self-converged motion (known to 1.2 %)"
+    assert found.min_error == pytest.approx(0.04)
+    assert "Within 1 %: cannot be told" in found.describe_verdict()[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("first", "message"), [(0.001, r"up to 0.0333333 s.*ask for --t-end 0.0333333"), (0.5, "no certified reference")]
+)
+def test_with_contact_a_time_that_is_too_long_is_refused(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, first: float, message: str
+):
+    simulator = touching(scene, monkeypatch, [first, *[0.5] * 5])
+    with pytest.raises(RunFailed, match=message):
+        study_simulator(simulator, scene, [GIVEN], 0.05)
 
 
 def test_a_setting_that_is_not_supported_ends_the_study(scene: Path):

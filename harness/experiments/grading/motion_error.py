@@ -142,8 +142,7 @@ class MotionReference:
             except (RunFailed, Unsupported) as error:
                 reason = str(error)
             else:
-                is_known = found.disagreement <= LARGEST_REFERENCE_ERROR
-                known = len(steps) if is_known.all() else int(is_known.argmin())
+                known = found.count_known_times(LARGEST_REFERENCE_ERROR)
                 if known < len(steps):
                     reason = _describe_uncertainty(found, known)
                 if known:
