@@ -151,6 +151,22 @@ def test_a_file_that_cannot_be_graded_is_refused_with_its_place(name, content, w
     assert name in str(caught.value)
 
 
+def test_the_only_array_of_a_file_is_read_and_named(tmp_path):
+    path, scene = load_case(tmp_path, "rope")
+    np.savez(tmp_path / "p.npz", U=simulate(scene, 3))
+    read = read_position_file(tmp_path / "p.npz", 5)
+    found = align_submission(make_grader(path).scene, read, 1)
+    assert found.notes[0] == "array: `U`, the only one in the file"
+    np.savez(tmp_path / "q.npz", U=np.zeros((3, 5, 3)), V=np.zeros((3, 5, 3)))
+    with pytest.raises(InputError, match="it holds U, V"):
+        read_position_file(tmp_path / "q.npz", 5)
+    np.save(tmp_path / "t.npy", np.zeros((5, 3, 3)))
+    with pytest.raises(
+        InputError, match=r"shape \(vertices, frames, 3\) = \(5, 3, 3\); wanted \(frames, vertices, 3\)"
+    ):
+        read_position_file(tmp_path / "t.npy", 5)
+
+
 def test_a_folder_with_a_missing_frame_is_refused(tmp_path):
     folder = write_folder(tmp_path / "p", np.zeros((4, 2, 3)), "obj")
     (folder / "frame02.obj").unlink()

@@ -180,6 +180,7 @@ def test_a_matrix_of_another_program_is_compared_and_stored_zeros_are_counted(tm
         (coo_array(np.abs(made.A.toarray())), "A", "not A of the scene"),
         (made.y + (made.b - made.y) / 70, "b", "b without k"),
         (made.d + np.eye(8, 3), "d", "differs most at row"),
+        (-made.d[::-1], "d", "equal to d of the scene, up to the order and the sign of its rows"),
     ):
         mmwrite(str(tmp_path / f"{name}.mtx"), matrix, precision=17, symmetry="general")
         assert words in compare_matrix_file(made, tmp_path / f"{name}.mtx")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.io import mmread
 from scipy.sparse import coo_array, csr_array
+from scipy.spatial import cKDTree
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import sandbox
 from springbench.harness.experiments.grading.local_global_matrices import LocalGlobalMatrices
@@ -44,6 +45,8 @@ def compare_matrix_file(matrices: LocalGlobalMatrices, path: Path) -> str:
         is_equal = np.abs(_square(came) - _square(expected)).max() <= MATRIX_RTOL
         equal = f"equal to {name} of the scene, up to the order of its rows"
         return f"{path}: {equal if is_equal else f'not {name} of the scene'}{stored}"
+    if name == "d" and _has_same_rows(_to_dense(came), expected):
+        return f"{path}: equal to d of the scene, up to the order and the sign of its rows"
     variants = {"": expected, **_list_mistakes(matrices, name)}
     right = _to_dense(expected)
     found, nonzero = _to_dense(came), np.abs(right[right != 0.0])
@@ -95,6 +98,17 @@ def _square(matrix: Any) -> Any:
     """Return X'X, which the order and the sign of rows do not change."""
     x = _to_dense(matrix)
     return x.T @ x
+
+
+def _has_same_rows(came: Any, expected: Any) -> bool:
+    """Return whether rows (m, 3) are equal in another order and with other signs."""
+    tolerance = MATRIX_RTOL * float(np.abs(expected).max(initial=0.0))
+    trees = [cKDTree(np.concatenate([rows, -rows])) for rows in (came, expected) if np.isfinite(rows).all()]
+    if len(trees) < 2:
+        return False
+    rows = np.concatenate([came, expected])
+    counts = [tree.query_ball_point(rows, tolerance, return_length=True) for tree in trees]
+    return bool(np.array_equal(*counts))
 
 
 def _to_dense(matrix: Any) -> Any:

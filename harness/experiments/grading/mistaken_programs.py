@@ -407,7 +407,7 @@ MISTAKES: tuple[ProgramMistake, ...] = (
     ProgramMistake(
         "one frame late",
         "writes each frame one step late",
-        "write p^(t+dt) after the step, not p^t before it",
+        "write p^(t+dt) after the step, not p^t before it; a file that begins with the start needs --first-frame 0",
         is_late=True,
     ),
 )

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,12 +49,14 @@ class PositionSequence:
       positions: (k, n, 3) [m].
       frames: frame numbers (k,) that the file states, None where it states none.
       times: times (k,) [s] that the file states, None where it states none.
+      notes: sentences on what was assumed to read the file.
     """
 
     source: Path
     positions: NDArray[np.float64]
     frames: NDArray[np.int64] | None = None
     times: NDArray[np.float64] | None = None
+    notes: tuple[str, ...] = ()
 
 
 def read_position_file(path: Path, num_vertices: int, array: str = DEFAULT_ARRAY) -> PositionSequence:
@@ -77,9 +80,10 @@ def read_position_file(path: Path, num_vertices: int, array: str = DEFAULT_ARRAY
     if not k:
         raise InputError(InputMistake("has no frames", path))
     if n != num_vertices:
-        raise InputError(
-            InputMistake(f"has {n:,} vertices; the scene has {num_vertices:,}. Is it of another scene or size?", path)
-        )
+        problem = f"has {n:,} vertices; the scene has {num_vertices:,}. Is it of another scene or size?"
+        if k == num_vertices:
+            problem = f"has the shape (vertices, frames, 3) = ({k}, {n}, 3); wanted (frames, vertices, 3)"
+        raise InputError(InputMistake(problem, path))
     return found
 
 
@@ -110,7 +114,21 @@ def _describe_formats() -> str:
 
 
 def _read_npz(path: Path, n: int, array: str) -> PositionSequence:
-    return PositionSequence(path, _to_frames(read_npz_array(path, array, allows_nonfinite=True), n, path))
+    only = _find_only_array(path) if array == DEFAULT_ARRAY else None
+    values = read_npz_array(path, only or array, allows_nonfinite=True)
+    notes = (f"array: `{only}`, the only one in the file",) if only and only != array else ()
+    return PositionSequence(path, _to_frames(values, n, path), notes=notes)
+
+
+def _find_only_array(path: Path) -> str | None:
+    """Return the name of the only array in an .npz file; None where there are others, or none can be listed."""
+    try:
+        with ZipFile(path) as archive:
+            names = archive.namelist()
+    except (OSError, ValueError, BadZipFile):
+        return None
+    name = names[0].removesuffix(".npy") if len(names) == 1 else ""
+    return name if name.isidentifier() else None
 
 
 def _read_npy(path: Path, n: int, array: str) -> PositionSequence:

@@ -119,7 +119,7 @@ def align_submission(
     Raises:
       InputError: the rest positions are not those of the scene, or frames or times are not those of its steps.
     """
-    start, notes = build_initial_state(scene).motion.positions, list[str]()
+    start, notes = build_initial_state(scene).motion.positions, list(read.notes)
     p, mistake = read.positions, lambda problem: InputError(InputMistake(problem, read.source))
     first_bad = next((k for k, one in enumerate(p) if not (np.abs(one) <= MAX_POSITION).all()), None)
     if first_bad is not None:
