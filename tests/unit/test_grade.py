@@ -161,9 +161,7 @@ def test_the_only_array_of_a_file_is_read_and_named(tmp_path):
     with pytest.raises(InputError, match="it holds U, V"):
         read_position_file(tmp_path / "q.npz", 5)
     np.save(tmp_path / "t.npy", np.zeros((5, 3, 3)))
-    with pytest.raises(
-        InputError, match=r"\(vertices, frames, 3\) = \(5, 3, 3\); wanted \(frames, "
-    ):
+    with pytest.raises(InputError, match=r"\(vertices, frames, 3\) = \(5, 3, 3\); wanted \(frames, "):
         read_position_file(tmp_path / "t.npy", 5)
 
 

@@ -107,8 +107,8 @@ def _has_same_rows(came: Any, expected: Any) -> bool:
     if len(trees) < 2:
         return False
     rows = np.concatenate([came, expected])
-    counts = [tree.query_ball_point(rows, tolerance, return_length=True) for tree in trees]
-    return bool(np.array_equal(*counts))
+    first, second = (tree.query_ball_point(rows, tolerance, return_length=True) for tree in trees)
+    return np.array_equal(first, second)
 
 
 def _to_dense(matrix: Any) -> Any:
