@@ -63,7 +63,7 @@ _TABLE = (
     (
         "published-times-of-untimed",
         "harness/experiments/archive/study_publication.py",
-        "(frozenset[str]() if is_timed else _TIME_COLUMNS)",
+        "(frozenset[str]() if is_timed or _ran_alone(rows) else _TIME_COLUMNS)",
         "frozenset[str]()",
         f"{_TESTS}::test_an_untimed_study_publishes_no_times",
     ),
