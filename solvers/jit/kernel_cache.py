@@ -175,13 +175,13 @@ def _cache_folder(home: Path, module: str, digest: str) -> Path:
 def _writable_root(source: str) -> Path:
     """Return the first writable cache folder; `source` is the folder of the source file."""
     users = Path(AppDirs("springbench", appauthor=False).user_cache_dir) / "kernels"
-    beside = Path(source) / "__pycache__"
-    for folder in (Path(_NUMBA_CONFIG.CACHE_DIR or users), beside):
+    local = Path(source) / "__pycache__"
+    for folder in (Path(_NUMBA_CONFIG.CACHE_DIR or users), local):
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
             tempfile.TemporaryFile(dir=folder).close()
             return folder
-    return beside
+    return local
 
 
 def _remove_stale(made: Path, module: str) -> None:

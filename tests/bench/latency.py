@@ -127,7 +127,7 @@ LATENCY_ROWS = {
         "velocity Verlet, cloth of 17 a side, a substep", 4e-6, (*_IN_PROCESS, "verlet-substep"), value_key="seconds"
     ),
     "useful-share": LatencyRow(
-        "share of processor time beside timed passes, 100 short runs",
+        "share of processor time outside timed passes, 100 short runs",
         0.4,
         (*_IN_PROCESS, "useful-share"),
         value_key="share",
@@ -341,8 +341,8 @@ def publish_measurements(measurements: Sequence[Mapping[str, Any]], folder: Path
     path = folder / TABLE_FILES["measurements"]
     known = parquet_rows.read_rows([path], MEASUREMENT_SCHEMA).to_pylist() if path.exists() else []
     now = {one["row"] for one in measurements}
-    kept = [one for one in known if one["row"] not in now and one["row"] in LATENCY_ROWS]
-    rows = sorted([*kept, *measurements], key=lambda one: (list(LATENCY_ROWS).index(one["row"]), one["repeat"]))
+    earlier = [one for one in known if one["row"] not in now and one["row"] in LATENCY_ROWS]
+    rows = sorted([*earlier, *measurements], key=lambda one: (list(LATENCY_ROWS).index(one["row"]), one["repeat"]))
     write_published_table(path, pa.Table.from_pylist([dict(one) for one in rows], MEASUREMENT_SCHEMA))
     metadata = {
         "config": os.path.relpath(QUICKSTART, folder.resolve()),

@@ -121,7 +121,7 @@ def test_the_verdict_names_what_is_wrong_and_the_cheapest_setting_for_each_error
     assert (
         "largest strain is 10 %; its energy at the end is 2 % of the largest kinetic energy less than true" in lines[1]
     )
-    assert lines[2] == "Twice the substeps change the motion by 20 %, which is more than is asked."
+    assert lines[2] == "Twice the substeps change the motion by 20 %, which is more than the required error."
     assert lines[3] == "Twice the iterations change the motion by 3 %, less than is asked."
     assert "as if it were 0.5 times as stiff" in lines[4]
     assert lines[5] == "Within 5 %: 4 x 4 is the cheapest, 16 ms a frame, 2 times the given."
@@ -138,7 +138,7 @@ def test_the_verdict_on_several_settings_has_a_line_for_each_and_what_the_neares
         lines[3]
         == "The motions of 2 x 4 and 4 x 8 differ by 17 %: what is found with one need not hold with the other."
     )
-    assert lines[4] == "4 x 8: twice the substeps change the motion by 20 %, which is more than is asked."
+    assert lines[4] == "4 x 8: twice the substeps change the motion by 20 %, which is more than the required error."
     assert lines[6] == "Within 5 %: 4 x 4 is the cheapest, 16 ms a frame."
     assert not drawn.is_converged
     good = synthetic(MAP, given=[StepSetting(4, 8), StepSetting(8, 8)], substeps=0.01)
@@ -160,7 +160,7 @@ def test_beyond_the_map_a_setting_is_predicted_by_the_trend(falls: Any, predicte
 def test_an_error_that_the_reference_does_not_resolve_is_not_claimed():
     vague = synthetic(MAP, min_error=0.02)
     assert vague.find_cheapest(0.01) is None
-    assert vague.describe_verdict()[-1] == "Within 1 %: cannot be told, for the reference resolves errors of 2 %."
+    assert vague.describe_verdict()[-1] == "Within 1 %: unknown, because the reference resolves only errors above 2 %."
     assert vague.find_cheapest(0.05) is not None
 
 
@@ -260,7 +260,7 @@ def test_with_contact_motions_are_compared_up_to_the_time_until_which_theirs_is_
     assert simulator.num_frames == 4
     assert found.reference == "the self-converged motion (known to 1.2 %)"
     assert found.min_error == pytest.approx(0.04)
-    assert "Within 1 %: cannot be told" in found.describe_verdict()[-1]
+    assert "Within 1 %: unknown" in found.describe_verdict()[-1]
 
 
 @pytest.mark.slow
