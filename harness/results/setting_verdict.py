@@ -241,7 +241,11 @@ class ConvergenceStudy:
     def _describe_changes(self, assessment: SettingAssessment) -> list[str]:
         lines = list[str]()
         for what, (factor, change) in assessment.known_changes.items():
-            still = "which is more than the required error" if change > self.error_requested else "less than the required error"
+            still = (
+                "which is more than the required error"
+                if change > self.error_requested
+                else "less than the required error"
+            )
             times = "Twice" if factor == 2.0 else f"{factor:.3g} times"
             lines.append(f"{times} the {what} change the motion by {describe_percent(change)}, {still}.")
         return lines
@@ -249,7 +253,8 @@ class ConvergenceStudy:
     def _describe_level(self, level: float) -> str:
         within = f"Within {describe_percent(level)}"
         if level < self.min_error:
-            return f"{within}: unknown, because the reference resolves only errors above {describe_percent(self.min_error)}."
+            smallest = describe_percent(self.min_error)
+            return f"{within}: unknown, because the reference resolves only errors above {smallest}."
         best = self.find_cheapest(level)
         if best is None:
             nearest = min(self.results, key=lambda result: result.error)

@@ -5,6 +5,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from springbench.harness.cli.main import app
+from springbench.harness.experiments.archive import study_publication
 from springbench.harness.report.pages.page_files import check_pages, write_pages
 from springbench.harness.results.published_set import read_study
 from typer.testing import CliRunner
@@ -67,6 +68,20 @@ def test_a_study_gains_the_runs_of_its_parts(checkout: Path) -> None:
         result = CliRunner().invoke(app, [*arguments, "--published", str(study.parent)])
         assert result.exit_code == 0, result.output
         assert read_study(study).metadata["runs"] == 13
+
+
+def test_a_study_that_is_too_large_leaves_the_published_one_as_it_is(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = checkout / "results" / "published" / "dummy"
+    before = {path: path.read_bytes() for path in study.parent.rglob("*") if path.is_file()}
+    monkeypatch.setattr(study_publication, "MAX_PUBLISHED_BYTES", 100)
+    config = str(checkout / "configs" / "dummy.yaml")
+    arguments = ["publish-study", str(checkout / "runs"), "--config", config, "--published", str(study.parent)]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2, result.output
+    assert "publish fewer runs" in " ".join(result.output.split())
+    assert {path: path.read_bytes() for path in study.parent.rglob("*") if path.is_file()} == before
 
 
 def test_equal_data_give_equal_bytes(checkout: Path) -> None:

@@ -122,7 +122,7 @@ def test_the_verdict_names_what_is_wrong_and_the_cheapest_setting_for_each_error
         "largest strain is 10 %; its energy at the end is 2 % of the largest kinetic energy less than true" in lines[1]
     )
     assert lines[2] == "Twice the substeps change the motion by 20 %, which is more than the required error."
-    assert lines[3] == "Twice the iterations change the motion by 3 %, less than is asked."
+    assert lines[3] == "Twice the iterations change the motion by 3 %, less than the required error."
     assert "as if it were 0.5 times as stiff" in lines[4]
     assert lines[5] == "Within 5 %: 4 x 4 is the cheapest, 16 ms a frame, 2 times the given."
     assert lines[6] == "Within 1 %: 8 x 8 is the cheapest, 64 ms a frame, 8 times the given."

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pyarrow as pa
@@ -81,12 +82,21 @@ def write_study(
         raise InputError(InputMistake("holds no rows; wanted the folder of one sweep, such as results/hard", parts[0]))
     is_timed = any(_is_timed(rows) for rows in found.values())
     folder = published / config.stem
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in folder.glob("*.parquet"):
-        path.unlink()
-    for table, rows in found.items():
-        left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed or _ran_alone(rows) else _TIME_COLUMNS)
-        write_published_table(folder / published_set.TABLE_FILES[table], _drop_columns(rows, left_out))
+    published.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=published, prefix=".") as temporary:
+        for table, rows in found.items():
+            left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed or _ran_alone(rows) else _TIME_COLUMNS)
+            write_published_table(Path(temporary) / published_set.TABLE_FILES[table], _drop_columns(rows, left_out))
+        older = list(folder.glob("*.parquet"))
+        size = sum(path.stat().st_size for path in published.rglob("*.parquet") if path not in older)
+        if size > MAX_PUBLISHED_BYTES:
+            why = f"takes {size:,} bytes with this study, and at most {MAX_PUBLISHED_BYTES:,} are part of a clone"
+            raise InputError(InputMistake(f"{why}; publish fewer runs", published))
+        folder.mkdir(exist_ok=True)
+        for path in older:
+            path.unlink()
+        for path in Path(temporary).iterdir():
+            path.replace(folder / path.name)
     metadata = {
         "config": os.path.relpath(config.resolve(), folder.resolve()),
         "config_digest": published_set.compute_file_digest(config),
@@ -103,10 +113,6 @@ def write_study(
     if made:
         metadata |= {"runs": sum(map(len, found.values())), "duration_seconds": None}
     study = write_study_file(folder, metadata)
-    size = sum(path.stat().st_size for path in published.rglob("*.parquet"))
-    if size > MAX_PUBLISHED_BYTES:
-        why = f"takes {size:,} bytes with this study, and at most {MAX_PUBLISHED_BYTES:,} are part of a clone"
-        raise InputError(InputMistake(f"{why}; publish fewer runs", published))
     print_message(f"{folder}: {sum(map(len, found.values())):,} rows; the published set takes {size / 2**20:.1f} MiB")
     return study
 
