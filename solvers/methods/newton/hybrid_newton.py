@@ -361,7 +361,10 @@ class _Approach:
                 if name == "lbfgs":
                     point = self._run_lbfgs()
                 else:
-                    self._run, before = None, self._method.factor.num_factorisations
+                    if self._run is not None:  # the gradient of L-BFGS has the round-off of its kernel
+                        positions = self._point.positions
+                        self._point, self._run = DescentPoint(positions, self._step.gradient(positions)), None
+                    before = self._method.factor.num_factorisations
                     point = self._take_newton_step() if name == "newton" else self._take_predicted_step()
                     self._record_step(name, point, self._method.factor.num_factorisations - before)
             if point is not self._point:
