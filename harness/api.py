@@ -326,7 +326,7 @@ def load_rows(folder: str | Path) -> Any:
 
 def _to_dataframe(table: Any) -> Any:
     """Convert rows to a DataFrame in which columns of integers and truth values may lack some."""
-    import pandas as pd
+    import pandas as pd  # pyright: ignore[reportMissingTypeStubs]
     import pyarrow as pa
 
     return table.to_pandas(types_mapper={pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype()}.get)

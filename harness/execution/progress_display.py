@@ -248,7 +248,7 @@ class _NotebookProgress(Progress):
 
     def start(self) -> None:
         """Display the bars."""
-        from IPython.display import display
+        from IPython.display import display  # pyright: ignore[reportUnknownVariableType]
 
         self._drawn = display(self, display_id=True)
 

@@ -31,8 +31,8 @@ class NotebookViewer:
             raise InputError(NOTEBOOKS.describe_absence())
 
     def _ipython_display_(self) -> None:
-        from IPython.display import display
-        from rerun_notebook import ErrorWidget, Viewer
+        from IPython.display import display  # pyright: ignore[reportUnknownVariableType]
+        from rerun_notebook import ErrorWidget, Viewer  # pyright: ignore[reportMissingTypeStubs]
 
         viewer = Viewer(width=self.width, height=self.height)
         viewer.send_rrd(self.path.read_bytes())

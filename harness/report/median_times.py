@@ -36,8 +36,8 @@ def write_medians(rows: pa.Table, folder: Path) -> list[Path]:
     label = label_runs(read_run_times(rows))
     found = [(*row, label[row[3]]) for row in query_table(_MEDIAN_QUERY, rows)]
     names = ("scene", "size", "solver", "run_id", "machine_id", "node_id", "median_seconds", "num_steps", "label")
-    columns = [[row[k] for row in found] for k in range(len(names))]
+    columns = {name: [row[k] for row in found] for k, name in enumerate(names)}
     path = folder / "medians.csv"
     with atomic_write(path) as partial:
-        csv.write_csv(pa.table(columns, names=list(names)), partial)
+        csv.write_csv(pa.table(columns), partial)
     return [path]

@@ -165,7 +165,7 @@ def _find_wrong_key(metadata: Any) -> str:
         and (duration is None or (isinstance(duration, int | float) and 0.0 <= duration < math.inf)),
         "command": isinstance(keys.get("command"), str),
         "machines": isinstance(machines, list)
-        and bool(machines)
+        and machines != []
         and all(isinstance(one, dict) for one in cast("list[object]", machines)),
         "files": isinstance(files, dict)
         and all(

@@ -122,8 +122,8 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
     [
         ("newton", 16, [6, 5, 5], 19, 0),
         ("newton", 32, [8, 23, 11], 90, 0),
-        ("hybrid", 16, [17, 22, 24], 3, 9),
-        ("hybrid", 32, [21, 30, 24], 4, 27),
+        ("hybrid", 16, [28, 18, 27], 4, 0),
+        ("hybrid", 32, [18, 31, 27], 6, 22),
     ],
 )
 def test_an_accuracy_takes_as_many_iterations_as_stored(
@@ -134,9 +134,9 @@ def test_an_accuracy_takes_as_many_iterations_as_stored(
         prepared = load_target(SOLVERS[solver])().prepare(scene.system)
         found = list(simulate_scene(scene, prepared, stop, initial_guess="previous", frames=3))
     assert {step.solution.termination_reason for step in found} == {"converged"}
-    # Newton's method converges quadratically, where round-off decides nothing. The hybrid begins with L-BFGS in
-    # float32, whose path may end an iteration earlier or later in each of its rounds on another processor, and where
-    # that leaves a Newton step to do it takes a factorisation, or some on an indefinite Hessian.
+    # Newton's method converges quadratically: round-off decides nothing. The hybrid begins with L-BFGS, in float32
+    # unless the mesh is small. Its path may end an iteration earlier or later in each of its rounds on another
+    # processor, and where that leaves a Newton step to do it takes a factorisation, or some on an indefinite Hessian.
     room, more = (0, 0) if solver == "newton" else (2, 4)
     assert [step.solution.num_iterations for step in found] == pytest.approx(iterations, abs=room)
     assert factorisations.separate == pytest.approx(saved, abs=room)

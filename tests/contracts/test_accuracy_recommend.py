@@ -196,7 +196,7 @@ def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scen
     said = list[str]()
     with pytest.raises(RunFailed, match="nothing moves"):
         recommend(scene, 0.1, print_message=said.append)
-    assert said[0].startswith("chain: contact has")
+    assert any(line.startswith("chain: contact has") for line in said)
     assert sum("no certified reference" in line for line in said) == 1
     assert not measured(scene)
 

@@ -31,7 +31,7 @@ from springbench.harness.experiments.run_pipeline import execute_run
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.recording.recording_reader import read_replay
 from springbench.harness.results import parquet_rows
-from springbench.harness.simulation.adaptive_stepping import Trajectory
+from springbench.harness.simulation.adaptive_stepping import StepObserver, Trajectory
 from springbench.harness.simulation.substepping import AdaptiveSubstepper
 from typer.testing import CliRunner
 
@@ -79,8 +79,10 @@ def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_pa
 class Boosting(AdaptiveSubstepper):
     """Its positions are right, and its velocities three times those of the motion."""
 
-    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
-        found = super().integrate_motion(setting, cpu_limit=cpu_limit)
+    def integrate_motion(
+        self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
+    ) -> Trajectory:
+        found = super().integrate_motion(setting, cpu_limit=cpu_limit, observe=observe)
         return replace(found, velocities=3.0 * found.velocities)
 
 

@@ -15,7 +15,7 @@ from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, Method
 from springbench.harness.experiments.error_control.method_search import SearchResult, Trial, search_cheapest_method
 from springbench.harness.reference.perturbation_growth import estimate_growth
-from springbench.harness.simulation.adaptive_stepping import Stepper, TimeBudgetExceeded, Trajectory
+from springbench.harness.simulation.adaptive_stepping import StepObserver, Stepper, TimeBudgetExceeded, Trajectory
 
 SPRING = load_scene(File(__file__).parents[2] / "configs" / "scenes" / "single-spring.yaml")
 STEPS = 10
@@ -35,7 +35,9 @@ class Formula(Stepper):
     def order(self) -> int:
         return self.stated
 
-    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+    def integrate_motion(
+        self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
+    ) -> Trajectory:
         steps = ceil(STEPS * setting)
         if (took := steps * self.seconds) > cpu_limit:
             raise TimeBudgetExceeded
@@ -51,7 +53,9 @@ class Tolerant(Formula):
 
     has_fixed_step: ClassVar[bool] = False
 
-    def integrate_motion(self, setting: float, *, cpu_limit: float = inf) -> Trajectory:
+    def integrate_motion(
+        self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
+    ) -> Trajectory:
         return super().integrate_motion(max(1.0, setting ** (-1.0 / (self.order + 1.0))))
 
 

@@ -6,6 +6,7 @@ import re
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from springbench.harness.experiments.archive.study_publication import (
@@ -67,7 +68,9 @@ def test_a_changed_figure_in_the_data_makes_a_finding_and_its_picture_stale(tmp_
     table = study.read_table("accuracy")
     at = table.column_names.index("cpu_seconds")
     slower = pc.if_else(
-        pc.equal(table["solver"], "velocity-verlet"), pc.multiply(table["cpu_seconds"], 10.0), table.column(at)
+        pc.equal(table["solver"], pa.scalar("velocity-verlet")),
+        pc.multiply(table["cpu_seconds"], 10.0),
+        table.column(at),
     )
     write_published_table(study.folder / "units.parquet", table.set_column(at, "cpu_seconds", slower))
     write_study_file(study.folder, study.metadata)

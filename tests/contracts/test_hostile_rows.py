@@ -63,7 +63,9 @@ def test_odd_rows_are_reported_at_the_end_of_a_sweep(tmp_path: Path, name: str):
 
 
 FILES = {
-    "a column twice": lambda path: pq.write_table(pa.table([["a"], ["b"]], names=["run_id", "run_id"]), path),
+    "a column twice": lambda path: pq.write_table(
+        pa.table([pa.array(["a"]), pa.array(["b"])], names=["run_id", "run_id"]), path
+    ),
     "a column of files": lambda path: pq.write_table(
         rows_with("reason", "").append_column(FILE_COLUMN, [["x"] * 32]), path
     ),
@@ -73,7 +75,10 @@ FILES = {
         pa.table({"run_id": pa.array([b"\xff\xfe"], pa.binary()).cast(pa.string(), safe=False)}), path
     ),
     "a text of 1 MB a million times": lambda path: pq.write_table(
-        pa.table({"run_id": pa.DictionaryArray.from_arrays(pa.array([0] * 1_000_000, pa.int32()), ["x" * 10**6])}), path
+        pa.table(
+            {"run_id": pa.DictionaryArray.from_arrays(pa.array([0] * 1_000_000, pa.int32()), pa.array(["x" * 10**6]))}
+        ),
+        path,
     ),
     "3 million zeros": lambda path: pq.write_table(pa.table({"size": pa.array([0] * 3_000_000)}), path),
 }

@@ -162,6 +162,7 @@ def test_what_the_gates_store_can_be_compared_and_names_no_host(tmp_path: Path):
             "tests.bench.conftest",
         ),
         "--benchmark-only",
+        "--all-gates",
         "-p",
         "no:cacheprovider",
     ]

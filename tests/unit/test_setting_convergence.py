@@ -130,7 +130,7 @@ def test_the_verdict_names_what_is_wrong_and_the_cheapest_setting_for_each_error
 
 def test_the_verdict_on_several_settings_has_a_line_for_each_and_what_the_nearest_lacks():
     given = [GIVEN, StepSetting(4, 8)]
-    drawn = synthetic(MAP, given=given, largest_difference=SettingDifference(*given, 0.17))
+    drawn = synthetic(MAP, given=given, largest_difference=SettingDifference(given[0], given[1], 0.17))
     lines = drawn.describe_verdict()
     assert lines[0].startswith("None of the 2 settings is converged to 5 %. 4 x 8 is the nearest to the integrated")
     assert lines[1] == "2 x 4: error 20 %, largest strain 10 %, hangs as if 0.5 times as stiff."

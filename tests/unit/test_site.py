@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from springbench.harness.errors import InputError
-from springbench.harness.report.site import page_build, refresh_results_page, update_page
+from springbench.harness.report.site import refresh_results_page, sweep_overview, update_page
 from springbench.harness.report.site.data_scripts import encode_column
 from springbench.harness.report.site.failure_causes import FailedRun, group_failures
 from springbench.harness.report.site.run_findings import describe_runs
@@ -209,9 +209,11 @@ def test_only_what_is_new_is_written_again(tmp_path: Path, monkeypatch: pytest.M
         synthetic_site_rows.write_site_results(tmp_path, 3, name)
     update_page(tmp_path)
     seen: list[str] = []
-    message = page_build.build_overview
+    build_overview = sweep_overview.build_overview
     monkeypatch.setattr(
-        page_build, "build_overview", lambda folder, *a, **k: (seen.append(folder.name), message(folder, *a, **k))[1]
+        sweep_overview,
+        "build_overview",
+        lambda folder, *a, **k: (seen.append(folder.name), build_overview(folder, *a, **k))[1],
     )
     update_page(tmp_path)
     assert not seen

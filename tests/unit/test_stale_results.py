@@ -158,16 +158,15 @@ def test_parameters_by_other_sources_coexist_for_a_while(tmp_path: Path, monkeyp
     (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     (tmp_path / "sweep.yaml").write_text("scenes: [scene.yaml]\nsolvers: [sparse]\n")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    for checkout in "ab":
+    folder, saved = tmp_path / "springbench" / "parameters", dict[str, Path]()
+    for checkout in "abc":
         monkeypatch.setattr(solver_parameters, "_hash_solver_sources", lambda checkout=checkout: 16 * checkout)
         load_config(tmp_path / "sweep.yaml", imports_code=False)
-    saved = {path.stem: path for path in (tmp_path / "springbench" / "parameters").iterdir()}
-    assert set(saved) == {f"sparse-{16 * checkout}" for checkout in "ab"}
-
-    os.utime(saved.pop(f"sparse-{16 * 'a'}"), (0, 0))
-    monkeypatch.setattr(solver_parameters, "_hash_solver_sources", lambda: 16 * "c")
-    load_config(tmp_path / "sweep.yaml", imports_code=False)
-    assert {path.stem[-1] for path in (tmp_path / "springbench" / "parameters").iterdir()} == {"b", "c"}
+        (saved[checkout],) = set(folder.iterdir()) - set(saved.values())
+        if checkout == "b":
+            assert set(folder.iterdir()) == set(saved.values())
+            os.utime(saved["a"], (0, 0))
+    assert set(folder.iterdir()) == {saved["b"], saved["c"]}
 
 
 def test_the_file_of_a_class_is_known_however_its_module_was_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
