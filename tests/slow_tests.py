@@ -53,6 +53,7 @@ LONG_NAME_PARTS = (
     *("is_free_and_the_way_to_it[newton]", "test_every_fragment_shows_something", "test_other_platforms.py"),
     *("blocks of 3000 bytes-supernodal", "test_a_program_that_takes_twice_as_long", "in_any_order_of_imports"),
     *("test_a_config_next_to_files_of_these_names", "it_is_said_to_be[effects-dashpots-1e12]"),
+    "test_an_impact_that_the_steps_do_not_resolve_has_no_truth",
     *("what_failed_is_done_again[200k]", "test_pictures_are_drawn_later_without", "is_recorded[nothing]"),
     *(
         "a_drawing_process_that_is_lost",
