@@ -26,6 +26,9 @@ Where a step may go either way, the last bit decides. Between an EPYC and a Xeon
 hard cases; a tenth of them has few runs, so that two per cent are allowed.
 """
 
+CURVE_LEVELS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
+"""Stationarities at which the iterations of a convergence curve are compared."""
+
 RunRows = Sequence[Mapping[str, Any]]
 
 
@@ -110,6 +113,69 @@ def _describe_difference(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
 
 def _meets_tolerance(row: Mapping[str, Any]) -> bool:
     return row["termination_reason"] in ("converged", "roundoff")
+
+
+CURVE_KEYS = (
+    "scene",
+    "size",
+    "snapshot",
+    "initial_guess",
+    "solver",
+    "parameters",
+    "integrator",
+    "time_step",
+    "threads",
+)
+"""Columns that identify a convergence curve on any machine."""
+
+
+def group_curves(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Group the rows of convergence curves by `CURVE_KEYS`; other rows are omitted."""
+    curves: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        if row["kind"] == "curve":
+            curves.setdefault(tuple(row.get(name) for name in CURVE_KEYS), []).append(row)
+    return curves
+
+
+def compare_repeated_curve(published: RunRows, repeated: RunRows) -> RunAgreement:
+    """Compare the convergence of a solver on a frozen step with the published one.
+
+    It is close if it reaches each of `CURVE_LEVELS` after as many iterations, within the tolerances and one sample.
+    """
+    first = published[0]
+    title = f"{first['scene']} {first['size']} {first['snapshot']} {first['solver']}"
+    if first["status"] != repeated[0]["status"]:
+        why = f"published as {first['status']!r}, here {repeated[0]['status']!r}"
+        return RunAgreement(title, AgreementLevel.DIFFERENT, why)
+    old, new = _read_curve(published), _read_curve(repeated)
+    if old == new:
+        return RunAgreement(title, AgreementLevel.IDENTICAL)
+    lowest = [min(curve.values(), default=math.inf) for curve in (old, new)]
+    for level in CURVE_LEVELS:
+        if any(level / RESIDUAL_FACTOR <= end <= level * RESIDUAL_FACTOR for end in lowest):
+            continue  # whether such an end is below the level is round-off
+        (was, sample), (now, _) = (_find_first_iteration(curve, level) for curve in (old, new))
+        if was != now and abs(now - was) > max(ITERATION_SLACK, ITERATION_TOLERANCE * min(was, now), sample):
+            why = f"a stationarity of {level:g} took {was:g} iterations, here {now:g}"
+            return RunAgreement(title, AgreementLevel.DIFFERENT, why)
+    return RunAgreement(title, AgreementLevel.CLOSE)
+
+
+def _read_curve(rows: RunRows) -> dict[int, float]:
+    """Return the stationarity by iteration, in ascending order."""
+    known = {row["iteration"]: row["stationarity"] for row in rows}
+    return {k: known[k] for k in sorted(k for k, value in known.items() if k is not None and value is not None)}
+
+
+def _find_first_iteration(curve: Mapping[int, float], level: float) -> tuple[float, float]:
+    """Return the first iteration at a level or below, infinite if there is none, and its distance to the one before."""
+    before = 0
+    for iteration, stationarity in curve.items():
+        if stationarity <= level:
+            return iteration, iteration - before
+        before = iteration
+    return math.inf, 0.0
 
 
 def compare_time_ratios(

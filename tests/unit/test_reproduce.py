@@ -17,8 +17,10 @@ from springbench.harness.results.published_set import read_study
 from springbench.harness.results.study_comparison import (
     AgreementLevel,
     RunAgreement,
+    compare_repeated_curve,
     compare_repeated_run,
     compare_time_ratios,
+    group_curves,
 )
 from springbench.harness.results.time_ratios import MethodTimeRatio
 from typer.testing import CliRunner, Result
@@ -54,6 +56,28 @@ def publish_sweep(home: Path, timing: str) -> Path:
 @pytest.fixture(scope="module")
 def untimed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return publish_sweep(tmp_path_factory.mktemp("untimed"), "none")
+
+
+def build_curve(iterations: list[int], stationarity: list[float], status: str = "ok") -> list[dict[str, Any]]:
+    names = {"kind": "curve", "scene": "cloth", "size": 4, "snapshot": "early", "solver": "numba", "status": status}
+    return [names | {"iteration": k, "stationarity": s} for k, s in zip(iterations, stationarity, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("repeated", "level"),
+    [
+        (build_curve([0, 10, 20, 30], [1.0, 0.05, 0.005, 0.0003]), AgreementLevel.IDENTICAL),
+        (build_curve([0, 10, 20, 30], [1.0, 0.04, 0.005, 0.0003]), AgreementLevel.CLOSE),
+        (build_curve([0, 10, 20, 30], [1.0, 0.05, 0.02, 0.0003]), AgreementLevel.CLOSE),  # one sample later
+        (build_curve([0, 10, 20, 30, 40], [1.0, 0.5, 0.2, 0.05, 0.0003]), AgreementLevel.DIFFERENT),
+        (build_curve([0, 10, 20, 30], [1.0, 0.05, 0.005, 0.00002]), AgreementLevel.DIFFERENT),  # another one reached
+        (build_curve([0], [1.0], "diverged"), AgreementLevel.DIFFERENT),
+    ],
+)
+def test_curves_agree_by_the_iterations_to_each_stationarity(repeated: list[dict[str, Any]], level: AgreementLevel):
+    published = build_curve([0, 10, 20, 30], [1.0, 0.05, 0.005, 0.0003])
+    assert compare_repeated_curve(published, repeated).level == level
+    assert list(group_curves([*published, {"kind": "minimum"}]).values()) == [published]
 
 
 @pytest.mark.slow

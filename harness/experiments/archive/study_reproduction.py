@@ -33,8 +33,10 @@ from springbench.harness.results.study_comparison import (
     AgreementLevel,
     RunAgreement,
     RunRows,
+    compare_repeated_curve,
     compare_repeated_run,
     compare_time_ratios,
+    group_curves,
     group_runs,
 )
 from springbench.harness.results.time_ratios import compute_time_ratios
@@ -171,17 +173,19 @@ def _reproduce_accuracy(
     print_message: Callable[[str], None],
     seed: int | None,
 ) -> StudyRepetition:
-    """Repeat an accuracy study: errors within their tolerance, and ratios of times."""
+    """Repeat an accuracy study: convergence of curves, errors of simulations, and ratios of their times."""
     plan = load_accuracy(study.config_path)
     curves, work = draw_sample(plan.curves, seed), draw_sample(plan.work, seed)
     files = run_accuracy_study(
         replace(plan, curves=tuple(curves), work=tuple(work)), folder, display, print_message, rerun_stale=True
     )
     rows = parquet_rows.read_rows(files, ACCURACY_SCHEMA).to_pylist()
-    published = [row for row in study.read_table("accuracy").to_pylist() if row["kind"] == "work"]
-    repeated = [row for row in rows if row["kind"] == "work"]
+    table = study.read_table("accuracy").to_pylist()
+    before = group_curves(table)
+    found = [compare_repeated_curve(before[key], curve) for key, curve in group_curves(rows).items() if key in before]
+    published, repeated = ([row for row in some if row["kind"] == "work"] for some in (table, rows))
     known = {_build_work_key(row): row for row in published}
-    found = [_compare_work(known[key], row) for row in repeated if (key := _build_work_key(row)) in known]
+    found += [_compare_work(known[key], row) for row in repeated if (key := _build_work_key(row)) in known]
     ratios = compare_time_ratios(compute_time_ratios(published), compute_time_ratios(repeated))
     return StudyRepetition(found, ratios)
 
