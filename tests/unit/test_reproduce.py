@@ -72,6 +72,8 @@ def build_curve(iterations: list[int], stationarity: list[float], status: str = 
         (build_curve([0, 10, 20, 30, 40], [1.0, 0.5, 0.2, 0.05, 0.0003]), AgreementLevel.DIFFERENT),
         (build_curve([0, 10, 20, 30], [1.0, 0.05, 0.005, 0.00002]), AgreementLevel.DIFFERENT),  # another one reached
         (build_curve([0], [1.0], "diverged"), AgreementLevel.DIFFERENT),
+        (build_curve([0, 10], [1.0, 0.05], "time-limit"), AgreementLevel.CLOSE),
+        (build_curve([0, 10, 20, 30], [1.0, 0.5, 0.2, 0.04], "time-limit"), AgreementLevel.DIFFERENT),
     ],
 )
 def test_curves_agree_by_the_iterations_to_each_stationarity(repeated: list[dict[str, Any]], level: AgreementLevel):
