@@ -16,7 +16,12 @@ from typing import Any
 import numpy as np
 from numba.extending import register_jitable
 from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner_options
-from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, REASON_STALLED, check_residual
+from springbench.solvers.kernels.iteration_loop import (
+    REASON_ITERATIONS,
+    REASON_STALLED,
+    build_unchecked_steps,
+    check_residual,
+)
 
 REASON_SWITCH = 4
 """The termination reason of rounds after which another method promises more."""
@@ -114,14 +119,7 @@ def build_compiled_rounds(
 ) -> Any:
     """Build the loop for kernels from inner functions of the state; `step_state` returns whether it succeeded."""
 
-    @jit_closure
-    def run_unchecked(state, num_iterations):
-        for count in range(num_iterations):
-            if not step_state(state):
-                return count
-        return num_iterations
-
-    return jit_closure(build_rounds(run_unchecked, residual, decrease))
+    return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, decrease))
 
 
 def init_rounds(newton_cost: float) -> Any:

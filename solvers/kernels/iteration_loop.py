@@ -95,12 +95,14 @@ def build_loop(
     return iterate
 
 
-def build_compiled_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> Any:
-    """Build the loop for kernels from inner functions of the state.
+def build_unchecked_steps(step_state: Callable[..., Any]) -> Any:
+    """Build the kernel function that does iterations of a state without computing residuals.
 
     Args:
         step_state: does an iteration and returns whether it succeeded.
-        residual: returns the residual [J^(1/2)].
+
+    Returns:
+        The `run_unchecked` of `build_loop`.
     """
 
     @jit_closure
@@ -110,8 +112,19 @@ def build_compiled_loop(step_state: Callable[..., Any], residual: Callable[..., 
                 return count
         return num_iterations
 
+    return run_unchecked
+
+
+def build_compiled_loop(step_state: Callable[..., Any], residual: Callable[..., Any]) -> Any:
+    """Build the loop for kernels from inner functions of the state.
+
+    Args:
+        step_state: does an iteration and returns whether it succeeded.
+        residual: returns the residual [J^(1/2)].
+    """
+
     @jit_closure
     def iterations_until_residual(state):
         return 1
 
-    return jit_closure(build_loop(run_unchecked, residual, iterations_until_residual))
+    return jit_closure(build_loop(build_unchecked_steps(step_state), residual, iterations_until_residual))
