@@ -171,7 +171,7 @@ def prepare_candidate_methods(
     found, reasons = list[Method](), list[str]()
     pairs, remark = list(candidates or list_candidate_methods()), ThrottledMessages(print_message)
     for number, (integrator, solver) in enumerate(pairs):
-        remark(f"  {number} of {len(pairs)} ways are prepared")
+        remark(f"  {number} of {len(pairs)} methods are prepared")
         way = Method(integrator, solver.name, _build_stepper(error_target, integrator, solver))
         try:
             _warm_up(error_target, integrator, solver)
