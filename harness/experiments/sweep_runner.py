@@ -117,8 +117,8 @@ def run_sweep(
             import_module(
                 "springbench.harness.experiments.run_pipeline"
             )  # here, for workers that are forks of this process
-            for name in {p.run.solver.name: None for p in todo if not isinstance(p.run.solver.name, PluginName)}:
-                load_target(SOLVER_TABLE[name])
+            for solver in {p.run.solver.name: None for p in todo if not isinstance(p.run.solver.name, PluginName)}:
+                load_target(SOLVER_TABLE[solver])
         many = min(num_workers or choose_num_workers(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
         if away:
