@@ -66,6 +66,17 @@ LONG_NAME_PARTS = (
         "has_order_1[surface-contact]",
         "has_order_1[self-contact]",
     ),
+    *("ends_no_command[accuracy]", "ends_no_command[roofline]", "ends_no_command[gallery]"),
+    *(
+        "its_files_and_nothing_else[without pictures]",
+        "blocks of 30000 bytes-supernodal, float16",
+        "is_recorded[falls]",
+    ),
+    *("topology-degree-1000-numba float32", "topology-degree-1000-jgs2", "effects-dashpots-1e12-a-jacobi"),
+    *("stiffness-number-1e12-symplectic-euler", "stiffness-number-1e12-velocity-verlet", "a held block at random-jgs2"),
+    *("supernodal-float16-cloth-Anderson", "never_passes_it[6.0-pncg]", "a hanging cloth in a line-jgs2"),
+    *("test_rerun_gaps.py", "test_a_limit_to_the_size_of_files", "1-cloth-numba, supernodal in float16"),
+    *("up_to_there[memory runs out]", "up_to_there[a factorisation fails]", "minimum[both, and contact-plain]"),
 )
 """Parts of names of tests that take 10 to 40 s; `pytest -m long` runs them."""
 
