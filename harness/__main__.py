@@ -6,7 +6,7 @@ import os
 import sys
 from io import TextIOWrapper
 
-from springbench.harness.execution import interrupts
+from springbench.harness.execution import interrupts, pandas_deferral
 
 
 def main() -> None:
@@ -36,6 +36,7 @@ def _prepare_environment() -> None:
         if isinstance(stream, TextIOWrapper):  # what a terminal cannot write is written as an escape sequence
             stream.reconfigure(errors="backslashreplace")
     os.environ["MPLBACKEND"] = "agg"  # all pictures go to files
+    pandas_deferral.request_deferral()
     threads = os.environ.get("NUMBA_NUM_THREADS") or "1"
     if not threads.isdecimal() or int(threads) < 1:
         print(

@@ -16,13 +16,15 @@ from springbench.solvers.jit import source_digest
 
 _LIBRARIES = ("pydantic",)
 """Libraries that the text depends on."""
+_MAX_STATES = 8
+"""Number of stored texts of one name, which serve as many checkouts."""
 
 
 def read_cached_text(name: str, build_text: Callable[[], str], *inputs: str) -> str:
     """Return a text from the cache, or build it and store it if possible.
 
     Args:
-        name: name of the text; a new one replaces the old one of this name.
+        name: name of the text; the newest of this name are stored.
         build_text: builds it.
         inputs: what it depends on, besides the sources.
     """
@@ -33,7 +35,8 @@ def read_cached_text(name: str, build_text: Callable[[], str], *inputs: str) -> 
     text = build_text()
     with suppress(OSError, WriteError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        for older in path.parent.glob(f"{name}-*.txt"):
+        stored = sorted(path.parent.glob(f"{name}-*.txt"), key=lambda text: text.stat().st_mtime)
+        for older in stored[: max(0, len(stored) + 1 - _MAX_STATES)]:
             older.unlink(missing_ok=True)
         with atomic_write(path) as partial:
             partial.write_text(text, encoding="utf-8")

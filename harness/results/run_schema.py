@@ -9,6 +9,9 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import pyarrow as pa
+from springbench.harness.execution.pandas_deferral import defer_pandas
+
+defer_pandas()
 
 
 class ColumnSpec(NamedTuple):

@@ -127,6 +127,13 @@ def _find_entry_points(search_path: tuple[str, ...]) -> Any:
     return entry_points()
 
 
+def list_entry_points() -> list[tuple[str, str, str]]:
+    """Return group, name and target of all installed entry points of this project's groups, sorted."""
+    groups = _find_entry_points(tuple(sys.path))
+    ours = (entry for group in groups.groups if group.startswith("springbench.") for entry in groups.select(group=group))
+    return sorted((entry.group, entry.name, entry.value) for entry in ours)
+
+
 def load_target(target: str) -> Any:
     """Import the module, or run the file, of "module:name" or "path.py:name" and return the named object."""
     place, _, name = target.rpartition(":")

@@ -136,6 +136,13 @@ def _get_parameter(key: str, run: RunSpec) -> Any:
 
 
 def _print_names() -> None:
+    from springbench.harness.execution.source_cache import read_cached_text
+    from springbench.solvers.plugins.plugin_discovery import list_entry_points
+
+    print(read_cached_text("names", _describe_names, repr(list_entry_points())))
+
+
+def _describe_names() -> str:
     from springbench.harness.scenes.effects.effect_table import EFFECT_TABLE as EFFECTS
     from springbench.harness.scenes.mesh.mesh_table import MESH_TABLE as MESHES
     from springbench.solvers.model.integrators import INTEGRATOR_TABLE as INTEGRATORS
@@ -147,13 +154,15 @@ def _print_names() -> None:
         "effects": EFFECTS,
         "meshes": MESHES,
     }
+    text: list[str] = []
     for heading, table in kinds.items():
-        print(f"\n{heading}, {len(table)}")
+        text.append(f"\n{heading}, {len(table)}")
         lines = [(f"  {name}", _read_summary(target)) for name, target in table.items()]
         width = max(len(name) for name, _ in lines)
-        for name, summary in lines:
-            print(f"{name:{width}}  {summary}".rstrip())
-    print("\nsolvers/README.md and configs/README.md describe each; `springbench schema` has all parameters")
+        text += [f"{name:{width}}  {summary}".rstrip() for name, summary in lines]
+    return "\n".join(
+        [*text, "\nsolvers/README.md and configs/README.md describe each; `springbench schema` has all parameters"]
+    )
 
 
 def _read_summary(target: Any) -> str:
