@@ -18,8 +18,11 @@ import re
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
+
+from springbench.solvers.jit.source_store import SourceFacts, read_facts, store_facts
 
 PROJECT_ROOT = Path(__file__).resolve().parents[2]
 """The folder of the project's packages."""
@@ -53,21 +56,24 @@ def _stamp_file(path: str) -> FileStamp:
     return found.st_mtime_ns, found.st_size
 
 
-def _stamp_folder(folder: str) -> Iterator[tuple[str, FileStamp]]:
+def _scan_folder(folder: str) -> Iterator[tuple[str, os.stat_result]]:
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.is_dir():
-                yield from _stamp_folder(entry.path)
+                yield from _scan_folder(entry.path)
             elif entry.name.endswith((".py", *COMPILED_SUFFIXES)):
-                found = entry.stat()
-                yield entry.path, (found.st_mtime_ns, found.st_size)
+                yield entry.path, entry.stat()
 
 
-_FIRST_STAMPS: dict[str, FileStamp] = {
-    path: stamp
+_FIRST_STATES = {
+    path: found
     for package in PACKAGE_NAMES
     if (PROJECT_ROOT / package).is_dir()
-    for path, stamp in _stamp_folder(str(PROJECT_ROOT / package))
+    for path, found in _scan_folder(str(PROJECT_ROOT / package))
+}
+"""State of each source of this project when this module was imported."""
+_FIRST_STAMPS: dict[str, FileStamp] = {
+    path: (found.st_mtime_ns, found.st_size) for path, found in _FIRST_STATES.items()
 }
 """Stamp of each source when it was first read."""
 
@@ -163,12 +169,33 @@ def _content_digest(path: str) -> bytes:
 
 @cache
 def _file_digest(path: str) -> bytes:
-    return hashlib.sha256(Path(path).read_bytes()).digest()
+    known = _read_facts().get(path)
+    return bytes.fromhex(known.digest) if known else hashlib.sha256(Path(path).read_bytes()).digest()
+
+
+@cache
+def _read_facts() -> dict[str, SourceFacts]:
+    """Return digest and imports of all sources of this project, from the store if they are there."""
+    facts = read_facts(_FIRST_STATES)
+    if not facts:
+        with suppress(OSError):  # one was removed
+            for path in _FIRST_STATES:
+                digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+                facts[path] = SourceFacts(digest, sorted(_parse_imports(path)))
+            store_facts(_FIRST_STATES, facts)
+            return facts
+        return {}
+    return facts
 
 
 @cache
 def _find_imports(source: str) -> set[str]:
     """Return the sources that a source imports or compiles, and the `__init__` files of their packages."""
+    known = _read_facts().get(source)
+    return set(known.imports) if known else _parse_imports(source)
+
+
+def _parse_imports(source: str) -> set[str]:
     if not source.endswith(".py"):
         return set()
     compiled = {

@@ -130,7 +130,9 @@ def _find_entry_points(search_path: tuple[str, ...]) -> Any:
 def list_entry_points() -> list[tuple[str, str, str]]:
     """Return group, name and target of all installed entry points of this project's groups, sorted."""
     groups = _find_entry_points(tuple(sys.path))
-    ours = (entry for group in groups.groups if group.startswith("springbench.") for entry in groups.select(group=group))
+    ours = (
+        entry for group in groups.groups if group.startswith("springbench.") for entry in groups.select(group=group)
+    )
     return sorted((entry.group, entry.name, entry.value) for entry in ours)
 
 
