@@ -8,14 +8,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from springbench.harness.results.parquet_rows import write_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 DRAWING = {"PIL", "matplotlib", "mpl_toolkits", "plotly", "pyvista", "vtkmodules", "rerun"}
 COMPUTING = {"duckdb", "llvmlite", "numba", "numpy", "pyarrow", "pydantic", "scipy"}
-STEPPING = {"duckdb", "llvmlite", "numba", "pyarrow", "scipy.linalg"}
+STEPPING = {"duckdb", "llvmlite", "numba", "pandas", "pyarrow", "scipy.linalg"}
 PROGRAM = (
     "import atexit, sys; atexit.register(lambda: print('loaded', *sys.modules)); from "
-    "springbench.harness.cli.main import main; main()"
+    "springbench.harness.__main__ import main; main()"
 )
 
 
@@ -41,14 +42,18 @@ def loads(arguments: list[str], cache: Path) -> list[str]:
             DRAWING | STEPPING | {"springbench.harness.report", "springbench.harness.recording.rerun_recorder"},
             800,
         ),
+        (["list"], DRAWING | COMPUTING - {"pydantic"}, 400),
+        (["query", "select size from rows"], DRAWING | {"numba", "pandas", "scipy"}, 900),
     ],
-    ids=["--help", "list"],
+    ids=["--help", "list-config", "list", "query"],
 )
 def test_a_command_that_tells_imports_neither_pictures_nor_recordings(
     arguments: list[str], without: set[str], fewer: int, tmp_path: Path
 ) -> None:
-    if "list" in arguments:
+    if "--help" not in arguments:
         arguments = [*arguments, "--results", str(tmp_path)]
+        (tmp_path / "sweep" / "rows").mkdir(parents=True)
+        write_rows(tmp_path / "sweep" / "rows" / "run.parquet", [{"run_id": "run", "size": 4}])
         loads(arguments, tmp_path)  # the first time it asks solvers for their parameters, and keeps them
     loaded = loads(arguments, tmp_path)
     assert not without & set(loaded)

@@ -215,7 +215,7 @@ def measure_command(
         process = subprocess.Popen(
             arguments,
             cwd=CHECKOUT,
-            env=os.environ | variables,
+            env=os.environ | {"PYTHONDONTWRITEBYTECODE": ""} | variables,  # bytecode is warm after one start
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
         )
