@@ -32,7 +32,7 @@ from springbench.harness.config.typed_keys import (
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.recording.local_origin import compute_local_origin, store_relative
 from springbench.harness.recording.obstacle_properties import build_obstacles_property, list_obstacles
-from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.recording.recorder_interface import INTERSECTION_FREE_PROPERTY, RecordingReplay
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.scenes.effects.effect_interface import SceneEffect
 from springbench.harness.scenes.mesh.mesh import Mesh
@@ -216,9 +216,14 @@ class Simulation:
             springs=springs.edges,
             rest_lengths=springs.rest_length,
             pinned_vertices=self._scene.system.pins.vertices,
-            strain_range=compute_strain_range([self._state.motion.positions], springs.edges, springs.rest_length),
+            strain_range=compute_strain_range(
+                self.mesh.rest_positions, [self._state.motion.positions], springs.edges, springs.rest_length
+            ),
             scalars={},
-            properties=build_obstacles_property(list_obstacles(self._spec.effects)),
+            properties={
+                **build_obstacles_property(list_obstacles(self._spec.effects)),
+                INTERSECTION_FREE_PROPERTY: self._scene.has_self_contact,
+            },
             origin=origin,
         )
         return draw_picture(replay)

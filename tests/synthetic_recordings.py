@@ -35,6 +35,7 @@ def build_recording_info(mesh: str = "cloth", **changes: Any) -> RecordingInfo:
         pinned_vertices=np.array([0, 2]),
         time_step=TIME_STEP,
         strain_range=0.1,
+        has_self_contact=False,
         properties={"scene": mesh, "size": 6, "solver": "test", "exact": True, "cpu": "a, b [c]", "note": ""},
     )
     return replace(plain, **changes)

@@ -39,7 +39,6 @@ from springbench.harness.experiments.source_fingerprint import (
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.recording.obstacle_properties import list_obstacles
 from springbench.harness.recording.recorder_interface import (
-    INTERSECTION_FREE_PROPERTY,
     FrameSamples,
     RecordedFrame,
     RecordingInfo,
@@ -431,7 +430,6 @@ def _open_recorder(
         "springs": len(scene.all_springs.edges),
         "frames": run.frames,
         **outcome,
-        INTERSECTION_FREE_PROPERTY: scene.has_self_contact,
         "cpu": here.cpu,
         "cores": here.cores,
         "memory_gib": here.memory_gib,
@@ -451,7 +449,10 @@ def _open_recorder(
             pinned_vertices=scene.system.pins.vertices,
             time_step=run.scene.time_step,
             strain_range=run.strain_range
-            or compute_strain_range(final_positions, scene.all_springs.edges, scene.all_springs.rest_length),
+            or compute_strain_range(
+                scene.mesh.rest_positions, final_positions, scene.all_springs.edges, scene.all_springs.rest_length
+            ),
+            has_self_contact=scene.has_self_contact,
             properties=properties,
             obstacles=list_obstacles(run.scene.effects),
         ),

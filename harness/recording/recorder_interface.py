@@ -66,6 +66,7 @@ class RecordingInfo:
       pinned_vertices: indices of the pinned vertices (q,).
       time_step: step size [s].
       strain_range: strain at the ends of the colour scale (0.1 is 10 %).
+      has_self_contact: whether an effect prevents self-intersection of the mesh; pictures of surfaces state it.
       properties: flat metadata of the run and its machine (scene, size, solver, iterations, cpu, ...).
       is_solve: whether the frames are the numbered iterates of one solve, instead of the steps of a run.
       obstacles: obstacles drawn with the mesh.
@@ -79,6 +80,7 @@ class RecordingInfo:
     pinned_vertices: NDArray[np.int64]
     time_step: float
     strain_range: float
+    has_self_contact: bool
     properties: Mapping[str, str | int | float | bool]
     is_solve: bool = False
     obstacles: Sequence[AnySurface] = ()

@@ -41,7 +41,12 @@ from springbench.harness.recording.local_origin import build_origin_property, co
 from springbench.harness.recording.obstacle_properties import build_obstacles_property
 from springbench.harness.recording.obstacle_shapes import ObstacleRecorder
 from springbench.harness.recording.partial_file import PartialFile
-from springbench.harness.recording.recorder_interface import LAYOUT_VERSION, RecordedFrame, RecordingInfo
+from springbench.harness.recording.recorder_interface import (
+    INTERSECTION_FREE_PROPERTY,
+    LAYOUT_VERSION,
+    RecordedFrame,
+    RecordingInfo,
+)
 from springbench.harness.recording.strain_scale import PIN_COLOUR, widen_range
 from springbench.harness.recording.strain_shading import StrainShading
 
@@ -192,6 +197,7 @@ class RerunRecorder:
     def _log_static(self) -> None:
         info, mesh = self._info, self._info.mesh
         stated = {**info.properties, **build_obstacles_property(info.obstacles), **build_origin_property(self._origin)}
+        stated[INTERSECTION_FREE_PROPERTY] = info.has_self_contact
         facts: dict[str, Any] = {k: [v] for k, v in stated.items()}
         self._stream.send_property("run", rr.AnyValues(**facts))
         network: dict[str, Any] = {

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
+from springbench.harness.recording.camera_framing import find_framed_vertices
 from springbench.harness.recording.recorder_interface import RecordingInfo
 from springbench.harness.recording.strain_scale import DEFAULT_STRAIN_RANGE, compute_strain_colours, round_scale_end
 from springbench.solvers.jit.kernel_compilation import cached_njit
@@ -23,18 +24,30 @@ NORMAL_STEPS = 32
 
 
 def compute_strain_range(
-    positions: Iterable[Positions], springs: NDArray[np.int64], rest_lengths: NDArray[np.float64]
+    rest_positions: Positions,
+    positions: Iterable[Positions],
+    springs: NDArray[np.int64],
+    rest_lengths: NDArray[np.float64],
 ) -> float:
     """Return the end of a scale that shows the strains at the given positions.
 
+    A spring to a vertex that the camera does not frame is left out: it would leave all others grey.
+
     Args:
+      rest_positions: rest positions (n, 3) [m].
       positions: vertex positions, each (n, 3) [m].
       springs: vertex pairs (m, 2).
       rest_lengths: rest lengths (m,) [m].
 
     Returns: the range of `round_scale_end` over all strains; DEFAULT_STRAIN_RANGE without springs.
     """
-    found = [compute_strains(p, springs, rest_lengths)[1] for p in positions if len(rest_lengths)]
+    found = list[RealArray]()
+    for p in positions if len(rest_lengths) else ():
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = np.linalg.norm(p - rest_positions, axis=1)
+        near = find_framed_vertices(rest_positions, moved) if np.isfinite(moved).all() else np.full(len(p), True)
+        framed = near[springs].all(axis=1)
+        found.append(compute_strains(p, springs[framed], rest_lengths[framed])[1][near])
     return round_scale_end(np.concatenate(found)) if found else DEFAULT_STRAIN_RANGE
 
 

@@ -22,6 +22,7 @@ from springbench.harness.recording.camera_framing import describe_outside
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.report.drawable_frames import (
     find_drawable_frames,
+    framed_vertex_mask,
     max_recorded_strain,
     strain_extremes,
     strain_scale_limit,
@@ -34,7 +35,7 @@ from springbench.harness.report.mesh_rendering import (
     view_aspect,
 )
 from springbench.harness.report.number_format import format_count, format_quantity, shorten_words
-from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
+from springbench.harness.report.obstacle_meshes import points_to_frame
 from springbench.harness.report.page_layout import (
     draw_header,
     draw_strain_scale,

@@ -1,11 +1,13 @@
-"""Selection of drawable frames of a recording, and their strain scale."""
+"""Selection of the drawable frames and the framed vertices of a recording, and their strain scale."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from springbench.harness.recording.camera_framing import find_framed_vertices
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.recording.strain_scale import round_scale_end
 from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain, mean_rest_length
@@ -26,14 +28,30 @@ def find_drawable_frames(replay: RecordingReplay) -> NDArray[np.int64]:
     return np.arange(len(good) if good.all() else int(np.argmin(good)))
 
 
+def framed_vertex_mask(replay: RecordingReplay, frames: Iterable[int]) -> NDArray[np.bool_]:
+    """Return the mask (n,) of the vertices that a camera frames in these recorded frames."""
+    start = replay.positions[0].astype(np.float64)
+    moved = [np.linalg.norm(replay.positions[k] - start, axis=1) for k in frames]
+    return find_framed_vertices(start, np.max(moved, axis=0))
+
+
 def strain_scale_limit(replays: Sequence[RecordingReplay], frames: Sequence[int]) -> float:
     """Return the end of a colour scale for the strains of these frames, see `round_scale_end`.
+
+    A spring to a vertex that the camera does not frame is left out: it would leave all others grey.
 
     Args:
         replays: recordings.
         frames: one frame index per recording.
     """
-    return round_scale_end(np.concatenate([compute_vertex_strain(r, k) for r, k in zip(replays, frames, strict=True)]))
+    return round_scale_end(np.concatenate([_framed_strain(r, k) for r, k in zip(replays, frames, strict=True)]))
+
+
+def _framed_strain(replay: RecordingReplay, frame: int) -> NDArray[np.float64]:
+    near = framed_vertex_mask(replay, [frame])
+    framed = near[replay.springs].all(axis=1)
+    part = replace(replay, springs=replay.springs[framed], rest_lengths=replay.rest_lengths[framed])
+    return compute_vertex_strain(part, frame)[near]
 
 
 def max_recorded_strain(replay: RecordingReplay) -> float:

@@ -20,13 +20,14 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from springbench.harness.recording.camera_framing import describe_outside
 from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.report.drawable_frames import framed_vertex_mask
 from springbench.harness.report.mesh_rendering import (
     OffscreenRenderer,
     choose_view_angles,
     compute_area_vectors,
     fit_camera,
 )
-from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
+from springbench.harness.report.obstacle_meshes import points_to_frame
 from springbench.harness.report.page_layout import save_page
 from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
@@ -47,6 +48,8 @@ _BALL_RADIUS, _HEAVY_RATIO = 0.03, 20.0
 """Radius of balls [share of the scene's size], drawn at vertices whose mass exceeds this multiple of the median."""
 _SHEET_MARGIN, _TILE_GAP, _TILE_HEIGHT, _CAPTION_HEIGHT, _FOOT_HEIGHT = 28, 20, 290, 78, 24
 """Pixels: margin of the sheet, gap between tiles, height of a tile, caption below it, text at the foot of the sheet."""
+
+_MAX_CAPTION_LINES = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,7 +105,7 @@ def draw_gallery_sheet(tiles: Sequence[SceneTile], path: Path, facts: Sequence[s
             )
             for words, below, size, color in (
                 (tile.name, 20, 15.0, TEXT_COLOUR),
-                *_wrap_effects(_format_title(tile), width),
+                *((line, 40 + 16 * k, 10.0, MUTED_COLOUR) for k, line in enumerate(_fit_caption(tile, width))),
             ):
                 page.text(left / PAGE_WIDTH, 1 - (top + _TILE_HEIGHT + below) / height, words, size=size, color=color)
         footer = "   ·   ".join((*facts, *describe_machine_and_commit([tile.replay.properties for tile in tiles])))
@@ -120,20 +123,19 @@ def choose_column_count(count: int) -> int:
     return min(range(_MIN_COLUMNS, _MAX_COLUMNS + 1), key=lambda columns: (-count % columns, abs(columns - 4)))
 
 
-def _format_title(tile: SceneTile) -> str:
-    return ", ".join(
-        [
-            tile.effect_words,
-            *describe_outside(framed_vertex_mask(tile.replay, [-1])),
-            *describe_self_intersection(tile.replay, [-1]),
-        ]
-    )
-
-
-def _wrap_effects(effects: str, width: int) -> list[tuple[str, int, float, str]]:
-    """Wrap the effects into at most two lines with offset, size and colour."""
-    lines = wrap(effects, int(width / 7.2), max_lines=2, placeholder=" …")
-    return [(words, 40 + 16 * k, 10.0, MUTED_COLOUR) for k, words in enumerate(lines)]
+def _fit_caption(tile: SceneTile, width: int) -> list[str]:
+    """Return the effects and the notes in lines; where they do not fit, the last effects are left out."""
+    effects, lines = tile.effect_words.split(", "), list[str]()
+    notes = [
+        *describe_outside(framed_vertex_mask(tile.replay, [-1])),
+        *describe_self_intersection(tile.replay, [-1]),
+    ]
+    for count in range(len(effects), -1, -1):
+        shown = [*effects[:count], *(["…"] if count < len(effects) else []), *notes]
+        lines = wrap(", ".join(shown), int(width / 7.2))
+        if len(lines) <= _MAX_CAPTION_LINES:
+            break
+    return lines[:_MAX_CAPTION_LINES]
 
 
 def _render_tile(studio: OffscreenRenderer, tile: SceneTile, aspect: float) -> np.ndarray:

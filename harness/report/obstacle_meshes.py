@@ -4,15 +4,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
-from springbench.harness.recording.camera_framing import find_framed_vertices
 from springbench.harness.recording.obstacle_properties import OBSTACLES_PROPERTY
 from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.report.drawable_frames import framed_vertex_mask
 
 if TYPE_CHECKING:  # a recording without obstacles imports none of them
     from springbench.harness.scenes.primitive_obstacles import (
@@ -40,13 +40,6 @@ def build_obstacle_meshes(replay: RecordingReplay, frame: int) -> list[pv.PolyDa
         for one in parse_obstacles(str(replay.properties[OBSTACLES_PROPERTY]))
     )
     return [one for one in made if one is not None]
-
-
-def framed_vertex_mask(replay: RecordingReplay, frames: Iterable[int]) -> NDArray[np.bool_]:
-    """Return the mask (n,) of the vertices that a camera frames in these recorded frames."""
-    start = replay.positions[0].astype(np.float64)
-    moved = [np.linalg.norm(replay.positions[k] - start, axis=1) for k in frames]
-    return find_framed_vertices(start, np.max(moved, axis=0))
 
 
 def points_to_frame(replay: RecordingReplay, frames: Sequence[int]) -> NDArray[np.float32]:

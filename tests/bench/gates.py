@@ -143,6 +143,7 @@ def record(scene: Scene, prepared: PreparedSolver, frames: int, path: Path) -> P
         pinned_vertices=scene.system.pins.vertices,
         time_step=scene.system.time_step,
         strain_range=0.1,
+        has_self_contact=scene.has_self_contact,
         properties={"scene": "sheet"},
     )
     recorder = RerunRecorder(path, info)

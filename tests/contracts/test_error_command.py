@@ -72,7 +72,7 @@ def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_pa
     assert all(one["predicted_seconds"] > 0.0 for one in tried)
     assert row["error"] <= row["error_estimated"] <= row["error_requested"] == 1e-3
     assert row["num_accepted_steps"] > 0
-    assert (tmp_path / "chain" / row["recording_path"]).is_file()
+    assert read_replay(tmp_path / "chain" / row["recording_path"]).properties["prevents_self_intersection"] is False
     assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
 
 

@@ -34,6 +34,7 @@ def test_meshes_side_by_side_have_one_camera_one_scale_and_the_distance_from_the
     assert len({picture.strain_limit for picture in pictures}) == len({picture.aspect for picture in pictures}) == 1
     assert len({picture.render.view for picture in pictures}) == 1
     shown = [np.asarray(ax.images[0].get_array()) for ax in figure.axes[:2]]
+    assert all("no self-contact" in picture.facts for picture in pictures)
     assert all((picture.min(axis=-1) < 200).mean() > 0.1 for picture in shown), "the mesh fills its place"
     alone, (one,) = compose_mesh_kind("run", folder)
     assert len(one.csv_rows()) == 36

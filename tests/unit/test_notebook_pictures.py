@@ -14,6 +14,7 @@ from PIL import Image
 from springbench.harness.execution.optional_parts import NOTEBOOKS, OptionalPart
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.report import opengl_probe
+from springbench.harness.report.self_intersection_notes import describe_self_intersection
 
 
 @pytest.fixture
@@ -41,6 +42,7 @@ def test_a_picture_has_the_start_and_the_present_state(
     assert [replay.frames.tolist() for replay in drawn] == [[0], [0, 2]]
     assert drawn[1].absolute_positions(1) == pytest.approx(simulation.positions, abs=1e-6)
     assert "sphere" in str(drawn[1].properties["obstacles"])
+    assert describe_self_intersection(drawn[1], [1]) == ["no self-contact"]
 
 
 def test_nothing_is_shown_where_nothing_can_be_drawn(

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from springbench.harness.errors import RunFailed
 from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.report import opengl_probe
 from springbench.harness.report.comparison_picture import draw_comparison_picture, find_reference_run
 from springbench.harness.report.drawable_frames import strain_scale_limit
 from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH
 from springbench.harness.report.run_picture import draw_run_picture, layout_frames
 
-from tests.unit.test_report_pictures import broken, cloth
+from tests.unit.test_report_pictures import broken, cloth, falling
 
 
 @pytest.mark.parametrize("shape", [0.2, 1.0, 1.3, 4.0])
@@ -35,13 +36,23 @@ def test_frames_of_any_shape_fill_the_page_and_do_not_meet(shape: float) -> None
 
 
 def test_the_scale_is_that_of_the_strains_that_are_seen() -> None:
-    # All springs at 5 % but one at 40 %: a scale to 40 % would show one grey cloth.
-    one = cloth(12, frames=1)
+    # All springs at 5 % but those of a corner at 40 %: a scale to 40 % would show one grey cloth.
+    one = cloth(24, frames=1)
     stretched = one.positions.copy()
-    stretched[0, 0] += np.array([-0.4 / 11, 0.0, 0.0], np.float32)
-    assert strain_scale_limit([replace(one, positions=stretched)], [0]) == pytest.approx(0.4, abs=0.35)
+    stretched[0, 0] += np.array([-0.4 / 23, 0.0, 0.0], np.float32)
+    assert strain_scale_limit([replace(one, positions=stretched)], [0]) == pytest.approx(0.05)
     assert strain_scale_limit([one], [0]) == pytest.approx(0.05)
     assert strain_scale_limit([cloth(stretch=1.39, frames=1)], [0]) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("n", [6, 12])
+def test_a_runaway_vertex_does_not_set_the_scale(n: int) -> None:
+    """Its springs, at 22,000 % and more, end at 3 to 9 % of the vertices, and would leave all others grey."""
+    away = falling(cloth(n), slice(3, 4), 44.0)
+    assert strain_scale_limit([cloth(n), away], [7, 7]) == strain_scale_limit([cloth(n)], [7]) == pytest.approx(0.05)
+    rest, p = (away.positions[k].astype(np.float64) for k in (0, 7))
+    for positions in (p, np.where(np.arange(n * n)[:, None] == 3, np.nan, p)):
+        assert compute_strain_range(rest, [positions], away.springs, away.rest_lengths) == pytest.approx(0.05)
 
 
 def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None:

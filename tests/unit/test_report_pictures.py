@@ -17,16 +17,17 @@ from PIL import Image
 from springbench.harness.recording.camera_framing import describe_outside
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.recording.strain_scale import STRAIN_COLOURS
-from springbench.harness.report import comparison_picture, opengl_probe, page_layout, run_picture
+from springbench.harness.report import comparison_picture, gallery_sheet, opengl_probe, page_layout, run_picture
 from springbench.harness.report.comparison_picture import draw_comparison_picture
-from springbench.harness.report.drawable_frames import find_drawable_frames
+from springbench.harness.report.drawable_frames import find_drawable_frames, framed_vertex_mask
+from springbench.harness.report.gallery_sheet import SceneTile, draw_gallery_sheet
 from springbench.harness.report.mesh_rendering import (
     OffscreenRenderer,
     choose_view_angles,
     compute_area_vectors,
     fit_camera,
 )
-from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
+from springbench.harness.report.obstacle_meshes import points_to_frame
 from springbench.harness.report.plot_style import BACKGROUND_COLOUR, PAGE_HEIGHT, PAGE_WIDTH
 from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain
 from springbench.harness.report.run_picture import PixelBox, draw_run_picture, layout_frames
@@ -101,7 +102,7 @@ def words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         written.extend(text.get_text() for text in sheet.texts)
         page_layout.save_page(sheet, path, **more)
 
-    for module in (run_picture, comparison_picture):
+    for module in (run_picture, comparison_picture, gallery_sheet):
         monkeypatch.setattr(module, "save_page", save)
     return written
 
@@ -353,6 +354,18 @@ def test_a_picture_says_of_a_surface_that_nothing_keeps_it_apart(apart: bool, fo
     assert describe_self_intersection(plain, [7]) == [], "a recording that does not say is not judged"
     net = replace(replay, triangles=replay.triangles[:0])
     assert describe_self_intersection(net, [7]) == [], "a net has no surface"
+
+
+@needs_opengl
+@pytest.mark.slow
+def test_every_picture_of_a_surface_says_that_nothing_keeps_it_apart(words: list[str], tmp_path: Path) -> None:
+    replay = replace(cloth(frames=1), properties={**cloth().properties, "prevents_self_intersection": False})
+    effects = "springs, gravity, bending, wind, air drag, strain limits, surface contact, dashpots, ether drag, pins"
+    draw_run_picture(replay, tmp_path / "run.png")
+    draw_comparison_picture({"a": replay}, tmp_path / "both.png")
+    sheet = [SceneTile(replay, np.ones(36), "cloth", effects, None)] * 4
+    draw_gallery_sheet(sheet, tmp_path / "sheet.png")
+    assert "\n".join(words).replace("self-\n", "self-").count("no self-contact") == 1 + 1 + 4
 
 
 def test_what_is_stretched_evenly_is_framed_whole() -> None:

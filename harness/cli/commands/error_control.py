@@ -333,8 +333,12 @@ def _record_motion(
         pinned_vertices=scene.system.pins.vertices,
         time_step=error_target.frame_seconds,
         strain_range=compute_strain_range(
-            best.trajectory.positions[-1:], scene.all_springs.edges, scene.all_springs.rest_length
+            scene.mesh.rest_positions,
+            best.trajectory.positions[-1:],
+            scene.all_springs.edges,
+            scene.all_springs.rest_length,
         ),
+        has_self_contact=scene.has_self_contact,
         properties={
             **properties,
             **{column: value for column, value in status_columns.items() if value},

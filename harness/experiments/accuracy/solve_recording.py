@@ -63,7 +63,10 @@ def record_solve(
         rest_lengths=scene.all_springs.rest_length,
         pinned_vertices=problem.system.pins.vertices,
         time_step=problem.system.time_step,
-        strain_range=compute_strain_range(finite[-1:], scene.all_springs.edges, scene.all_springs.rest_length),
+        strain_range=compute_strain_range(
+            scene.mesh.rest_positions, finite[-1:], scene.all_springs.edges, scene.all_springs.rest_length
+        ),
+        has_self_contact=scene.has_self_contact,
         properties={
             "scene": spec.case.scene_name,
             "size": spec.case.size,

@@ -17,7 +17,12 @@ from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.recording.camera_framing import describe_outside
 from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.report.comparison_picture import find_reference_run, format_distance
-from springbench.harness.report.drawable_frames import find_drawable_frames, max_recorded_strain, strain_scale_limit
+from springbench.harness.report.drawable_frames import (
+    find_drawable_frames,
+    framed_vertex_mask,
+    max_recorded_strain,
+    strain_scale_limit,
+)
 from springbench.harness.report.figures.figure_panels import MeshPicture, MeshRenderer
 from springbench.harness.report.figures.panel_selection import PanelEntry
 from springbench.harness.report.figures.timing_panels import read_sweep_rows
@@ -30,7 +35,7 @@ from springbench.harness.report.mesh_rendering import (
     view_aspect,
 )
 from springbench.harness.report.number_format import format_count, format_quantity
-from springbench.harness.report.obstacle_meshes import framed_vertex_mask, points_to_frame
+from springbench.harness.report.obstacle_meshes import points_to_frame
 from springbench.harness.report.page_layout import format_frame_time
 from springbench.harness.report.plot_style import SeriesStyle, assign_solver_styles
 from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
