@@ -53,6 +53,28 @@ def test_what_stands_elsewhere_or_twice_is_refused(tmp_path: Path):
             mutation.apply(tmp_path)
 
 
+def test_bytecode_of_the_source_without_an_error_does_not_hide_it(tmp_path: Path):
+    """The error leaves the length as it is, and the file's time would be the same within a second."""
+
+    class Small(SourceCopy):
+        def __init__(self) -> None:
+            self._root, self._compiled, self._num_planted = tmp_path, tmp_path, 0
+
+    (tmp_path / "small.py").write_text("x = 1\n")
+    copy, mutation = Small(), replace(TABLE[0], file="small.py", fragment="x = 1", replacement="x = 2")
+
+    def imported() -> tuple[int, str]:
+        return copy.run_command(mutation, ["-c", "import small; print(small.x)"], 60.0)
+
+    found = [imported()]
+    for _ in range(2):
+        with copy.planted(mutation):
+            found.append(imported())
+        found.append(imported())
+    assert found == [(0, "1\n"), (0, "2\n"), (0, "1\n"), (0, "2\n"), (0, "1\n")]
+    assert list((tmp_path / "__pycache__").iterdir()), "bytecode is written"
+
+
 class ChanceFailures(SourceCopy):
     """Tests with known results: the first failure is by chance, the second by the error."""
 
