@@ -16,6 +16,7 @@ from springbench.harness.report.comparison_picture import draw_comparison_pictur
 from springbench.harness.report.drawable_frames import strain_scale_limit
 from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH
 from springbench.harness.report.run_picture import draw_run_picture, layout_frames
+from springbench.harness.report.site.mesh_scripts import _select_iterates
 
 from tests.unit.test_report_pictures import broken, cloth, falling
 
@@ -53,6 +54,20 @@ def test_a_runaway_vertex_does_not_set_the_scale(n: int) -> None:
     rest, p = (away.positions[k].astype(np.float64) for k in (0, 7))
     for positions in (p, np.where(np.arange(n * n)[:, None] == 3, np.nan, p)):
         assert compute_strain_range(rest, [positions], away.springs, away.rest_lengths) == pytest.approx(0.05)
+
+
+def test_iterates_that_diverge_do_not_set_the_scale_of_distances() -> None:
+    """The vertices of a solve's iterates end 1 mm to 1 m from the reference; one of 36 leaves in one iterate of 8."""
+    replay = cloth()
+    reference = replay.positions[-1] + np.array([0.0, 0.0, 1e-3], np.float32)
+    replay.positions[:, :, 2] += np.geomspace(1.0, 1e-3, 8, dtype=np.float32)[:, None] - np.float32(1e-3)
+    usual = _select_iterates(replay, reference)["max_distance"]
+    assert usual == pytest.approx(1.04, abs=0.05)
+    for value in (1e30, np.nan, np.inf):
+        replay.positions[3, 5] = value
+        assert _select_iterates(replay, reference)["max_distance"] == pytest.approx(usual, rel=0.02)
+    replay.positions[:] = np.nan
+    assert _select_iterates(replay, reference)["max_distance"] == 1.0
 
 
 def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None:

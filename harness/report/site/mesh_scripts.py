@@ -132,14 +132,18 @@ def _write_snapshot_solves(
 
 
 def _select_iterates(replay: RecordingReplay, reference: NDArray[np.float32]) -> dict[str, Any]:
-    """Select some of a solve's iterates, with the limits of their distances [m].
+    """Select some of a solve's iterates, with the limits of a scale of their distances [m].
 
-    Distances are from the reference.
+    Distances are from the reference. One in a hundred lies beyond the scale, and so does what is not finite: iterates
+    that diverge do not hide how the others converge.
     """
     selected = np.unique(
         np.linspace(0, len(replay.frames) - 1, min(MAX_ITERATES, len(replay.frames))).round().astype(int)
     )
-    farthest = float(np.linalg.norm(replay.positions[selected] - reference, axis=2).max()) or 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = np.linalg.norm(replay.positions[selected].astype(np.float64) - reference, axis=2)
+    known = distance[np.isfinite(distance)]
+    farthest = (float(np.quantile(known, 0.99)) if len(known) else 0.0) or 1.0
     return _mesh_topology(replay) | {
         "iterations": replay.frames[selected].tolist(),
         "positions": _encode_array(replay.positions[selected], np.float32),

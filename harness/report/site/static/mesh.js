@@ -137,7 +137,7 @@ Object.assign(springbench, (() => {
     slider.oninput = () => { show(); keep({ at: found.iterations[Number(slider.value)] }); };
     const wanted = where().query.has("at") ? Number(where().query.get("at")) : at ?? found.iterations.at(-1);
     slider.value = found.iterations.reduce((b, v, j) => (Math.abs(v - wanted) < Math.abs(found.iterations[b] - wanted) ? j : b), 0);
-    box.append(words, slider, element("div.scrub", {}, element("figure", {}, left.canvas, element("figcaption", {}, `the iterate of ${item.label}, by its distance from the reference`), scaleBox(`${number(found.min_distance)} m`, `${number(found.max_distance)} m`)),
+    box.append(words, slider, element("div.scrub", {}, element("figure", {}, left.canvas, element("figcaption", {}, `the iterate of ${item.label}, by its distance from the reference`), scaleBox(`${number(found.min_distance)} m`, `${number(found.max_distance)} m or more`)),
       element("figure", {}, right.canvas, element("figcaption", {}, `the reference: the last iterate of ${found.reference.reference_label}, ${number(found.reference.distance)} m from the certified minimum`))));
     right.show(best);
     show();
