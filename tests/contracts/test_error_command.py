@@ -76,6 +76,33 @@ def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_pa
     assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
 
 
+THROWN = """
+mesh: {kind: grid}
+mass: 1
+time_step: 1/30
+frames: 15
+default_size: 6
+velocity: [0, 0, 6]
+effects:
+  - {kind: springs, stretch: 500}
+  - {kind: gravity}
+  - {kind: air-drag, drag_law: quadratic, coefficient: 0.3}
+  - {kind: pins, indices: [0, 5], weight: exact}
+"""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("error", ["2e-2", "1e-2", "5e-3"])
+def test_errors_in_quadratic_drag_are_reached_though_a_method_loses_its_order(error: str, tmp_path: Path):
+    """Midpoint is of order 1 there, and another method has to take over from it."""
+    (tmp_path / "net.yaml").write_text(THROWN)
+    given = ["run", str(tmp_path / "net.yaml"), "--error", error, "--t-end", "0.5", "--verify"]
+    found = CliRunner().invoke(app, [*given, "--results", str(tmp_path)])
+    assert found.exit_code == 0, found.output
+    row, *_ = parquet_rows.read_rows((tmp_path / "net" / "accuracy").glob("*.parquet"), ACCURACY_SCHEMA).to_pylist()
+    assert row["error"] <= row["error_requested"] == float(error)
+
+
 class Boosting(AdaptiveSubstepper):
     """Its positions are right, and its velocities three times those of the motion."""
 
