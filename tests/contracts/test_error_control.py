@@ -248,6 +248,15 @@ def test_a_refusal_names_the_longest_horizon_that_works(tmp_path):
         store.load_trajectory(CRUMPLING, 7, [1.6], error=error)
 
 
+def test_long_steps_that_an_error_allows_cause_no_warning(caplog: pytest.LogCaptureFixture):
+    error_target = ErrorTarget.from_scene(SWINGING, 5, 40.0, lambda line: None)
+    with caplog.at_level("WARNING", logger="springbench"):
+        error_target.build_scene(20.0, "esdirk-4")
+        assert not caplog.records
+        build_scene(SWINGING.with_time_step(20.0), 5)
+        assert "a time step of 20 s is long" in caplog.text, "as it is of steps that somebody states"
+
+
 def test_an_error_below_round_off_is_refused_with_the_one_that_can_be_had():
     pendulum = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 1.0)
     assert (

@@ -244,6 +244,29 @@ def test_a_file_next_to_the_config_travels_between_processes(plugin_folder: Path
     assert completed.stdout.rstrip().endswith(run.build_identity())
 
 
+WEIGHTED = """
+from dataclasses import dataclass, field
+
+import numpy as np
+from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
+
+
+@dataclass(frozen=True)
+class Weighted(SparseLocalGlobal):
+    weights: np.ndarray = field(default_factory=lambda: np.ones(3))
+"""
+
+
+@pytest.mark.slow
+def test_a_file_with_a_blank_in_its_name_and_a_field_that_is_an_array_are_verified(plugin_folder: Path):
+    (plugin_folder / "my solver.py").write_text(WEIGHTED)
+    sweep = configs(plugin_folder, WAYS["beside"] | {"solver": "./my solver.py:Weighted"})
+    sweep.write_text(sweep.read_text().replace(", patience: 5", "").replace("rounds: 1", "rounds: 1, verify: true"))
+    springbench(plugin_folder, "run", "sweep.yaml")
+    rows = [row for path in (plugin_folder / "results").rglob("*.parquet") for row in pq.read_table(path).to_pylist()]
+    assert {(row["solver"], row["status"]) for row in rows} == {("./my solver.py:Weighted", "ok")}
+
+
 REFUSED = {
     "../mine.py:Mine": "wanted",
     "/mine.py:Mine": "wanted",

@@ -295,6 +295,26 @@ def test_the_script_that_is_printed_ends_where_the_run_did(
 
 
 @engines
+def test_the_folder_of_a_script_is_made_and_a_file_in_its_place_refused(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    scene, engine = made(*HANGING), load_target(OPTIONAL_SOLVERS[name])()
+    end = scene.mesh.rest_positions
+    texts = write_engine_script("hangs", scene, engine, 20, 2, tmp_path / "new" / "folder", end=end)
+    assert {path.name for path in (tmp_path / "new" / "folder").iterdir()} == {*texts, "hangs.npz"}
+    (tmp_path / "net.yaml").write_text(NET)
+    (tmp_path / "config.yaml").write_text(CONFIG.format(engine=name))
+    (tmp_path / "file").touch()
+    result = CliRunner().invoke(app, ["export-script", str(tmp_path / "config.yaml"), "-o", str(tmp_path / "file")])
+    assert result.exit_code == 0, "without a point it only lists them"
+    point = next(line for line in result.stdout.splitlines() if f"net-3-work-{name}" in line).split()[0]
+    refused = ["export-script", str(tmp_path / "config.yaml"), point[-6:], "-o", str(tmp_path / "file")]
+    result = CliRunner().invoke(app, refused)
+    assert result.exit_code == 2
+    assert "is a file; expected a folder" in result.stderr + capsys.readouterr().err
+
+
+@engines
 def test_a_script_moves_pins_and_slows_velocities_as_the_run_does(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
