@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -257,6 +259,31 @@ def test_light_and_dark_are_a_choice(tab: Tab, page: str):
     light = shown.evaluate(ground)
     shown.get_by_role("button", name="Show the page dark").click()
     assert shown.evaluate(ground) != light
+
+
+def test_pictures_follow_the_theme_legends_leave_curves_free_and_axes_end_with_the_data(browser: Any, page: str):
+    tab = Tab(browser, 400, 844, "dark")
+    shown = tab.open(page, "overview")
+    filters = shown.evaluate("[...document.querySelectorAll('img')].map(one => getComputedStyle(one).filter)")
+    assert filters
+    assert all("invert" in one for one in filters), "a picture on white is inverted"
+    ranges = "[...document.querySelectorAll('.js-plotly-plot')].flatMap(plot => Object.keys(plot._fullLayout)"
+    ranges += (
+        ".filter(key => /^xaxis/.test(key)).map(key => [plot._fullLayout[key].type, plot._fullLayout[key].range[1],"
+    )
+    ranges += " Math.max(...plot.data.flatMap(one => [...one.x].map(Number)))]))"
+    boxes = "[...document.querySelectorAll('.legend, .js-plotly-plot')].map(one => one.getBoundingClientRect())"
+    boxes += ".map(box => [box.top, box.bottom]).sort((a, b) => a[0] - b[0])"
+    for view in ("plots?sweep=made", VIEWS["two runs"]):
+        tab.go(view)
+        shown.locator(".js-plotly-plot").first.wait_for()
+        for kind, end, last in shown.evaluate(ranges):
+            assert end <= (last * 1.1 if kind == "linear" else math.log10(last) + 0.3), (
+                f"{view}: to {end}, data to {last}"
+            )
+        found = shown.evaluate(boxes)
+        assert all(above[1] <= below[0] + 1.0 for above, below in pairwise(found)), f"{view}: {found}"
+    tab.close()
 
 
 @pytest.mark.long
