@@ -38,6 +38,7 @@ from springbench.harness.report.number_format import format_count, format_quanti
 from springbench.harness.report.obstacle_meshes import points_to_frame
 from springbench.harness.report.page_layout import (
     draw_header,
+    draw_provenance,
     draw_strain_scale,
     draw_text,
     new_page,
@@ -54,7 +55,6 @@ from springbench.harness.report.plot_style import (
     SeriesStyle,
     assign_solver_styles,
 )
-from springbench.harness.report.provenance_words import draw_provenance
 from springbench.harness.report.recorded_strain import mean_rest_length
 from springbench.harness.report.self_intersection_notes import describe_self_intersection
 

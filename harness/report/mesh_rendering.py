@@ -22,7 +22,8 @@ from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.recording.strain_scale import PIN_COLOUR
 from springbench.harness.report import opengl_probe
 from springbench.harness.report.obstacle_meshes import build_obstacle_meshes
-from springbench.harness.report.plot_style import BACKGROUND_COLOUR, STRAIN_MAP, TEXT_COLOUR
+from springbench.harness.report.page_layout import STRAIN_MAP
+from springbench.harness.report.plot_style import BACKGROUND_COLOUR, TEXT_COLOUR
 from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain, mean_rest_length
 
 PointArray = NDArray[np.floating]

@@ -1,6 +1,7 @@
 """Check whether this process can draw with OpenGL.
 
-VTK crashes with a segmentation fault where the system has no OpenGL libraries, so a child process tries first.
+VTK crashes with a segmentation fault where the system has no OpenGL libraries, so a child process tries first. That
+it succeeded without a display is stored for the user until packages of the system or VTK change.
 """
 
 from __future__ import annotations
@@ -8,8 +9,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import suppress
 from functools import cache
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
 
+from springbench.harness.atomic_files import user_cache_dir
 from springbench.harness.errors import RunFailed
 from springbench.harness.execution.optional_parts import PICTURES
 
@@ -24,6 +30,9 @@ raise SystemExit(not window.SupportsOpenGL())
 """
 _PROBE_TIMEOUT = 60
 
+_SYSTEM_FILES = ("/etc/ld.so.cache", "/var/lib/dpkg/status", "/var/lib/rpm")
+"""Files that change with the installed libraries."""
+
 _PROBES = list["subprocess.Popen[bytes]"]()
 """The child process of the probe, if it was started."""
 
@@ -34,6 +43,8 @@ def start_opengl_probe() -> None:
         return
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    if (marker := _find_marker()) and marker.exists():
+        return
     nowhere = subprocess.DEVNULL
     _PROBES.append(subprocess.Popen([sys.executable, "-c", _PROBE_SCRIPT], stdout=nowhere, stderr=nowhere))
 
@@ -47,6 +58,8 @@ def find_opengl_problem() -> str | None:
     if not PICTURES.is_installed():
         return PICTURES.describe_absence()
     start_opengl_probe()
+    if not _PROBES:
+        return None
     child = _PROBES.pop()
     try:
         ended = f"exit code {child.wait(_PROBE_TIMEOUT)}"
@@ -55,11 +68,27 @@ def find_opengl_problem() -> str | None:
         child.wait()
         ended = f"no answer within {_PROBE_TIMEOUT} s"
     if child.returncode == 0:
+        if marker := _find_marker():
+            with suppress(OSError):
+                marker.parent.mkdir(parents=True, exist_ok=True)
+                marker.touch()
         return None
     return (
         f"pictures need OpenGL, and a trial drawing failed ({ended}); on Debian and Ubuntu install it with "
         "`apt-get install libegl1 libgl1-mesa-dri` (no display is needed)"
     )
+
+
+def _find_marker() -> Path | None:
+    """Return the file that exists if drawing has succeeded with these libraries; None where a display takes part."""
+    if sys.platform != "linux" or os.environ.get("DISPLAY"):
+        return None
+    found = [os.stat(name) for name in _SYSTEM_FILES if os.path.exists(name)]
+    variables = {
+        name: value for name, value in os.environ.items() if name.startswith(("LD_", "VTK_", "EGL", "LIBGL", "MESA"))
+    }
+    state = [(one.st_mtime_ns, one.st_size) for one in found], sorted(variables.items()), version("vtk"), sys.prefix
+    return user_cache_dir("opengl") / sha256(repr((state, _PROBE_SCRIPT)).encode()).hexdigest()[:32]
 
 
 def require_opengl() -> None:

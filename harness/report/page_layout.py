@@ -7,7 +7,7 @@ The page has PAGE_WIDTH x PAGE_HEIGHT pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter
@@ -23,7 +24,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.recording.recorder_interface import RecordingReplay
-from springbench.harness.recording.strain_scale import PIN_COLOUR, format_percent
+from springbench.harness.recording.strain_scale import PIN_COLOUR, STRAIN_COLOURS, format_percent
 from springbench.harness.report.number_format import shorten_words
 from springbench.harness.report.picture_sources import SOURCES_KEY
 from springbench.harness.report.plot_style import (
@@ -32,9 +33,12 @@ from springbench.harness.report.plot_style import (
     PAGE_DPI,
     PAGE_HEIGHT,
     PAGE_WIDTH,
-    STRAIN_MAP,
     TEXT_COLOUR,
 )
+from springbench.harness.report.provenance_words import describe_machine_and_commit
+
+STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLOURS, N=512)
+"""Colour map of strains in recordings, from -strain_range to strain_range."""
 
 
 def new_page() -> Figure:
@@ -59,6 +63,18 @@ def draw_text(
         **text_options: further keywords of `Figure.text`.
     """
     page.text(x / PAGE_WIDTH, 1 - y / PAGE_HEIGHT, words, size=size, color=color, **text_options)
+
+
+def draw_provenance(page: Figure, replays: Iterable[RecordingReplay], y: float) -> None:
+    """Draw machine and code version of recordings, right-aligned.
+
+    Args:
+        page: figure to draw on.
+        replays: recordings.
+        y: distance of the baseline from the top [pixels].
+    """
+    words = describe_machine_and_commit([replay.properties for replay in replays])
+    draw_text(page, PAGE_WIDTH - 36, y, "   ·   ".join(words), size=9, color=MUTED_COLOUR, ha="right")
 
 
 def add_axes(page: Figure, left: float, top: float, width: float, height: float) -> Axes:

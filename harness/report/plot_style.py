@@ -8,9 +8,7 @@ from functools import cache
 from hashlib import sha256
 from typing import Any, NamedTuple
 
-from matplotlib.colors import LinearSegmentedColormap, to_hex, to_rgb
 from springbench.harness.execution.source_cache import read_cached_text
-from springbench.harness.recording.strain_scale import STRAIN_COLOURS
 from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, load_target
 
 PAGE_WIDTH, PAGE_HEIGHT, PAGE_DPI = 1600, 900, 100
@@ -27,9 +25,6 @@ WARNING_COLOUR = "#b3261e"
 
 SLOWER_COLOUR, FASTER_COLOUR = WARNING_COLOUR, "#1b7f5c"
 """Colours of benchmark changes."""
-
-STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLOURS, N=512)
-"""Colour map of strains in recordings, from -strain_range to strain_range."""
 
 PAGE_RC: Any = {
     "font.family": "DejaVu Sans",
@@ -190,10 +185,10 @@ def _shipped_solver_styles(names: tuple[str, ...]) -> dict[str, SeriesStyle]:
 
 
 def shade_colour(color: str, amount: float) -> str:
-    """Mix a colour with white, or with black if `amount` is negative."""
+    """Mix a colour #rrggbb with white, or with black if `amount` is negative."""
     end = 1.0 if amount > 0.0 else 0.0
-    red, green, blue = ((1.0 - abs(amount)) * part + abs(amount) * end for part in to_rgb(color))
-    return to_hex((red, green, blue))
+    parts = (int(color[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
+    return "#" + "".join(f"{round(255.0 * ((1.0 - abs(amount)) * part + abs(amount) * end)):02x}" for part in parts)
 
 
 def assign_label_styles(label_solver_pairs: Iterable[tuple[str, str]]) -> dict[str, SeriesStyle]:

@@ -5,11 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from matplotlib.figure import Figure
-from springbench.harness.recording.recorder_interface import RecordingReplay
 from springbench.harness.report.number_format import shorten_words
-from springbench.harness.report.page_layout import draw_text
-from springbench.harness.report.plot_style import MUTED_COLOUR, PAGE_WIDTH
 
 _DIRTY_SUFFIX = "-dirty"
 PROVENANCE_COLUMNS = ("cpu", "threads", "commit", "source_fingerprint")
@@ -52,15 +48,3 @@ def describe_provenance(rows: Sequence[Mapping[str, Any]]) -> str:
     words += describe_commits(row.get("commit") for row in rows)
     words += [f"code {', '.join(codes)}" if len(codes) <= 2 else f"{len(codes)} codes"] if codes else []
     return ", ".join(words)
-
-
-def draw_provenance(page: Figure, replays: Iterable[RecordingReplay], y: float) -> None:
-    """Draw machine and code version of recordings, right-aligned.
-
-    Args:
-        page: figure to draw on.
-        replays: recordings.
-        y: distance of the baseline from the top [pixels].
-    """
-    words = describe_machine_and_commit([replay.properties for replay in replays])
-    draw_text(page, PAGE_WIDTH - 36, y, "   ·   ".join(words), size=9, color=MUTED_COLOUR, ha="right")

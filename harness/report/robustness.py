@@ -97,6 +97,12 @@ RUN_OUTCOMES = (
     UNSUPPORTED,
 )
 
+MAP_NOTE = (
+    "Numbers: the largest final residual |Q\u207b\u00b9 grad g|_Q of a step, over its value at the start of the step "
+    "(or round-off); for methods that do not minimise, the largest distance from a converged run, in percent of the "
+    "scene's size. \u2248: right, by other minima than the reference. Shares: of the cases that a solver supports."
+)
+
 _CONVERGED_REASONS = ("converged", "roundoff")
 """Termination reasons with which a solver claims convergence."""
 _OUTCOME_OF_STATUS = {
@@ -347,6 +353,21 @@ def score_solvers(cells: Sequence[VerifiedRun]) -> list[SolverScore]:
 def format_share(share: float | None) -> str:
     """Format a share in percent; empty for None."""
     return "" if share is None else f"{share:.0%}"
+
+
+def format_cell(cell: VerifiedRun) -> str:
+    """Format the worst error of a run, marked if it is correct by another motion than the reference."""
+    return f"{cell.error_text} \u2248".lstrip() if cell.has_other_motion else cell.error_text
+
+
+def map_headline(cells: Sequence[VerifiedRun], name: str) -> str:
+    """Return the headline of the map: counts of the main outcomes."""
+    of = {outcome: sum(cell.outcome == outcome for cell in cells) for outcome in RUN_OUTCOMES}
+    broken = of[DIVERGED] + of[FAILED]
+    return (
+        f"{name}: {of[CORRECT]} of {len(cells)} runs right, {of[SILENTLY_WRONG]} "
+        f"silently wrong, {broken} diverged or failed"
+    )
 
 
 def build_score_table(cells: Sequence[VerifiedRun]) -> Table:

@@ -17,14 +17,13 @@ from springbench.harness.errors import InputError
 from springbench.harness.report.plot_style import BACKGROUND_COLOUR, MUTED_COLOUR, PAGE_DPI, RULE_COLOUR, TEXT_COLOUR
 from springbench.harness.report.provenance_words import describe_machine_and_commit
 from springbench.harness.report.robustness import (
-    CORRECT,
-    DIVERGED,
-    FAILED,
+    MAP_NOTE,
     RUN_OUTCOMES,
-    SILENTLY_WRONG,
     RunOutcome,
     VerifiedRun,
+    format_cell,
     format_share,
+    map_headline,
     read_verified_runs,
     score_solvers,
 )
@@ -51,27 +50,6 @@ _TITLE_SIZE, _NOTE_SIZE, _LETTER_WIDTH = 13.0, 8.0, 0.64
 
 _SCORE_ROWS, _HEADING_ROWS = 3, 1.2
 """Number of rows for the solvers' scores, and rows between two families of cases."""
-
-MAP_NOTE = (
-    "Numbers: the largest final residual |Q\u207b\u00b9 grad g|_Q of a step, over its value at the start of the step "
-    "(or round-off); for methods that do not minimise, the largest distance from a converged run, in percent of the "
-    "scene's size. \u2248: right, by other minima than the reference. Shares: of the cases that a solver supports."
-)
-
-
-def format_cell(cell: VerifiedRun) -> str:
-    """Format the worst error of a run, marked if it is correct by another motion than the reference."""
-    return f"{cell.error_text} \u2248".lstrip() if cell.has_other_motion else cell.error_text
-
-
-def map_headline(cells: Sequence[VerifiedRun], name: str) -> str:
-    """Return the headline of the map: counts of the main outcomes."""
-    of = {outcome: sum(cell.outcome == outcome for cell in cells) for outcome in RUN_OUTCOMES}
-    broken = of[DIVERGED] + of[FAILED]
-    return (
-        f"{name}: {of[CORRECT]} of {len(cells)} runs right, {of[SILENTLY_WRONG]} "
-        f"silently wrong, {broken} diverged or failed"
-    )
 
 
 def draw_robustness_map(cells: Sequence[VerifiedRun], path: Path, title: str, stale_ids: Collection[str] = ()) -> None:

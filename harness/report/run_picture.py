@@ -38,6 +38,7 @@ from springbench.harness.report.number_format import format_count, format_quanti
 from springbench.harness.report.obstacle_meshes import points_to_frame
 from springbench.harness.report.page_layout import (
     draw_header,
+    draw_provenance,
     draw_strain_scale,
     draw_text,
     format_frame_time,
@@ -55,7 +56,6 @@ from springbench.harness.report.plot_style import (
     RULE_COLOUR,
     TEXT_COLOUR,
 )
-from springbench.harness.report.provenance_words import draw_provenance
 from springbench.harness.report.self_intersection_notes import describe_self_intersection
 
 _FRAMES_LEFT, _FRAMES_TOP, _FRAMES_RIGHT, _FRAMES_HEIGHT = 36, 114, PAGE_WIDTH - 36, 750

@@ -24,7 +24,14 @@ from springbench.harness.report.mesh_rendering import (
     fit_camera,
 )
 from springbench.harness.report.obstacle_meshes import points_to_frame
-from springbench.harness.report.page_layout import draw_header, draw_text, new_page, paste_picture, save_page
+from springbench.harness.report.page_layout import (
+    draw_header,
+    draw_provenance,
+    draw_text,
+    new_page,
+    paste_picture,
+    save_page,
+)
 from springbench.harness.report.plot_style import (
     MUTED_COLOUR,
     PAGE_HEIGHT,
@@ -33,7 +40,6 @@ from springbench.harness.report.plot_style import (
     TEXT_COLOUR,
     indexed_style,
 )
-from springbench.harness.report.provenance_words import draw_provenance
 
 _VIEW_LEFT, _VIEW_TOP, _COLUMN_GAP, _LEGEND_ROW_HEIGHT = 36, 114, 40, 24
 _LEGEND_WIDTH, _VIEW_HEIGHT = 420, 750

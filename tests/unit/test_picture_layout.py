@@ -92,3 +92,27 @@ def test_without_opengl_the_message_names_the_command(monkeypatch: pytest.Monkey
     finally:
         opengl_probe.find_opengl_problem.cache_clear()
     assert not list(tmp_path.iterdir())
+
+
+def test_a_trial_drawing_that_succeeded_is_not_repeated_until_the_libraries_change(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def count_trials() -> int:
+        opengl_probe.find_opengl_problem.cache_clear()
+        trials.clear()
+        assert opengl_probe.find_opengl_problem() is None
+        return len(trials)
+
+    trials: list[object] = []
+    begin = opengl_probe.subprocess.Popen
+    monkeypatch.setattr(opengl_probe.subprocess, "Popen", lambda *a, **k: trials.append(a) or begin(*a, **k))
+    monkeypatch.setattr(opengl_probe, "_PROBE_SCRIPT", "pass")
+    monkeypatch.setattr(opengl_probe, "_SYSTEM_FILES", (str(tmp_path / "packages"),))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("DISPLAY", raising=False)
+    try:
+        assert [count_trials(), count_trials()] == [1, 0]
+        (tmp_path / "packages").write_text("one less")
+        assert [count_trials(), count_trials()] == [1, 0]
+    finally:
+        opengl_probe.find_opengl_problem.cache_clear()

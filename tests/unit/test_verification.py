@@ -27,10 +27,12 @@ from springbench.harness.report.robustness import (
     VerifiedRun,
     build_score_table,
     classify_run,
+    format_cell,
+    map_headline,
     read_verified_runs,
     score_solvers,
 )
-from springbench.harness.report.robustness_map import draw_robustness_map, format_cell, map_headline
+from springbench.harness.report.robustness_map import draw_robustness_map
 from springbench.harness.results import parquet_rows
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh

@@ -37,8 +37,8 @@ from springbench.harness.report.figures.panel_drawing import (
     legend_handle,
     write_cell_values,
 )
-from springbench.harness.report.page_layout import tick_formatter
-from springbench.harness.report.plot_style import MUTED_COLOUR, STRAIN_MAP, TEXT_COLOUR
+from springbench.harness.report.page_layout import STRAIN_MAP, tick_formatter
+from springbench.harness.report.plot_style import MUTED_COLOUR, TEXT_COLOUR
 
 MILLIMETRES_PER_INCH = 25.4
 _PANEL_WIDTH, _PICTURE_WIDTH = 58.0, 36.0

@@ -9,8 +9,14 @@ from typing import Any
 
 import pyarrow as pa
 from springbench.harness.report.citations import format_citation
-from springbench.harness.report.robustness import RUN_OUTCOMES, read_verified_runs, score_solvers
-from springbench.harness.report.robustness_map import MAP_NOTE, format_cell, map_headline
+from springbench.harness.report.robustness import (
+    MAP_NOTE,
+    RUN_OUTCOMES,
+    format_cell,
+    map_headline,
+    read_verified_runs,
+    score_solvers,
+)
 from springbench.harness.report.site.data_scripts import round_number
 from springbench.harness.report.site.sweep_folders import SweepFolder
 
