@@ -163,3 +163,12 @@ def describe_misnamed_file(head: bytes, size: int) -> str:
     if start.startswith((b"<!doctype html", b"<html")):
         return "is a web page; download the file itself"
     return ""
+
+
+def explain_unreadable_file(path: Path) -> str:
+    """Describe an existing file that has the name of a data file but other content; "" for any other one."""
+    try:
+        with path.open("rb") as file:
+            return describe_misnamed_file(file.read(HEAD_BYTES), path.stat().st_size)
+    except OSError:
+        return ""

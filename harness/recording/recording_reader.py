@@ -23,6 +23,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, LazyStore, RrdReader
+from springbench.harness.atomic_files import explain_unreadable_file
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.recording import chunk_cells
 from springbench.harness.recording.chunk_cells import read_cell
@@ -186,8 +187,8 @@ def open_recording_source(path: Path) -> Generator[RecordingSource]:
     with path.open("rb") as file:
         start = file.read(len(_MAGIC))
     if start != _MAGIC:
-        came = f"begins with {start!r}" if start else "is empty"
-        raise InputError(InputMistake(f"{came} and so is not a Rerun recording (.rrd)", file=path))
+        came = explain_unreadable_file(path) or f"begins with {start!r}"
+        raise InputError(InputMistake(f"{came}; it is not a Rerun recording (.rrd)", file=path))
     require_intact(path, _try_reading)
     with ExitStack() as stack, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # for files without a footer, which `complete` reports

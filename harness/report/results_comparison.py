@@ -25,6 +25,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from springbench.harness.atomic_files import explain_unreadable_file
 from springbench.harness.console import split_wide_table
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results import bootstrap_statistics, parquet_rows, row_store
@@ -176,7 +177,7 @@ def _open_results(path: Path) -> Generator[Path]:
                     for info in inside:  # not `extractall`: its safe filter is not in every Python 3.11
                         _unpack_member(packed, info, Path(scratch))
             else:
-                raise InputError(InputMistake(expected, path))
+                raise InputError(InputMistake(explain_unreadable_file(path) or expected, path))
         except (OSError, zipfile.BadZipFile, tarfile.TarError) as error:
             raise InputError(InputMistake(f"cannot be unpacked: {error}", path)) from error
         yield Path(scratch)

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from springbench.harness.atomic_files import atomic_write
+from springbench.harness.atomic_files import atomic_write, explain_unreadable_file
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import sandbox
 from springbench.harness.results import row_store, row_union
@@ -242,9 +242,8 @@ def _read_packed(paths: Sequence[Path]) -> dict[Path, pa.Table]:
             with file.open("rb") as content:
                 table = pq.read_table(content, filters=chosen, partitioning=None)
         except (pa.ArrowException, OSError) as error:
-            raise InputError(
-                InputMistake(f"holds no packed rows ({error}); take it out of the results", file)
-            ) from error
+            problem = explain_unreadable_file(file) or f"holds no packed rows ({error}); take it out of the results"
+            raise InputError(InputMistake(problem, file)) from error
         names_of_rows: Any = table[row_store.FILE_COLUMN].combine_chunks()
         of_row = names_of_rows.dictionary_encode()
         order = np.argsort(of_row.indices.to_numpy(), kind="stable")
@@ -321,7 +320,8 @@ def _read_unit(
         table = pa.concat_tables([schema.empty_table(), found], promote_options="default")
         table.validate(full=True)  # text is UTF-8
     except (pa.ArrowException, OSError) as error:
-        raise InputError(InputMistake(f"holds no rows ({error}); take it out of the results", path)) from error
+        problem = explain_unreadable_file(path) or f"holds no rows ({error}); take it out of the results"
+        raise InputError(InputMistake(problem, path)) from error
     lacking = [name for name in required_columns if name not in table.column_names or table[name].null_count]
     if lacking or not len(table):
         why = f"no {lacking[0]}" if lacking else "it is empty"

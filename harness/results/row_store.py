@@ -17,7 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from springbench.harness.atomic_files import is_file_name
+from springbench.harness.atomic_files import explain_unreadable_file, is_file_name
 from springbench.harness.errors import InputError, InputMistake
 
 if TYPE_CHECKING:
@@ -94,7 +94,8 @@ def _read_packed_units(path: Path, *state: int) -> frozenset[str]:
             raise OSError(f"{foreign[0]!r} is the name of no unit")
         return found
     except (pa.ArrowException, OSError, KeyError) as error:
-        raise InputError(InputMistake(f"holds no packed rows ({error}); take it out of the results", path)) from error
+        problem = explain_unreadable_file(path) or f"holds no packed rows ({error}); take it out of the results"
+        raise InputError(InputMistake(problem, path)) from error
 
 
 def list_units(folder: Path) -> list[Path]:

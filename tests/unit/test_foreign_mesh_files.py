@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
+import meshio
 import numpy as np
 import pytest
 from springbench.harness.errors import InputError
-from springbench.harness.scenes.mesh import ply_reader
+from springbench.harness.experiments.archive.archive_verification import unpack_archive
+from springbench.harness.experiments.grading.position_files import read_position_file
+from springbench.harness.recording.recording_reader import read_replay
+from springbench.harness.results import parquet_rows
+from springbench.harness.scenes.mesh import file_truncation, ply_reader
 from springbench.harness.scenes.mesh.file_mesh import FileMesh
 from springbench.harness.schema.yaml_loader import read_yaml
 
@@ -211,7 +217,7 @@ def test_what_stands_in_place_of_a_file_is_named(tmp_path, name, case):
     [
         ("mesh.vtk", b"# vtk DataFile Version 1.0\n", "VTK data type"),
         ("mesh.off", b"COFF\n3 1 0\n", "OFF"),
-        ("mesh.msh", b"$MeshFormat\n2.2 7 8\n", "msh"),
+        ("mesh.msh", b"$MeshFormat\n2.2 7 8\n$EndMeshFormat\n$Elements\n$EndElements\n", "msh"),
     ],
 )
 def test_the_reason_that_a_reader_prints_is_in_the_message(tmp_path, name, content, words):
@@ -247,3 +253,93 @@ def test_a_colon_without_quotes_is_named_with_what_to_quote(tmp_path, config, li
 def test_text_is_read_as_float64_and_not_as_the_declared_type():
     found = ply_reader.read_ply(text(CORNERS, "", "4 0 1 2 3\n", "").replace(b"1 1 0\n", b"1 0.1 0\n"))
     assert np.array_equal(found.points[2], [1, 0.1, 0])
+
+
+PLANE = np.stack(np.meshgrid([0.0, 0.5, 1.0], [0.0, 1.0], [0.25]), -1).reshape(-1, 3)
+FACES = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]])
+LEGACY_POLYDATA = b"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET POLYDATA\nPOINTS 3 float\n" + b"".join(
+    (struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0), b"\nPOLYGONS 1 4\n", struct.pack(">4i", 3, 0, 1, 2))
+)
+WRITTEN = {
+    "text.stl": {"binary": False},
+    "binary.stl": {"binary": True},
+    "text.vtk": {"binary": False, "file_format": "vtk"},
+    "binary.vtk": {"binary": True, "file_format": "vtk"},
+    "old.vtk": {"binary": True, "file_format": "vtk42"},
+    "text.vtu": {"binary": False},
+    "packed.vtu": {"binary": True},
+    "text22.msh": {"file_format": "gmsh22", "binary": False},
+    "binary22.msh": {"file_format": "gmsh22", "binary": True},
+    "text41.msh": {"file_format": "gmsh", "binary": False},
+    "binary41.msh": {"file_format": "gmsh", "binary": True},
+    "mesh.off": {},
+    "mesh.mesh": {},
+}
+
+
+def cut_copies(path: Path) -> Iterator[Path]:
+    """Copies of a file that end in its second quarter, its third one, and in its last word."""
+    content = path.read_bytes()
+    for n in (len(content) * 2 // 5, len(content) * 3 // 5, len(content.rstrip()) - 1):
+        short = path.with_stem(f"cut-{n}")
+        short.write_bytes(content[:n])
+        yield short
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.filterwarnings("ignore")
+def test_a_file_that_was_cut_is_said_to_be_cut(tmp_path, name):
+    path = tmp_path / name
+    mesh = meshio.Mesh(PLANE, [("triangle", FACES.astype(np.int32))])
+    meshio.write(path, mesh, **WRITTEN[name])
+    assert len(FileMesh(path=path).build_mesh().triangles) == 4
+    for short in cut_copies(path):
+        with pytest.raises(InputError, match=r"was (the file )?cut"):
+            FileMesh(path=short).build_mesh()
+
+
+def test_a_cut_legacy_vtk_file_of_surfaces_is_not_completed_by_arbitrary_numbers():
+    assert file_truncation.find_strict_truncation(".vtk", LEGACY_POLYDATA) == ""
+    for n, section in ((4, "POLYGONS promises 4"), (20, "POLYGONS"), (31, "POINTS promises 9")):
+        assert section in file_truncation.find_strict_truncation(".vtk", LEGACY_POLYDATA[:-n])
+    attributes = LEGACY_POLYDATA + b"\nPOINT_DATA 3\nSCALARS load float 1\nLOOKUP_TABLE default\n" + bytes(12)
+    assert file_truncation.find_strict_truncation(".vtk", attributes) == ""
+    assert "SCALARS promises 3" in file_truncation.find_strict_truncation(".vtk", attributes[:-1])
+
+
+@pytest.mark.parametrize("text", ["v 0 0 0\nv 1 0 0\nv 1", "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1"])
+def test_a_cut_obj_is_said_to_end_within_a_line(tmp_path, text):
+    path = tmp_path / "cut.obj"
+    path.write_text(text)
+    with pytest.raises(InputError, match="ends within this line: was it cut"):
+        FileMesh(path=path).build_mesh()
+    path.write_text(text + "\n")
+    with pytest.raises(InputError) as caught:
+        FileMesh(path=path).build_mesh()
+    assert "was it cut" not in str(caught.value)
+
+
+def test_a_cut_json_scene_is_said_to_be_cut(tmp_path):
+    path = tmp_path / "scene.json"
+    path.write_text('{"obj": "mesh.obj", "k": 1, "b": [1, 2')
+    with pytest.raises(InputError, match="does not end with }: was it cut"):
+        FileMesh(path=path).build_mesh()
+
+
+READERS = {
+    "run.rrd": read_replay,
+    "rows/run.parquet": lambda path: parquet_rows.read_rows([path]),
+    "results.zip": lambda path: unpack_archive(path).__enter__(),
+    "frames/0.ply": lambda path: read_position_file(path.parent, 3),
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("case", ["a pointer", "a page"])
+def test_readers_of_results_name_what_stands_in_place_of_a_file(tmp_path, name, case):
+    content, words = STAND_INS[case]
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        READERS[name](path)

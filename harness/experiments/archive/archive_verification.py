@@ -29,6 +29,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from springbench.harness.atomic_files import explain_unreadable_file
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.config.run_options import AUTO, RUN_OPTIONS
 from springbench.harness.config.sweep_config import RunSpec
@@ -169,7 +170,8 @@ def unpack_archive(archive: Path) -> Generator[Path]:
                     raise InputError(InputMistake(f"{why}; {wanted}", archive))
                 packed.extractall(scratch)  # names that lead out of the folder are made to stay in it
         except (*_DAMAGED_ARCHIVE_ERRORS, OSError) as error:
-            raise InputError(InputMistake(f"cannot be unpacked ({error}); {wanted}", archive)) from error
+            problem = explain_unreadable_file(archive) or f"cannot be unpacked ({error}); {wanted}"
+            raise InputError(InputMistake(problem, archive)) from error
         yield Path(scratch)
 
 

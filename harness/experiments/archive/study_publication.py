@@ -19,7 +19,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from springbench.harness.atomic_files import atomic_write
+from springbench.harness.atomic_files import atomic_write, explain_unreadable_file
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
@@ -196,7 +196,8 @@ def _read_measurements(path: Path) -> pa.Table:
     try:
         table = pq.read_table(path, partitioning=None)
     except (pa.ArrowException, OSError) as error:
-        raise InputError(InputMistake(f"holds no table ({error}); wanted a Parquet file", path)) from error
+        problem = explain_unreadable_file(path) or f"holds no table ({error}); wanted a Parquet file"
+        raise InputError(InputMistake(problem, path)) from error
     return table.select([name for name in table.column_names if name != row_store.FILE_COLUMN])
 
 

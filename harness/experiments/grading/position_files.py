@@ -28,6 +28,7 @@ from springbench.harness.execution import sandbox
 from springbench.harness.execution.npz_reader import check_data_file, read_npy_array, read_npz_array
 from springbench.harness.scenes.mesh import ply_reader
 from springbench.harness.scenes.mesh.obj_reader import read_obj
+from springbench.harness.scenes.mesh.spring_network import check_mesh_file
 
 DEFAULT_ARRAY = "positions"
 """Name of the array in an .npz file that `springbench run --positions` writes."""
@@ -266,6 +267,7 @@ def _read_mesh_points(path: Path) -> NDArray[np.float64]:
     """Read the vertices (n, 3) of an OBJ or PLY file."""
     if path.suffix.lower() == ".obj":
         return np.asarray(read_obj(path).points, float)
+    check_mesh_file(path)
     try:
         return sandbox.call_in_sandbox(_read_ply_points, path, limits=_PLY_LIMITS)
     except sandbox.SandboxError as error:

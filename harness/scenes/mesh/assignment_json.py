@@ -35,9 +35,11 @@ def read_assignment_json(path: Path) -> AssignmentJson:
     """Read a scene from a JSON file; raise InputError with file, line and key of each mistake."""
     check_mesh_file(path, max_bytes=MAX_SCENE_BYTES)
     try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"), object_pairs_hook=_reject_repeated_keys)
+        text = path.read_text(encoding="utf-8-sig").rstrip()
+        data = json.loads(text, object_pairs_hook=_reject_repeated_keys)
     except json.JSONDecodeError as error:
-        raise InputError(InputMistake(f"is no JSON: {error.msg}", path, error.lineno)) from None
+        hint = "" if error.doc.endswith("}") else "; the file does not end with }: was it cut?"
+        raise InputError(InputMistake(f"is no JSON: {error.msg}{hint}", path, error.lineno)) from None
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(InputMistake(f"cannot be read as JSON: {error}", path)) from None
     if not isinstance(data, dict):

@@ -2,9 +2,8 @@
 # meshio has no types.
 """Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY, .vtp and glTF.
 
-The subprocess is that of `springbench.harness.execution.sandbox`. meshio accepts some truncated files as complete.
-Hence the
-sections of a .msh must be closed, and a text STL must have its end marker.
+The subprocess is that of `springbench.harness.execution.sandbox`. meshio and VTK accept some truncated files as
+complete; `springbench.harness.scenes.mesh.file_truncation` recognises these.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ import meshio
 import numpy as np
 from meshio.gmsh import _gmsh40, _gmsh41
 from numpy.typing import NDArray
-from springbench.harness.scenes.mesh import gltf_reader, ply_reader, vtp_reader
+from springbench.harness.scenes.mesh import file_truncation, gltf_reader, ply_reader, vtp_reader
 
 CellBlock = tuple[str, NDArray[np.int64]]
 """Cells of one kind: its meshio name, and the point indices of each cell."""
@@ -80,8 +79,21 @@ def read_mesh_file(path: Path) -> MeshFileContent:
         PermissionError: if the file refers to a file outside of its folder.
         Exception: of any type, for other broken files.
     """
-    with _restrict_file_access(path):
-        return _read_by_suffix(path)
+    suffix, content = path.suffix.lower(), path.read_bytes()
+    what = file_truncation.find_strict_truncation(suffix, content)
+    if not what:
+        try:
+            with _restrict_file_access(path):
+                return _read_by_suffix(path)
+        except PermissionError:
+            raise
+        except Exception as error:
+            what = file_truncation.guess_truncation(suffix, content)
+            if not what or "was cut" in str(error):
+                raise
+            symptom = str(error) or type(error).__name__
+            raise ValueError(f"{what}: was the file cut before its end? ({symptom})") from error
+    raise ValueError(f"{what}; the file was cut before its end, so write it once more")
 
 
 def _read_by_suffix(path: Path) -> MeshFileContent:
@@ -94,13 +106,9 @@ def _read_by_suffix(path: Path) -> MeshFileContent:
         return _convert_gltf(gltf_reader.read_gltf(path))
     if suffix == ".vtk" and _VTK_POLYDATA.search(path.read_bytes()[:_VTK_HEAD_BYTES]):
         return _convert_vtp(vtp_reader.read_vtp(_convert_legacy_polydata(path)))
-    content = path.read_bytes() if suffix in (".msh", ".stl") else b""
-    if suffix == ".msh" and _GMSH_PARAMETRIC.search(content):
+    if suffix == ".msh" and _GMSH_PARAMETRIC.search(path.read_bytes()):
         raise ValueError("it has parametric nodes; save it without them (Mesh.SaveParametric = 0 in Gmsh)")
     raw = _read_with_meshio(path)
-    missing = _TRUNCATION_CHECKS.get(suffix)
-    if missing and (what := missing(content, raw)):
-        raise ValueError(f"{what}; the file was cut before its end, so write it once more")
     blocks = [(block.type, np.array(block.data, np.int64)) for block in raw.cells if len(block.data)]
     cell_blocks = [(kind, data) for kind, data in blocks if kind != "vertex"]
     points = np.array(raw.points, np.float64)
@@ -284,31 +292,4 @@ def _split_columns(numbers: dict[str, NDArray[Any]], n: int) -> dict[str, NDArra
     return {name: np.ascontiguousarray(column) for name, column in found.items()}
 
 
-_GMSH_SECTION = re.compile(
-    rb"^\$(End)?((?:MeshFormat|PhysicalNames|Entities|Nodes|Elements|Periodic)\b|\w+Data\b)", re.M
-)
 _GMSH_PARAMETRIC = re.compile(rb"^\$ParametricNodes\b", re.M)
-
-
-def _find_unclosed_section(content: bytes, raw: _MeshioMesh) -> str:
-    """Find an unclosed section of a Gmsh .msh.
-
-    The ANSYS format of the same suffix has no sections.
-    """
-    begun: dict[bytes, int] = {}
-    for end, name in _GMSH_SECTION.findall(content):
-        begun[name] = begun.get(name, 0) + (-1 if end else 1)
-    left = next((name.decode() for name, count in begun.items() if count > 0), "")
-    return f"the section ${left} has no $End{left}" if left else ""
-
-
-def _find_truncated_stl(content: bytes, raw: _MeshioMesh) -> str:
-    """Detect a truncated STL; a binary one contains its number of triangles."""
-    text = content.lstrip().startswith(b"solid") and b"facet" in content
-    return "it has no endsolid" if text and b"endsolid" not in content else ""
-
-
-_TRUNCATION_CHECKS: dict[str, Callable[[bytes, _MeshioMesh], str]] = {
-    ".msh": _find_unclosed_section,
-    ".stl": _find_truncated_stl,
-}

@@ -8,9 +8,11 @@ normals, groups and materials are ignored; anything else is a mistake.
 
 from __future__ import annotations
 
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -59,9 +61,19 @@ def read_obj(path: Path) -> MeshCells:
                     break
                 if len(reader.points) > MAX_VERTICES:
                     raise InputError(InputMistake(f"has more than {MAX_VERTICES:,} vertices", path, number))
+                reader.last_line = number
     except OSError as error:
         raise InputError(InputMistake(f"cannot be read ({error.strerror})", path)) from None
+    if reader.mistakes and reader.mistakes[-1].line == reader.last_line and not _ends_with_a_line_end(path):
+        last = reader.mistakes[-1]
+        reader.mistakes[-1] = replace(last, problem=f"{last.problem}; the file ends within this line: was it cut?")
     return reader.build_cells()
+
+
+def _ends_with_a_line_end(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        return file.read(1) in (b"\n", b"\r")
 
 
 def _split_statements(lines: Iterable[str]) -> Iterator[tuple[int, str]]:
@@ -95,6 +107,7 @@ class _ObjReader:
         self.colours: list[tuple[float, ...]] = []
         self.groups: dict[str, set[int]] = defaultdict(set)
         self.current_groups: list[str] = []
+        self.last_line = 0
         self.mistakes: list[InputMistake] = []
         self.repetitions: list[InputMistake] = []
 

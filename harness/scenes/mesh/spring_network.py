@@ -133,7 +133,7 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
     rest, groups = cells.points, list(cells.polygons.values())
     pairs = sum(len(g) * (g.shape[1] if spring_rule == "edges" else g.shape[1] ** 2 // 2) for g in groups)
     if not len(rest) or not (pairs or len(cells.segments) or len(cells.tetrahedra)):
-        raise InputError(InputMistake("holds no vertices or no cells (faces, lines, tetrahedra) on them", path))
+        raise InputError(InputMistake("holds no vertices or no cells (faces, lines, tetrahedra); was it cut?", path))
     if len(rest) > MAX_VERTICES or pairs > _MAX_PAIRS:
         raise InputError(
             InputMistake(
