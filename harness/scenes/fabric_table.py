@@ -157,6 +157,9 @@ MEMBRANE_RANGE = PlausibleRange(
     "was it given in N/mm or kN/m?",
     "was it given in Pa? Then state `youngs_modulus` and `thickness`",
 )
+PRODUCT_RANGE = MEMBRANE_RANGE._replace(
+    if_small="was `youngs_modulus` given in MPa or `thickness` in km?", if_large="was `thickness` given in mm?"
+)
 BENDING_RANGE = PlausibleRange(
     "flexural rigidity",
     "N m",
@@ -164,6 +167,9 @@ BENDING_RANGE = PlausibleRange(
     max(x.rigidity_range[1] for x in _FABRICS),
     "is it a Young's modulus times thickness cubed, in mm?",
     "was it given in uN m (1e-6 N m), gf cm^2/cm (9.8e-5 N m) or N/m?",
+)
+BENDING_LENGTH_RANGE = BENDING_RANGE._replace(
+    if_small="was `bending_length` given in km?", if_large="was `bending_length` given in mm or cm?"
 )
 DENSITY_RANGE = PlausibleRange(
     "mass per area",

@@ -72,7 +72,7 @@ class MembraneModulus(NamedTuple):
         low, high = self.poisson
         return (
             f"membrane stiffness {self.low:.3g} to {self.high:.3g} N/m by direction, mean {self.mean:.3g} N/m "
-            f"(isotropic within {self.modulus_anisotropy:.0%}); Poisson's ratio {low:.2f} to {high:.2f}"
+            f"(isotropic within {self.modulus_anisotropy:.0%}); Poisson's ratio {low:z.2f} to {high:z.2f}"
         )
 
 

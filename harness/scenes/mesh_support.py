@@ -6,13 +6,14 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from springbench.harness.scenes.effects.springs_effect import SpringsEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect, StretchConstant
 from springbench.harness.scenes.membrane_modulus import compute_membrane_modulus
 from springbench.harness.scenes.mesh.file_mesh import FileMesh
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_checks import NO_VERTICES, MeshSupport
 from springbench.harness.scenes.mesh.mesh_report import find_mesh_remarks, format_finding
 from springbench.harness.scenes.mesh.mesh_topology import NO_PAIRS
+from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.scenes.vertex_selectors import find_selections
 from springbench.solvers.model.energies.spring_energy import Springs
@@ -62,11 +63,20 @@ def describe_membranes(scene: SceneSpec, mesh: Mesh) -> list[str]:
         return []
     lines = list[str]()
     for k, effect in enumerate(scene.effects):
-        if not isinstance(effect, SpringsEffect) or not isinstance(effect.stretch, float | int):
+        if not isinstance(effect, SpringsEffect) or (stated := _describe_stretch(effect.find_stretch(mesh))) is None:
             continue
         energies = effect.build_contribution(mesh, np.ones(len(mesh.rest_positions)), scene.time_step).energies
         springs = Springs.from_parts([energy for energy in energies if isinstance(energy, Springs)])
         if len(springs.edges):
             words = compute_membrane_modulus(mesh, springs.edges, springs.stiffness).describe_modulus()
-            lines.append(f"effects[{k}] (springs, {effect.scaling_rule}) states {effect.stretch:g} N/m: {words}")
+            lines.append(f"effects[{k}] (springs, {effect.scaling_rule}){stated}: {words}")
     return lines
+
+
+def _describe_stretch(stretch: StretchConstant | None) -> str | None:
+    """Describe what an effect states along the lines; None for exact lengths, which have no modulus."""
+    if stretch == "exact":
+        return None
+    if isinstance(stretch, OrthotropicStiffness):
+        return f" states {stretch.warp:g}, {stretch.weft:g} and {stretch.bias:g} N/m along warp, weft and bias"
+    return "" if stretch is None else f" states {stretch:g} N/m"

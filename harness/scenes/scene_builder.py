@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,10 @@ from springbench.harness.scenes.effects.effect_interface import (
     SceneEffect,
     VelocityFilter,
 )
-from springbench.harness.scenes.fabric_table import BENDING_RANGE, DENSITY_RANGE, MEMBRANE_RANGE
+from springbench.harness.scenes.fabric_table import DENSITY_RANGE, PlausibleRange
 from springbench.harness.scenes.key_frames import KeyFrameMotion
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_topology import lump_areas
-from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.scenes.start_positions import RestStart
 from springbench.harness.scenes.vertex_selectors import VertexSelection
@@ -49,6 +48,15 @@ MIN_COARSENING_SIZE = 9
 """Smallest mesh size that is coarsened for nested iteration: below it, a solve costs next to nothing."""
 LONG_TIME_STEP = 1.0
 """Time steps [s] above this value cause a warning: most motion ends within a few of them."""
+
+
+@runtime_checkable
+class StatesMaterial(Protocol):
+    """An effect that states the material of a cloth."""
+
+    def list_material_values(self, mesh: Mesh, mass: NDArray[np.float64]) -> list[tuple[PlausibleRange, float]]:
+        """Return values of the material, each with the range of published fabrics."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +283,7 @@ def find_implausible_materials(effects: Sequence[SceneEffect], mesh: Mesh, mass:
     """Describe stiffnesses and densities of a cloth that are far from those of published fabrics.
 
     Args:
-        effects: the effects of the scene; only `springs` by the rule `continuum`, and `bending`, are checked.
+        effects: the effects of the scene; those that state a material are checked.
         mesh: the mesh; only cloth is checked.
         mass: vertex masses (n,) [kg].
     """
@@ -285,14 +293,9 @@ def find_implausible_materials(effects: Sequence[SceneEffect], mesh: Mesh, mass:
     if problem := DENSITY_RANGE.describe_outlier(float(mass.sum() / area) if area else 0.0):
         yield problem
     for i, effect in enumerate(effects):
-        is_material = effect.kind == "springs" and getattr(effect, "scaling_rule", "") == "continuum"
-        values = [getattr(effect, "stretch", None) if is_material else None]
-        if isinstance(values[0], OrthotropicStiffness):
-            values = [values[0].warp, values[0].weft]
-        found = [MEMBRANE_RANGE.describe_outlier(value) for value in values if isinstance(value, float)]
-        if effect.kind == "bending" and isinstance(rigidity := getattr(effect, "stiffness", None), float):
-            found.append(BENDING_RANGE.describe_outlier(rigidity))
-        yield from (f"effects[{i}] ({effect.kind}): {problem}" for problem in found if problem)
+        values = effect.list_material_values(mesh, mass) if isinstance(effect, StatesMaterial) else []
+        problems = (plausible.describe_outlier(value) for plausible, value in values)
+        yield from (f"effects[{i}] ({effect.kind}): {problem}" for problem in problems if problem)
 
 
 def _compute_vertex_masses(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
@@ -319,7 +322,8 @@ def _require_determined_positions(system: System, mesh: Mesh) -> None:
         assemble_system_matrix(system, [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)])
     except NotPositiveDefinite as error:
         numbers = mesh.format_file_numbers(*error.vertices) if error.vertices else ""
-        raise InputError(InputMistake(f"{error}{numbers}", key="mesh")) from error
+        remedy = "" if mesh.file_numbers is None else "; `unused: drop` of the mesh drops vertices without a face"
+        raise InputError(InputMistake(f"{error}{numbers}{remedy}", key="mesh")) from error
 
 
 def _merge_pins(

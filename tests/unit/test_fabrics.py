@@ -47,7 +47,7 @@ def test_a_modulus_times_a_thickness_is_a_membrane_stiffness(tmp_path: Path, cap
         ("chain", "youngs_modulus: 1.0, thickness: 1.0", "axial stiffness EA"),
         ("grid", "stretch: 1, youngs_modulus: 1.0, thickness: 1.0", "leave out one of them"),
         ("grid", "stretch: 1, thickness: 1.0", "needs a `youngs_modulus`"),
-        ("grid", "youngs_modulus: 1.0, thickness: 1.0, scaling_rule: fixed", "scaling rule `continuum`"),
+        ("grid", "youngs_modulus: 1.0, thickness: 1.0, scaling_rule: fixed", "scaling rule `continuum` or `area`"),
         ("grid", "", "`stretch` is missing"),
     ],
 )
@@ -111,6 +111,9 @@ def test_what_a_scene_states_takes_precedence_over_its_fabric(tmp_path: Path):
         ("mass_per_area: 0.2", "kind: springs, stretch: 0.1", "N/mm"),
         ("mass_per_area: 150", "kind: springs, stretch: 100", "0.15 kg/m"),
         ("mass_per_area: 0.2", "kind: bending, stiffness: 20", "uN m"),
+        ("mass_per_area: 0.2", "kind: springs, youngs_modulus: 5.0e+5, thickness: 0.5", "`thickness` given in mm"),
+        ("mass_per_area: 0.2", "kind: bending, bending_length: 21", "`bending_length` given in mm"),
+        ("mass_per_area: 0.2", "kind: bending, bending_length: 0.021", ""),
         ("mass_per_area: 0.2", "kind: springs, stretch: 100", ""),
         ("mass_per_area: 0.2", "kind: springs, stretch: 5.0e+6, scaling_rule: fixed", ""),
     ],

@@ -239,6 +239,12 @@ def test_a_run_says_the_modulus_and_its_anisotropy(tmp_path, caplog):
     assert "effects[0] (springs, area) states 500 N/m: membrane stiffness 375 to 600 N/m by direction" in line
     assert "isotropic within 23%" in line
     caplog.clear()
+    (tmp_path / "scene.yaml").write_text(SCENE.replace("stretch: 500", "youngs_modulus: 5.0e+8, thickness: 1.0e-3"))
+    CliRunner().invoke(app, ["list", str(tmp_path / "scene.yaml")])
+    assert any("states 500000 N/m: membrane stiffness" in message for message in caplog.messages)
+    assert any("was `thickness` given in mm?" in message for message in caplog.messages)
+    caplog.clear()
+    (tmp_path / "scene.yaml").write_text(SCENE)
     write_mesh(tmp_path, square_points(), square_quads())
     CliRunner().invoke(app, ["list", str(tmp_path / "scene.yaml")])
     assert any("nothing resists shear" in message for message in caplog.messages)

@@ -167,6 +167,31 @@ def test_a_scene_tells_which_parts_nothing_holds(tmp_path, caplog):
     assert not any("springbench mesh" in message for message in caplog.messages)
 
 
+REFUSED_FAULTS = {
+    "unused-vertices": "`unused: drop`",
+    "repeated-corners": "`faces: drop-degenerate`",
+    "crossed-faces": "list its corners in order",
+}
+"""Faults with which a scene does not start, and the remedy that the error names."""
+EARLY_FAULTS = {"flat-faces": "triangles without area", "duplicate-faces": "each counts once"}
+"""Faults that a scene names in other words."""
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_the_start_of_a_run_names_each_fault(tmp_path, caplog, name):
+    text, *_ = FAULTS[name]
+    report = build_mesh_report(FileMesh(path=write(tmp_path, text)))
+    (found,) = [one for one in report.findings if one.name == name]
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    done = CliRunner().invoke(app, ["list", str(tmp_path / "scene.yaml")])
+    if name in REFUSED_FAULTS:
+        assert done.exit_code == 2
+        assert REFUSED_FAULTS[name] in " ".join(done.output.split())
+    else:
+        assert done.exit_code == 0
+        assert any(EARLY_FAULTS.get(name, found.problem.split(":")[0]) in message for message in caplog.messages)
+
+
 def test_a_scene_without_a_mesh_file_is_refused(tmp_path):
     (tmp_path / "scene.yaml").write_text(SCENE.replace("{kind: file, path: mesh.obj}", "{kind: star}"))
     code, output = run_command(tmp_path / "scene.yaml")

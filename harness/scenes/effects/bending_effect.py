@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, PositiveFloat, model_validator
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.effects.effect_interface import NEGLIGIBLE_FRACTION, EffectContribution, ObservedMotion
+from springbench.harness.scenes.fabric_table import BENDING_LENGTH_RANGE, BENDING_RANGE, PlausibleRange
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_topology import lump_areas
 from springbench.harness.schema.base_model import ConfigModel
@@ -73,7 +74,9 @@ class BendingEffect(ConfigModel):
                 "bending: more than two triangles meet at the edge "
                 f"{ends}{mesh.format_file_numbers(*ends)}; repair the mesh"
             )
-        B = self._compute_rigidity(mesh, mass)
+        B = self.find_rigidity(mesh, mass)
+        if self.bending_length is not None:
+            _LOG.info("bending: the bending length makes a flexural rigidity of %.4g N m", B)
         return EffectContribution(energies=(bending_energy.Bending.from_rest_shape(mesh.rest_positions, triangles, B),))
 
     @model_validator(mode="after")
@@ -84,7 +87,7 @@ class BendingEffect(ConfigModel):
             raise ValueError("needs a `stiffness` [N m] or a `bending_length` [m]")
         return self
 
-    def _compute_rigidity(self, mesh: Mesh, mass: NDArray[np.float64]) -> float:
+    def find_rigidity(self, mesh: Mesh, mass: NDArray[np.float64]) -> float:
         """Return the flexural rigidity [N m] of the mesh; raise InputError for a bending length without a mass."""
         if self.stiffness is not None:
             return _average_threads(self.stiffness)
@@ -92,9 +95,12 @@ class BendingEffect(ConfigModel):
         weight = STANDARD_GRAVITY * float(mass.sum() / areas.sum())
         if weight == 0.0:
             raise InputError(InputMistake("`bending_length` needs a cloth with a mass", key="bending_length"))
-        B = weight * _average_threads(self.bending_length) ** 3
-        _LOG.info("bending: the bending length makes a flexural rigidity of %.4g N m at %.4g N/m^2", B, weight)
-        return B
+        return weight * _average_threads(self.bending_length) ** 3
+
+    def list_material_values(self, mesh: Mesh, mass: NDArray[np.float64]) -> list[tuple[PlausibleRange, float]]:
+        """Return the flexural rigidity [N m], with the range of fabrics."""
+        plausible = BENDING_RANGE if self.bending_length is None else BENDING_LENGTH_RANGE
+        return [(plausible, self.find_rigidity(mesh, mass))]
 
     @classmethod
     def find_evidence(cls, observed: ObservedMotion) -> str:

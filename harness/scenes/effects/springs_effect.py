@@ -20,6 +20,7 @@ from springbench.harness.scenes.effects.effect_interface import (
     build_length_constraints,
     build_rest_springs,
 )
+from springbench.harness.scenes.fabric_table import MEMBRANE_RANGE, PRODUCT_RANGE, PlausibleRange
 from springbench.harness.scenes.mesh.mesh import STRETCH, Mesh
 from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.spring_stiffness import compute_spring_stiffness
@@ -64,7 +65,12 @@ class SpringsEffect(ConfigModel):
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the springs as one energy, empty without stiffness, and the length constraints."""
-        given = _require_stretch(self._compute_stretch(mesh), mesh)
+        given = _require_stretch(self.find_stretch(mesh), mesh)
+        if self.youngs_modulus is not None and mesh.dimension == 2:
+            E, t = self.youngs_modulus, self.thickness
+            _LOG.info(
+                "springs: a Young's modulus of %g Pa and a thickness of %g m make a stretch of %g N/m", E, t, given
+            )
         stretch, shear = (inf if x == "exact" else x for x in (given, given if self.shear is None else self.shear))
         k = compute_spring_stiffness(
             mesh,
@@ -91,8 +97,12 @@ class SpringsEffect(ConfigModel):
             parts = springs, TensionOnlySprings.from_springs(cables)
         return replace(found, energies=tuple(one for one in parts if len(one.edges)))
 
-    def _compute_stretch(self, mesh: Mesh) -> StretchConstant | None:
-        """Return `stretch`, or what Young's modulus and thickness amount to; raise InputError if they do not fit."""
+    def find_stretch(self, mesh: Mesh) -> StretchConstant | None:
+        """Return `stretch`, or the product of Young's modulus and thickness.
+
+        Raises:
+            InputError: if these do not fit the mesh.
+        """
         if self.youngs_modulus is None:
             return self.stretch
         E, t = self.youngs_modulus, self.thickness
@@ -105,8 +115,16 @@ class SpringsEffect(ConfigModel):
             return E
         if t is None:
             raise InputError(InputMistake("`thickness` [m] is missing beside `youngs_modulus`", key="thickness"))
-        _LOG.info("springs: a Young's modulus of %g Pa and a thickness of %g m make a stretch of %g N/m", E, t, E * t)
         return E * t
+
+    def list_material_values(self, mesh: Mesh, mass: NDArray[np.float64]) -> list[tuple[PlausibleRange, float]]:
+        """Return the membrane stiffnesses [N/m] that the effect states for a cloth, with the range of fabrics."""
+        if self.scaling_rule not in ("continuum", "area"):
+            return []
+        stretch = self.find_stretch(mesh)
+        values = [stretch.warp, stretch.weft] if isinstance(stretch, OrthotropicStiffness) else [stretch]
+        plausible = MEMBRANE_RANGE if self.youngs_modulus is None else PRODUCT_RANGE
+        return [(plausible, value) for value in values if isinstance(value, float)]
 
     @model_validator(mode="after")
     def _check_material(self) -> SpringsEffect:
@@ -114,8 +132,8 @@ class SpringsEffect(ConfigModel):
             raise ValueError("has a `thickness`, which needs a `youngs_modulus`")
         if self.youngs_modulus is not None and self.stretch is not None:
             raise ValueError("has `stretch` and `youngs_modulus`; leave out one of them")
-        if self.youngs_modulus is not None and self.scaling_rule != "continuum":
-            raise ValueError("has a `youngs_modulus`, which needs the scaling rule `continuum`")
+        if self.youngs_modulus is not None and self.scaling_rule not in ("continuum", "area"):
+            raise ValueError("has a `youngs_modulus`, which needs the scaling rule `continuum` or `area`")
         return self
 
 

@@ -42,6 +42,8 @@ from springbench.harness.scenes.mesh.spring_network import (
 
 _MAX_NAMED = 5
 """Number of places that a line of text names."""
+_MAX_QUICK_TRIANGLES = 20_000
+"""Number of triangles up to which the start of a run searches self-intersections."""
 _MAX_LISTED = 8
 """Number of parts, loops and groups that a line of text lists."""
 
@@ -148,7 +150,7 @@ def build_mesh_report(source: FileMesh, support: MeshSupport | None = None) -> M
 
 
 def find_mesh_remarks(mesh: Mesh, support: MeshSupport | None) -> list[MeshFinding]:
-    """Check a mesh that is about to be simulated; self-intersections are not searched."""
+    """Check a mesh that is about to be simulated; self-intersections are searched if that takes about a second."""
     points, springs = mesh.rest_positions, mesh.springs
     used = np.zeros(len(points), np.bool_)
     used[springs.ravel()] = True
@@ -158,6 +160,7 @@ def find_mesh_remarks(mesh: Mesh, support: MeshSupport | None) -> list[MeshFindi
         *check_edges(points, springs),
         *_report_unused(np.flatnonzero(~used)),
         *check_surface(points, mesh.triangles),
+        *(check_self_intersections(points, mesh.triangles) if len(mesh.triangles) <= _MAX_QUICK_TRIANGLES else []),
     ]
 
 
