@@ -52,7 +52,7 @@ from springbench.harness.console import get_error_console, get_output_console, s
 from springbench.harness.console import print_message as _say
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.optional_parts import RECORDINGS
-from springbench.harness.execution.platform_calls import can_isolate_processes
+from springbench.solvers.platform_calls import can_isolate_processes
 
 if TYPE_CHECKING:
     import pyarrow as pa

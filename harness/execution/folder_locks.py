@@ -14,7 +14,7 @@ from time import monotonic, sleep
 
 from springbench.harness.atomic_files import open_lock_file
 from springbench.harness.errors import InputError
-from springbench.harness.execution.platform_calls import (
+from springbench.solvers.platform_calls import (
     LockMode,
     run_after_fork,
     try_lock_byte,

@@ -29,7 +29,6 @@ from springbench.harness.atomic_files import WriteError, atomic_write
 from springbench.harness.errors import SpringbenchError
 from springbench.harness.execution import interrupts
 from springbench.harness.execution.error_location import format_error, locate_error, parse_fault_location
-from springbench.harness.execution.platform_calls import can_isolate_processes
 from springbench.harness.execution.process_memory import ProcessTreeMemory
 from springbench.harness.execution.progress_events import (
     POLL,
@@ -46,6 +45,7 @@ from springbench.harness.execution.worker_process import (
     TaskOutcome,
 )
 from springbench.harness.execution.worker_supervisor import BUFFER_BYTES, supervise_worker
+from springbench.solvers.platform_calls import can_isolate_processes
 
 RunningTask = Generator[Connection, None, Any]
 """A running task: a generator that yields the connection to wait for, and returns the task's value."""

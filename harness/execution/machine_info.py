@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.execution.platform_calls import list_usable_cores, read_load_average
+from springbench.solvers.platform_calls import list_usable_cores, read_load_average
 
 _PROJECT_ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("harness", "solvers")

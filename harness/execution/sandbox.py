@@ -23,7 +23,7 @@ from time import process_time
 from typing import Any, BinaryIO
 
 from springbench.harness.errors import InputError
-from springbench.harness.execution.platform_calls import (
+from springbench.solvers.platform_calls import (
     can_isolate_processes,
     disable_core_dumps,
     get_soft_limit,

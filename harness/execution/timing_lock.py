@@ -22,7 +22,8 @@ from time import sleep
 
 from springbench.harness.atomic_files import open_lock_file
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.execution.platform_calls import (
+from springbench.harness.execution.progress_events import WAITING, ProgressCallback, report_activity
+from springbench.solvers.platform_calls import (
     LockMode,
     list_usable_cores,
     pin_threads,
@@ -30,7 +31,6 @@ from springbench.harness.execution.platform_calls import (
     unlock_file,
     wait_for_lock,
 )
-from springbench.harness.execution.progress_events import WAITING, ProgressCallback, report_activity
 
 _RETRY_SECONDS = 0.02
 """Seconds between two searches for a free core."""

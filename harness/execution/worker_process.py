@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 from springbench.harness.console import reset_error_console
 from springbench.harness.errors import SpringbenchError
 from springbench.harness.execution.error_location import format_error, locate_error
-from springbench.harness.execution.platform_calls import disable_core_dumps, get_signal, set_soft_limit
 from springbench.harness.execution.sandbox import get_sandbox_pid, read_data_bytes
 from springbench.solvers.iteration.device_interface import is_device_lost
+from springbench.solvers.platform_calls import disable_core_dumps, get_signal, set_soft_limit
 
 ProgressCallback = Callable[[str], None]
 TaskFunction = Callable[[ProgressCallback], Any]

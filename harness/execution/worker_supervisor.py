@@ -16,7 +16,6 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import NoReturn
 
-from springbench.harness.execution.platform_calls import disable_core_dumps
 from springbench.harness.execution.worker_process import (
     DUMP_SIGNAL,
     adopt_orphans,
@@ -24,6 +23,7 @@ from springbench.harness.execution.worker_process import (
     serve_tasks,
     tie_to_parent,
 )
+from springbench.solvers.platform_calls import disable_core_dumps
 
 BUFFER_BYTES = 2**25
 """Maximum number of output bytes that wait for the command; further output is dropped."""

@@ -10,9 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from springbench.harness.execution import platform_calls
 from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure, TaskLimits
 from springbench.harness.execution.sandbox import CallLimits, SandboxError, call_in_sandbox
+from springbench.solvers import platform_calls
 
 ABSENT = """
 import multiprocessing.popen_fork, os, psutil, signal, subprocess, sys, tempfile  # what uses these calls itself
@@ -127,4 +127,4 @@ def test_one_module_imports_what_linux_has():
         for path in (root / folder).rglob("*.py")
         if re.search(r"^\s*(import|from) (fcntl|resource|grp|pwd|termios)\b", path.read_text(), re.M)
     }
-    assert importing == {"harness/execution/platform_calls.py"}
+    assert importing == {"solvers/platform_calls.py"}

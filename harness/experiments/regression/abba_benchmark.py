@@ -21,7 +21,6 @@ from random import Random, SystemRandom
 from time import perf_counter
 from typing import Literal
 
-from springbench.harness.execution.platform_calls import read_load_average
 from springbench.harness.experiments.regression.confidence_sequence import (
     RatioInterval,
     SequentialTest,
@@ -29,6 +28,7 @@ from springbench.harness.experiments.regression.confidence_sequence import (
     compute_log_ratio,
 )
 from springbench.harness.results.regression_verdict import RegressionVerdict
+from springbench.solvers.platform_calls import read_load_average
 
 BLOCK_ORDERS = ("ABBA", "BAAB")
 

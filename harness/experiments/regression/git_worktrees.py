@@ -17,8 +17,8 @@ from typing import Any
 
 from springbench.harness.atomic_files import open_lock_file, user_cache_dir
 from springbench.harness.errors import InputError
-from springbench.harness.execution.platform_calls import LockMode, wait_for_lock
 from springbench.harness.experiments.regression.revision_process import PACKAGE_FOLDER, GitRevision
+from springbench.solvers.platform_calls import LockMode, wait_for_lock
 
 MAX_WORKTREES = 6
 """Maximum number of worktrees in the cache."""

@@ -18,13 +18,13 @@ import numpy as np
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.errors import RunFailed
 from springbench.harness.execution import machine_info
-from springbench.harness.execution.platform_calls import read_load_average
 from springbench.harness.execution.worker_process import ProgressCallback
 from springbench.harness.experiments.failure_columns import build_failure_columns
 from springbench.harness.experiments.provenance import build_run_columns
 from springbench.harness.experiments.roofline.benchmark_candidates import BenchmarkCandidate, CandidateTiming
 from springbench.harness.simulation.timing_pass import hash_positions
 from springbench.solvers.model.step_problem import Positions
+from springbench.solvers.platform_calls import read_load_average
 
 NUM_PREPARATIONS = 3
 """Number of preparations of each candidate, including the first."""
