@@ -87,6 +87,15 @@ def pin_threads(cores: set[int]) -> None:
             os.sched_setaffinity(int(thread), cores)
 
 
+def measure_memory() -> float:
+    """Return the memory of this machine [bytes]."""
+    if hasattr(os, "sysconf"):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    import psutil  # only where the system does not state it by itself
+
+    return psutil.virtual_memory().total
+
+
 def read_load_average() -> float:
     """Return the mean number of busy processes in the last minute; NaN if the system does not state it."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")

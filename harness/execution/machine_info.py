@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from springbench.harness.errors import InputError, InputMistake
-from springbench.solvers.platform_calls import list_usable_cores, read_load_average
+from springbench.solvers.platform_calls import list_usable_cores, measure_memory, read_load_average
 
 _PROJECT_ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("harness", "solvers")
@@ -52,8 +52,7 @@ class MachineInfo:
 def describe_machine() -> MachineInfo:
     """Describe the machine of this process, with the cores that it may use now."""
     system = f"{platform.system()} {platform.release()} {platform.machine()}"
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return MachineInfo(_read_cpu_name(), _count_cores(), round(memory / 2**30, 1), system)
+    return MachineInfo(_read_cpu_name(), _count_cores(), round(measure_memory() / 2**30, 1), system)
 
 
 @cache

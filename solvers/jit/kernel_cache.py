@@ -41,11 +41,7 @@ from numba.core.sigutils import normalize_signature
 from numba.misc.appdirs import AppDirs
 from springbench.solvers.jit import source_digest
 from springbench.solvers.jit.inline_linking import rebuild_result
-
-try:
-    import fcntl
-except ImportError:  # on other systems than Unix processes do not wait for each other
-    fcntl = None
+from springbench.solvers.platform_calls import try_lock_byte
 
 _STALE_SECONDS = 7 * 86400.0
 """Age [s] of the last use after which the cache folder of other sources is removed; a process that still runs with such
@@ -201,17 +197,15 @@ def _lock_entry(path: Path) -> Generator[None]:
     """
     lock_path = path.with_name(f".{path.name}.lock")
     try:
-        lock = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        lock = os.open(lock_path, os.O_RDWR | os.O_CREAT, 0o644)
     except OSError:  # nothing can be stored either
         yield
         return
     try:
-        if fcntl is not None:
-            for _ in range(_MAX_LOCK_POLLS):
-                with suppress(BlockingIOError, PermissionError):
-                    fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                Event().wait(_LOCK_POLL_SECONDS)
+        for _ in range(_MAX_LOCK_POLLS):
+            if try_lock_byte(lock, 0):
+                break
+            Event().wait(_LOCK_POLL_SECONDS)
         yield
     finally:
         with suppress(OSError):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from springbench.solvers.platform_calls import measure_memory
 
 
 def allocate_aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
@@ -22,7 +22,7 @@ def compute_memory_limit() -> float:
 
     The remainder is for other data of a run.
     """
-    return 0.75 * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 0.75 * measure_memory()
 
 
 def format_bytes(count: float) -> str:

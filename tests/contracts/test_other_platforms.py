@@ -13,13 +13,14 @@ import pytest
 from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure, TaskLimits
 from springbench.harness.execution.sandbox import CallLimits, SandboxError, call_in_sandbox
 from springbench.solvers import platform_calls
+from springbench.solvers.jit import kernel_cache
 
 ABSENT = """
 import multiprocessing.popen_fork, os, psutil, signal, subprocess, sys, tempfile  # what uses these calls itself
 for name in ("fcntl", "resource"):
     sys.modules[name] = None
 for name in ("sched_getaffinity", "sched_setaffinity", "getloadavg", "fork", "pidfd_open", "waitid", "setsid",
-             "register_at_fork", "O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_DIRECTORY"):
+             "register_at_fork", "sysconf", "O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_DIRECTORY"):
     delattr(os, name)
 for name in ("SIGKILL", "SIGUSR1"):
     delattr(signal, name)
@@ -119,12 +120,51 @@ def test_cores_are_counted_without_affinity(monkeypatch: pytest.MonkeyPatch):
     assert platform_calls.list_usable_cores() == list(range(os.cpu_count() or 1))
 
 
-def test_one_module_imports_what_linux_has():
+def test_a_kernel_is_stored_without_locks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    monkeypatch.setattr(platform_calls, "fcntl", None)
+    monkeypatch.delattr(os, "O_CLOEXEC")
+    with kernel_cache._lock_entry(tmp_path / "kernel"), kernel_cache._lock_entry(tmp_path / "kernel"):
+        assert (tmp_path / ".kernel.lock").exists()
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_memory_is_known_without_sysconf(monkeypatch: pytest.MonkeyPatch):
+    import psutil  # it needs sysconf itself, on Linux
+
+    known = platform_calls.measure_memory()
+    monkeypatch.delattr(os, "sysconf")
+    assert platform_calls.measure_memory() == psutil.virtual_memory().total == pytest.approx(known, rel=1e-6)
+
+
+UNIX_MODULES = re.compile(r"^\s*(?:import|from) (?:fcntl|resource|grp|pwd|termios)\b", re.M)
+UNIX_CALLS = re.compile(
+    r"\bos\.(?:fork|setsid|killpg|getpgid|sched_\w+|sysconf|waitid|pidfd_open|geteuid|getuid|mkfifo|uname|getloadavg|"
+    r"O_NOFOLLOW|O_NONBLOCK|O_CLOEXEC|O_DIRECTORY|WNOHANG)\b|\bsignal\.(?:SIGKILL|SIGALRM|SIGXCPU|SIGCONT|SIGUSR\d|"
+    r"pthread_sigmask|setitimer)\b|\bselect\.poll\b|[\"']/proc/"
+)
+"""What Windows lacks."""
+GUARDED = {
+    "harness/execution/interrupts.py": "sys.platform",
+    "harness/experiments/archive/compaction.py": 'hasattr(os, "O_DIRECTORY")',
+    "harness/execution/process_memory.py": "OSError",
+    **dict.fromkeys(
+        (f"harness/execution/{name}.py" for name in ("isolated_worker", "sandbox")), "can_isolate_processes()"
+    ),
+    "harness/execution/worker_supervisor.py": "",
+    "harness/execution/worker_process.py": "",
+}
+"""Modules with such calls, and how they check for them; the last two run only in processes of `isolated_worker`."""
+
+
+def test_one_module_has_what_only_unix_has():
     root = Path(__file__).resolve().parents[2]
-    importing = {
-        path.relative_to(root).as_posix()
+    sources = {
+        path.relative_to(root).as_posix(): path.read_text()
         for folder in ("harness", "solvers")
         for path in (root / folder).rglob("*.py")
-        if re.search(r"^\s*(import|from) (fcntl|resource|grp|pwd|termios)\b", path.read_text(), re.M)
     }
+    importing = {name for name, text in sources.items() if UNIX_MODULES.search(text)}
     assert importing == {"solvers/platform_calls.py"}
+    calling = {name for name, text in sources.items() if UNIX_CALLS.search(text)} - importing
+    assert calling == set(GUARDED)
+    assert all(guard in sources[name] for name, guard in GUARDED.items())
