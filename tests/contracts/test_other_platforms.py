@@ -156,6 +156,7 @@ GUARDED = {
 """Modules with such calls, and how they check for them; the last two run only in processes of `isolated_worker`."""
 
 
+@pytest.mark.slow
 def test_one_module_has_what_only_unix_has():
     root = Path(__file__).resolve().parents[2]
     sources = {
