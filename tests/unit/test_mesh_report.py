@@ -111,6 +111,13 @@ def test_a_unit_is_guessed_from_the_extent(extent, scale):
     assert guess_unit(1.0) is None
 
 
+def test_an_extent_that_no_unit_explains_is_a_remark(tmp_path):
+    report = build_mesh_report(FileMesh(path=write(tmp_path, CLEAN), units="nm"))
+    (found,) = report.findings
+    assert (found.name, found.is_suspicious) == ("units", False)
+    assert "1e-09 m wide, high or deep, which is unusual for cloth" in found.problem
+
+
 def run_command(*arguments: object) -> tuple[int, str]:
     """The exit code and output of the command."""
     done = CliRunner().invoke(app, ["mesh", *map(str, arguments)])

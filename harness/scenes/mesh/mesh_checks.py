@@ -131,10 +131,14 @@ def check_parts(num_vertices: int, pairs: IndexArray, support: MeshSupport | Non
 
 
 def guess_unit(extent: float) -> tuple[str, float] | None:
-    """Guess the unit of a mesh from its largest extent, in units of the file; None if metres are plausible."""
+    """Guess the unit of a mesh from its largest extent, in units of the file.
+
+    Returns: the unit and its metres; None if metres are plausible, or no unit gives the extent of a cloth.
+    """
     if extent <= 0.0 or _MIN_EXTENT <= extent <= _MAX_EXTENT:
         return None
-    return min(_GUESSED_UNITS, key=lambda unit: abs(math.log(extent * unit[1] / _TYPICAL_EXTENT)))
+    plausible = [unit for unit in _GUESSED_UNITS if _MIN_EXTENT <= extent * unit[1] <= _MAX_EXTENT]
+    return min(plausible, key=lambda unit: abs(math.log(extent * unit[1] / _TYPICAL_EXTENT)), default=None)
 
 
 def check_size(points: PointArray) -> list[MeshFinding]:
@@ -145,6 +149,9 @@ def check_size(points: PointArray) -> list[MeshFinding]:
     if unit := guess_unit(extent):
         problem = f"the mesh is {extent:,.4g} m wide, high or deep: is it in {unit[0]}?"
         found.append(MeshFinding("units", 1, problem, f"`scale: {unit[1]:g}` makes it {extent * unit[1]:.3g} m"))
+    elif extent and not _MIN_EXTENT <= extent <= _MAX_EXTENT:
+        problem = f"the mesh is {extent:,.4g} m wide, high or deep, which is unusual for cloth"
+        found.append(MeshFinding("units", 1, problem, "state `units` if it is not in metres", is_suspicious=False))
     if extent and offset > _FAR_RATIO * extent:
         problem = f"the mesh is {offset:.3g} m from the origin and {extent:.3g} m large"
         found.append(MeshFinding("far-from-origin", 1, problem, "subtract an offset in the file"))
