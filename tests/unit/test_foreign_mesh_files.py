@@ -15,7 +15,7 @@ from springbench.harness.experiments.grading.position_files import read_position
 from springbench.harness.recording.recording_reader import read_replay
 from springbench.harness.results import parquet_rows
 from springbench.harness.scenes.mesh import file_truncation, ply_reader
-from springbench.harness.scenes.mesh.file_mesh import FileMesh
+from springbench.harness.scenes.mesh.file_mesh import FileMesh, read_cells
 from springbench.harness.schema.yaml_loader import read_yaml
 
 XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -216,7 +216,7 @@ def test_what_stands_in_place_of_a_file_is_named(tmp_path, name, case):
     ("name", "content", "words"),
     [
         ("mesh.vtk", b"# vtk DataFile Version 1.0\n", "VTK data type"),
-        ("mesh.off", b"COFF\n3 1 0\n", "OFF"),
+        ("mesh.off", b"OFF BINARY\n", "binary OFF file"),
         ("mesh.msh", b"$MeshFormat\n2.2 7 8\n$EndMeshFormat\n$Elements\n$EndElements\n", "msh"),
     ],
 )
@@ -343,3 +343,57 @@ def test_readers_of_results_name_what_stands_in_place_of_a_file(tmp_path, name, 
     path.write_bytes(content)
     with pytest.raises(InputError, match=words):
         READERS[name](path)
+
+
+FACETS = struct.pack("<12fH", 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 7) + struct.pack(
+    "<12fH", 0, 0, 1, 1, 0, 0, 1, 1, 0, 0, 1, 0, 0
+)
+TEXT_STL = b"solid a b\n" + b"".join(
+    b"facet normal 0 0 1\nouter loop\n%bendloop\nendfacet\n" % corners
+    for corners in (
+        b"vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n",
+        b"vertex 1 0 0\n vertex 1.0e0 1 0\nvertex 0 1 -0\n",
+    )
+)
+COLOURED_OFF = b"COFF\n4 2 5\n0 0 0 .1 .2 .3 1\n1 0 0 0 0 0 1\n1 1 0 0 0 0 1\n0 1 0 0 0 0 1\n3 0 1 3 255 0 0\n3 1 2 3\n"
+FILES_IN_PRACTICE = {
+    "a-text-header.stl": b"solid but binary".ljust(80) + struct.pack("<I", 2) + FACETS,
+    "bytes-behind.stl": bytes(80) + struct.pack("<I", 2) + FACETS + b"\0\0\r\n",
+    "capitals.stl": (TEXT_STL + b"endsolid a b\n").upper(),
+    "two-solids.stl": (TEXT_STL + b"endsolid\n").replace(b"endfacet\n", b"endfacet\nendsolid\nsolid\n", 1),
+    "windows.stl": (TEXT_STL + b"endsolid").replace(b"\n", b"\r\n"),
+    "comments.off": b"OFF\n# c\n\n4 2 0\n0 0 0\n1 0 0 # x\n1 1 0\n0 1 0\n3 0 1 3\n3 1 2 3\n",
+    "colours.off": COLOURED_OFF,
+    "one-line.off": b"OFF 4 2 5\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 3\n3 1 2 3",
+    "no-keyword.off": b"4 2 5\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 3\n3 1 2 3\n",
+}
+
+
+@pytest.mark.parametrize("name", FILES_IN_PRACTICE)
+def test_stl_and_off_files_of_practice_are_read(tmp_path, name):
+    path = tmp_path / name
+    path.write_bytes(FILES_IN_PRACTICE[name])
+    mesh = FileMesh(path=path).build_mesh()
+    assert len(mesh.rest_positions) == 4
+    assert len(mesh.triangles) == 2
+    assert mesh.surface_area == 1.0
+
+
+def test_an_off_file_has_polygons_of_any_number_of_corners(tmp_path):
+    path = tmp_path / "house.off"
+    path.write_bytes(b"OFF\n6 2 0\n0 0 0\n1 0 0\n1 1 0\n.5 2 0\n0 1 0\n2 0 0\n5 0 1 2 3 4\n3 1 5 2\n")
+    assert len(FileMesh(path=path).build_mesh().springs) == 7
+    path.write_bytes(path.read_bytes().replace(b"3 1 5 2", b"3 1 5 9"))
+    with pytest.raises(InputError, match=r"names the points \[1, 5, 9\]"):
+        FileMesh(path=path).build_mesh()
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".off"])
+def test_stl_and_off_files_have_the_vertices_that_meshio_gives_them(tmp_path, suffix):
+    path = tmp_path / f"mesh{suffix}"
+    points = np.random.default_rng(1).normal(size=(20, 3)).astype(np.float32)
+    triangles = np.random.default_rng(2).permuted(np.tile(np.arange(20), (30, 1)), axis=1)[:, :3]
+    meshio.Mesh(points, [("triangle", triangles)]).write(path, **({"binary": True} if suffix == ".stl" else {}))
+    known, found = meshio.read(path), read_cells(path)
+    np.testing.assert_array_equal(found.points, known.points)
+    np.testing.assert_array_equal(found.polygons[3], known.cells_dict["triangle"])

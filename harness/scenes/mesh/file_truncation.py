@@ -14,8 +14,6 @@ _GMSH_SECTION = re.compile(
     rb"^\$(End)?((?:MeshFormat|PhysicalNames|Entities|Nodes|Elements|Periodic)\b|\w+Data\b)", re.M
 )
 _XML_ROOT = re.compile(rb"<([A-Za-z][\w:.-]*)[\s>]")
-_NUMBER_LINE = re.compile(rb"^[ \t]*[-+.0-9]", re.M)
-_STL_HEAD_BYTES, _STL_TRIANGLE_BYTES = 84, 50
 
 _VTK_SIZES = {"char": 1, "short": 2, "int": 4, "long": 8, "float": 4, "double": 8, "vtkidtype": 4,
               "vtktypeint32": 4, "vtktypeint64": 8}  # fmt: skip
@@ -57,15 +55,6 @@ def _find_open_gmsh_section(content: bytes) -> str:
     return "it has no section $Elements" if b"MeshFormat" in open_sections and b"Elements" not in open_sections else ""
 
 
-def _find_cut_stl(content: bytes) -> str:
-    if content.lstrip().startswith(b"solid") and b"facet" in content:
-        num_begun = len(re.findall(rb"^\s*solid\b", content, re.M))
-        return "it has no endsolid" if len(re.findall(rb"^\s*endsolid\b", content, re.M)) < num_begun else ""
-    promised = int.from_bytes(content[_STL_HEAD_BYTES - 4 : _STL_HEAD_BYTES], "little")
-    found = max(0, len(content) - _STL_HEAD_BYTES) // _STL_TRIANGLE_BYTES
-    return f"its head promises {promised:,} triangles, and {found:,} follow" if found < promised else ""
-
-
 def _find_open_xml(content: bytes) -> str:
     root = _XML_ROOT.search(content)
     if root is None or content.rstrip(b"\0 \t\r\n").endswith(b"</" + root[1] + b">"):
@@ -83,17 +72,6 @@ def _find_missing_word(word: bytes, name: str) -> Callable[[bytes], str]:
         return "" if re.search(rb"^\s*" + word + rb"\b", content, re.M | re.I) else f"it has no {name}"
 
     return check
-
-
-def _find_cut_off(content: bytes) -> str:
-    """Count the lines of numbers of an OFF file: the counts, the points and the faces."""
-    counts = re.search(rb"^[ \t]*(\d+)[ \t]+(\d+)\b", content, re.M)
-    if not counts:
-        return ""
-    promised = int(counts[1]) + int(counts[2])
-    found = len(_NUMBER_LINE.findall(content, counts.start())) - 1
-    what = f"its head promises {int(counts[1]):,} vertices and {int(counts[2]):,} faces, and {found:,} lines follow"
-    return what if found < promised else ""
 
 
 class _VtkScan:
@@ -190,14 +168,12 @@ def _has_next_word(scan: _VtkScan, word: bytes) -> bool:
 
 _STRICT_CHECKS: dict[str, Callable[[bytes], str]] = {
     ".msh": _find_open_gmsh_section,
-    ".stl": _find_cut_stl,
     ".vtk": _find_cut_vtk,
     **dict.fromkeys((".vtp", ".vtu", ".xdmf", ".xmf"), _find_open_xml),
     ".gltf": _find_open_json,
 }
 """Checks that no complete file fails."""
 _WEAK_CHECKS: dict[str, Callable[[bytes], str]] = {
-    ".off": _find_cut_off,
     ".mesh": _find_missing_word(b"End", "End"),
     **dict.fromkeys((".nas", ".bdf", ".fem"), _find_missing_word(b"ENDDATA", "ENDDATA")),
 }

@@ -1,6 +1,6 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 # meshio has no types.
-"""Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY, .vtp and glTF.
+"""Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY, STL, OFF, .vtp and glTF.
 
 The subprocess is that of `springbench.harness.execution.sandbox`. meshio and VTK accept some truncated files as
 complete; `springbench.harness.scenes.mesh.file_truncation` recognises these.
@@ -23,7 +23,14 @@ import meshio
 import numpy as np
 from meshio.gmsh import _gmsh40, _gmsh41
 from numpy.typing import NDArray
-from springbench.harness.scenes.mesh import file_truncation, gltf_reader, ply_reader, vtp_reader
+from springbench.harness.scenes.mesh import (
+    file_truncation,
+    gltf_reader,
+    off_reader,
+    ply_reader,
+    stl_reader,
+    vtp_reader,
+)
 
 CellBlock = tuple[str, NDArray[np.int64]]
 """Cells of one kind: its meshio name, and the point indices of each cell."""
@@ -101,7 +108,12 @@ def _read_by_suffix(path: Path) -> MeshFileContent:
     if suffix == ".vtp":
         return _convert_vtp(vtp_reader.read_vtp(path.read_bytes()))
     if suffix == ".ply":
-        return _convert_ply(ply_reader.read_ply(path.read_bytes()))
+        return _convert_polygons(ply_reader.read_ply(path.read_bytes()))
+    if suffix == ".off":
+        return _convert_polygons(off_reader.read_off(path.read_bytes()))
+    if suffix == ".stl":
+        points, triangles = stl_reader.read_stl(path.read_bytes())
+        return MeshFileContent(points, [("triangle", triangles)], {}, {}, [np.arange(len(triangles))])
     if suffix in (".gltf", ".glb"):
         return _convert_gltf(gltf_reader.read_gltf(path))
     if suffix == ".vtk" and _VTK_POLYDATA.search(path.read_bytes()[:_VTK_HEAD_BYTES]):
@@ -194,7 +206,7 @@ def _number_faces(blocks: list[CellBlock]) -> list[NDArray[np.int64]]:
     return [first + np.arange(len(data)) for first, (_, data) in zip(faces, blocks, strict=False)]
 
 
-def _convert_ply(read: ply_reader.PlyContent) -> MeshFileContent:
+def _convert_polygons(read: ply_reader.PolygonContent) -> MeshFileContent:
     blocks = [(_CELL_KIND_BY_CORNERS.get(k, "polygon"), rows) for k, (rows, _) in read.faces.items()]
     places = [read.first_face_line + which for _, which in read.faces.values()]
     counted: Literal["line", "face"] = "line" if read.first_face_line else "face"

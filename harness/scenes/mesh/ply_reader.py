@@ -46,8 +46,8 @@ class PlyElement(NamedTuple):
     properties: list[PlyProperty]
 
 
-class PlyContent(NamedTuple):
-    """Contents of a PLY file.
+class PolygonContent(NamedTuple):
+    """Contents of a file of points and polygons.
 
     Attributes:
         points: (n, 3).
@@ -62,7 +62,7 @@ class PlyContent(NamedTuple):
     first_face_line: int
 
 
-def read_ply(content: bytes) -> PlyContent:
+def read_ply(content: bytes) -> PolygonContent:
     """Read the contents of a PLY file; raise ValueError for a broken one."""
     form, elements, start = _parse_header(content)
     rows_of: Callable[[PlyElement, str], _ElementRows] = (
@@ -77,13 +77,15 @@ def read_ply(content: bytes) -> PlyContent:
         if element.name == "vertex":
             columns = found.columns
         elif wanted:
-            faces = _group_by_corner_count(found.lists)
+            faces = group_by_corner_count(found.lists)
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
     if not faces and any(element.name == "tristrips" for element in elements):
         raise ValueError("it holds triangle strips (tristrips); save it with faces instead")
     points = np.column_stack([columns.pop(axis) for axis in "xyz"])
-    return PlyContent(points, columns, faces, _find_first_face_line(content, start, elements) if form == "ascii" else 0)
+    return PolygonContent(
+        points, columns, faces, _find_first_face_line(content, start, elements) if form == "ascii" else 0
+    )
 
 
 def _parse_header(content: bytes) -> tuple[str, list[PlyElement], int]:
@@ -119,7 +121,7 @@ def _find_corner_property(element: PlyElement) -> str:
     return names[0] if names else ""
 
 
-def _group_by_corner_count(lists: list[FloatArray] | FloatArray) -> dict[int, tuple[IndexArray, IndexArray]]:
+def group_by_corner_count(lists: list[FloatArray] | FloatArray) -> dict[int, tuple[IndexArray, IndexArray]]:
     """Group faces by their number of corners; raise ValueError for corners that are not integers."""
     if isinstance(lists, np.ndarray):
         return {lists.shape[1]: (_to_integers(lists), np.arange(len(lists)))} if len(lists) else {}
