@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -393,7 +394,8 @@ def test_stl_and_off_files_have_the_vertices_that_meshio_gives_them(tmp_path, su
     path = tmp_path / f"mesh{suffix}"
     points = np.random.default_rng(1).normal(size=(20, 3)).astype(np.float32)
     triangles = np.random.default_rng(2).permuted(np.tile(np.arange(20), (30, 1)), axis=1)[:, :3]
-    meshio.Mesh(points, [("triangle", triangles)]).write(path, **({"binary": True} if suffix == ".stl" else {}))
+    options: dict[str, Any] = {"binary": True} if suffix == ".stl" else {}
+    meshio.write(path, meshio.Mesh(points, [("triangle", triangles)]), **options)
     known, found = meshio.read(path), read_cells(path)
     np.testing.assert_array_equal(found.points, known.points)
     np.testing.assert_array_equal(found.polygons[3], known.cells_dict["triangle"])

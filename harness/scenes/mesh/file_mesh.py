@@ -58,8 +58,8 @@ class FileMesh(SpringValueKeys):
 
     kind: Literal["file"] = "file"
     path: Path
-    """Path of an OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, VTP or glTF, or a meshio format (VTK,
-    Gmsh, Abaqus, ...)."""
+    """Path of an OBJ, a JSON scene of the assignment (its OBJ is read), a PLY, STL, OFF, VTP or glTF, or a meshio
+    format (VTK, Gmsh, Abaqus, ...)."""
     scale: Annotated[float, Field(ge=1e-9, le=1e9)] = 1.0
     """Metres per unit of the file's coordinates, 0.001 for millimetres."""
     units: LengthUnit | None = None
