@@ -36,7 +36,12 @@ a_i = c/dt^2 (x_i - target) is the acceleration of a stage. Implicit Euler has o
 force that the scene does not have: where a solve ends early, it may supply energy as well as dissipate it. Of length
 constraints, tensions are the part of the residual in the span of their gradients, and do no work in the exact motion.
 Sources are changing forces, moving pins and obstacles, and energies whose parameters change, at the mean of a step's
-two ends. Exactly pinned vertices have no kinetic energy; penalty pins store none at the start.
+two ends. Exactly pinned vertices have no kinetic energy.
+
+A start may have pinned vertices away from their targets. The constraint projects them, which is no part of the motion:
+its energy at the start is that after the projection. Midpoint has its stage while the pins are still on their way, and
+solvers of frames move them uniformly; the work on that way is then a source. Penalty pins that reach their targets in this first step act as exact ones during the
+run: the kinetic energy of their vertices, which may ring, is work of the pins.
 
 The terms are evaluated separately, so their sum tests them: it differs from the change of the energy by round-off.
 
@@ -74,7 +79,7 @@ from springbench.solvers.model.energies.augmented_lagrangian import (
     concatenate_constraints,
     length_errors,
 )
-from springbench.solvers.model.integrators import Motion, RungeKutta
+from springbench.solvers.model.integrators import Motion, RungeKutta, SingleStageIntegrator
 from springbench.solvers.model.rounding_bound import ROUNDOFF_FACTOR, gradient_roundoff
 from springbench.solvers.model.step_problem import (
     Energy,
@@ -102,6 +107,9 @@ BLOW_UP_FACTOR = 1e6
 _ACTIVE_LENGTH_RTOL = 1e-6
 """Distance from a bound, relative to it, within which a length is taken to be constrained: solves keep lengths to
 1e-9 and better."""
+
+_PLACED_RTOL = 1e-2
+"""Distance from their targets after the first step, relative to that before it, within which pins have been placed."""
 
 _REGULARISATION, _NUM_REFINEMENTS = 1e-10, 4
 """Shift of the matrix of the tensions, whose diagonal is 2, as redundant constraints make it singular; and the
@@ -395,23 +403,49 @@ class DissipationBudget(_StepAccount):
         self._begun: tuple[Energy, ...] = ()
         self._provided = 0.0
         self._last_power = _StagePower()
+        self._pin_positions, self._is_projected, self._are_pins_driven = np.empty((0, 3)), False, False
+        self._dynamic = self._free
 
     def add_step(self, step: SimulationStep, end_time: float | None = None) -> StepDissipation:
         """Return the dissipation of the next step, which ends at a time [s]; that of its index if omitted."""
         end = self._scene.compute_time(step.index) if end_time is None else end_time
+        if step.index == 1:
+            self._place_start(step, end)
         with np.errstate(over="ignore", invalid="ignore"):
             found = self._add_stages(step, end) if step.solution.velocity is None else self._add_integrated(step, end)
         self._motion, self._kinetic, self._time = step.state.motion, found.kinetic_energy, end
+        self._is_projected, self._pin_positions = False, self._scene.pin_targets_at(end)
         return found
+
+    def _place_start(self, step: SimulationStep, end: float) -> None:
+        """Place the pins of the start where the first step, which ends at a time [s], finds them."""
+        system, targets = self._scene.system, self._scene.pin_targets_at(0.0)
+        pinned, (soft, vertices, _) = system.pins.vertices, system.penalty_pins
+        away = targets - self._first[pinned]
+        left = self._scene.pin_targets_at(end)[soft] - step.positions[vertices]
+        placed = float(np.linalg.norm(left)) <= _PLACED_RTOL * float(np.linalg.norm(away[soft]))
+        self._are_pins_driven = bool(away[soft].any()) and placed
+        self._dynamic = np.setdiff1d(self._free, vertices) if self._are_pins_driven else self._free
+        led = system.pins.exact_mask | self._are_pins_driven
+        is_way_simulated = self._when < 1.0 or step.solution.velocity is not None
+        self._pin_positions = np.where((led & is_way_simulated)[:, None], self._first[pinned], targets)
+        if not is_way_simulated and away[led].any():
+            self._is_projected, self._first = True, self._first.copy()
+            self._first[pinned[led]] = targets[led]
+            self._motion = self._motion._replace(positions=self._first)
 
     def _add_stages(self, step: SimulationStep, end: float) -> StepDissipation:
         """Add a step of an integrator, which ends at a time [s]."""
-        problem, moved = step.problem, self._scene.pin_targets_at(end) - self._scene.pin_targets_at(self._time)
+        problem, moved = step.problem, self._scene.pin_targets_at(end) - self._pin_positions
         work = self._sum_work(step, moved)
         before, after, driven = self._update_potentials(step, step.solution.positions, end)
         kinetic = self._kinetic_energy(step.state.motion.velocity)
         filtered = self._kinetic_energy(problem.step_start.velocity)
         removed = self._kinetic - filtered
+        ringing = 0.0
+        if self._are_pins_driven:
+            ringing = self._gain_of_pins(problem, step.state.motion.velocity) + float(after[-2] - before[-2])
+            driven += ringing
         sources = work.sources + driven - min(0.0, removed)
         changed = float((after - before).sum())
         found = StepDissipation(
@@ -425,7 +459,16 @@ class DissipationBudget(_StepAccount):
             dissipation_solve=-work.residual,
         )  # fmt: skip
         error = kinetic - self._kinetic + changed - (sources - found.dissipated_energy)
-        return found._replace(provided_energy=self._update_provided(sources), balance_error=error)
+        return found._replace(provided_energy=self._update_provided(sources - ringing), balance_error=error)
+
+    @staticmethod
+    def _gain_of_pins(problem: StepProblem, velocity: Positions) -> float:
+        """Return the kinetic energy [J] that the vertices of penalty pins gain up to velocities (n, 3) [m/s]."""
+        soft = problem.system.penalty_pins[1]
+        before, after = (
+            compute_kinetic_energy(problem.system.mass[soft], v[soft]) for v in (problem.step_start.velocity, velocity)
+        )
+        return after - before
 
     def _update_potentials(
         self, step: SimulationStep, x: Positions, end: float
@@ -437,8 +480,7 @@ class DissipationBudget(_StepAccount):
         problem, p = step.problem, step.positions
         after = self._evaluate_potentials(problem, x, p, end)
         if step.index == 1:
-            first = problem.step_start.positions  # integrators of several stages place exact pins on their targets
-            at_start = self._evaluate_potentials(problem, first, first, 0.0)
+            at_start = self._evaluate_potentials(problem, self._first, self._first, 0.0)
             self._set_start(np.where(np.isfinite(at_start), at_start, after))
             self._begun = problem.energies
         before, driven = self._potentials, self._parameter_work(problem, after, self._motion.positions, p)
@@ -449,7 +491,7 @@ class DissipationBudget(_StepAccount):
         """Add a step that the solver integrated itself."""
         problem, v = step.problem, step.state.motion.velocity
         pinned = problem.system.pins.vertices
-        led = step.positions[pinned] - problem.step_start.positions[pinned]
+        led = step.positions[pinned] - self._motion.positions[pinned]
         kinetic = self._kinetic_energy(v)
         unknown = any(isinstance(energy, ContactEnergy) for energy in problem.energies)
         if unknown or (led.any() and self._scene.system.length_constraints):
@@ -461,9 +503,7 @@ class DissipationBudget(_StepAccount):
         removed = self._kinetic - filtered
         sources = work.sources + driven - min(0.0, removed)
         if led.any():  # penalty pins also move the mass of their vertices, and store energy
-            soft = problem.system.penalty_pins[1]
-            was, now = (compute_kinetic_energy(problem.system.mass[soft], u[soft]) for u in (self._motion.velocity, v))
-            sources += now - was + float(after[-2] - before[-2])
+            sources += self._gain_of_pins(problem, v) + float(after[-2] - before[-2])
         damping = work.damping + max(0.0, removed)
         lost = self._kinetic - kinetic - float((after - before).sum()) + sources - damping
         own = (None, None, lost) if self._has_inner_solves else (lost, None, None)
@@ -477,7 +517,7 @@ class DissipationBudget(_StepAccount):
         dt, pinned, rate = system.time_step, system.pins.vertices, system.velocity_rate
         power = list[_StagePower]()
         for part in _QUADRATURE_NODES:
-            p, v = interpolate_hermite(Motion(start.positions, start.velocity), step.state.motion, dt, part)
+            p, v = interpolate_hermite(Motion(self._motion.positions, start.velocity), step.state.motion, dt, part)
             p, v = p.copy(), v.copy()
             p[pinned], v[pinned] = step.positions[pinned] - (1.0 - part) * led, led / dt
             time = start.time + part * dt
@@ -510,7 +550,7 @@ class DissipationBudget(_StepAccount):
         start = step.problem.step_start
         scene = self._scene.scene_of_step(0)
         stages = StageSequence(scene, self._motion._replace(velocity=start.velocity), None, start.time)
-        power = self._stage_power(stages.build_start_problem(), self._first, np.zeros_like(scene.pin_targets))
+        power = self._stage_power(stages.build_start_problem(), self._first, scene.pin_velocities_at(0.0))
         return power._replace(inertia=-power.residual, residual=0.0)
 
     def _stage_power(
@@ -521,7 +561,12 @@ class DissipationBudget(_StepAccount):
         With the start of a frame, forces that change are those of that start, and penalty pins act as exact ones.
         """
         system, start, free, exact = problem.system, problem.step_start, self._free, self._exact
+        soft, vertices, weight = system.penalty_pins
         v, total = start.velocity_at(x), np.zeros_like(x)
+        if self._is_projected and isinstance(self._scene.integrator, SingleStageIntegrator) and not frame:
+            v[exact] = pin_velocity[~soft]
+        if self._are_pins_driven and not frame:
+            v[vertices] = pin_velocity[soft]
         potentials = damping = friction = sources = 0.0
         for energy in problem.energies:
             gradient = np.zeros_like(x)
@@ -539,10 +584,11 @@ class DissipationBudget(_StepAccount):
                 sources += normal + tangential
                 power += normal - rubbed
             potentials += power
-        soft, vertices, weight = system.penalty_pins
-        pull = weight[:, None] * (x[vertices] - problem.pin_targets[soft])
-        potentials += _dot(pull, v[vertices] - pin_velocity[soft]) - _dot(self._load, v[free])
-        sources -= _dot(pull, pin_velocity[soft])
+        potentials -= _dot(self._load, v[free])
+        if not self._are_pins_driven:
+            pull = weight[:, None] * (x[vertices] - problem.pin_targets[soft])
+            potentials += _dot(pull, v[vertices] - pin_velocity[soft])
+            sources -= _dot(pull, pin_velocity[soft])
         sources += _dot((problem.external_force - self._scene.constant_force)[free], v[free])
         for force in self._scene.varying_forces:
             if getattr(force, "is_dissipative", False):
@@ -552,16 +598,17 @@ class DissipationBudget(_StepAccount):
         residual = problem.gradient(x)
         tension = self._find_tensions(x, residual)
         sources += _dot((total - tension)[exact], v[exact])
-        if frame:
-            sources += _dot((total - problem.external_force)[vertices], v[vertices])
-        inertia = system.inertia_diagonal[free, None] * (x - problem.inertial_target)[free]
+        if frame or self._are_pins_driven:
+            sources += _dot((total - problem.external_force - tension)[vertices], v[vertices])
+        dynamic = self._dynamic
+        inertia = system.inertia_diagonal[dynamic, None] * (x - problem.inertial_target)[dynamic]
         return _StagePower(
-            _dot(inertia, v[free]),
+            _dot(inertia, v[dynamic]),
             potentials,
             damping,
             friction,
             sources,
-            _dot((residual - tension)[free], v[free]),
+            _dot((residual - tension)[dynamic], v[dynamic]),
             _dot(tension, v),
         )
 
@@ -621,8 +668,9 @@ class DissipationBudget(_StepAccount):
         )
 
     def _set_start(self, potentials: NDArray[np.float64]) -> None:
-        """Set the potentials of the start; penalty pins are on their targets there, whatever its shape."""
-        potentials[-2] = 0.0
+        """Set the potentials of the start, at which penalty pins that act as exact ones store none."""
+        if self._are_pins_driven:
+            potentials[-2] = 0.0
         self._potentials = potentials
         self._provided = self._kinetic + float(np.maximum(potentials, 0.0).sum())
 

@@ -36,6 +36,13 @@ ENERGY_BALANCE = (
         "0.0,",
         _TESTS,
     ),
+    Mutation(
+        "pins-projected-by-the-integrator",
+        _BALANCE,
+        "if not is_way_simulated and away[led].any():",
+        "if False:",
+        ("tests/unit/test_dissipation.py::test_pins_that_the_start_has_displaced_are_projected_before_the_motion",),
+    ),
     Mutation("growth-of-a-thousand", _BALANCE, "GROWTH_LIMIT = 1.0", "GROWTH_LIMIT = 1e4", _TESTS),
     Mutation(
         "growth-is-ok",

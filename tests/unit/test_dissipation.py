@@ -25,6 +25,7 @@ from springbench.harness.scenes.effects.pins_effect import PinsEffect
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.scenes.start_positions import RestStart
 from springbench.harness.simulation.energy_balance import DissipationBudget, StepDissipation, sum_dissipation
 from springbench.harness.simulation.time_loop import (
     MotionState,
@@ -38,7 +39,7 @@ from springbench.harness.simulation.time_loop import (
 from springbench.solvers.model import integrators
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.integrators import Motion
-from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.model.step_problem import DirichletPins, Positions, StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.scene_builders import build_test_scene
@@ -80,6 +81,11 @@ def observe(
 def shipped(name: str, integrator: str = "implicit-euler") -> Scene:
     spec = load_scene(SCENES / f"{name}.yaml")
     return build_scene(spec, min(spec.default_size or 8, 8), integrator)
+
+
+def make_pins_exact(scene: Scene) -> Scene:
+    pins = DirichletPins(scene.system.pins.vertices, np.full(len(scene.system.pins.vertices), np.inf))
+    return replace(scene, system=replace(scene.system, pins=pins))
 
 
 def size_of(found: StepDissipation) -> float:
@@ -137,6 +143,47 @@ def test_the_balance_closes_to_round_off_in_every_frame(name: str):
 def test_the_balance_closes_by_every_integrator(integrator: str):
     found = [now for _, now in observe(shipped("hanging-cloth", integrator), 3, stop=StopRule(20, 1e-6))]
     assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
+
+
+class _PulledPin(RestStart):
+    """The rest shape with its pinned vertex away from its target."""
+
+    def compute_positions(self, rest_positions: Positions) -> Positions:
+        p = rest_positions.copy()
+        p[0] += (0.1, 0.2, 0.0)
+        return p
+
+
+@pytest.mark.parametrize(
+    ("integrator", "weight"),
+    [
+        *((name, "exact") for name in ("implicit-euler", "bdf2", "sdirk-4", "esdirk-3", "tr-bdf2")),
+        ("implicit-euler", 1e10),
+        ("sdirk-4", 1e10),
+    ],
+)
+def test_pins_that_the_start_has_displaced_are_projected_before_the_motion(integrator: str, weight: str | float):
+    """All else is at rest: its springs have been strained by the pin alone, and no one gives or takes energy."""
+    pins = PinsEffect.model_validate({"parts": ["first"], "weight": weight})
+    scene = replace(pendulum(SPRINGS, pins, integrator=integrator), start=_PulledPin())
+    found = [now for _, now in observe(scene, 3)]
+    jump = 25.0 * (float(np.hypot(0.9, 0.2)) - 1.0) ** 2
+    for now in found:
+        assert abs(now.dissipation_integrator or 0.0) + abs(now.dissipation_solve or 0.0) < 1e-9 * jump
+        assert (now.provided_energy or 0.0) < 1e-6 * jump
+        assert abs(now.balance_error or 0.0) <= ROUND_OFF * max(1.0, size_of(now))
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "midpoint", "esdirk-3", "esdirk-4"])
+def test_a_perturbed_start_is_dissipated_alike_with_exact_and_penalty_pins(integrator: str):
+    """Energy that a method of order 4 takes is a hundredth; accelerations of penalties were 10^4 times all energy."""
+    lost = list[float]()
+    for scene in (shipped("spinning-skirt", integrator), make_pins_exact(shipped("spinning-skirt", integrator))):
+        found = [now for _, now in observe(scene, 3)]
+        assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
+        lost.append(sum(now.dissipation_integrator or 0.0 for now in found) / (found[-1].provided_energy or 1.0))
+    assert lost[0] == pytest.approx(lost[1], rel=0.03, abs=2e-3)
+    assert abs(lost[0]) < 0.05 or integrator in ("implicit-euler", "esdirk-3")
 
 
 def test_energies_of_the_last_frame_are_those_of_the_start_plus_all_terms():
