@@ -77,9 +77,9 @@ _TABLE = (
     (
         "grade-anything-is-a-minimum",
         f"{_FOLDER}/step_verdicts.py",
-        "return self.residual <= max(CONVERGED_RESIDUAL, FLOOR_FACTOR * self.residual_floor)",
-        "return self.residual <= max(1.0, FLOOR_FACTOR * self.residual_floor)",
-        _NAMED,
+        "return self.is_stationary and self.gap <= max(CONVERGED_GAP, FLOOR_FACTOR**2 * self.gap_floor)",
+        "return self.is_stationary",
+        f"{_GRADE}::test_a_saddle_is_no_minimum",
     ),
     (
         "matrix-zeros-uncounted",

@@ -21,9 +21,9 @@ from springbench.harness.experiments.grading.grading import (
     SceneGrader,
 )
 from springbench.harness.experiments.grading.mistaken_programs import MISTAKES as KNOWN_MISTAKES
-from springbench.harness.experiments.grading.motion_error import LARGEST_REFERENCE_ERROR, SMALLEST_ERROR
+from springbench.harness.experiments.grading.motion_error import LARGEST_REFERENCE_ERROR
 from springbench.harness.experiments.grading.position_files import PositionSequence, read_position_file
-from springbench.harness.experiments.grading.step_verdicts import spread_order
+from springbench.harness.experiments.grading.step_verdicts import StepJudge, StepVerdict, spread_order
 from springbench.harness.experiments.grading.submission import align_submission, estimate_precision
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
@@ -46,6 +46,19 @@ effects: [{kind: springs, stretch: 40}, {kind: gravity}]
 """
 
 
+PRESSED = """
+mesh: {kind: chain, length: 1}
+mass: 0.6
+time_step: 1/20
+frames: 1
+default_size: 3
+effects:
+  - {kind: springs, stretch: 4000, scaling_rule: fixed}
+  - {kind: pins, parts: [first], weight: exact}
+  - {kind: pins, parts: [last], weight: exact, motion: {key_frames: [{time: 0}, {time: 0.05, offset: [-0.3, 0, 0]}]}}
+"""
+
+
 def load_case(folder: Path, name: str = "cloth") -> tuple[Path, dict]:
     """The scene file, and what a program reads from it."""
     path = write_scene(folder, name)
@@ -63,6 +76,12 @@ def grade_array(grader: SceneGrader, p: np.ndarray) -> PositionGrade:
     return grader.grade_submission(
         align_submission(grader.scene, PositionSequence(Path("p"), p), grader.request.first_frame)
     )
+
+
+def judge(path: Path, p: np.ndarray, seconds: float, size: int = 0) -> list[StepVerdict]:
+    """The verdicts on the steps alone, without fingerprints."""
+    scene = build_scene(load_scene(path), size)
+    return StepJudge(scene).judge_steps(align_submission(scene, PositionSequence(path, p), 1), seconds)
 
 
 def name_mistake(grader: SceneGrader, p: np.ndarray) -> tuple[str, tuple[str, ...]]:
@@ -254,6 +273,42 @@ def test_a_correct_program_is_correct_and_a_mistake_is_named(tmp_path):
     assert bad.num_minima == 0
 
 
+@pytest.mark.parametrize("seconds", [0.0, 5.0])
+def test_positions_collapsed_to_a_point_are_no_minimum(seconds, tmp_path):
+    """No spring has a direction there: the round-off of the residual is unbounded, and the gap is what shows it."""
+    path, scene = load_case(tmp_path)
+    V = scene["V"]
+    for p in (np.zeros((4, *V.shape)), np.tile(V.mean(axis=0), (4, len(V), 1))):
+        steps = judge(path, np.concatenate([simulate(scene, 3), p]), seconds)
+        assert [one.is_minimum for one in steps] == [True] * 3 + [False] * 4
+        assert all(one.gap > 1.0 for one in steps[3:] if one.gap is not None)
+
+
+@pytest.mark.parametrize("digits", [np.float32, 3, 5])
+def test_minima_in_few_digits_are_minima_by_their_gap_too(digits, tmp_path):
+    path, scene = load_case(tmp_path)
+    p = simulate(scene, 8, iterations=400)
+    stored = p.astype(digits).astype(float) if digits is np.float32 else np.round(p, digits)
+    steps = judge(path, stored, 20.0)
+    assert all(one.is_minimum and one.gap is not None and one.gap_floor > 0.0 for one in steps)
+
+
+def test_a_saddle_is_no_minimum(tmp_path):
+    """Two springs are pressed along their line: where their middle is in equilibrium there, it buckles."""
+    (tmp_path / "rod.yaml").write_text(PRESSED)
+    scene = build_scene(load_scene(tmp_path / "rod.yaml"), 3)
+    p, inertia = (
+        scene.mesh.rest_positions + np.array([[0, 0, 0], [0, 0, 0], [-0.3, 0, 0]]),
+        20**2 * scene.system.mass[1],
+    )
+    p[1, 0] = (4000 * (p[0, 0] + p[2, 0]) + inertia * p[1, 0]) / (8000 + inertia)
+    (step,) = judge(tmp_path / "rod.yaml", p[None], 5.0, size=3)
+    assert step.residual < 1e-9
+    assert step.gap is not None
+    assert step.gap > 0.01
+    assert not step.is_minimum
+
+
 def test_a_scene_without_required_iterations_asks_for_convergence(tmp_path):
     path, scene = load_case(tmp_path)
     found = grade_array(make_grader(path, required=None), simulate(scene, 6, iterations=12))
@@ -324,7 +379,7 @@ def test_scenes_with_contact_are_graded_by_converged_steps_whose_error_is_stated
     assert good.shares
     for one in good.shares:
         assert one.reference_kind == "self-converged"
-        assert SMALLEST_ERROR < one.reference_error <= LARGEST_REFERENCE_ERROR
+        assert 0.0 < one.reference_error <= LARGEST_REFERENCE_ERROR
         assert one.solver_share < 1e-4
         assert one.total == pytest.approx(one.time_step_share, rel=1e-3)
     p[10:] += 0.01

@@ -6,8 +6,12 @@
 
 g is the objective of implicit Euler whose p^t and p^(t-dt) are those of the submission, so that errors of earlier steps
 do not count. The digits that a file stores limit all of them: `residual_floor` is the residual of a minimum with
-positions rounded as those of the file. Pins by penalty are placed where the minimum has them if the difference is
-round-off of the file.
+positions rounded as those of the file, `gap_floor` its gap. Pins by penalty are placed where the minimum has them if
+the difference is round-off of the file.
+
+A small residual does not make a minimum: at a saddle it is zero, and where springs have collapsed to a point it is
+round-off of any size. A minimum has a small gap as well. Steps whose residual is excused by the digits, and these are
+too few to show anything, are the first whose gap is computed; without it they are no minima.
 
 Friction has the normal forces at p itself, which is what lagged friction converges to. An iteration that ends as ours
 does (`springbench.solvers.contact.lagged_friction`) leaves a residual of FRICTION_RTOL times that of friction.
@@ -31,8 +35,12 @@ from springbench.solvers.model.step_problem import Positions, StepProblem, Unsup
 
 CONVERGED_RESIDUAL = 1e-6
 """Residual up to which a step is a minimum."""
+CONVERGED_GAP = 1e-6
+"""Energy gap up to which a step is a minimum: about the square of the residual, times the condition of the Hessian."""
 FLOOR_FACTOR = 4.0
-"""Factor on the residual that rounded positions have, up to which a step is a minimum."""
+"""Factor on the residual that rounded positions have, up to which a step is a minimum; its square for the gap."""
+LARGEST_FLOOR = 0.1
+"""Residual of rounded positions above which a residual shows nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +52,7 @@ class StepVerdict:
       residual: relative to the residual at the step's start.
       residual_floor: residual that the stored digits, and the iteration of friction, allow.
       gap: energy gap relative to that of the step's start; None where no minimum was computed.
+      gap_floor: energy gap that the stored digits, and the iteration of friction, allow.
       distance: distance to the minimum relative to the mesh; None likewise.
       flaw: why the minimum is not certified; empty if it is.
     """
@@ -54,11 +63,25 @@ class StepVerdict:
     gap: float | None = None
     distance: float | None = None
     flaw: str = ""
+    gap_floor: float = 0.0
+
+    @property
+    def is_stationary(self) -> bool:
+        """Whether the residual is as small as the stored digits show."""
+        return self.residual <= max(CONVERGED_RESIDUAL, FLOOR_FACTOR * self.residual_floor)
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether the step is stationary only because its digits show nothing, and its energy gap is unknown."""
+        shown = self.residual <= max(CONVERGED_RESIDUAL, FLOOR_FACTOR * min(self.residual_floor, LARGEST_FLOOR))
+        return self.gap is None and self.is_stationary and not shown
 
     @property
     def is_minimum(self) -> bool:
         """Whether the step minimises its objective as far as the stored digits show."""
-        return self.residual <= max(CONVERGED_RESIDUAL, FLOOR_FACTOR * self.residual_floor)
+        if self.gap is None:
+            return self.is_stationary and not self.is_doubtful
+        return self.is_stationary and self.gap <= max(CONVERGED_GAP, FLOOR_FACTOR**2 * self.gap_floor)
 
 
 class StepJudge:
@@ -82,7 +105,7 @@ class StepJudge:
         """Judge all steps; certified minima are computed for as many of them as the time [s] allows."""
         verdicts = {step: self._judge_residual(submission, step) for step in range(1, submission.num_steps + 1)}
         until = time.monotonic() + seconds
-        for step in spread_order(submission.num_steps):
+        for step in sorted(spread_order(submission.num_steps), key=lambda step: not verdicts[step].is_doubtful):
             if time.monotonic() > until:
                 break
             verdicts[step] = self._judge_minimum(submission, verdicts[step])
@@ -98,23 +121,44 @@ class StepJudge:
     def _judge_residual(self, submission: SubmittedMotion, step: int) -> StepVerdict:
         problem, p = self.build_problem(submission, step), submission.position_after(step)
         with np.errstate(all="ignore"):
-            start = self._evaluator.compute_initial_residual(problem)
+            start = self._measure_start(problem)
             residual = self._evaluator.compute_residual(problem, p) / start
             floor = self._measure_floor(problem, p, submission.bound_error(step)) / start
         return StepVerdict(step, float(residual), float(floor))
 
+    def _measure_start(self, problem: StepProblem) -> float:
+        """Measure the residual at the step's start, or its round-off if larger.
+
+        The round-off is unbounded where springs have collapsed, so that at the rest shape is taken if it is smaller.
+        """
+        places = problem.current_positions, self._scene.mesh.rest_positions
+        bound = min(self._evaluator.bound_roundoff(problem, p) for p in places)
+        residual = self._evaluator.compute_residual(problem, problem.current_positions)
+        return max(residual, bound if np.isfinite(bound) else 0.0, np.finfo(float).tiny)
+
     def _measure_floor(self, problem: StepProblem, p: Positions, error: float) -> float:
         """Measure the change of the residual by rounding errors [m] of the three positions."""
-        rng = np.random.default_rng(0)
-        moved = rng.uniform(-1.0, 1.0, (2, *p.shape)) * error
+        moved = _draw_rounding(p, error)
         change = problem.gradient(p + moved[0]) - problem.gradient(p)
-        change += problem.system.inertia_diagonal[:, None] * 2.24 * moved[1]  # sqrt(1 + 4) for p^(t-dt) and 2 p^t
-        by_friction = sum(
+        change += problem.system.inertia_diagonal[:, None] * _PREVIOUS_ERRORS * moved[1]
+        return self._evaluator.compute_energy_norm(change) + self._measure_friction(problem, p)
+
+    def _measure_friction(self, problem: StepProblem, p: Positions) -> float:
+        """Measure the residual [J^(1/2)] that the iteration of friction leaves at p (n, 3) [m]."""
+        return sum(
             self._evaluator.compute_energy_norm(FRICTION_RTOL * gradient)
             for energy in problem.energies
             if has_friction(energy) and (gradient := energy.friction_gradient(p)) is not None
         )
-        return self._evaluator.compute_energy_norm(change) + by_friction
+
+    def _measure_gap_floor(self, problem: StepProblem, p: Positions, error: float) -> float:
+        """Measure the gap [J] of a minimum p (n, 3) [m] by rounding errors [m] of free vertices, and by friction."""
+        first, second = _draw_rounding(p, error)
+        moved = first + _PREVIOUS_ERRORS * second
+        moved[problem.system.pins.vertices] = 0.0
+        by_digits = problem.value(p + moved) - problem.value(p)
+        by_friction = self._measure_friction(problem, p) ** 2
+        return sum(max(0.0, one) for one in (by_digits, by_friction) if np.isfinite(one))
 
     def _judge_minimum(self, submission: SubmittedMotion, verdict: StepVerdict) -> StepVerdict:
         problem, p = self.build_problem(submission, verdict.step), submission.position_after(verdict.step)
@@ -126,10 +170,21 @@ class StepJudge:
             lowest, begun = found.objective, problem.value(problem.current_positions)
             noise = 64.0 * np.finfo(float).eps * problem.value_scale(p)
             above = problem.value(p) - lowest
-            gap = 0.0 if abs(above) <= noise else above / max(begun - lowest, noise)
+            scale = max(begun - lowest, noise)
+            gap = 0.0 if abs(above) <= noise else above / scale
+            floor = self._measure_gap_floor(problem, found.positions, submission.bound_error(verdict.step)) / scale
             distance = float(np.linalg.norm(p - found.positions, axis=1).max(initial=0.0)) / self._size
         flaw = "" if found.is_certified else found.describe_flaw
-        return StepVerdict(verdict.step, verdict.residual, verdict.residual_floor, float(gap), distance, flaw)
+        return replace(verdict, gap=float(gap), distance=distance, flaw=flaw, gap_floor=float(floor))
+
+
+_PREVIOUS_ERRORS = 2.24
+"""Rounding errors of p^(t-dt) and 2 p^t together, relative to that of one position: sqrt(1 + 4)."""
+
+
+def _draw_rounding(p: Positions, error: float) -> Positions:
+    """Draw rounding errors (2, n, 3) [m] of at most `error` [m] for positions (n, 3), the same in each call."""
+    return np.random.default_rng(0).uniform(-1.0, 1.0, (2, *p.shape)) * error
 
 
 def _snap_pins(problem: StepProblem, p: Positions, there: Positions, tolerance: float) -> Positions:
