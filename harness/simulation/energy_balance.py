@@ -40,8 +40,9 @@ two ends. Exactly pinned vertices have no kinetic energy.
 
 A start may have pinned vertices away from their targets. The constraint projects them, which is no part of the motion:
 its energy at the start is that after the projection. Midpoint has its stage while the pins are still on their way, and
-solvers of frames move them uniformly; the work on that way is then a source. Penalty pins that reach their targets in this first step act as exact ones during the
-run: the kinetic energy of their vertices, which may ring, is work of the pins.
+solvers of frames move them uniformly; the work on that way is then a source. Penalty pins that reach their targets in
+this first step act as exact ones during the run: the kinetic energy of their vertices, which may ring, is work of the
+pins.
 
 The terms are evaluated separately, so their sum tests them: it differs from the change of the energy by round-off.
 
