@@ -22,6 +22,7 @@ from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.time_loop import build_initial_state
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.jit.kernel_compilation import jit_kernel
+from springbench.solvers.model.barrier_energy import without_barriers
 from springbench.solvers.model.energies.spring_energy import ZERO_LENGTH, Springs
 from springbench.solvers.model.step_problem import Positions, StepStart, is_lagged
 
@@ -60,7 +61,7 @@ class OdeField:
             raise NotIntegrable("pins by penalty vibrate faster than can be followed; make them exact")
         if system.length_constraints:
             raise NotIntegrable("lengths that are exact make it no differential equation; give them a stiffness")
-        if without_vertex_contact(system) is not system:
+        if without_barriers(without_vertex_contact(system)) is not system:
             raise NotIntegrable("contact is stiff, and its friction begins anew each step; leave it out")
         x = Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
         arrays = x.edges, x.stiffness, x.rest_length, x.rest_direction

@@ -26,6 +26,7 @@ from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.barrier_energy import without_barriers
 from springbench.solvers.model.step_problem import Positions, StopRule, System
 
 LIMIT_INTEGRATORS = ("implicit-euler", "bdf2")
@@ -48,8 +49,8 @@ class NotConverged(UnpredictableMotion):
 
 
 def has_contact(system: System) -> bool:
-    """Return whether a system has contact."""
-    return without_vertex_contact(system) is not system
+    """Return whether a system has contact: with half-spaces, or by barriers with itself and with obstacles."""
+    return without_barriers(without_vertex_contact(system)) is not system
 
 
 @dataclass(frozen=True, slots=True, eq=False)

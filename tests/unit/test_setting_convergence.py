@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import replace
+from functools import partial
 from importlib.util import find_spec
 from math import inf
 from pathlib import Path
@@ -25,7 +26,7 @@ from springbench.harness.experiments.setting_convergence import (
     measure_change,
     study_convergence,
 )
-from springbench.harness.reference import self_converged_trajectory
+from springbench.harness.reference import reference_store, self_converged_trajectory
 from springbench.harness.reference.equations_of_motion import NotIntegrable
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.report.convergence_map import draw_convergence_map
@@ -237,9 +238,16 @@ def test_without_a_reference_settings_are_compared_with_the_finest(scene: Path, 
     assert "energy" not in found.describe_verdict()[1]
 
 
-def touching(scene: Path, monkeypatch: pytest.MonkeyPatch, disagreement: list[float]) -> SettingSimulator:
+FLOOR = "obstacles: [{kind: plane, point: [0, %s, 0]}]"
+HALF_SPACE = "{kind: contact, %s}" % (FLOOR % -9)  # noqa: UP031
+BARRIERS = "{kind: self-contact, min_distance: 0.01, friction: 0.3}, {kind: surface-contact, min_distance: 0.01, %s}"
+
+
+def touching(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, disagreement: list[float], effects: str = HALF_SPACE, solver="sparse"
+) -> SettingSimulator:
     """The chain above a floor, with a self-converged motion of this uncertainty at its six frames."""
-    contact = "{kind: contact, obstacles: [{kind: plane, point: [0, -9, 0]}]}]"
+    contact = f"{effects}]"
     scene.write_text(SCENE.replace("parts: [ends]}]", f"parts: [ends]}}, {contact}"))
     monkeypatch.setattr(self_converged_trajectory, "MAX_RELATIVE_ERROR", 2.0)  # two step sizes are enough
     load = ReferenceStore.load_self_converged
@@ -248,7 +256,22 @@ def touching(scene: Path, monkeypatch: pytest.MonkeyPatch, disagreement: list[fl
         "load_self_converged",
         lambda *given, **how: replace(load(*given, **{**how, "error": 2.0}), disagreement=np.array(disagreement)),
     )
-    return simulate(scene, "sparse")
+    return simulate(scene, solver)
+
+
+@pytest.mark.slow
+def test_barriers_are_contact_and_their_motion_is_compared(scene: Path, monkeypatch: pytest.MonkeyPatch):
+    """A rope that falls onto a floor a hundredth below it: the floor is felt, and the verdict states its reference."""
+    quick = partial(self_converged_trajectory.compute_self_converged, seconds=2.0)
+    monkeypatch.setattr(reference_store, "compute_self_converged", quick)
+    simulator = touching(scene, monkeypatch, [0.001] * 6, BARRIERS % (FLOOR % -0.03), "newton")
+    found = study_simulator(simulator, scene, [StepSetting(1, 10)], 0.05)
+    assert found.reference == "the self-converged motion (known to 0.1 %)"
+    given = found.find_result(StepSetting(1, 10))
+    assert not given.reason
+    assert 0.0 < given.error < 1.0
+    assert given.positions[:, :, 1].min() > -0.03
+    assert found.find_result(StepSetting(2, 20)).error < given.error
 
 
 @pytest.mark.slow

@@ -10,13 +10,13 @@ from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.execution.progress_display import ThrottledMessages
 from springbench.harness.experiments.error_control.step_doubling import estimate_by_step_doubling
+from springbench.harness.reference.self_converged_trajectory import has_contact
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.adaptive_stepping import AdaptiveImplicitStepper, Stepper
 from springbench.harness.simulation.fixed_stepping import FixedImplicitStepper
 from springbench.harness.simulation.substepping import AdaptiveSubstepper, FixedSubstepper
-from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.model.integrators import INTEGRATORS, RungeKutta, SingleStageIntegrator, find_integrator
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Unsupported
 from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info, is_minimiser, load_target
@@ -75,7 +75,7 @@ class ErrorTarget:
             raise InputError(mistakes)
         target = cls(scene, size, t_end, frames)
         system = target.build_scene(target.frame_seconds, "implicit-euler").system
-        if without_vertex_contact(system) is not system:
+        if has_contact(system):
             if print_message:
                 print_message(
                     "no error can be promised with contact; halving steps for "
