@@ -239,7 +239,7 @@ def test_without_a_reference_settings_are_compared_with_the_finest(scene: Path, 
 
 
 FLOOR = "obstacles: [{kind: plane, point: [0, %s, 0]}]"
-HALF_SPACE = "{kind: contact, %s}" % (FLOOR % -9)  # noqa: UP031
+HALF_SPACE = "{kind: contact, %s}" % (FLOOR % -9)
 BARRIERS = "{kind: self-contact, min_distance: 0.01, friction: 0.3}, {kind: surface-contact, min_distance: 0.01, %s}"
 
 
