@@ -52,14 +52,14 @@ def refused(place: tuple[str, int], security: Security | None) -> bool:
     bare = ssl.create_default_context()
     bare.check_hostname, bare.verify_mode = False, ssl.CERT_NONE
     context = security.get_connection_args("client")["ssl_context"] if security else bare
-    with socket.create_connection(place, timeout=10.0) as connection:
+    with socket.create_connection(place, timeout=60.0) as connection:
         try:
             with context.wrap_socket(connection, server_hostname="dask-internal") as talk:
                 talk.sendall(b"\0" * 64)
                 return not talk.recv(1)
         except OSError:
             pass
-    with socket.create_connection(place, timeout=10.0) as connection:
+    with socket.create_connection(place, timeout=60.0) as connection:
         connection.sendall(b"GET /health HTTP/1.0\r\n\r\n")
         try:
             return connection.recv(64).startswith((b"HTTP/1.1 404", b"HTTP/1.0 404")) or not connection.recv(1)
@@ -68,7 +68,7 @@ def refused(place: tuple[str, int], security: Security | None) -> bool:
 
 
 def test_no_client_without_the_certificate_reaches_a_cluster_of_this_machine():
-    with open_scheduler("local:1") as found, Client(found, timeout=60.0) as client:
+    with open_scheduler("local:1") as found, Client(found, timeout=300.0) as client:
         assert client.submit(os.getpid).result() != os.getpid()
         me = psutil.Process()
         there = [c for process in (me, *me.children(recursive=True)) for c in process.net_connections()]

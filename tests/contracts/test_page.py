@@ -13,6 +13,7 @@ from springbench.harness.report.site import update_page
 
 from tests import synthetic_accuracy_rows, synthetic_benchmarks, synthetic_results, synthetic_site_rows
 from tests.headless_browser import launch_chromium
+from tests.machine_load import shares_per_core
 from tests.synthetic_site_rows import build_run_columns, is_failing_run
 
 COUNT = 300
@@ -293,7 +294,7 @@ def test_it_is_ready_within_seconds(tmp_path: Path, browser: Any, count: int, go
     for view in ("overview", "runs"):
         # The least of three: others may have the processor for a while.
         seconds = min(tab.open(page, view).evaluate("performance.now() / 1000") for _ in range(3))
-        assert seconds < goal, f"{view}: {seconds:.2f} s"
+        assert seconds < goal * shares_per_core(), f"{view}: {seconds:.2f} s"
     assert tab.rows() == count
     tab.page.get_by_role("grid").focus()
     tab.page.keyboard.press("End")
