@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from pathlib import Path
 
+import pytest
 from springbench.harness.config.config_loader import load_config
 from springbench.solvers.iteration.solver_info import ENGINE_FAMILY
 from springbench.solvers.model.integrators import INTEGRATORS, SUBSTEPPING
@@ -36,3 +39,12 @@ def test_the_page_of_configs_counts_the_solvers_of_the_hard_cases():
     names = {run.solver.name for run in runs}
     words = f"by {WORDS[len(names & OURS)]} of the shipped solvers and {WORDS[len(names & ENGINES)]} outside engines"
     assert words in said("configs/README.md")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(Path(sys.prefix) != ROOT / ".venv", reason="another environment may hold anything")
+def test_the_first_page_states_the_size_of_the_environment():
+    """An environment with `dev` has its stated size, and 15 % are for other versions of libraries."""
+    (stated,) = re.findall(r"with `dev` ([0-9.]+) GB", (ROOT / "README.md").read_text())
+    taken = sum(path.lstat().st_blocks * 512 for path in Path(sys.prefix).rglob("*"))
+    assert taken / 2**30 == pytest.approx(float(stated), rel=0.15)
