@@ -6,6 +6,7 @@ import os
 import sys
 from io import TextIOWrapper
 
+from springbench.harness.console import show_activity
 from springbench.harness.execution import interrupts, pandas_deferral
 
 
@@ -14,7 +15,8 @@ def main() -> None:
     interrupts.install_handler()
     try:
         _prepare_environment()
-        _announce_start()
+        if len(sys.argv) > 1:
+            show_activity("loading")
         from springbench.harness.cli.main import main as run_command
 
         run_command()
@@ -44,13 +46,6 @@ def _prepare_environment() -> None:
             file=sys.stderr,
         )
         sys.exit(2)
-
-
-def _announce_start() -> None:
-    """Show on a terminal that the command is being loaded; its first line of output replaces the words."""
-    if len(sys.argv) > 1 and sys.stderr is not None and sys.stderr.isatty():
-        sys.stderr.write("loading ...\r")
-        sys.stderr.flush()
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ Rich is imported on first output, so that no command waits for it earlier.
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import TYPE_CHECKING
@@ -20,6 +21,10 @@ CONSOLE_WIDTH = 100
 """Maximum width of the project's own tables, in columns."""
 _PIPE_WIDTH = 240
 """Width of a pipe or a file, in columns. Neither has a width of its own, and no cell should be truncated there."""
+
+
+_ACTIVITY_WIDTH = 40
+"""Characters to which an activity is padded, so that nothing of an earlier one remains."""
 
 
 @cache
@@ -112,6 +117,13 @@ def print_message(line: str) -> None:
         emoji=False,
         soft_wrap=True,
     )
+
+
+def show_activity(words: str) -> None:
+    """Show on a terminal what is being done; the next line of output replaces the words."""
+    if sys.stderr is not None and sys.stderr.isatty():
+        sys.stderr.write(f"{words} ...".ljust(_ACTIVITY_WIDTH) + "\r")
+        sys.stderr.flush()
 
 
 def enable_logging() -> None:

@@ -48,7 +48,7 @@ from springbench.harness.cli.shared_options import (
     require_output_file,
 )
 from springbench.harness.config.cli_options import build_command_class
-from springbench.harness.console import get_error_console, get_output_console, split_wide_table
+from springbench.harness.console import get_error_console, get_output_console, show_activity, split_wide_table
 from springbench.harness.console import print_message as _say
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.optional_parts import RECORDINGS
@@ -253,11 +253,13 @@ def report(
     from springbench.harness.report.robustness_map import draw_robustness_maps
     from springbench.harness.report.site import update_page
 
+    show_activity("reading the rows")
     for picture, words in draw_device_speedups(results):
         for line in words:
             _say(line)
         if picture:
             _say(f"what a device saves is drawn in {picture}")
+    show_activity("writing the page")
     page = update_page(results, with_recordings=True, with_viewer=viewer, print_message=_say)
     for picture, cells in draw_robustness_maps(results, find_stale_runs_in_folder):
         get_output_console().print(split_wide_table(build_score_table(cells)))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.cli.shared_options import SCENE_HELP, ResultsOption, describe_config
-from springbench.harness.console import print_message
+from springbench.harness.console import print_message, show_activity
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 
 if TYPE_CHECKING:
@@ -78,6 +78,7 @@ def convergence(
     folder = claim_folder(results / f"convergence-{scene.stem}", scene)
     options = {"error": error, "time_limit": time_limit, "search_time": search_time}
     options["doublings"] = doublings or (1 if len(given) > 1 else 2)
+    show_activity("measuring")
     study = run_isolated(
         partial(_study_setting, spec, scene.stem, number, made, integrator, t_end, given, results, folder, options),
         spec.find_plugins(),

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from springbench.harness.console import print_message
+from springbench.harness.console import print_message, show_activity
 from springbench.harness.errors import InputError, InputMistake
 
 
@@ -41,6 +41,7 @@ def figure(
     from springbench.harness.experiments.stale_results import find_stale_runs
     from springbench.harness.report.figures.figure_maker import make_figure
 
+    show_activity("drawing")
     folder = output or results / "figures"
     made = make_figure(kind, found, results, lambda table: find_stale_runs(results, table), folder, wanted)
     across, up = made.size_mm

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from springbench.harness.cli.shared_options import SCENE_HELP, describe_config, require_output_file
-from springbench.harness.console import format_plain_table, get_output_console, print_message, split_wide_table
+from springbench.harness.console import (
+    format_plain_table,
+    get_output_console,
+    print_message,
+    show_activity,
+    split_wide_table,
+)
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.isolated_call import run_isolated
 
@@ -62,6 +68,7 @@ def grade(
     run = load_scene_run(scene, size)
     required = iterations or (ASSIGNMENT_ITERATIONS if is_assignment_file(scene) else None)
     request = GradeRequest(run.scene, run.size, required, first_frame, rest, array, budget)
+    show_activity("grading")
     work = partial(_grade_students if students else _grade_one, request, positions)
     lines, table, cells, is_good = run_isolated(
         work, run.scene.find_plugins(), TaskLimits(run.time_limit, run.memory_limit), print_message

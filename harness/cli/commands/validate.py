@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import count
 from pathlib import Path
+from time import monotonic
 from typing import Annotated, Any
 
 import typer
@@ -32,7 +34,15 @@ def validate(
             raise InputError(f"--case: came {name!r}; wanted {suggest_name(name, known)}")
     if output.exists() and not output.is_dir():
         raise InputError(f"--output: {output} is no folder; give the name of one")
-    rows = validate_solver(_create_solver(solver), case or known, lambda name: print_message(f"{name} ..."))
+    cases, began = case or known, monotonic()
+    total, numbers = len(cases), count()
+
+    def announce_case(name: str) -> None:
+        done = next(numbers)
+        left = f", {(monotonic() - began) * (total / done - 1.0):.0f} s left" if 2 * done >= total else ""
+        print_message(f"{name} ... ({done + 1} of {total}{left})")
+
+    rows = validate_solver(_create_solver(solver), cases, announce_case)
     _print_table(rows)
     output.mkdir(parents=True, exist_ok=True)
     for path in write_validation_page(rows, solver, output):
