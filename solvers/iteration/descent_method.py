@@ -11,12 +11,13 @@ the slope must decrease instead.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from springbench.solvers.iteration.idle_contact import IdleContactSolver
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.kernels.line_search_conditions import (
     ARMIJO_FRACTION,
@@ -26,7 +27,7 @@ from springbench.solvers.kernels.line_search_conditions import (
 from springbench.solvers.linalg.direct_solvers import DenseCholesky
 from springbench.solvers.linalg.solver_selection import build_linear_solver
 from springbench.solvers.model import system_matrix_assembly
-from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
@@ -201,6 +202,12 @@ class PreparedDescent(IterativeSolver):
     method: DescentMethod
     description: str
     stats: dict[str, float]
+
+    def skip_idle_contact(self) -> PreparedSolver:
+        """Return the method that ignores barrier energies where they vanish; itself without barrier energies."""
+        if not self.fixed_objective.has_barriers:
+            return self
+        return IdleContactSolver(self, replace(self, fixed_objective=self.fixed_objective.ignore_barriers()))
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""

@@ -17,7 +17,7 @@ from typing import Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.solvers.model.step_problem import Energy, Positions, System
+from springbench.solvers.model.step_problem import Energy, Positions, StepProblem, System
 
 
 class PairBlocks(Protocol):
@@ -120,3 +120,9 @@ def without_barriers(system: System) -> System:
     """Return the system without barrier energies; the system itself if it has none."""
     remaining = tuple(energy for energy in system.energies if not is_barrier_energy(energy))
     return system if len(remaining) == len(system.energies) else replace(system, energies=remaining)
+
+
+def ignore_barriers(problem: StepProblem) -> StepProblem:
+    """Return the problem without barrier energies; the problem itself if it has none."""
+    system = without_barriers(problem.system)
+    return problem if system is problem.system else replace(problem, system=system)

@@ -6,6 +6,7 @@ The degrees of freedom are the free vertices. The matrix of the Hessian is analy
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property, reduce
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from scipy.sparse import csr_array
 from springbench.solvers.kernels import objective_kernels, spring_hessian
 from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
 from springbench.solvers.model import system_matrix_assembly
+from springbench.solvers.model.barrier_energy import is_barrier_energy
 from springbench.solvers.model.energies.element_energies import ElementLaw, Elements
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Energy, ProjectiveEnergy, System, is_lagged
@@ -70,6 +72,17 @@ class FixedObjective:
         self.element_energy_indices = [k for k, e in rest.items() if hasattr(e, "element_law")]
         self.other_energy_indices = [k for k in rest if k not in self.element_energy_indices]
         self.projective_indices = {k for k, e in energies.items() if isinstance(e, ProjectiveEnergy)}
+
+    @property
+    def has_barriers(self) -> bool:
+        """Whether any energy is a barrier."""
+        return any(is_barrier_energy(self.system.energies[k]) for k in self.other_energy_indices)
+
+    def ignore_barriers(self) -> FixedObjective:
+        """Return the objective without barrier energies, for problems of the same system and with the same matrix."""
+        found, energies = copy(self), self.system.energies
+        found.other_energy_indices = [k for k in self.other_energy_indices if not is_barrier_energy(energies[k])]
+        return found
 
     @property
     def interpreted_energies(self) -> str:

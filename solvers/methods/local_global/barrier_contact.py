@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.descent_method import DescentPoint, backtracking_line_search
+from springbench.solvers.iteration.idle_contact import IdleContactSolver
 from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.methods.local_global.half_space_contact import (
     ContactCorrections,
@@ -41,7 +42,7 @@ _MAX_CG_ITERATIONS = 60
 """Maximum number of conjugate gradient iterations."""
 
 
-def prepare_with_barriers(solver: Solver, system: System) -> PreparedBarrierLocalGlobal:
+def prepare_with_barriers(solver: Solver, system: System) -> IdleContactSolver:
     """Prepare a local-global method with barrier contact.
 
     Args:
@@ -58,9 +59,10 @@ def prepare_with_barriers(solver: Solver, system: System) -> PreparedBarrierLoca
         )
     idle: Any = solver.prepare(without_barriers(system))
     base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base
-    return PreparedBarrierLocalGlobal(
+    found = PreparedBarrierLocalGlobal(
         replace(base, system=system), idle, FixedObjective(system), ContactCorrections(base)
     )
+    return IdleContactSolver(found, idle)
 
 
 @dataclass(frozen=True, eq=False)

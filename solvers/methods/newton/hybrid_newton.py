@@ -53,6 +53,7 @@ from springbench.solvers.iteration.descent_method import (
     inner_product,
     lower_start_positions,
 )
+from springbench.solvers.iteration.idle_contact import IdleContactSolver
 from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, init_rounds
@@ -78,8 +79,8 @@ from springbench.solvers.methods.newton.newton_direct import NewtonIteration
 from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, objective_decrease
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
 from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated
-from springbench.solvers.model.barrier_energy import without_barriers
-from springbench.solvers.model.step_problem import Positions, StepProblem, System
+from springbench.solvers.model.barrier_energy import ignore_barriers
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
@@ -121,7 +122,7 @@ class HybridNewton:
         cost="1 L-BFGS iteration or 1 Newton step",
     )
 
-    def prepare(self, system: System) -> PreparedHybrid:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
@@ -131,12 +132,17 @@ class HybridNewton:
         with cache_symbolic_analysis():
             metric, objective = ResidualMetric(system), FixedObjective(system)
             is_small = metric.stats.get("nnz_factor", np.inf) <= _CACHED_ENTRIES
-            lbfgs = Lbfgs(precision="float64" if is_small else "float32").prepare_with_factor(without_barriers(system))
+            lbfgs = Lbfgs(precision="float64" if is_small else "float32").prepare_without_barriers(system)
             method, factor = HybridIteration(objective, metric, lbfgs, is_small), objective.hessian_matrix.factor
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.description}"
         choice += objective.interpreted_energies
-        return PreparedHybrid(objective, metric, method, choice, facts)
+        found = PreparedHybrid(objective, metric, method, choice, facts)
+        if not objective.has_barriers:
+            return found
+        alone = objective.ignore_barriers()
+        method = HybridIteration(alone, metric, lbfgs, is_small)
+        return IdleContactSolver(found, replace(found, fixed_objective=alone, method=method))
 
 
 class PreparedHybrid(PreparedDescent):
@@ -154,7 +160,7 @@ class PreparedHybrid(PreparedDescent):
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)] at p (n, 3) [m]."""
         lbfgs = self.hybrid_iteration.exact_lbfgs
-        return lbfgs.residual_at(problem, p) if lbfgs else super().residual_at(problem, p)
+        return lbfgs.residual_at(ignore_barriers(problem), p) if lbfgs else super().residual_at(problem, p)
 
 
 @dataclass
@@ -283,7 +289,8 @@ class HybridIteration:
             objective.system.inertia_diagonal[objective.system.free_vertices], 3
         )
         self.factor = factor = objective.hessian_matrix.factor
-        is_exact = is_small and objective.system is without_vertex_contact(without_barriers(objective.system))
+        is_exact = is_small and not objective.has_barriers
+        is_exact = is_exact and objective.system is without_vertex_contact(objective.system)
         self.exact_lbfgs = lbfgs if is_exact else None
         constant, per_spring, per_entry = _LBFGS_NANOSECONDS
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
@@ -320,10 +327,7 @@ class HybridIteration:
 
     def start_lbfgs(self, step: StepObjective, p: Positions) -> AcceleratedState:
         """Start L-BFGS at p, without surface contact."""
-        problem = step.problem
-        if step.barrier_energies:
-            problem = replace(problem, system=without_barriers(problem.system))
-        return self._lbfgs.init_state(problem, p)
+        return self._lbfgs.init_state(ignore_barriers(step.problem), p)
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return whether the stationary point `at` is a minimum, as far as the method can determine."""

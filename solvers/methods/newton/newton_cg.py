@@ -100,7 +100,7 @@ class NewtonCG(PrecisionOptions):
         method = TruncatedNewtonIteration(metric, objective, self.preconditioner)
         return PreparedDescent(
             objective, metric, method, metric.description + objective.interpreted_energies, metric.stats
-        )
+        ).skip_idle_contact()
 
 
 class TruncatedNewtonIteration:

@@ -41,7 +41,7 @@ from springbench.solvers.methods.newton.hessian_regularisation import (
 )
 from springbench.solvers.methods.newton.negative_curvature import escape_saddle, is_positive_definite
 from springbench.solvers.model.barrier_energy import is_barrier_energy
-from springbench.solvers.model.step_problem import Positions, System, Unsupported
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
@@ -73,7 +73,7 @@ class NewtonSolver:
 
     indefinite_strategy: IndefiniteStrategy = "shift-schedule"
 
-    def prepare(self, system: System) -> PreparedDescent:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
@@ -96,7 +96,8 @@ class NewtonSolver:
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.description}"
         choice += objective.interpreted_energies
-        return PreparedDescent(objective, metric, NewtonIteration(metric, self.indefinite_strategy), choice, facts)
+        method = NewtonIteration(metric, self.indefinite_strategy)
+        return PreparedDescent(objective, metric, method, choice, facts).skip_idle_contact()
 
 
 class NewtonIteration:

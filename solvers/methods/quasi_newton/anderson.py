@@ -19,11 +19,10 @@ from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.acceleration_coefficients import ANDERSON_RULE
 from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme
 from springbench.solvers.methods.quasi_newton.windowed_acceleration import (
-    PreparedAccelerated,
     WindowedAcceleration,
     prepare_accelerated,
 )
-from springbench.solvers.model.step_problem import System
+from springbench.solvers.model.step_problem import PreparedSolver, System
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Anderson(WindowedAcceleration):
         cost="1 solve, 1 pass, dot products",
     )
 
-    def prepare(self, system: System) -> PreparedAccelerated:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:

@@ -26,8 +26,8 @@ from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.acceleration_coefficients import CHEBYSHEV_RULE
 from springbench.solvers.linalg.solver_selection import LinearSolverName, Precision
 from springbench.solvers.methods.local_global.accelerated_local_global import AccelerationScheme
-from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated, prepare_accelerated
-from springbench.solvers.model.step_problem import System
+from springbench.solvers.methods.quasi_newton.windowed_acceleration import prepare_accelerated
+from springbench.solvers.model.step_problem import PreparedSolver, System
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Chebyshev:
     linear_solver: LinearSolverName = "auto"
     precision: Precision = "float64"
 
-    def prepare(self, system: System) -> PreparedAccelerated:
+    def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:

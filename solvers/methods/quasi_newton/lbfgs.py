@@ -32,6 +32,7 @@ from springbench.solvers.methods.quasi_newton.windowed_acceleration import (
     PreparedAccelerated,
     WindowedAcceleration,
     prepare_accelerated,
+    prepare_without_barriers,
 )
 from springbench.solvers.model.barrier_energy import without_barriers
 from springbench.solvers.model.step_problem import (
@@ -103,7 +104,7 @@ class Lbfgs(WindowedAcceleration):
                 "touch; take preconditioner: cholesky"
             )
         if self.preconditioner == "cholesky":
-            return self.prepare_with_factor(system)
+            return prepare_accelerated(system, self._acceleration_scheme, self.linear_solver, self.precision)
         words, scheme, metric = (
             f"{self.jacobi_sweeps} sweeps of Jacobi",
             self._acceleration_scheme,
@@ -113,9 +114,9 @@ class Lbfgs(WindowedAcceleration):
         base = prepare_local_global(system, energies, lambda Q: (AggregatedSweeps(Q, self.jacobi_sweeps), words))
         return _PreparedLbfgsJacobi(base, metric, scheme, FixedObjective(system))
 
-    def prepare_with_factor(self, system: System) -> PreparedAccelerated:
-        """Prepare with the factor of Q; raises as `prepare` does."""
-        return prepare_accelerated(system, self._acceleration_scheme, self.linear_solver, self.precision)
+    def prepare_without_barriers(self, system: System) -> PreparedAccelerated:
+        """Prepare the method with the factor of Q that ignores barrier energies; raises as `prepare` does."""
+        return prepare_without_barriers(system, self._acceleration_scheme, self.linear_solver, self.precision)
 
     @property
     def _acceleration_scheme(self) -> AccelerationScheme:

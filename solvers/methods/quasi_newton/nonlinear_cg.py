@@ -17,7 +17,7 @@ holds for a step along d. Landing sheets took 340 to 2,600 iterations where L-BF
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -28,6 +28,7 @@ from springbench.solvers.iteration.descent_method import (
     backtracking_line_search,
     inner_product,
 )
+from springbench.solvers.iteration.idle_contact import IdleContactSolver
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.iteration.preconditioners import (
     PreconditionerBuilder,
@@ -81,8 +82,13 @@ class NonlinearCG:
             )
         metric, objective = ResidualMetric(system), FixedObjective(system)
         at = build_preconditioner(self.preconditioner, metric, objective, "pncg")
-        return PreparedNonlinearCG(
+        found = PreparedNonlinearCG(
             metric, objective, at, metric.description + objective.interpreted_energies, metric.stats
+        )
+        return (
+            IdleContactSolver(found, replace(found, fixed_objective=objective.ignore_barriers()))
+            if objective.has_barriers
+            else found
         )
 
 

@@ -22,7 +22,7 @@ from springbench.solvers.methods.local_global.accelerated_local_global import (
 )
 from springbench.solvers.methods.local_global.half_space_contact import ContactCorrections
 from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
-from springbench.solvers.model.step_problem import Positions, StepProblem, System
+from springbench.solvers.model.step_problem import Positions, StepProblem
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
@@ -34,10 +34,14 @@ class ContactEngine:
     """Acceleration engine with vertex contact; contact_free: the engine used while no contact is active."""
 
     def __init__(
-        self, scheme: AccelerationScheme, system: System, base: PreparedLocalGlobal, contact_free: AccelerationEngine
+        self,
+        scheme: AccelerationScheme,
+        objective: FixedObjective,
+        base: PreparedLocalGlobal,
+        contact_free: AccelerationEngine,
     ) -> None:
         self._scheme, self._base, self._contact_free = scheme, base, contact_free
-        self._objective, self._corrections = FixedObjective(system), ContactCorrections(base)
+        self._objective, self._corrections = objective, ContactCorrections(base)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Return the initial state of a step."""

@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
+from springbench.solvers.iteration.idle_contact import IdleContactSolver
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, compute_max_coordinate
 from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
@@ -47,7 +48,7 @@ from springbench.solvers.methods.local_global.prefactored import (
 )
 from springbench.solvers.methods.quasi_newton import accelerated_step
 from springbench.solvers.model.barrier_energy import without_barriers
-from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.spring_form import SpringForm
 from springbench.solvers.objective.step_objective import StepObjective
@@ -55,7 +56,7 @@ from springbench.solvers.objective.step_objective import StepObjective
 
 def prepare_accelerated(
     system: System, scheme: AccelerationScheme, linear: LinearSolverName, precision: Precision
-) -> PreparedAccelerated:
+) -> PreparedSolver:
     """Factorise Q and compile the iteration.
 
     Args:
@@ -68,22 +69,55 @@ def prepare_accelerated(
         Unsupported: for energies that the method does not support.
         NotPositiveDefinite: if the system leaves some positions undetermined.
     """
-    bare = without_vertex_contact(system)
+    alone = prepare_without_barriers(system, scheme, linear, precision)
+    if without_barriers(system) is system:
+        return alone
+    base = alone.local_global
+    base = replace(base, description=f"{base.description}; where pairs touch, iterations are interpreted")
+    engine = _build_interpreted_engine(scheme, FixedObjective(system), base)
+    return IdleContactSolver(PreparedAccelerated(base, engine), alone)
+
+
+def prepare_without_barriers(
+    system: System, scheme: AccelerationScheme, linear: LinearSolverName, precision: Precision
+) -> PreparedAccelerated:
+    """Prepare the method that ignores the system's barrier energies, as `prepare_accelerated` does."""
+    bare = without_barriers(without_vertex_contact(system))
     energies = (
-        require_projective(without_barriers(bare), scheme.name)
+        require_projective(bare, scheme.name)
         if scheme.needs_projective
         else [energy for energy in bare.energies if isinstance(energy, ProjectiveEnergy)]
     )
     base = prepare_local_global(bare, energies, lambda Q: build_linear_solver(Q, linear, precision))
     found = compile_iterations(base, use_corrections=True)
-    known = isinstance(found, PreparedCompiledLocalGlobal)
-    base = found.base if known else replace(base, description=f"{base.description}; {found}")
-    engine: AccelerationEngine = _CompiledEngine(scheme, found) if known else _InterpretedEngine(scheme, system, base)
-    if bare is not system:
-        from springbench.solvers.methods.quasi_newton.quasi_newton_contact import ContactEngine  # for those who need it
+    if not isinstance(found, PreparedCompiledLocalGlobal):
+        base = replace(base, description=f"{base.description}; {found}")
+        return PreparedAccelerated(
+            base, _build_interpreted_engine(scheme, FixedObjective(system).ignore_barriers(), base)
+        )
+    engine = _CompiledEngine(scheme, found)
+    if without_vertex_contact(system) is system:
+        return PreparedAccelerated(found.base, engine)
+    objective = FixedObjective(system).ignore_barriers()
+    return PreparedAccelerated(found.base, _add_vertex_contact(scheme, objective, found.base, engine))
 
-        engine = ContactEngine(scheme, system, base, engine)
-    return PreparedAccelerated(base, engine)
+
+def _build_interpreted_engine(
+    scheme: AccelerationScheme, objective: FixedObjective, base: PreparedLocalGlobal
+) -> AccelerationEngine:
+    """Build the interpreted iteration of an objective."""
+    engine = _InterpretedEngine(scheme, objective, base)
+    if without_vertex_contact(objective.system) is objective.system:
+        return engine
+    return _add_vertex_contact(scheme, objective, base, engine)
+
+
+def _add_vertex_contact(
+    scheme: AccelerationScheme, objective: FixedObjective, base: PreparedLocalGlobal, engine: AccelerationEngine
+) -> AccelerationEngine:
+    from springbench.solvers.methods.quasi_newton.quasi_newton_contact import ContactEngine  # for those who need it
+
+    return ContactEngine(scheme, objective, base, engine)
 
 
 @dataclass(frozen=True)
@@ -235,8 +269,8 @@ class _CompiledAccelerationState(AcceleratedState):
 class _InterpretedEngine:
     """Interpreted iteration for all energies and all factors."""
 
-    def __init__(self, scheme: AccelerationScheme, system: System, base: PreparedLocalGlobal) -> None:
-        self._acceleration_scheme, self._local_global, self._fixed_objective = scheme, base, FixedObjective(system)
+    def __init__(self, scheme: AccelerationScheme, objective: FixedObjective, base: PreparedLocalGlobal) -> None:
+        self._acceleration_scheme, self._local_global, self._fixed_objective = scheme, base, objective
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Start a solve from an initial guess (n, 3) [m]."""

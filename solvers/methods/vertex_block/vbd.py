@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from springbench.solvers.contact.half_space.vertex_contact import (
 )
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.device_interface import PrecisionOptions
+from springbench.solvers.iteration.idle_contact import IdleContactSolver
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
@@ -111,11 +112,11 @@ class VertexBlockDescent(PrecisionOptions):
             from springbench.solvers.methods.vertex_block.device_vbd import prepare_vbd  # imported only for a device
 
             return prepare_vbd(system, parts, made, self.spectral_radius, self.real_dtype)
-        gauge = cast("ContactFreeSolver", CompiledLocalGlobal().prepare(system))
+        gauge: Any = CompiledLocalGlobal().prepare(system)
         shares = ObjectiveWeights.from_packets(
             made.spring_packets, made.anchor_stiffness, made.row_of_vertex[system.pins.vertices[system.pins.exact_mask]]
         )
-        return PreparedVertexBlockDescent(
+        found = PreparedVertexBlockDescent(
             system,
             parts,
             vertex_elements.with_rows(made.row_of_vertex, n + 2),
@@ -128,6 +129,13 @@ class VertexBlockDescent(PrecisionOptions):
             made.majorant[made.row_of_vertex],
             gauge,
             f"vertices in {made.num_colours} colours; for the residual alone {gauge.description}",
+        )
+        return (
+            IdleContactSolver(
+                found, replace(found, system=without_barriers(system), residual_solver=gauge.contact_free)
+            )
+            if isinstance(gauge, IdleContactSolver)
+            else found
         )
 
 

@@ -1,0 +1,103 @@
+"""Solves without contact while nothing is near.
+
+A step with barrier energies is first solved by the method without them, with the same kernels as in a scene without
+contact. Its solution q is one of the step with contact too if barriers vanish at q and the straight path from the
+initial guess to q is free of collisions: there the gradient and the Hessian of barriers vanish as well. One certificate
+a step replaces those of all iterates. Otherwise, and if a barrier acts at the initial guess, the method with contact
+solves the step from the initial guess.
+
+The k-th iterate is that of the method without contact where its certificate holds, else that of the method with
+contact. It depends on the problem alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+from springbench.solvers.iteration.iterative_solver import IterativeSolver
+from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size
+from springbench.solvers.model.step_problem import Positions, Solution, StepProblem, StopRule
+
+
+@dataclass(frozen=True, eq=False)
+class IdleContactSolver:
+    """A method with barrier energies, prepared, that ignores them where they are certified to vanish.
+
+    Attributes:
+        with_contact: the method.
+        contact_free: the method without barrier energies; accepts the same problems.
+    """
+
+    with_contact: IterativeSolver
+    contact_free: IterativeSolver
+
+    @property
+    def description(self) -> str:
+        """Description of the method with contact."""
+        return self.with_contact.description
+
+    @property
+    def stats(self) -> dict[str, float]:
+        """Exact counts of the setup."""
+        return self.with_contact.stats
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """Yield the iterates; the next one may overwrite a yielded array."""
+        certificate, touching = _Certificate(problem), None
+        if not certificate.may_be_idle():
+            yield from self.with_contact.iterates(problem)
+        for count, p in enumerate(self.contact_free.iterates(problem)):
+            is_idle = certificate.is_idle_at(p)
+            if touching is None and not is_idle:
+                touching = islice(self.with_contact.iterates(problem), count, None)
+            following = next(touching) if touching else p
+            yield p if is_idle else following
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Iterate until `stop` terminates the solve, without contact if that is certified to make no difference."""
+        certificate = _Certificate(problem)
+        if certificate.may_be_idle():
+            found = self.contact_free.solve(problem, stop)
+            if certificate.is_idle_at(found.positions):
+                return found
+        return self.with_contact.solve(problem, stop)
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """Return the residual [J^(1/2)] at p (n, 3) [m], with contact."""
+        return self.with_contact.residual_at(problem, p)
+
+    def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """Build a function that returns `residual_at` for many positions of one step."""
+        return self.with_contact.build_residual(problem)
+
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """Return the phases of an iteration with contact."""
+        return self.with_contact.iteration_phases(problem)
+
+
+class _Certificate:
+    """The test whether contact makes no difference to a step."""
+
+    def __init__(self, problem: StepProblem) -> None:
+        self._problem = problem
+        self._energies: list[BarrierEnergy] = [energy for energy in problem.energies if is_barrier_energy(energy)]
+
+    def may_be_idle(self) -> bool:
+        """Return whether barriers vanish at the initial guess, and at the positions of the initial residual."""
+        guess, current = self._problem.initial_guess, self._problem.current_positions
+        return self._vanish_at(guess) and (current is guess or self._vanish_at(current))
+
+    def is_idle_at(self, p: Positions) -> bool:
+        """Return whether barriers vanish at p (n, 3) and the path from the initial guess is free of collisions."""
+        direction = p - self._problem.initial_guess
+        return (
+            bool(np.isfinite(direction).all())
+            and max_step_size(self._energies, self._problem.initial_guess, direction) == 1.0
+            and self._vanish_at(p)
+        )
+
+    def _vanish_at(self, p: Positions) -> bool:
+        return all(energy.value(p) == 0.0 for energy in self._energies)
