@@ -57,6 +57,8 @@ def intersection_free_guess(problem: StepProblem) -> StepProblem:
     guess = current
     if problem.initial_guess is not problem.current_positions:
         guess = problem.initial_guess if free(problem.initial_guess) else start
+    if current is problem.current_positions and guess is problem.initial_guess:
+        return problem
     return replace(problem, current_positions=current, initial_guess=guess)
 
 

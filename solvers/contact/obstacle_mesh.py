@@ -75,11 +75,8 @@ class ObstacleCollisionMesh:
     def compute_clearance_bounds(self, p: Positions, q: Positions, query: CollisionQuery) -> ClearanceBounds | None:
         """Return clearance bounds at q from one box around each side, or None."""
         n = len(self.stiffness)
-        return (
-            ClearanceBounds(query.inflation_radius, query.inflation_radius)
-            if aabb.are_aabbs_separated((0, n), (n, len(p)), p, q, query)
-            else None
-        )
+        clearance = aabb.compute_aabb_clearance((0, n), (n, len(p)), p, q, query)
+        return ClearanceBounds(clearance, clearance) if clearance else None
 
     def max_relative_displacement(self, p: Positions, q: Positions) -> float:
         """Return the largest relative displacement [m] of any two vertices."""

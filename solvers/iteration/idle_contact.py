@@ -15,11 +15,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
+from typing import Protocol
 
 import numpy as np
-from springbench.solvers.iteration.iterative_solver import IterativeSolver
 from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size
-from springbench.solvers.model.step_problem import Positions, Solution, StepProblem, StopRule
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, StepProblem, StopRule
+
+
+class ResidualSolver(PreparedSolver, Protocol):
+    """A prepared method that also builds residual functions."""
+
+    def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:
+        """Build a function that returns `residual_at` for many positions of one step."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +39,8 @@ class IdleContactSolver:
         contact_free: the method without barrier energies; accepts the same problems.
     """
 
-    with_contact: IterativeSolver
-    contact_free: IterativeSolver
+    with_contact: ResidualSolver
+    contact_free: PreparedSolver
 
     @property
     def description(self) -> str:

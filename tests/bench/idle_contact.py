@@ -1,18 +1,26 @@
 """What contact costs while nothing is near: steps of cloth with contact over steps without.
 
     python -m tests.bench.idle_contact [--sizes 33 64 128] [--solvers hybrid newton] [--scenes cloth flag]
+    python -m tests.bench.idle_contact --broad-phases [--sizes 33 64 128] [--scenes cloth flag]
 
 The swinging cloth and the flag are simulated to a relative residual of 1e-6: with self-contact, with surface contact to
 a plane 5 m below, and without. Both simulations advance one step each in turn on one thread, in several rounds. A cell
-is the ratio of the processor times of all steps after the first two, up to the first in which contact acts; of each step
-the least time of the rounds counts. The number of these steps follows.
+is the ratio of the processor times of all steps after the first two, up to the first in which contact acts. Of each
+step the least time of the rounds counts. The number of these steps follows.
+
+The second command compares ways to certify that a step with self-contact is free of collisions and ends without active
+pairs: affine clusters, the hierarchy of boxes, and a list of the pairs within a skin, which is made again where two
+vertices may have moved relative to each other by more than the skin. The best of several skins counts.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from time import thread_time
+from typing import NamedTuple
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -25,6 +33,13 @@ from springbench.harness.scenes.effects.self_contact_effect import SelfContactEf
 from springbench.harness.scenes.effects.surface_contact_effect import SurfaceContactEffect
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.contact import ccd
+from springbench.solvers.contact.ccd import MIN_GAP_FRACTION
+from springbench.solvers.contact.collisions import Candidates, pad_positions
+from springbench.solvers.contact.contact_potential import SelfContact
+from springbench.solvers.contact.geometry.aabb import CollisionQuery
+from springbench.solvers.contact.potentials.barrier import compute_distances
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
 from springbench.solvers.model.step_problem import Positions, StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
@@ -37,6 +52,8 @@ CONTACTS: dict[str, SceneEffect] = {
     ),
 }
 STOP, NUM_WARMUP_STEPS = StopRule(5000, 1e-6), 2
+SKIN_FACTORS, MAX_LIST_PAIRS = (2.0, 5.0, 10.0, 20.0, 40.0), 2_000_000
+"""Skins of lists, in activation distances."""
 
 
 def measure_step_ratio(
@@ -76,6 +93,76 @@ def measure_step_ratio(
     return with_contact / without, len(least), without / len(least)
 
 
+class BroadPhases(NamedTuple):
+    """Processor time [ms] of a step's certificate by method; skin [m]: that of the list, nan where none suffices."""
+
+    clusters: float
+    boxes: float
+    pair_list: float
+    skin: float
+
+
+def measure_broad_phases(cloth: str, size: int, frames: int) -> BroadPhases:
+    """Measure certificates of the steps of a motion without contact."""
+    spec = load_scene(SCENES / CLOTHS[cloth])
+    scene = build_scene(spec, size, log_warnings=False)
+    contact = spec.model_copy(update={"effects": (*spec.effects, CONTACTS["self-contact"])})
+    (mesh,) = (
+        energy.collision_mesh
+        for energy in build_scene(contact, size, log_warnings=False).system.energies
+        if isinstance(energy, SelfContact)
+    )
+    steps = simulate_scene(
+        scene, prepare(scene, HybridNewton()), StopRule(60, 1e-2), initial_guess="previous", frames=frames
+    )
+    path = [scene.mesh.rest_positions, *(step.positions.copy() for step in steps)]
+    pairs, limit = list(pairwise(path))[NUM_WARMUP_STEPS:], mesh.min_distance + mesh.dhat
+    query = CollisionQuery(1.5 * limit, mesh.min_distance, MIN_GAP_FRACTION)
+
+    def by_clusters(p: Positions, q: Positions) -> object:
+        return mesh.compute_clearance_bounds(p, q, query)
+
+    def by_boxes(p: Positions, q: Positions) -> object:
+        d = q - p - (q - p).mean(axis=0)
+        x, y, fast = pad_positions(p), pad_positions(p + d), float(np.linalg.norm(d, axis=1).max())
+        limits = CollisionQuery(limit, mesh.min_distance, MIN_GAP_FRACTION, 2.0 * fast)
+        return [certify(mesh.find_ccd_candidates(x, y, limits, edges), p, q) for edges in (False, True)]
+
+    def certify(near: Candidates, p: Positions, q: Positions) -> tuple[float, float]:
+        d = q - p - (q - p).mean(axis=0)
+        free = ccd.collision_free_step_size(near, pad_positions(p), pad_positions(d), 1.0, *ccd.allocate_ccd_scratch())
+        return free, float(compute_distances(near, q).min(initial=np.inf))
+
+    def by_list(skin: float) -> float:
+        """Return the time of a step [s], infinite where the skin is too small or has too many pairs."""
+        at, near, began = path[0], None, thread_time()
+        for p, q in pairs[:6]:
+            if near is None or max(_largest_relative_displacement(at, x) for x in (p, q)) > skin:
+                at, near = p, mesh.find_proximity_candidates(p, limit + skin)
+                if _largest_relative_displacement(at, q) > skin or len(near.vertices) > MAX_LIST_PAIRS:
+                    return np.inf
+            certify(near, p, q)
+        return (thread_time() - began) / len(pairs[:6])
+
+    for work in (by_clusters, by_boxes):  # compiled
+        work(*pairs[0])
+    took = [[_seconds(work, p, q) for p, q in pairs] for work in (by_clusters, by_boxes)]
+    best, skin = min((by_list(limit * factor), limit * factor) for factor in SKIN_FACTORS)
+    clusters, boxes = np.median(took, axis=1).tolist()
+    return BroadPhases(1e3 * clusters, 1e3 * boxes, 1e3 * best, skin if np.isfinite(best) else np.nan)
+
+
+def _seconds(work: Callable[[Positions, Positions], object], p: Positions, q: Positions) -> float:
+    began = thread_time()
+    work(p, q)
+    return thread_time() - began
+
+
+def _largest_relative_displacement(p: Positions, q: Positions) -> float:
+    d = q - p
+    return 2.0 * float(np.linalg.norm(d - d.mean(axis=0), axis=1).max())
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -85,8 +172,19 @@ def main() -> None:
     parser.add_argument("--contacts", nargs="+", choices=CONTACTS, default=list(CONTACTS))
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--broad-phases", action="store_true")
     options = parser.parse_args()
-    table = Table("scene", "a side", "solver", "step without [ms]", *options.contacts, box=SIMPLE_HEAD)
+    if options.broad_phases:
+        table = Table("scene", "a side", "clusters", "boxes", "list", "skin", box=SIMPLE_HEAD)
+        table.title = f"certificate of a step with self-contact, in ms; {describe_machine().cpu}"
+        with limit_threads(1):
+            for cloth in options.scenes:
+                for size in options.sizes:
+                    found = measure_broad_phases(cloth, size, options.frames)
+                    table.add_row(cloth, str(size), *(f"{x:.3g}" for x in found))
+        Console(width=120).print(table)
+        return
+    table = Table("scene", "a side", "solver", "step without, ms", *options.contacts, box=SIMPLE_HEAD)
     table.title = f"a step with contact that is idle over one without; {describe_machine().cpu}"
     with limit_threads(1):
         for cloth in options.scenes:

@@ -32,9 +32,10 @@ from springbench.harness.simulation.time_loop import (
     simulate_scene,
 )
 from springbench.solvers.contact.contact_potential import SelfContact as Energy
+from springbench.solvers.iteration.idle_contact import _Certificate
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model import integrators
-from springbench.solvers.model.step_problem import StopRule, Unsupported
+from springbench.solvers.model.step_problem import StepProblem, StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.oracles.verify_scene import verify_terms
@@ -44,6 +45,7 @@ SOON = ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "anderson")
 """Those that are near a minimum within some hundred iterations."""
 TAKE = (*SOON, "chebyshev", "sparse", "numba")
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+is_idle_at = _Certificate.is_idle_at
 THICKNESS = 0.01
 APART = SelfContactEffect(min_distance=THICKNESS)
 
@@ -134,8 +136,10 @@ def test_sheets_that_all_but_touch_fall_as_one(name):
     assert all(step.solution.termination_reason == "converged" for step in steps)
 
 
-@pytest.mark.parametrize("name", ["newton", "hybrid", "sparse", "numba", "vbd"])
-def test_where_nothing_is_near_the_motion_is_that_without(name):
+@pytest.mark.parametrize("name", TAKE)
+def test_where_nothing_is_near_the_motion_is_that_without(name, monkeypatch):
+    calls = []
+    monkeypatch.setattr(_Certificate, "is_idle_at", lambda *given: calls.append(given) or is_idle_at(*given))
     runs = []
     for effects in ((), (SelfContactEffect(min_distance=1e-4),)):
         pins = PinsEffect(parts=("top_corners",))
@@ -147,6 +151,42 @@ def test_where_nothing_is_near_the_motion_is_that_without(name):
         )
         runs.append([step.positions for step in steps])
     np.testing.assert_array_equal(*runs)
+    assert len(calls) == 3  # one certificate a step
+
+
+@functools.cache
+def first_touch() -> tuple[Scene, StepProblem]:
+    """The first step that begins without and ends with active pairs."""
+    made = upside_down(APART)
+    (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
+    for step in simulate_scene(
+        made, prepare(made, NewtonSolver()), StopRule(60, 1e-3), initial_guess="previous", frames=14
+    ):
+        if energy.value(step.positions) > 0.0:
+            return made, step.problem
+    raise AssertionError("nothing touches")
+
+
+@pytest.mark.parametrize("name", TAKE)
+def test_a_solve_of_the_first_touch_ends_at_exactly_the_iterate_of_its_number(name):
+    made, stated = first_touch()
+    prepared = prepare(made, solver(name))
+    path = [p.copy() for p in islice(prepared.iterates(stated), 6)]
+    for count in (1, 3, 6):
+        np.testing.assert_array_equal(prepared.solve(stated, StopRule(count)).positions, path[count - 1])
+
+
+def test_an_iterate_without_contact_counts_only_where_its_path_is_free():
+    made, stated = first_touch()
+    certificate = _Certificate(stated)
+    p, (energy,) = stated.initial_guess, (e for e in made.system.energies if isinstance(e, Energy))
+    beyond = p.copy()
+    beyond[:, 1] = -1.0 - p[:, 1]  # what is on one side of a plane comes to the other, through itself
+    assert certificate.may_be_idle()
+    assert certificate.is_idle_at(p + 1e-6)
+    assert energy.value(beyond) == 0.0
+    assert not certificate.is_idle_at(beyond)
+    assert not certificate.is_idle_at(np.full_like(p, np.nan))
 
 
 def test_two_free_sheets_that_collide_keep_their_momentum():

@@ -37,7 +37,9 @@ from springbench.harness.simulation.time_loop import (
     prepare,
     simulate_scene,
 )
+from springbench.solvers.contact.ccd import MIN_GAP_FRACTION
 from springbench.solvers.contact.contact_potential import ObstacleContact
+from springbench.solvers.contact.geometry.aabb import CollisionQuery, compute_aabb_clearance
 from springbench.solvers.contact.obstacle_advancement import NoClearance
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.integrators import Motion
@@ -197,6 +199,19 @@ def test_frames_of_another_mesh_are_refused(tmp_path):
     for given, words in ((frames, "came 5 points for a mesh of"), ({"positions": [[[0, 0, 0]]]}, "came 1 points")):
         with pytest.raises(ValidationError, match=words):
             draped(BALL.model_dump() | {"mesh": {"kind": "balloon"}, "frames": given})
+
+
+def test_clearance_of_an_obstacle_far_away_is_nearly_its_distance_and_never_more():
+    rng, query = np.random.default_rng(0), CollisionQuery(0.05, 0.01, MIN_GAP_FRACTION)
+    for k in range(20):
+        p = rng.uniform(size=(40, 3))
+        p[20:, 1] -= rng.uniform(0.9, 6.0)
+        q = p + 0.1 * rng.normal(size=p.shape) * (k % 2)
+        found = compute_aabb_clearance((0, 20), (20, 40), p, q, query)
+        distance = float(np.linalg.norm(q[:20, None] - q[None, 20:], axis=2).min())
+        assert found == 0.0 or query.inflation_radius <= found <= distance
+        assert found > 0.0 or distance < 1.0
+    assert compute_aabb_clearance((0, 20), (20, 40), p, p + np.eye(3)[1] * (p[:, 1:2] < 0.0) * 9.0, query) == 0.0
 
 
 def test_what_is_squeezed_between_obstacles_is_said():

@@ -74,10 +74,10 @@ def store_aabbs(low, high, boxes, node):
         store_packet(high[axis], boxes, _NODE_STRIDE * node + 24 + 8 * axis)
 
 
-def are_aabbs_separated(
+def compute_aabb_clearance(
     one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positions, query: CollisionQuery
-) -> bool:
-    """Return whether the boxes of two vertex ranges prove that no limit is violated.
+) -> float:
+    """Return the distance [m] of the boxes of two vertex ranges at q, if they prove that no limit is violated.
 
     Args:
         one: first and last vertex of one range.
@@ -85,20 +85,25 @@ def are_aabbs_separated(
         p: start positions (n, 3) [m] of the linear motion.
         q: end positions (n, 3) [m].
         query: limits of the distances.
+
+    Returns:
+        Lower bound of the distances at q, at least the inflation radius; 0 without a proof.
     """
     low, high = np.empty((2, 2, 3)), np.empty((2, 2, 3))
     for k, x in enumerate((p, q)):
         for j, (first, last) in enumerate((one, other)):
             compute_vertex_aabb(x, first, last, low[k, j], high[k, j])
+    apart = np.maximum(low[1, 0] - high[1, 1], low[1, 1] - high[1, 0])
+    clearance = float(np.linalg.norm(np.maximum(apart, 0.0)))
     begin, end = low.min(axis=0), high.max(axis=0)
     if max(float((begin[0] - end[1]).max()), float((begin[1] - end[0]).max())) > query.inflation_radius:
-        return True  # no way leads so near, and what no way leads to bounds no step
+        return clearance  # no way leads so near, and what no way leads to bounds no step
     wide = float(np.linalg.norm(high[0].max(axis=0) - low[0].min(axis=0)))
     wide = min(
         max(query.inflation_radius, query.min_distance + query.relative_min_distance * wide), max_inflation(query)
     )
     gap = np.array([low[:, 0] - high[:, 1], low[:, 1] - high[:, 0]])
-    return bool((gap > wide).all(axis=1).any())
+    return clearance if (gap > wide).all(axis=1).any() else 0.0
 
 
 @jit_kernel
