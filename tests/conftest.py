@@ -17,6 +17,9 @@ from springbench.harness.atomic_files import user_cache_dir
 
 from tests import slow_tests
 
+# Two processes run tests on two cores: threads of OpenBLAS in each would spin while they wait for one another.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # A test with a cache folder of its own does not compile all kernels for it.
 os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache_dir("kernels")))
 
