@@ -212,7 +212,7 @@ def _build_mesh(spec: SceneSpec, size: int) -> Mesh:
         return spec.mesh.build_mesh(size)
     plugin, _ = spec.plugins["mesh"]
     try:
-        with scene_plugins.attribute_errors(plugin, "generate"):
+        with scene_plugins.attribute_errors(plugin, "generate_mesh"):
             made: Any = spec.mesh.build_mesh(size)
         return scene_plugins.check_plugin_mesh(plugin, made)
     except InputError as error:

@@ -244,6 +244,19 @@ def test_a_file_next_to_the_config_travels_between_processes(plugin_folder: Path
     assert completed.stdout.rstrip().endswith(run.build_identity())
 
 
+RAISES = {
+    "generate_mesh": ('"cord"\n', '"cord"\n\n    def generate_mesh(self, size):\n        return {}[3]\n'),
+    "build_contribution": ("        return EffectContribution(", "        {}[3]; return EffectContribution("),
+}
+
+
+@pytest.mark.parametrize("method", RAISES)
+def test_a_method_that_raises_is_named_with_its_line(method: str, plugin_folder: Path):
+    (plugin_folder / "mine.py").write_text(CODE.replace(*RAISES[method]))
+    with pytest.raises(InputError, match=rf"scene\.yaml:.*`{method}` raised KeyError: 3 \(mine\.py:\d+\)"):
+        load_config(configs(plugin_folder, WAYS["beside"]))
+
+
 WEIGHTED = """
 from dataclasses import dataclass, field
 
