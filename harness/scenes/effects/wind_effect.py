@@ -119,28 +119,16 @@ def _triangle_wind(wind: WindEffect, mesh: Mesh, mass: NDArray[np.float64], dt: 
     if not wind.air_density or not (wind.drag_coefficient or wind.lift_coefficient):
         return ()
     limit = _lump_triangle_masses(mesh, mass) / dt
+    coefficients = np.array([0.5 * wind.air_density, wind.drag_coefficient, wind.lift_coefficient])
 
     def force(p: Positions, v: Positions, t: float) -> Positions:
-        a, b, c = (p[corner] for corner in triangles.T)
-        u = field((a + b + c) / 3.0, t) - v[triangles].mean(axis=1)
-        area = 0.5 * np.cross(b - a, c - a)  # times the normal
-        speed = np.linalg.norm(u, axis=1)
-        wide = np.einsum("ij,ij->i", area, u)  # the area that faces the air, times the speed
-        ahead = np.divide(u, speed[:, None], out=np.zeros_like(u), where=speed[:, None] > 0.0)
-        size = np.linalg.norm(area, axis=1)[:, None]
-        normal = np.sign(wide)[:, None] * np.divide(area, size, out=np.zeros_like(area), where=size > 0.0)
-        across = normal - np.einsum("ij,ij->i", normal, ahead)[:, None] * ahead
-        f = (
-            0.5
-            * wind.air_density
-            * (np.abs(wide) * speed)[:, None]
-            * (wind.drag_coefficient * ahead + wind.lift_coefficient * across)
-        )
-        most, wanted_force = limit * speed, np.linalg.norm(f, axis=1)
-        f *= np.divide(most, wanted_force, out=np.ones_like(wanted_force), where=wanted_force > most)[:, None]
-        out = np.zeros_like(p)
-        for corner in triangles.T:
-            np.add.at(out, corner, f / 3.0)
+        from springbench.solvers.kernels import wind_forces  # for scenes with wind
+
+        p, v = np.ascontiguousarray(p), np.ascontiguousarray(v)
+        centres, scratch, out = np.empty((len(triangles), 3)), np.empty((len(triangles), 3)), np.empty_like(p)
+        wind_forces.compute_triangle_centres(p, triangles, centres)
+        air = np.ascontiguousarray(np.broadcast_to(field(centres, t), centres.shape))
+        wind_forces.compute_triangle_wind(p, v, triangles, air, limit, coefficients, scratch, out)
         return out
 
     return (force,)
@@ -169,8 +157,9 @@ def _gust_field(wind: WindEffect, mesh: Mesh) -> WindField:
     carried = mean / size**2 if wind.acts_on == "triangle" else mean / size / (mesh.bounding_box_diagonal or 1.0)
 
     def field(x: Positions, t: float) -> Positions:
-        late = (t - x @ carried)[:, None]
-        return mean + height * sum(np.cos(w * late + phi) for w, phi in zip(turns, phase, strict=True))
+        from springbench.solvers.kernels.wind_forces import evaluate_gusts  # for scenes with gusts
+
+        return evaluate_gusts(t - x @ carried, turns, phase, mean, height)
 
     return field if size else _constant_field(wind, mesh)
 
