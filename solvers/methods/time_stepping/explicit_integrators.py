@@ -11,6 +11,7 @@ eigenvalue of M^-1 A'KA, the value for springs at their largest stiffness.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import ceil
 from typing import ClassVar
 
@@ -294,6 +295,23 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
         """Description of the chosen substeps."""
         return self.substep_choice.description
 
+    @cached_property
+    def _inverse_mass_rows(self) -> NDArray[np.float64]:
+        """1/m [1/kg] in rows of four, 0 for pinned vertices."""
+        s = self.system
+        return _expand_to_rows(np.divide(1.0, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask))
+
+    @cached_property
+    def _drag_rate_rows(self) -> NDArray[np.float64]:
+        return _expand_to_rows(self.explicit_forces.drag_rate)
+
+    @cached_property
+    def _kick_factors(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Decay and gain of the velocities by the kicks of a substep."""
+        assert isinstance(self.method, SplittingMethod)
+        h = self.system.time_step / self.substep_choice.num_substeps
+        return integrate_drag(self.method.kicks, h, self._drag_rate_rows)
+
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve whose only iteration is the whole step."""
         return SingleIterateState(*self.step(problem)[:2])
@@ -313,7 +331,6 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
         p, v = pad_rows(start.positions, pad_far=True), pad_rows(start.velocity)
         v.reshape(-1, 4)[pins] = 0.0
         force = pad_rows(problem.external_force + self.explicit_forces.constant_force)
-        inverse = _expand_to_rows(np.divide(1.0, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask))
         right, x = (
             self.explicit_forces.spring_packets.build_right_hand_side(np.zeros(s.num_vertices + 2), force),
             self.explicit_forces,
@@ -324,8 +341,8 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
             x.form_pairs,
             x.form_weight,
             x.form_vertex_weight,
-            inverse,
-            _expand_to_rows(x.drag_rate),
+            self._inverse_mass_rows,
+            self._drag_rate_rows,
             pins.copy(),
             begin,
             end,
@@ -345,8 +362,7 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
     ) -> None:
         count = self.substep_choice.num_substeps
         h = self.system.time_step / count
-        velocity_factor, gained = integrate_drag(method.kicks, h, forces.drag_rate)
-        run_splitting(forces, method.drifts, velocity_factor, gained, count, h, p, v, np.zeros_like(v))
+        run_splitting(forces, method.drifts, *self._kick_factors, count, h, p, v, np.zeros_like(v))
 
     def _integrate(
         self,
