@@ -193,4 +193,11 @@ MEASURING = (
         "np.ascontiguousarray(unit * replay.positions[0].astype(np.float64), np.float32)",
         (_PICTURES,),
     ),
+    Mutation(
+        "processor-time-not-compared",
+        "harness/simulation/stopwatch.py",
+        "            or self.thread_seconds - total > self.max_difference\n",
+        "",
+        (_UNIT_CLOCK,),
+    ),
 )

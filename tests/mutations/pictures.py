@@ -10,6 +10,7 @@ _RECORDINGS, _READ_BACK, _DRAWN, _LAYOUT = (
     "tests/unit/test_report_pictures.py",
     "tests/unit/test_record_layout.py",
 )
+_SCALES = "tests/unit/test_picture_layout.py"
 
 PICTURES = (
     Mutation(
@@ -96,5 +97,40 @@ PICTURES = (
         'play_state="playing"',
         'play_state="following"',
         (_LAYOUT,),
+    ),
+    Mutation(
+        "scale-of-runaway",
+        "harness/report/drawable_frames.py",
+        "framed = near[replay.springs].all(axis=1)",
+        "framed = near[replay.springs].any(axis=1)",
+        (_SCALES,),
+    ),
+    Mutation(
+        "recorded-scale-of-runaway",
+        "harness/recording/strain_shading.py",
+        "framed = near[springs].all(axis=1)",
+        "framed = near[springs].any(axis=1)",
+        (_SCALES,),
+    ),
+    Mutation(
+        "scale-of-diverged-iterates",
+        "harness/report/site/mesh_scripts.py",
+        "np.quantile(known, 0.99)",
+        "known.max()",
+        (_SCALES,),
+    ),
+    Mutation(
+        "self-contact-inverted",
+        "harness/recording/rerun_recorder.py",
+        "= info.has_self_contact",
+        "= not info.has_self_contact",
+        (_RECORDINGS,),
+    ),
+    Mutation(
+        "caption-cut-at-its-notes",
+        "harness/report/gallery_sheet.py",
+        'shown = [*effects[:count], *(["…"] if count < len(effects) else []), *notes]',
+        "shown = [*effects, *notes]",
+        (f"{_DRAWN}::test_every_picture_of_a_surface_says_that_nothing_keeps_it_apart",),
     ),
 )
