@@ -9,7 +9,7 @@ import re
 import shlex
 import shutil
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pytest
 from springbench.harness.cli.main import app
@@ -43,6 +43,29 @@ def test_there_are_commands_in_the_pages():
     assert len(COMMANDS) > 60
 
 
+def options_of(found: Any) -> set[str]:
+    return {
+        option
+        for parameter in found.get_params(found.context_class(found))
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
+
+
+def test_a_command_in_a_message_exists_with_its_options():
+    """What stands in the braces of a message is left out."""
+    seen = set[str]()
+    for path in [*(ROOT / "harness").rglob("*.py"), *(ROOT / "solvers").rglob("*.py")]:
+        text = re.sub(r"\{[^{}]*\}", "X", path.read_text())
+        for marked, name, rest in re.findall(r"(`?)springbench ([a-z][a-z-]*)\b([^`\n;]*)", text):
+            assert not marked or name in GROUP.commands, f"{path}: springbench {name}"
+            if name in GROUP.commands:
+                seen.add(name)
+                assert set(re.findall(r"(?<!\S)--[a-z-]+", rest)) <= options_of(GROUP.commands[name]), (
+                    f"{path}: springbench {name}{rest}"
+                )
+    assert len(seen) > 15
+
+
 @pytest.mark.parametrize(("page", "command"), COMMANDS, ids=lambda value: getattr(value, "name", value))
 def test_a_command_of_a_page_has_its_options_and_its_files(page: Path, command: str):
     name, *arguments = shlex.split(command.replace("[", "").replace("]", ""))
@@ -50,12 +73,7 @@ def test_a_command_of_a_page_has_its_options_and_its_files(page: Path, command: 
     if isinstance(found, TyperGroup):
         name, *arguments = arguments
         found = found.commands[name]
-    options = {
-        option
-        for parameter in found.get_params(found.context_class(found))
-        for option in (*parameter.opts, *parameter.secondary_opts)
-    }
-    assert {word for word in arguments if word.startswith("-") and word != "-"} <= options
+    assert {word for word in arguments if word.startswith("-") and word != "-"} <= options_of(found)
     for word in arguments:
         if word.startswith("configs/") and "{" not in word:
             assert (ROOT / word).is_file()
