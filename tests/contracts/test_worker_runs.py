@@ -187,6 +187,18 @@ def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_mea
     assert len([*(tmp_path / "r").rglob("*.parquet")]) == 2
 
 
+def test_the_plot_of_times_has_the_name_of_its_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from springbench.harness.report import timing_plot
+
+    def write_title(table: Any, path: Path, title: str, *_: Any) -> None:
+        (tmp_path / "title.txt").write_text(title)
+
+    monkeypatch.setattr(timing_plot, "draw_timing_plot", write_title)  # also where it draws, a fork of this process
+    made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, max_iterations: 5")
+    assert (result := ran(made)).exit_code == 0, result.output
+    assert (tmp_path / "title.txt").read_text() == "sweep"
+
+
 def leave(*_: Any, **__: Any) -> None:
     """End the process."""
     os._exit(3)
