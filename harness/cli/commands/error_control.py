@@ -166,7 +166,7 @@ def _execute_error_control(
         *(_build_third_party_rows(row, error_target, error, answer, print_message) if compare_third_party else ()),
     ]
     shared = {name: row[name] for name in (*_SHARED_COLUMNS, "problem_digest")} | build_provenance_columns()
-    found += [shared | way for way in build_trial_rows(answer, before, error)]
+    found += [shared | trial_row for trial_row in build_trial_rows(answer, before, error)]
     parquet_rows.write_rows(
         folder / "accuracy" / f"{label}.parquet", [one | {"unit_id": label} for one in found], ACCURACY_SCHEMA
     )

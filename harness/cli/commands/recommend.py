@@ -84,8 +84,8 @@ def recommend(
     get_output_console().print(split_wide_table(table))
     print_message(found.verdict)
     points = [
-        CandidatePoint(way.work_spec.solver.name, way.error, way.seconds_per_simulated_second, str(way))
-        for way in found.measured_methods
+        CandidatePoint(method.work_spec.solver.name, method.error, method.seconds_per_simulated_second, str(method))
+        for method in found.measured_methods
     ]
     aim = f"Ways to an error of {100 * error:g} %" if error else f"Ways to spend {budget} a frame"
     title = f"{aim}: {scene.stem} {found.best_method.work_spec.case.size or ''}".rstrip()

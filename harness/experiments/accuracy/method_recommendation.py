@@ -529,7 +529,7 @@ def _read_measured_methods(
 
     Returns the methods that have an error, cheapest first, and the rows of those that have none.
     """
-    here, ways, without = machine_info.describe_machine().machine_id, list[MeasuredMethod](), list[dict[str, Any]]()
+    here, methods, without = machine_info.describe_machine().machine_id, list[MeasuredMethod](), list[dict[str, Any]]()
     units = (
         unit
         for folder in row_store.find_row_folders(results, "accuracy", "*/")
@@ -541,10 +541,10 @@ def _read_measured_methods(
         if path.stem != spec.build_file_stem() or row["machine_id"] != here or row["t_end"] != t_end:
             continue  # the scene was another then, or the machine, or the question
         if is_measured(row):
-            ways.append(_build_measured_method(spec, row, reference_error))
+            methods.append(_build_measured_method(spec, row, reference_error))
         else:
             without.append(row)
-    return sorted(ways, key=lambda way: way.seconds_per_simulated_second), without
+    return sorted(methods, key=lambda method: method.seconds_per_simulated_second), without
 
 
 def _build_work_spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from springbench.harness.config.config_loader import find_scene_mistakes
 from springbench.harness.config.sweep_config import SolverSpec
@@ -172,12 +173,12 @@ def prepare_candidate_methods(
     pairs, remark = list(candidates or list_candidate_methods()), ThrottledMessages(print_message)
     for number, (integrator, solver) in enumerate(pairs):
         remark(f"  {number} of {len(pairs)} methods are prepared")
-        way = Method(integrator, solver.name, _build_stepper(error_target, integrator, solver))
+        method = Method(integrator, solver.name, _build_stepper(error_target, integrator, solver))
         try:
             _warm_up(error_target, integrator, solver)
-            found.append(way)
+            found.append(method)
         except (Unsupported, NotPositiveDefinite) as error:
-            reasons.append(f"{way}: {str(error).removeprefix(f'{solver.name}: ')}")
+            reasons.append(f"{method}: {str(error).removeprefix(f'{solver.name}: ')}")
             print_message(f"  not by {reasons[-1]}")
     if not found:
         raise RunFailed(f"no method that keeps to an error knows this scene: {'; '.join(reasons)}")
@@ -198,8 +199,11 @@ def _build_stepper(
             if even
             else AdaptiveSubstepper(scene, made, frames)
         )
-    way = AdaptiveImplicitStepper if isinstance(find_integrator(integrator), RungeKutta) else FixedImplicitStepper
-    return way(lambda h: error_target.build_scene(h, integrator), made, error_target.frame_seconds * frames, frames)
+    stepper_class = (
+        AdaptiveImplicitStepper if isinstance(find_integrator(integrator), RungeKutta) else FixedImplicitStepper
+    )
+    build_scene = partial(error_target.build_scene, integrator=integrator)
+    return stepper_class(build_scene, made, error_target.frame_seconds * frames, frames)
 
 
 def _warm_up(error_target: ErrorTarget, integrator: str, solver: SolverSpec) -> None:

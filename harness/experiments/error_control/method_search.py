@@ -264,9 +264,9 @@ class _MethodSearch:
         found, stuck, limit = list[Trial](), list[StepSizeUnderflow](), _INITIAL_TIME_LIMIT
         while methods and not found:
             late = list[tuple[Method, float]]()
-            for way in methods:
+            for method in methods:
                 try:
-                    found.append(self._run_trial(way, way.stepper.initial_setting(step_atol), limit))
+                    found.append(self._run_trial(method, method.stepper.initial_setting(step_atol), limit))
                     comparable = [one for one in found if not one.method.stepper.has_fixed_step]
                     if comparable:
                         cheapest = min(one.trajectory.cpu_seconds for one in comparable)
@@ -274,10 +274,10 @@ class _MethodSearch:
                 except StepSizeUnderflow as error:
                     stuck.append(error)
                 except TimeBudgetExceeded:
-                    late.append((way, limit))
-            methods, limit = [way for way, _ in late], _TIME_LIMIT_GROWTH * limit
-            for way, given in late if found else ():
-                self._print_message(f"  {way}: given up after {given:.3g} s, for it is slower than others")
+                    late.append((method, limit))
+            methods, limit = [method for method, _ in late], _TIME_LIMIT_GROWTH * limit
+            for method, given in late if found else ():
+                self._print_message(f"  {method}: given up after {given:.3g} s, for it is slower than others")
         if not found:
             raise stuck[0]
         return found
