@@ -34,7 +34,7 @@ FIGURE_SOURCES: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "winners": ("", made.write_winner_results),
     "profiles": ("performance:1e-3", made.write_accuracy_results),
     "growth": ("net:previous", made.write_accuracy_results),
-    "liu2013": ("figure-2", made.write_accuracy_results),
+    "liu2013": ("figure-2:iterations", made.write_accuracy_results),
     "timing": ("step", made.write_sweep_results),
     "hard": ("map", made.write_sweep_results),
     "ablation": ("", made.write_ablation_results),

@@ -212,7 +212,7 @@ def accuracy(
     from springbench.harness.config.accuracy_loader import load_accuracy
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.accuracy.accuracy_study import list_failed_units, run_accuracy_study
-    from springbench.harness.report.accuracy import draw_accuracy_report
+    from springbench.harness.report.accuracy_report import draw_accuracy_report
     from springbench.harness.report.site import refresh_results_page
     from springbench.harness.results.folder_ownership import claim_folder
 

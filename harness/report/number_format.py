@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from math import floor, log10
+
+_SUPERSCRIPT_TABLE = str.maketrans("-0123456789.", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹·")
+
 
 def format_count(number: int) -> str:
     """Format an integer with thin spaces between thousands."""
@@ -18,6 +22,19 @@ def format_quantity(value: float) -> str:
 def format_factor(value: float) -> str:
     """Format a ratio to two significant digits, or to an integer from 100 on."""
     return f"{value:.2g}" if value < 100 else format_quantity(value)
+
+
+def format_power(value: float) -> str:
+    """Format a power of ten, or a plain number between 0.01 and 1000.
+
+    The exponent is in superscript characters of the full font size; math text would use 0.7 of it.
+    """
+    if 0.01 < value < 1000.0:
+        return f"{value:g}"
+    exponent = floor(log10(value) + 1e-9)
+    mantissa = value / 10.0**exponent
+    front = "" if abs(mantissa - 1.0) < 1e-6 else f"{mantissa:g}·"
+    return f"{front}10{str(exponent).translate(_SUPERSCRIPT_TABLE)}"
 
 
 def shorten_words(words: str, limit: int) -> str:

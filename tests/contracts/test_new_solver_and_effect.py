@@ -18,7 +18,7 @@ from springbench.harness.experiments.ablation.effect_suggestions import build_ev
 from springbench.harness.experiments.accuracy.accuracy_study import run_accuracy_study
 from springbench.harness.experiments.run_pipeline import execute_run
 from springbench.harness.experiments.sweep_plan import RunFiles
-from springbench.harness.report.accuracy import draw_accuracy_report
+from springbench.harness.report.accuracy_report import draw_accuracy_report
 from springbench.harness.report.plot_style import assign_solver_styles
 from springbench.harness.report.robustness import CORRECT, read_verified_runs
 from springbench.harness.report.site import update_page

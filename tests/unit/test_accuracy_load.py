@@ -10,7 +10,7 @@ import pytest
 from springbench.harness.config.accuracy_loader import AccuracyPlan, load_accuracy
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError
-from springbench.harness.report.accuracy.convergence_plot import INITIAL_GUESS_LABELS
+from springbench.harness.report.accuracy.accuracy_data import INITIAL_GUESS_LABELS
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.scenes.scene_spec import InitialGuess
 from springbench.harness.simulation.time_loop import COARSE_TO_FINE, INITIAL_GUESSES

@@ -36,7 +36,7 @@ from springbench.harness.report.accuracy.time_to_accuracy import (
     format_gap,
     is_contested,
 )
-from springbench.harness.report.accuracy.work_precision_plot import find_default_setting, pareto_front
+from springbench.harness.report.accuracy.work_precision import find_default_setting, pareto_front
 
 from tests import synthetic_accuracy_rows as made
 

@@ -16,9 +16,9 @@ from springbench.harness.report.accuracy.engine_comparison import (
     format_markdown_table,
     pareto_fronts,
 )
-from springbench.harness.report.figures.engine_panels import engine_panels
-from springbench.harness.report.figures.figure_panels import CurvePlot
-from springbench.harness.report.site.engine_chart import build_engine_chart
+from springbench.harness.report.charts.chart_description import select_curve_plots
+from springbench.harness.report.charts.engine_chart import build_engine_chart
+from springbench.harness.report.site.chart_json import serialise_chart
 
 from tests import synthetic_accuracy_rows as made
 from tests import synthetic_results
@@ -65,15 +65,15 @@ def test_a_front_holds_what_no_other_setting_of_the_program_beats(works: list[Wo
 
 
 def test_each_mesh_has_a_panel_where_engines_and_ours_were_tried(tmp_path: Path) -> None:
-    panels = [entry.build_panel() for entry in engine_panels(synthetic_results.write_engine_results(tmp_path))]
+    panels = [*select_curve_plots(build_engine_chart(read_accuracy(synthetic_results.write_engine_results(tmp_path))))]
     assert [(one.group, one.name) for one in panels] == [(("engines",), ("net", "9")), (("engines",), ("stiff", "9"))]
     drawn = panels[1]
-    assert isinstance(drawn, CurvePlot)
     assert [series.label for series in drawn.series] == [OWN_PROGRAM, "mujoco"], "pypbd refuses it"
 
 
 def test_the_page_has_a_line_for_each_program_on_each_mesh(tmp_path: Path) -> None:
-    items = build_engine_chart(read_accuracy(synthetic_results.write_engine_results(tmp_path)))["items"]
+    chart = build_engine_chart(read_accuracy(synthetic_results.write_engine_results(tmp_path)))
+    items = serialise_chart(chart)["items"]
     assert {(item["scene"], item["label"]) for item in items} == {
         *(("net 9", OWN_PROGRAM), ("net 9", "mujoco"), ("net 9", "pypbd")),
         *(("stiff 9", OWN_PROGRAM), ("stiff 9", "mujoco")),
@@ -85,5 +85,4 @@ def test_nothing_is_reported_where_no_engine_was_tried(tmp_path: Path) -> None:
     rows: list[dict[str, Any]] = list(made.build_work_rows("net", 10))
     findings = summarise_findings(read_accuracy(made.write_accuracy_rows(tmp_path, rows)))
     assert not [title for title in findings if "engine" in title]
-    assert not engine_panels(tmp_path)
-    assert not build_engine_chart(read_accuracy(tmp_path))["items"]
+    assert not build_engine_chart(read_accuracy(tmp_path)).frames

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from springbench.harness.cli.main import app
-from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot
+from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot
 from springbench.harness.report.figures.panel_selection import entries_from_panels, select_entries
 from typer.testing import CliRunner
 

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 from springbench.harness.cli.main import app
+from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures import figure_kinds
 from springbench.harness.report.figures.figure_layout import (
     MILLIMETRES_PER_INCH,
@@ -25,7 +26,6 @@ from springbench.harness.report.figures.figure_layout import (
     visible_texts,
 )
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
-from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures.layout_checks import find_layout_faults
 from springbench.harness.report.figures.panel_drawing import marker_style
 from springbench.harness.report.plot_style import SeriesStyle
@@ -67,7 +67,7 @@ def test_all_kinds_are_on_a_sheet() -> None:
 
 
 def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tmp_path: Path) -> None:
-    now = tile_figures(list(figures.values()), (2100, 1080))
+    now = tile_figures(list(figures.values()), (2460, 1080))
     now.save(tmp_path / "figures.png")
     then = Image.open(LOOKS)
     hint = f"look at {tmp_path / 'figures.png'} beside {LOOKS}, and where it is better, put it there"

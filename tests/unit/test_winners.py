@@ -10,10 +10,10 @@ import pytest
 from springbench.harness.report.accuracy.accuracy_findings import summarise_findings
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy.winner_map import NO_WINNER, WinnerCell, build_winner_cells, method_family
-from springbench.harness.report.figures.accuracy_panels import work_precision_panels
-from springbench.harness.report.figures.figure_panels import CellMap, CurvePlot
+from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot
+from springbench.harness.report.figures.figure_kinds import FIGURE_KINDS
 from springbench.harness.report.figures.winner_panels import winner_panels
-from springbench.harness.report.site.accuracy_charts import build_accuracy_charts
+from springbench.harness.report.site.accuracy_charts import build_page_charts
 from springbench.harness.report.site.winner_chart import build_winner_chart
 
 from tests import synthetic_accuracy_rows as made
@@ -114,12 +114,13 @@ def test_errors_by_a_self_converged_motion_are_marked_wherever_they_are_shown(tm
     table = read_accuracy(folder)
     panels = [
         panel
-        for entry in (*work_precision_panels(folder), *winner_panels(folder))
+        for kind in ("work", "winners")
+        for entry in FIGURE_KINDS[kind].list_panels(folder, lambda _: ())
         if isinstance(panel := entry.build_panel(), CurvePlot | CellMap)
     ]
     shown = [" ".join(panel.notes) for panel in panels]
-    on_page = build_accuracy_charts(table, folder)
-    shown += [on_page[name]["note"] for name in ("work", "winners")]
+    on_page = build_page_charts(table, folder)
+    shown += [" ".join(frame["notes"]) for frame in on_page["work"]["frames"]] + [on_page["winners"]["note"]]
     shown += [" ".join(summarise_findings(table)["Work and precision"])]
     assert {"by a self-converged reference, for there is contact: net 9." in text for text in shown} == {
         truth == "self-converged"

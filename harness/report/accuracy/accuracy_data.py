@@ -16,6 +16,14 @@ from springbench.harness.report.number_format import format_time_step
 
 FloatArray = NDArray[np.float64]
 
+INITIAL_GUESS_LABELS: dict[str, str] = {
+    "previous": "from the previous positions",
+    "inertial": "from the inertial target",
+    "extrapolated": "from extrapolated positions",
+    "assignment": "as in the assignment",
+}
+"""Initial guesses in words."""
+
 
 @dataclass(frozen=True, slots=True)
 class SnapshotProblem:

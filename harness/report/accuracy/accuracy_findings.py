@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from springbench.harness.report.accuracy import engine_comparison, work_precision_plot
+from springbench.harness.report.accuracy import engine_comparison, work_precision
 from springbench.harness.report.accuracy.accuracy_data import (
+    INITIAL_GUESS_LABELS,
     AccuracyData,
     ConvergenceCurve,
     FloatArray,
     describe_self_converged,
     without_short_curves,
 )
-from springbench.harness.report.accuracy.convergence_plot import INITIAL_GUESS_LABELS, describe_failures
 from springbench.harness.report.accuracy.liu2013_comparison import (
     LIU2013_FIGURE_2,
     LIU2013_ITERATIONS,
@@ -196,7 +196,7 @@ def _format_factor(values: FloatArray) -> str:
 
 def _describe_work_precision(table: AccuracyData) -> Iterator[str]:
     for mesh in dict.fromkeys(work.mesh_label for work in table.work_points):
-        for sentence in work_precision_plot.describe_cheapest_settings(
+        for sentence in work_precision.describe_cheapest_settings(
             [work for work in table.work_points if work.mesh_label == mesh]
         ):
             yield f"{mesh}: {sentence}."
@@ -234,3 +234,22 @@ def _format_comparison(comparison: PaperComparison) -> str:
     """Format the own error, the paper's error and their ratio."""
     far = "**" if max(comparison.error_ratio, 1 / comparison.error_ratio) > MAX_ERROR_RATIO else ""
     return f"{comparison.own_error:.2g} / {comparison.published_error:.2g} = {far}{comparison.error_ratio:.2g}{far}"
+
+
+def describe_failures(curves: Sequence[ConvergenceCurve]) -> list[str]:
+    """Describe failures and convergence to another minimum, one sentence each."""
+    words: list[str] = []
+    for curve in curves:
+        if curve.status != "ok":
+            why = f": {curve.reason}" if curve.reason else ""
+            words.append(
+                f"× {curve.label}, {INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)}, "
+                f"{curve.status}{why}"
+            )
+        if curve.minimum_index:
+            words.append(
+                f"{curve.label}, {INITIAL_GUESS_LABELS.get(curve.initial_guess, curve.initial_guess)}, "
+                f"ended in minimum {curve.minimum_index}, "
+                "higher than the lowest known (minimum 0); its vertex errors refer to the minimum that it reached"
+            )
+    return words

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from springbench.harness.report.accuracy.accuracy_data import WorkPoint
 from springbench.harness.report.accuracy.time_to_accuracy import format_duration, format_gap
-from springbench.harness.report.accuracy.work_precision_plot import pareto_front
+from springbench.harness.report.accuracy.work_precision import pareto_front
 from springbench.harness.report.number_format import format_factor
 from springbench.harness.report.plot_style import TEXT_COLOUR, SeriesStyle, indexed_style
 from springbench.solvers.iteration.solver_info import ENGINE_FAMILY

@@ -1,5 +1,3 @@
-# pyright: reportUnknownMemberType=false
-# Matplotlib's stubs do not type most keywords.
 """Reproduction of figures 2 and 3 of Liu et al. 2013.
 
 Own curves are drawn over the paper's, and their differences are listed. The paper's values are read from its figures
@@ -10,40 +8,15 @@ not state pins, damping and frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
 from springbench.harness.report.accuracy.accuracy_data import (
     LONG_CURVE_ITERATIONS,
     AccuracyData,
     ConvergenceCurve,
     SnapshotProblem,
-    describe_stale_results,
-)
-from springbench.harness.report.accuracy.plot_sheet import (
-    PANEL_LEFT,
-    PANEL_RIGHT,
-    PANEL_TOP,
-    add_panel,
-    draw_legend,
-    draw_line,
-    draw_notes,
-    format_log_axis,
-    log_limits,
-    notes_top,
-    plot_sheet,
-    sheet_paths,
-)
-from springbench.harness.report.plot_style import (
-    BACKGROUND_COLOUR,
-    MUTED_COLOUR,
-    TEXT_COLOUR,
-    SeriesStyle,
-    assign_label_styles,
 )
 from springbench.solvers.iteration.solver_info import LOCAL_GLOBAL_FAMILY
 
@@ -68,9 +41,6 @@ LIU2013_FIGURE_3 = {
 
 MAX_ERROR_RATIO = 2.0
 """Ratio to the paper's error beyond which a sentence reports the difference."""
-
-_CURTAIN_COLORS = ("#0b3c5d", "#2f7fb8", "#3fae8f", "#c9a227", "#d9822b", "#c0392b", "#7b2d8b")
-_PANEL_TITLES = ("Figure 2, by iterations", "Figure 2, by time", "Figure 3, by size", "Figure 3, 21 × 21 by stiffness")
 
 
 class PaperComparison(NamedTuple):
@@ -106,7 +76,7 @@ def curtain_stiffness(problem: SnapshotProblem) -> float:
 def compare_with_paper(table: AccuracyData) -> list[PaperComparison]:
     """Return all points of the paper that the rows have a counterpart of."""
     found: list[PaperComparison] = []
-    for curve in _select_long_curves(table)[:1]:
+    for curve in select_long_curves(table)[:1]:
         for iterations, (theirs, _) in LIU2013_FIGURE_2.items():
             ours = gap_at_iteration(curve, iterations)
             if np.isfinite(ours):
@@ -159,7 +129,8 @@ def _iteration_seconds(curve: ConvergenceCurve) -> float:
     return seconds / done if done and np.isfinite(seconds) else np.inf
 
 
-def _select_long_curves(table: AccuracyData) -> list[ConvergenceCurve]:
+def select_long_curves(table: AccuracyData) -> list[ConvergenceCurve]:
+    """Select the own curves of the step of figure 2."""
     return [
         c
         for c in select_own_curves(table)
@@ -177,128 +148,3 @@ def _select_curtain_curves(table: AccuracyData, side: int, k: float) -> list[Con
         for c in select_own_curves(table)
         if c.problem.vertices == side**2 and abs(curtain_stiffness(c.problem) / k - 1) < 0.1
     ]
-
-
-def draw_liu2013(table: AccuracyData, stem: Path) -> list[Path]:
-    """Draw four panels of own results over the paper's, and return the files.
-
-    No file is written if no row belongs to the reproduction.
-    """
-    found = compare_with_paper(table)
-    if not found:
-        return []
-    far = sorted(
-        (c for c in found if max(c.error_ratio, 1 / c.error_ratio) > MAX_ERROR_RATIO),
-        key=lambda c: -abs(np.log(c.error_ratio)),
-    )
-    words = [
-        *describe_stale_results(select_own_curves(table)),
-        *(f"differs by more than {MAX_ERROR_RATIO:g}: {c.description}" for c in far),
-    ]
-    facts = ["relative error (g − g*) / (g0 − g*)", "ours filled, the paper's open", *table.machine_words]
-    long = [
-        c
-        for c in table.curves
-        if _select_long_curves(table)
-        and c.problem is _select_long_curves(table)[0].problem
-        and c.initial_guess == "inertial"
-    ]
-    marked = assign_label_styles((c.label, c.solver) for c in long)
-    with plot_sheet(stem, "Liu et al. 2013, reproduced", facts) as page:
-        width, height = (PANEL_RIGHT - PANEL_LEFT - 62) / 4 - 20, notes_top(words) - PANEL_TOP - 176
-        axes = [
-            add_panel(page, PANEL_LEFT + 62 + k * (width + 20), PANEL_TOP + 22, width, height, h)
-            for k, h in enumerate(_PANEL_TITLES)
-        ]
-        _draw_figure_2(axes[0], axes[1], long, marked, found)
-        _draw_figure_3(axes[2], found, [key for key in LIU2013_FIGURE_3 if key[1] * 80 == 1200 * (key[0] - 1)])
-        _draw_figure_3(axes[3], found, [key for key in LIU2013_FIGURE_3 if key[0] == 21])
-        _format_axes(axes)
-        theirs = Line2D([], [], color=TEXT_COLOUR, marker="o", mfc=BACKGROUND_COLOUR, linestyle=(0, (1, 1.6)))
-        draw_legend(
-            page,
-            marked,
-            extra_entries=[
-                (theirs, "Liu et al. 2013"),
-                (Line2D([], [], color=TEXT_COLOUR, marker="D", mfc=BACKGROUND_COLOUR, linestyle=""), "their Newton"),
-            ],
-        )
-        draw_notes(page, words)
-    return sheet_paths(stem)
-
-
-def _draw_figure_2(
-    by_iterations: Axes,
-    by_time: Axes,
-    curves: Sequence[ConvergenceCurve],
-    styles: dict[str, SeriesStyle],
-    comparisons: Sequence[PaperComparison],
-) -> None:
-    for curve in curves:
-        gap = np.maximum(curve.gap, curve.problem.roundoff_gap)
-        draw_line(by_iterations, curve.iterations[1:], gap[1:], styles[curve.label])
-        draw_line(by_time, np.median(curve.seconds, axis=0)[1:], gap[1:], styles[curve.label])
-    ratios = [f"{c.error_ratio:.2g}" for c in comparisons if c.curve == "figure 2"]
-    _draw_text_below(
-        by_iterations, 0, f"ours / the paper's after {', '.join(map(str, LIU2013_FIGURE_2))}:", MUTED_COLOUR
-    )
-    _draw_text_below(by_iterations, 1, f"81 × 81, k = 1200:   {'   '.join(ratios) or 'not measured'}", TEXT_COLOUR)
-    errors, seconds = zip(*LIU2013_FIGURE_2.values(), strict=True)
-    look: dict[str, Any] = {
-        "color": TEXT_COLOUR,
-        "linestyle": (0, (1, 1.6)),
-        "mfc": BACKGROUND_COLOUR,
-        "markersize": 7,
-        "mew": 1.4,
-        "zorder": 6,
-    }
-    empty: Any = look | {"linestyle": ""}
-    by_iterations.plot([*LIU2013_FIGURE_2], errors, marker="o", **look)
-    by_time.plot(seconds, errors, marker="o", **look)
-    by_time.plot(*zip(*LIU2013_FIGURE_2_NEWTON, strict=True), marker="D", **empty)
-
-
-def _draw_figure_3(ax: Axes, comparisons_by_size: Sequence[PaperComparison], keys: Sequence[tuple[int, int]]) -> None:
-    """Draw own and published errors in one colour per curtain, with the ratios below."""
-    for row, (side, k) in enumerate(keys):
-        color = _CURTAIN_COLORS[list(LIU2013_FIGURE_3).index((side, k))]
-        theirs = LIU2013_FIGURE_3[side, k]
-        ax.plot(
-            LIU2013_ITERATIONS,
-            theirs,
-            color=color,
-            linestyle=(0, (1, 1.6)),
-            marker="o",
-            mfc=BACKGROUND_COLOUR,
-            mew=1.4,
-            markersize=7,
-        )
-        found = [c for c in comparisons_by_size if c.curve == f"figure 3, {side} × {side}, k = {k}"]
-        ax.plot(
-            [c.iterations for c in found],
-            [c.own_error for c in found],
-            color=color,
-            marker="o",
-            markersize=5,
-            linewidth=1.5,
-        )
-        ratios = "   ".join(f"{c.error_ratio:.2g}" for c in found) or "not measured"
-        _draw_text_below(ax, row + 1, f"{side} × {side}, k = {k}:   {ratios}", color)
-    _draw_text_below(ax, 0, f"ours / the paper's after {', '.join(map(str, LIU2013_ITERATIONS))}:", MUTED_COLOUR)
-
-
-def _draw_text_below(ax: Axes, row: int, words: str, color: str) -> None:
-    """Draw a line of text below a panel."""
-    ax.text(0.0, -(62 + 17 * row) / ax.bbox.height, words, color=color, fontsize=8.5, transform=ax.transAxes)
-
-
-def _format_axes(axes: Sequence[Axes]) -> None:
-    """Set one error scale for all panels; the x-axis is iterations, or time."""
-    drawn = [line for ax in axes for line in ax.lines]
-    errors = log_limits((value for line in drawn for value in np.asarray(line.get_ydata(), float)), lower_bound=1e-12)
-    for k, ax in enumerate(axes):
-        across = [value for line in ax.lines for value in np.asarray(line.get_xdata(), float)]
-        format_log_axis(ax.xaxis, *log_limits(across), unit="time" if k == 1 else "plain")
-        format_log_axis(ax.yaxis, *errors)
-        ax.set_xlabel("wall time, ours and of 2012" if k == 1 else "iterations", fontsize=9, loc="left")
-        ax.tick_params(labelleft=k == 0)

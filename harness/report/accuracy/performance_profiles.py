@@ -1,5 +1,3 @@
-# pyright: reportUnknownMemberType=false
-# Matplotlib's stubs do not type most keywords.
 """Performance profiles and data profiles over all step snapshots.
 
 Performance profiles follow Dolan and More 2002, data profiles More and Wild 2009. A step with one initial guess is one
@@ -16,42 +14,21 @@ others would depend on the selection of problems.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from math import inf
-from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from springbench.harness.report.accuracy.accuracy_data import (
     AccuracyData,
     ConvergenceCurve,
     FloatArray,
-    describe_stale_results,
-)
-from springbench.harness.report.accuracy.plot_sheet import (
-    PANEL_LEFT,
-    PANEL_RIGHT,
-    PANEL_TOP,
-    add_panel,
-    draw_legend,
-    draw_line,
-    draw_notes,
-    format_log_axis,
-    notes_top,
-    plot_sheet,
-    sheet_paths,
 )
 from springbench.harness.report.accuracy.time_to_accuracy import (
-    GAP_TARGETS,
     amortised_seconds,
-    describe_excluded_steps,
-    format_gap,
     group_by_start,
     is_contested,
     is_solvable,
 )
-from springbench.harness.report.page_layout import draw_text
-from springbench.harness.report.plot_style import SeriesStyle, assign_label_styles
 from springbench.solvers.iteration.solver_info import LOCAL_GLOBAL_FAMILY
 
 
@@ -142,58 +119,3 @@ def median_iteration_seconds(race: Iterable[ConvergenceCurve], solver: str) -> f
             spans = curve.seconds[:, -1] - curve.seconds[:, 0]
             return float(np.median(spans)) / (curve.iterations[-1] - curve.iterations[0])
     return np.nan
-
-
-_PROFILE_KINDS = (
-    ("within this many times the fastest solver's time", performance_ratios),
-    ("within the time of this many iterations of {}", data_profile_ratios),
-)
-
-
-def draw_profiles(table: AccuracyData, stem: Path) -> list[Path]:
-    """Draw performance profiles and data profiles, and return the files.
-
-    There is a row for each kind and a column for each accuracy.
-    """
-    if not any(solvable_races(table, target) for target in GAP_TARGETS):
-        return []
-    missed = count_partial_coverage(table)
-    marked = assign_label_styles((curve.label, curve.solver) for curve in table.curves if curve.label not in missed)
-    words = ["The step alone, set-up apart. A solver that failed on a problem never solves it."]
-    words += [
-        *describe_omitted_solvers(table),
-        *describe_excluded_steps(table.problems),
-        *describe_stale_results(table.curves),
-    ]
-    steps = f"{sum(not problem.uncertified_reason for problem in table.problems)} steps, first guesses apart"
-    with plot_sheet(
-        stem, "Performance and data profiles", ["share of the problems solved", steps, *table.machine_words]
-    ) as page:
-        width = (PANEL_RIGHT - PANEL_LEFT - 50) / len(GAP_TARGETS) - 16
-        height = (notes_top(words) - PANEL_TOP - 170) / 2
-        for row, (heading, ratios) in enumerate(_PROFILE_KINDS):
-            top = PANEL_TOP + 46 + row * (height + 96)
-            draw_text(page, PANEL_LEFT + 50, top - 30, heading.format(baseline_solver(table)), size=11, weight="bold")
-            for column, target in enumerate(GAP_TARGETS):
-                found = ratios(table, target)
-                problems = len(next(iter(found.values())))
-                name = f"to a gap of {format_gap(target)}: {problems} problems"
-                ax = add_panel(page, PANEL_LEFT + 50 + column * (width + 16), top, width, height, name)
-                _draw_profile_steps(ax, found, marked)
-                ax.tick_params(labelleft=column == 0)
-        draw_legend(page, marked)
-        draw_notes(page, words)
-    return sheet_paths(stem)
-
-
-def _draw_profile_steps(ax: Axes, ratios: Mapping[str, FloatArray], styles: Mapping[str, SeriesStyle]) -> None:
-    """Draw the profiles of all solvers as steps."""
-    finite = np.concatenate([values[np.isfinite(values)] for values in ratios.values()])
-    low, high = finite.min(initial=1.0), 2.0 * finite.max(initial=5.0)
-    for label, values in ratios.items():
-        if np.isfinite(values).any():
-            x = np.unique([low, *values[np.isfinite(values)], high])
-            draw_line(ax, x, cumulative_share(values, x), styles[label], drawstyle="steps-post", markevery=0.3)
-    format_log_axis(ax.xaxis, low, high, unit="plain")
-    ax.set_ylim(-0.02, 1.03)
-    ax.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.0f} %")

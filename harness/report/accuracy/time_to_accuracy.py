@@ -148,3 +148,13 @@ def format_duration(seconds: float) -> str:
     """Format a time with three significant digits: 41.2 ms, 1.3 s."""
     unit, scale = next(((u, s) for u, s in (("s", 1.0), ("ms", 1e-3)) if seconds >= 0.9995 * s), ("µs", 1e-6))
     return f"{format_quantity(seconds / scale)} {unit}"
+
+
+def median_time(curves: Sequence[ConvergenceCurve], target: float, steps: int | None = None) -> float:
+    """Return the median time over a solver's solvable problems [s].
+
+    It is infinite if half of them are unsolved.
+    """
+    times = [amortised_seconds(curve, target, steps) for curve in curves if is_solvable(curve.problem, target)]
+    # The upper of the two middle values: a mean with infinity would hide the solved half.
+    return sorted(times)[len(times) // 2] if times else np.nan

@@ -16,7 +16,7 @@ from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import machine_info
 from springbench.harness.report import ablation_summary
 from springbench.harness.report.ablation_summary import ResultRow
-from springbench.harness.report.figures.figure_panels import (
+from springbench.harness.report.charts.figure_panels import (
     AxisScale,
     CellMap,
     CurvePlot,

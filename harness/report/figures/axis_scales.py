@@ -17,11 +17,12 @@ from matplotlib.axis import Axis
 from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 from matplotlib.transforms import Bbox
 from springbench.harness.report.accuracy.time_to_accuracy import format_duration
-from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot, FloatArray
-from springbench.harness.report.number_format import format_count, format_quantity
+from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, FloatArray
+from springbench.harness.report.number_format import format_count, format_power, format_quantity
 from springbench.harness.report.page_layout import tick_formatter
 
-_SUPERSCRIPT_TABLE = str.maketrans("-0123456789.", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹·")
+_SHARED_DIVISIONS = ("log", "iterations", "linear")
+"""Divisions of x axes that panels share; sizes are those of a scene."""
 _AXIS_MARGIN = 0.06
 """Share of the axis that is empty at each end."""
 
@@ -31,24 +32,6 @@ def frame_size_points(ax: Axes) -> tuple[float, float]:
     figure = ax.get_figure(root=True)
     assert figure
     return ax.bbox.width / figure.dpi * 72.0, ax.bbox.height / figure.dpi * 72.0
-
-
-def _to_superscript(words: str) -> str:
-    """Convert a number to superscript characters of the full font size.
-
-    Math text would use 0.7 of it.
-    """
-    return words.translate(_SUPERSCRIPT_TABLE)
-
-
-def format_power(value: float) -> str:
-    """Format a power of ten, or a plain number between 0.01 and 1000."""
-    if 0.01 < value < 1000.0:
-        return f"{value:g}"
-    exponent = int(np.floor(np.log10(value) + 1e-9))
-    mantissa = value / 10.0**exponent
-    front = "" if abs(mantissa - 1.0) < 1e-6 else f"{mantissa:g}·"
-    return f"{front}10{_to_superscript(str(exponent))}"
 
 
 def _format_percent(value: float) -> str:
@@ -64,9 +47,19 @@ _TICK_FORMATS: dict[str, Callable[[float], str]] = {
 }
 
 
-def set_axis_scales(ax: Axes, panel: CurvePlot) -> None:
-    """Set limits and ticks of both axes from the panel's data."""
-    points = _data_extent(panel)
+def set_axis_scales(ax: Axes, panel: CurvePlot, panels: Sequence[CurvePlot]) -> None:
+    """Set limits and ticks of both axes.
+
+    Panels of a figure that show the same quantity have the same limits, so that they can be compared.
+
+    Args:
+        ax: axes of the panel.
+        panel: panel to draw.
+        panels: all panels of the figure.
+    """
+    across = [_data_extent(one)[0] for one in panels if one.x == panel.x and panel.x.division in _SHARED_DIVISIONS]
+    up = [_data_extent(one)[1] for one in panels if one.y == panel.y]
+    points = np.concatenate(across or [_data_extent(panel)[0]]), np.concatenate(up)
     for axis, scale, values in zip((ax.xaxis, ax.yaxis), (panel.x, panel.y), points, strict=True):
         _AXIS_SETTERS[scale.division](axis, scale, values)
     ax.tick_params(length=2.5, width=0.5, pad=2)

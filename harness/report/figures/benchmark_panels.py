@@ -13,7 +13,7 @@ from springbench.harness.report.change_detection import (
     find_stored_files,
     read_histories,
 )
-from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot, CurveSeries
+from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
 from springbench.harness.report.plot_style import MUTED_COLOUR, TEXT_COLOUR, SeriesStyle
 

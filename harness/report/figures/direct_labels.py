@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.text import Annotation, Text
+from springbench.harness.report.charts.figure_panels import CurvePlot, CurveSeries, FigurePanel
 from springbench.harness.report.figures.axis_scales import frame_size_points
 from springbench.harness.report.figures.figure_options import FigureOptions
-from springbench.harness.report.figures.figure_panels import CurvePlot, CurveSeries, FigurePanel
+from springbench.harness.report.plot_style import TEXT_COLOUR
 
 _MAX_LABELS, _MAX_WIDTH_SHARE = 9, 0.3
 """Maximum number of labels of a frame, and maximum share of the width for them."""
+_CALLOUT_RADIUS = 5.0
+"""Distance of a callout from its point [points]; the ring is a little smaller."""
 _LABEL_DISTANCE = 7.0
 """Distance from the frame to the labels [points]."""
 
@@ -31,6 +34,9 @@ def add_direct_labels(axes: Sequence[Axes], panels: Sequence[FigurePanel], optio
         panels: panels of the figure; only a single one gets direct labels.
         options: options of the figure.
     """
+    for ax, one in zip(axes, panels, strict=True):
+        if isinstance(one, CurvePlot):
+            _add_callouts(ax, one.series, options)
     panel = panels[0]
     if len(panels) > 1 or not isinstance(panel, CurvePlot):
         return False
@@ -138,6 +144,20 @@ def _label_points(ax: Axes, series: Sequence[CurveSeries], options: FigureOption
             name = ax.annotate(
                 one.label, (x, y), (5, 0), textcoords="offset points", va="center", fontsize=options.small_font_size,
                 annotation_clip=False,
+            )  # fmt: skip
+            setattr(name, "settle", lambda name=name: _place_label(ax, name))  # noqa: B010 as above
+
+
+def _add_callouts(ax: Axes, series: Sequence[CurveSeries], options: FigureOptions) -> None:
+    """Draw a ring and words at each point that has a callout."""
+    for one in series:
+        for k, words in one.callouts.items():
+            x, y = float(one.x[k]), float(one.y[k])
+            ring = 4.2 * _CALLOUT_RADIUS / 2.0
+            ax.plot(x, y, "o", mfc="none", mec=TEXT_COLOUR, ms=ring, mew=0.8, zorder=5)
+            name = ax.annotate(
+                words, (x, y), (_CALLOUT_RADIUS, 0), textcoords="offset points", va="center",
+                fontsize=options.small_font_size, color=TEXT_COLOUR, annotation_clip=False,
             )  # fmt: skip
             setattr(name, "settle", lambda name=name: _place_label(ax, name))  # noqa: B010 as above
 

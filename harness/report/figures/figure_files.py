@@ -16,10 +16,10 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 from springbench.harness.atomic_files import atomic_write
+from springbench.harness.report.charts.figure_panels import CellMap, CsvRow, CurvePlot, FigurePanel, MeshPicture
 from springbench.harness.report.figures import script_templates
 from springbench.harness.report.figures.figure_layout import FIGURE_RC, MILLIMETRES_PER_INCH
 from springbench.harness.report.figures.figure_options import FigureOptions
-from springbench.harness.report.figures.figure_panels import CellMap, CsvRow, CurvePlot, FigurePanel, MeshPicture
 from springbench.harness.report.figures.panel_drawing import RASTER_DPI
 
 
@@ -37,15 +37,10 @@ def write_figure(
     Raises:
         WriteError: if a file cannot be written.
     """
-    stem.parent.mkdir(parents=True, exist_ok=True)
     about = "; ".join(
         dict.fromkeys(words for panel in panels for words in (panel.subject, panel.machine_words) if words)
     )
-    paths: list[Path] = []
-    for kind in options.formats:
-        paths.append(stem.with_name(f"{stem.name}.{kind}"))
-        with matplotlib.rc_context(FIGURE_RC), atomic_write(paths[-1]) as partial:
-            figure.savefig(partial, format=kind, dpi=RASTER_DPI, metadata=_build_metadata(kind, title, about))
+    paths = write_images(figure, stem, title, about, options)
     paths.append(stem.with_name(f"{stem.name}.csv"))
     _write_csv(paths[-1], [row for panel in panels for row in panel.csv_rows()], [title, about])
     if isinstance(panels[0], MeshPicture):
@@ -55,6 +50,29 @@ def write_figure(
     paths.append(stem.with_name(f"{stem.name}.py"))
     with atomic_write(paths[-1]) as partial:
         partial.write_text(build_script(figure, panels, stem.name, options), encoding="utf-8")
+    return paths
+
+
+def write_images(
+    figure: Figure, stem: Path, title: str, about: str, options: FigureOptions, dpi: int = RASTER_DPI
+) -> list[Path]:
+    """Write a figure in the formats of its options, and return the files.
+
+    Args:
+        figure: figure to write.
+        stem: path of the files without suffix.
+        title, about: metadata of the files.
+        options: options of the figure.
+        dpi: resolution of images [dots per inch].
+    Raises:
+        WriteError: if a file cannot be written.
+    """
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    paths: list[Path] = []
+    for kind in options.formats:
+        paths.append(stem.with_name(f"{stem.name}.{kind}"))
+        with matplotlib.rc_context(FIGURE_RC), atomic_write(paths[-1]) as partial:
+            figure.savefig(partial, format=kind, dpi=dpi, metadata=_build_metadata(kind, title, about))
     return paths
 
 

@@ -11,16 +11,17 @@ from typing import Any, NamedTuple
 
 from springbench.harness.config.sweep_config import REPORT_TABLE
 from springbench.harness.errors import InputError, InputMistake, RunFailed, SpringbenchError, suggest_name
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.charts.chart_description import select_curve_plots
+from springbench.harness.report.charts.chart_table import build_accuracy_chart
+from springbench.harness.report.charts.figure_panels import CellMap, FigurePanel, MeshPicture
 from springbench.harness.report.figures import (
     ablation_panels,
-    accuracy_panels,
     benchmark_panels,
-    engine_panels,
     robustness_panels,
     timing_panels,
     winner_panels,
 )
-from springbench.harness.report.figures.figure_panels import CellMap, FigurePanel, MeshPicture
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
 from springbench.solvers.plugins.plugin_discovery import load_target
 
@@ -88,32 +89,37 @@ def _without_stale(
     return read
 
 
+def _list_accuracy_plots(name: str) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
+    """Return a function that lists the plots of a chart of an accuracy measurement."""
+    return _without_stale(
+        lambda folder: entries_from_panels(select_curve_plots(build_accuracy_chart(name, read_accuracy(folder))))
+    )
+
+
 _MESH_PANELS = "springbench.harness.report.figures.mesh_panels"
-_ACCURACY_ROWS, _SWEEP_ROWS = accuracy_panels.REQUIRED_ROWS, "rows of `springbench run CONFIG`"
+_ACCURACY_ROWS, _SWEEP_ROWS = "rows of `springbench accuracy CONFIG`", "rows of `springbench run CONFIG`"
 _GAP_PANELS = (("gap", "time"), ("gap", "iterations"))
 _PROFILE_PANELS = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
 
 FIGURE_KINDS: dict[str, FigureKind] = {
-    "convergence": FigureKind(
-        "Convergence", _ACCURACY_ROWS, _without_stale(accuracy_panels.convergence_panels), _GAP_PANELS
-    ),
+    "convergence": FigureKind("Convergence", _ACCURACY_ROWS, _list_accuracy_plots("convergence"), _GAP_PANELS),
     "times": FigureKind(
         "Time to accuracy",
         _ACCURACY_ROWS,
-        _without_stale(accuracy_panels.time_to_accuracy_panels),
+        _list_accuracy_plots("times"),
         (("alone",), ("over-1",)),
     ),
     "winners": FigureKind("The cheapest way to an error", _ACCURACY_ROWS, _without_stale(winner_panels.winner_panels)),
     "engines": FigureKind(
-        "Outside engines beside ours", f"{_ACCURACY_ROWS}, with engines", _without_stale(engine_panels.engine_panels)
+        "Outside engines beside ours", f"{_ACCURACY_ROWS}, with engines", _list_accuracy_plots("engines")
     ),
-    "work": FigureKind("Work and precision", _ACCURACY_ROWS, _without_stale(accuracy_panels.work_precision_panels)),
-    "profiles": FigureKind("Profiles", _ACCURACY_ROWS, _without_stale(accuracy_panels.profile_panels), _PROFILE_PANELS),
-    "growth": FigureKind("Growth with size", _ACCURACY_ROWS, _without_stale(accuracy_panels.scaling_panels)),
+    "work": FigureKind("Work and precision", _ACCURACY_ROWS, _list_accuracy_plots("work")),
+    "profiles": FigureKind("Profiles", _ACCURACY_ROWS, _list_accuracy_plots("profiles"), _PROFILE_PANELS),
+    "growth": FigureKind("Growth with size", _ACCURACY_ROWS, _list_accuracy_plots("growth")),
     "liu2013": FigureKind(
         "Liu et al. 2013, reproduced",
         f"{_ACCURACY_ROWS}, of liu2013.yaml",
-        _without_stale(accuracy_panels.liu2013_panels),
+        _list_accuracy_plots("liu2013"),
     ),
     "timing": FigureKind("Time a step", _SWEEP_ROWS, timing_panels.timing_panels, (("step",), ("prepare",))),
     "hard": FigureKind(

@@ -25,10 +25,10 @@ from matplotlib.legend import Legend
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 from springbench.harness.recording.strain_scale import format_percent
+from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot, CurveSeries, FigurePanel, MeshPicture
 from springbench.harness.report.figures.axis_scales import thin_ticks
 from springbench.harness.report.figures.direct_labels import add_direct_labels
 from springbench.harness.report.figures.figure_options import FigureOptions
-from springbench.harness.report.figures.figure_panels import CellMap, CurvePlot, CurveSeries, FigurePanel, MeshPicture
 from springbench.harness.report.figures.panel_drawing import (
     cell_map_names,
     draw_cell_map,
@@ -77,13 +77,16 @@ FIGURE_RC: Any = {
 }
 
 
-def compose_figure(panels: Sequence[FigurePanel], title: str, options: FigureOptions) -> Figure:
+def compose_figure(
+    panels: Sequence[FigurePanel], title: str, options: FigureOptions, columns: int | None = None
+) -> Figure:
     """Compose the figure of these panels.
 
     Args:
         panels: panels of the figure.
         title: title; the panels' subject is appended if they share one.
         options: options of the figure.
+        columns: number of panels in a row; None for as many as the width allows.
     """
     rc: Any = {
         **FIGURE_RC,
@@ -99,14 +102,14 @@ def compose_figure(panels: Sequence[FigurePanel], title: str, options: FigureOpt
             layout="constrained",
         )
         FigureCanvasAgg(figure)
-        columns = _choose_column_count(panels, options)
+        columns = columns or _choose_column_count(panels, options)
         subjects = list(dict.fromkeys(panel.subject for panel in panels))
         heads = [_panel_title_lines(panel, options, columns, several=len(subjects) > 1) for panel in panels]
         heights = _compute_row_heights(panels, heads, columns, options)
         grid = figure.add_gridspec(len(heights), columns, height_ratios=heights)
         axes = [figure.add_subplot(grid[divmod(k, columns)]) for k in range(len(panels))]
         for ax, panel, head in zip(axes, panels, heads, strict=True):
-            _draw_panel(ax, panel, head, options, columns)
+            _draw_panel(ax, panel, head, options, columns, panels)
         below = _draw_strain_scale(figure, axes, panels, options)
         direct = add_direct_labels(axes, panels, options)
         whole = ": ".join([title, subjects[0]] if len(subjects) == 1 and subjects[0] else [title])
@@ -161,13 +164,20 @@ def _panel_title_lines(panel: FigurePanel, options: FigureOptions, columns: int,
     return [line for one in words if one for line in wrap_words(one, room, options.small_font_size)]
 
 
-def _draw_panel(ax: Axes, panel: FigurePanel, head: Sequence[str], options: FigureOptions, columns: int) -> None:
+def _draw_panel(
+    ax: Axes,
+    panel: FigurePanel,
+    head: Sequence[str],
+    options: FigureOptions,
+    columns: int,
+    panels: Sequence[FigurePanel],
+) -> None:
     if isinstance(panel, MeshPicture):
         draw_mesh_picture(ax, panel, options, options.width_mm / MILLIMETRES_PER_INCH / columns)
         ax.set_title("\n".join(head), loc="center", fontsize=options.small_font_size, color=TEXT_COLOUR)
         return
     if isinstance(panel, CurvePlot):
-        draw_curve_plot(ax, panel, options)
+        draw_curve_plot(ax, panel, options, [one for one in panels if isinstance(one, CurvePlot)])
     else:
         draw_cell_map(ax, panel, options)
     ax.set_title("\n".join(head), loc="center", x=0.0, ha="left", fontsize=options.small_font_size)

@@ -39,6 +39,11 @@ class FigureOptions:
         return max(MIN_FONT_SIZE, self.font_size - 1.0)
 
     @property
+    def mark_scale(self) -> float:
+        """Size of markers and lines relative to those of a figure whose font size is the default or smaller."""
+        return max(1.0, self.font_size / 8.0)
+
+    @property
     def background_colour(self) -> str:
         """The background colour in Matplotlib's terms."""
         return "none" if self.is_transparent else "white"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.recording.camera_framing import describe_outside
 from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.report.charts.figure_panels import MeshPicture, MeshRenderer
 from springbench.harness.report.comparison_picture import find_reference_run, format_distance
 from springbench.harness.report.drawable_frames import (
     find_drawable_frames,
@@ -23,7 +24,6 @@ from springbench.harness.report.drawable_frames import (
     max_recorded_strain,
     strain_scale_limit,
 )
-from springbench.harness.report.figures.figure_panels import MeshPicture, MeshRenderer
 from springbench.harness.report.figures.panel_selection import PanelEntry
 from springbench.harness.report.figures.timing_panels import read_sweep_rows
 from springbench.harness.report.mesh_rendering import (

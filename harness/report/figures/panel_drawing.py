@@ -7,6 +7,7 @@ Sizes are in points of the printed figure.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.transforms import ScaledTranslation
 from springbench.harness.report.accuracy.plot_sheet import marker_scale as enlarged
+from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot, CurveSeries, FloatArray, MeshPicture
 from springbench.harness.report.figures.axis_scales import frame_size_points, set_axis_scales
 from springbench.harness.report.figures.figure_options import FigureOptions
-from springbench.harness.report.figures.figure_panels import CellMap, CurvePlot, CurveSeries, FloatArray, MeshPicture
 from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEXT_COLOUR, SeriesStyle
 
 _LINE_WIDTH, _MARKER_SIZE, _MAX_MARKERS = 1.1, 3.6, 12
@@ -29,15 +30,16 @@ RASTER_DPI = 300
 """Resolution of images in vector formats [dots per inch]."""
 
 
-def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions) -> None:
+def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions, panels: Sequence[CurvePlot]) -> None:
     """Draw curves with their intervals, shaded bands and lines at marked values.
 
     Args:
         ax: axes.
         panel: panel to draw.
         options: options of the figure.
+        panels: all panels of the figure.
     """
-    set_axis_scales(ax, panel)
+    set_axis_scales(ax, panel, panels)
     for band in panel.bands:
         low, high = max(band.low, ax.get_ylim()[0]), min(band.high, ax.get_ylim()[1])
         if low < high:
@@ -51,21 +53,22 @@ def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions) -> None:
     if panel.x.division == "linear" and ax.get_xlim()[0] < 0.0 < ax.get_xlim()[1]:
         ax.axvline(0.0, color=MUTED_COLOUR, linewidth=0.5, zorder=1)
     for series in panel.series:
-        _draw_curve(ax, series)
+        _draw_curve(ax, series, options)
+        if series.has_cross:
+            _draw_cross(ax, series, options)
     ax.grid(axis="x" if panel.y.division == "names" else "y", linewidth=0.4)
     ax.set_axisbelow(True)
     ax.set_xlabel(panel.x.label, loc="left", fontsize=options.small_font_size, labelpad=2)
 
 
-def _draw_curve(ax: Axes, series: CurveSeries) -> None:
+def _draw_curve(ax: Axes, series: CurveSeries, options: FigureOptions) -> None:
     look = series.style
     how: Any = {"drawstyle": "steps-post"} if series.is_stepped else {}
     if series.lower is not None and series.upper is not None:
         _draw_interval(ax, series, series.lower, series.upper)
     if series.is_connected and len(series.x) > 1:
-        ax.plot(
-            series.x, series.y, color=look.color, linestyle=look.dash, linewidth=_LINE_WIDTH, label=series.label, **how
-        )
+        width = options.mark_scale * _LINE_WIDTH
+        ax.plot(series.x, series.y, color=look.color, linestyle=look.dash, linewidth=width, label=series.label, **how)
     older = np.zeros(len(series.x), bool) if series.stale is None else series.stale
     many = series.is_connected and len(series.x) > _MAX_MARKERS
     for chosen, hollow in ((~older, False), (older, True)):
@@ -74,12 +77,20 @@ def _draw_curve(ax: Axes, series: CurveSeries) -> None:
                 series.x[chosen],
                 series.y[chosen],
                 linestyle="none",
-                **marker_style(look, series.marker_scale, is_stale=hollow),
+                **marker_style(look, options.mark_scale * series.marker_scale, is_stale=hollow),
             )
             if series.is_stepped:
                 marks.set_markevery((0.1, 0.3))  # a step is no measurement: marks but tell the curves apart
             elif many:
                 marks.set_markevery(0.14)
+
+
+def _draw_cross(ax: Axes, series: CurveSeries, options: FigureOptions) -> None:
+    """Draw a cross at the end of a curve that ended early."""
+    known = np.flatnonzero(np.isfinite(series.x) & np.isfinite(series.y))
+    if len(known):
+        at = series.x[known[-1:]], series.y[known[-1:]]
+        ax.plot(*at, "x", color=series.style.color, ms=1.8 * options.mark_scale * _MARKER_SIZE, mew=1.4, zorder=4)
 
 
 def marker_style(style: SeriesStyle, marker_scale: float = 1.0, *, is_stale: bool = False) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.report.figures.figure_panels import FigurePanel
+from springbench.harness.report.charts.figure_panels import FigurePanel
 
 MAX_PANELS = 12
 """Maximum number of panels of a figure."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from springbench.harness.report.figures.figure_panels import (
+from springbench.harness.report.charts.figure_panels import (
     AxisScale,
     CellMap,
     CurvePlot,

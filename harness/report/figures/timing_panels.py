@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.report.figures.figure_panels import AxisScale, CurvePlot, CurveSeries
+from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
 from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles
 from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance

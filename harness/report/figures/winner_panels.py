@@ -10,7 +10,7 @@ from pathlib import Path
 from springbench.harness.report.accuracy.accuracy_data import describe_self_converged
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy.winner_map import NO_WINNER, assign_family_styles, build_winner_cells
-from springbench.harness.report.figures.figure_panels import CellMap, MapCell
+from springbench.harness.report.charts.figure_panels import CellMap, MapCell
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
 from springbench.harness.report.number_format import format_count, format_quantity
 

@@ -31,10 +31,10 @@ from typing import Any
 
 import jinja2
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.report.charts.figure_panels import FigurePanel
 from springbench.harness.report.figures.figure_kinds import find_figure_kind
 from springbench.harness.report.figures.figure_layout import compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
-from springbench.harness.report.figures.figure_panels import FigurePanel
 from springbench.harness.report.figures.panel_selection import select_entries
 from springbench.harness.report.pages.page_charts import ChartForm, ChartPoint, PageChart, draw_chart
 from springbench.harness.report.pages.published_queries import PublishedQueries

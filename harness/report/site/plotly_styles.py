@@ -19,7 +19,7 @@ from springbench.harness.report.plot_style import (
 )
 
 _PLOTLY_SYMBOLS: dict[Any, str] = {
-    "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
+    "None": "none", "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
     ">": "triangle-right", "D": "diamond", "d": "diamond-tall", "P": "cross", "X": "x", "p": "pentagon",
     "h": "hexagon", "*": "star", "H": "hexagon2", "8": "octagon",
     STAR_MARKERS[0]: "star-diamond", STAR_MARKERS[1]: "hexagram", STAR_MARKERS[2]: "star-triangle-up",

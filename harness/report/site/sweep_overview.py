@@ -214,10 +214,10 @@ def _build_accuracy_section(
     from springbench.harness.report.accuracy.accuracy_data import without_short_curves
     from springbench.harness.report.accuracy.accuracy_findings import list_failures, summarise_findings
     from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
-    from springbench.harness.report.site.accuracy_charts import build_accuracy_charts
+    from springbench.harness.report.site.accuracy_charts import build_page_charts
 
     table = read_accuracy(folder.path, on_invalid=_report_skipped(print_message))
-    scripts, facts = build_accuracy_charts(table, folder.path), dict[str, Any]()
+    scripts, facts = build_page_charts(table, folder.path), dict[str, Any]()
     if with_recordings and RECORDINGS.is_installed():
         from springbench.harness.report.site.mesh_scripts import write_recordings, write_solves
 

@@ -31,9 +31,10 @@ springbench.chart = (() => {
   addEventListener("hashchange", hide);
 
   function trace(chart, item, x, y, panel, tail) {
-    const mark = own(chart.styles, item.label), ink = colour(mark.color), points = chart.shape === "points";
+    const mark = own(chart.styles, item.label), ink = colour(mark.color), shape = item.shape ?? chart.shape, points = shape === "points";
     const ends = ["", "_low", "_high"].map(end => item[`${x.column}${end}`]), upright = ["", "_low", "_high"].map(end => item[`${y.column}${end}`]);
-    const bars = some => (some[1] && some[2] ? {
+    // Intervals of many points would cover their line.
+    const bars = some => (some[1] && some[2] && some[0].length <= 24 ? {
       type: "data", symmetric: false, color: ink, thickness: 1.2, width: 3,
       array: some[2].map((v, k) => v - some[0][k]), arrayminus: some[1].map((v, k) => some[0][k] - v),
     } : undefined);
@@ -41,10 +42,10 @@ springbench.chart = (() => {
     const hollow = item[x.column].map((_, k) => older(item, k));
     return {
       x: item[x.column], y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
-      mode: item.joined ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
-      line: { color: ink, dash: mark.dash, width: 1.7, shape: chart.shape === "hv" ? "hv" : undefined },
+      mode: item.joined || mark.symbol === "none" ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
+      line: { color: ink, dash: mark.dash, width: 1.7, shape: shape === "hv" ? "hv" : undefined },
       // The number of markers per line is limited, whatever the number of its points.
-      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.small ? 5 : item.large ? 13 : 8, maxdisplayed: points ? 0 : chart.shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
+      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.large ? 13 : 8 * (item.scale ?? 1), maxdisplayed: points ? 0 : shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
     };
   }
 
@@ -54,6 +55,24 @@ springbench.chart = (() => {
       x: [item[x.column][k]], y: [item[y.column][k]], xaxis: `x${tail}`, yaxis: `y${tail}`, mode: "markers", hoverinfo: "skip",
       marker: { symbol: "x-thin", size: 12, line: { width: 2.4, color: ink } },
     }];
+  }
+
+  // The shaded ranges, marked values and words at points of a panel; the words belong to the first quantity of y.
+  function marks(chart, items, x, y, tail) {
+    const shapes = [], annotations = [], frames = new Set(items.map(item => chart.frames?.[item.frame]));
+    const log = (axis, v) => (axis.axis.type === "log" ? Math.log10(v) : v);
+    for (const frame of frames) {
+      for (const [low, high] of frame?.bands[y.column] || []) shapes.push({ type: "rect", layer: "below", xref: `x${tail} domain`, yref: `y${tail}`, x0: 0, x1: 1, y0: y.axis.type === "log" ? Math.max(low, high * 1e-20) : low, y1: high, line: { width: 0 }, fillcolor: css("--hair") });
+      for (const [at, words] of frame?.lines[y.column] || []) {
+        shapes.push({ type: "line", layer: "below", xref: `x${tail} domain`, yref: `y${tail}`, x0: 0, x1: 1, y0: at, y1: at, line: { width: 1, dash: "dash", color: css("--muted") } });
+        if (words) annotations.push({ text: words, xref: `x${tail} domain`, yref: `y${tail}`, x: 1, y: log(y, at), xanchor: "right", yanchor: "bottom", showarrow: false, font: { size: 12, color: css("--muted") } });
+      }
+    }
+    for (const item of y === chart.y?.[0] ? items : []) for (const [k, words] of Object.entries(item.callouts || {})) {
+      const [left, up] = [item[x.column][k], item[y.column][k]];
+      if (left !== null && up !== null) annotations.push({ text: words, xref: `x${tail}`, yref: `y${tail}`, x: log(x, left), y: log(y, up), ax: 24, ay: -18, arrowcolor: css("--muted"), arrowhead: 0, font: { size: 12, color: css("--ink") } });
+    }
+    return { shapes, annotations };
   }
 
   // The visible range of the axes as a URL parameter, such as "x:0,2;y:-3,1"; empty if everything is visible.
@@ -77,7 +96,7 @@ springbench.chart = (() => {
     };
     const layout = {
       margin: { t: panels[0] ? 30 : 12, l: 20, r: 10, b: 20 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", hovermode: "closest", hoverdistance: 24, showlegend: false,
-      annotations: [], font: { family: getComputedStyle(document.body).fontFamily, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
+      annotations: [], shapes: [], font: { family: getComputedStyle(document.body).fontFamily, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
     };
     const traces = [], gap = narrow ? 0.16 : 0.05, n = panels.length;
     // Over few decades 1, 2 and 5 are labelled, over more only the powers of ten.
@@ -95,8 +114,12 @@ springbench.chart = (() => {
       layout[`xaxis${tail}`] = { ...style, ...range(x), title: { ...style.title, text: narrow && k < n - 1 ? "" : x.title }, domain: across, anchor: `y${tail}` };
       layout[`yaxis${tail}`] = { ...style, ...range(y), title: { ...style.title, text: k && !narrow ? "" : y.title }, domain: up, anchor: `x${tail}`, matches: k ? "y" : undefined, showticklabels: !k || narrow };
       if (panel && n > 0) layout.annotations.push({ text: `<b>${panel}</b>`, x: across[0], y: up[1], yshift: 22, xref: "paper", yref: "paper", showarrow: false, xanchor: "left", font: { size: 13, color: css("--ink") } });
-      for (const item of items) {
-        if ((item.panel ?? "") !== panel || hidden.has(item.label)) continue;
+      const here = items.filter(item => (item.panel ?? "") === panel && !hidden.has(item.label)), extra = marks(chart, here, x, y, tail);
+      const label = items.find(item => (item.panel ?? "") === panel && chart.frames?.[item.frame].x_label);
+      if (label) layout[`xaxis${tail}`].title.text = chart.frames[label.frame].x_label;
+      layout.shapes.push(...extra.shapes);
+      layout.annotations.push(...extra.annotations);
+      for (const item of here) {
         traces.push(trace(chart, item, x, y, panel, tail));
         if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour(own(chart.styles, item.label).color)));
       }

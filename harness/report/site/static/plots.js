@@ -87,6 +87,8 @@
       }
       const one = (axes, name) => axes.find(a => a.column === name) || axes[0], x = one(chart.x, next.get("x")), y = one(chart.y, next.get("y"));
       const items = chart.items.filter(item => chart.filters.every(key => chosen[key] === "all" || item[key] === chosen[key]));
+      const notes = new Set(items.flatMap(item => chart.frames?.[item.frame].notes || []));
+      note.textContent = [note.textContent, ...notes].join(" ");
       const hidden = new Set((next.get("off") || "").split("~").filter(Boolean)), labels = [...new Set(items.map(item => item.label))];
       const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper", benchmark: "Benchmark" };
       const plotBox = anew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one, plus and minus zoom, Home shows all.` }) : current.plotBox;

@@ -5,7 +5,7 @@ The same panel is drawn, written as CSV, and reproduced by the script next to th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -45,6 +45,8 @@ class CurveSeries:
         labels_points: whether `label` is drawn at each point.
         setting: distinguishes curves of the same label in the data.
         marker_scale: marker size relative to other curves.
+        has_cross: whether a cross marks the end, because the measurement ended early.
+        callouts: words at single points, by index.
     """
 
     label: str
@@ -60,6 +62,8 @@ class CurveSeries:
     labels_points: bool = False
     setting: str = ""
     marker_scale: float = 1.0
+    has_cross: bool = False
+    callouts: Mapping[int, str] = field(default_factory=dict[int, str])
 
 
 class ShadedBand(NamedTuple):

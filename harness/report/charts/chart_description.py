@@ -1,0 +1,214 @@
+"""The description of a chart: named columns of numbers, and the axes that they may be drawn along.
+
+A builder makes one description of its rows. Matplotlib draws its curve plots (`select_curve_plots`) as figures and
+sheets; the results page draws its JSON (`springbench.harness.report.site.chart_json`) by Plotly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from springbench.harness.report.charts.figure_panels import (
+    AxisScale,
+    CurvePlot,
+    CurveSeries,
+    FloatArray,
+    MarkedValue,
+    ShadedBand,
+)
+from springbench.harness.report.plot_style import SeriesStyle
+
+LOW_SUFFIX, HIGH_SUFFIX = "_low", "_high"
+"""Ends of the names of the columns with the interval of a column."""
+
+
+class ChartAxis(NamedTuple):
+    """A quantity that a chart can be drawn along.
+
+    Attributes:
+        column: column of the series with its values; its interval, if known, is in columns with the suffixes above.
+        scale: label, division and tick format.
+        name: part of a panel's name that selects the quantity; empty if the chart has no other.
+        title: what distinguishes it from others with the same scale.
+        is_on_sheets: whether sheets show it too.
+    """
+
+    column: str
+    scale: AxisScale
+    name: str = ""
+    title: str = ""
+    is_on_sheets: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChartSeries:
+    """One curve, or a set of points.
+
+    Attributes:
+        label, style: entry of the legend.
+        columns: values of the k points by column; numbers, or words that are shown for a point.
+        description: what was measured, in words.
+        stale: whether other code measured the points, in total or for each of them.
+        status: "ok", or how the measurement ended; then a cross marks its end.
+        is_stepped, is_connected, marker_scale, setting: see `CurveSeries`.
+        callouts: words at points, by index; drawn where the first quantity of y is shown.
+        links: what the page offers for a point, such as a recording.
+    """
+
+    label: str
+    style: SeriesStyle
+    columns: Mapping[str, Sequence[Any] | FloatArray]
+    description: str = ""
+    stale: bool | Sequence[bool] = False
+    status: str = "ok"
+    is_stepped: bool = False
+    is_connected: bool = True
+    marker_scale: float = 1.0
+    setting: str = ""
+    callouts: Mapping[int, str] = field(default_factory=dict[int, str])
+    links: Mapping[str, Any] = field(default_factory=dict[str, Any])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChartFrame:
+    """Series that are drawn together.
+
+    Attributes:
+        group, name: parts of the names of its panels, see `CurvePlot`.
+        subject: what was measured, such as a scene; frames of one subject are shown side by side.
+        title: what distinguishes the frame from the others of its subject.
+        bands, lines: shaded ranges and marked values, by column of y.
+        notes: sentences about these series.
+        x_label: label of the horizontal axis, if it is not that of the chart.
+        sheet: name of the sheet that shows the frame; empty for the sheet of the chart.
+    """
+
+    group: tuple[str, ...]
+    name: tuple[str, ...]
+    subject: str
+    title: str
+    series: Sequence[ChartSeries]
+    bands: Mapping[str, Sequence[ShadedBand]] = field(default_factory=dict[str, Sequence[ShadedBand]])
+    lines: Mapping[str, Sequence[MarkedValue]] = field(default_factory=dict[str, Sequence[MarkedValue]])
+    notes: Sequence[str] = ()
+    x_label: str = ""
+    sheet: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChartDescription:
+    """A chart as plain data.
+
+    Attributes:
+        title: title of the chart.
+        note: how to read it, in sentences.
+        frames: its frames, in the order of their appearance.
+        x, y: quantities that it can be drawn along; the first ones are drawn by default.
+        subject_key: what the subjects are: problem, scene, gap, curve or benchmark.
+        hover: columns that are stated at a point, with their words.
+        machine_words: provenance of the data.
+        citations: citation of the method of a series, by label.
+        command: command that measures the rows.
+    """
+
+    title: str
+    note: str
+    frames: Sequence[ChartFrame]
+    x: tuple[ChartAxis, ...]
+    y: tuple[ChartAxis, ...]
+    subject_key: str
+    hover: Sequence[tuple[str, str]] = ()
+    machine_words: str = ""
+    citations: Mapping[str, str] = field(default_factory=dict[str, str])
+    command: str = ""
+
+
+def select_curve_plots(
+    chart: ChartDescription, frames: Sequence[ChartFrame] | None = None, y: Sequence[ChartAxis] | None = None
+) -> Iterator[CurvePlot]:
+    """Yield a plot for each frame and each pair of quantities that some series of it has.
+
+    Args:
+        chart: the chart.
+        frames: frames to draw; None for all.
+        y: quantities of the vertical axis; None for all.
+    """
+    for frame in chart.frames if frames is None else frames:
+        for up in chart.y if y is None else y:
+            for across in chart.x:
+                series = [made for one in frame.series if (made := _build_curve(one, across, up, up is chart.y[0]))]
+                if series:
+                    yield _build_plot(chart, frame, across, up, series)
+
+
+def _build_plot(
+    chart: ChartDescription, frame: ChartFrame, across: ChartAxis, up: ChartAxis, series: list[CurveSeries]
+) -> CurvePlot:
+    scales = across.scale._replace(label=frame.x_label or across.scale.label), up.scale
+    if across.scale.division == "sizes" and len({float(x) for one in series for x in one.x}) == 1:
+        scales = up.scale, AxisScale("", "names", place_names=tuple(one.label for one in _sort_by_value(series)))
+        series = [_lay_down(one, k) for k, one in enumerate(_sort_by_value(series))]
+    return CurvePlot(
+        group=frame.group,
+        name=(*frame.name, *filter(None, (up.name, across.name))),
+        subject=frame.subject,
+        title=", ".join(filter(None, (frame.title, up.title))),
+        x=scales[0],
+        y=scales[1],
+        series=series,
+        bands=frame.bands.get(up.column, ()),
+        lines=frame.lines.get(up.column, ()),
+        notes=frame.notes,
+        machine_words=chart.machine_words,
+    )
+
+
+def _sort_by_value(series: Sequence[CurveSeries]) -> list[CurveSeries]:
+    return sorted(series, key=lambda one: float(one.y[0]))
+
+
+def _lay_down(series: CurveSeries, row: int) -> CurveSeries:
+    """Turn the point of a series into one in a row of its own."""
+    return CurveSeries(
+        series.label, series.style, series.y, np.full(len(series.y), float(row)), series.lower, series.upper,
+        is_horizontal=True, stale=series.stale, is_connected=False, setting=series.setting,
+    )  # fmt: skip
+
+
+def _build_curve(one: ChartSeries, across: ChartAxis, up: ChartAxis, with_callouts: bool) -> CurveSeries | None:
+    """Build the curve of a series; None if it lacks a quantity."""
+    if across.column not in one.columns or up.column not in one.columns:
+        return None
+    x, y = (as_numbers(one.columns[axis.column]) for axis in (across, up))
+    if not (np.isfinite(x) & np.isfinite(y)).any():
+        return None
+    intervals = [
+        (axis, [as_numbers(one.columns[axis.column + end]) for end in (LOW_SUFFIX, HIGH_SUFFIX)])
+        for axis in (up, across)
+        if axis.column + LOW_SUFFIX in one.columns
+    ]
+    along, (lower, upper) = intervals[0] if intervals else (up, (None, None))
+    return CurveSeries(
+        label=one.label,
+        style=one.style,
+        x=x,
+        y=y,
+        lower=lower,
+        upper=upper,
+        is_horizontal=along is across,
+        stale=np.broadcast_to(np.asarray(one.stale, bool), x.shape),
+        is_stepped=one.is_stepped,
+        is_connected=one.is_connected,
+        setting=one.setting,
+        marker_scale=one.marker_scale,
+        has_cross=one.status != "ok",
+        callouts=one.callouts if with_callouts else {},
+    )
+
+
+def as_numbers(column: Sequence[Any] | FloatArray) -> FloatArray:
+    """Convert a column to an array; a missing value is nan."""
+    return np.array([np.nan if value is None else value for value in column], float)

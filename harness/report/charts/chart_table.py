@@ -1,0 +1,53 @@
+"""The charts of an accuracy measurement by name, as sheets, figures and the results page have them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from springbench.harness.report.accuracy.accuracy_data import AccuracyData, without_short_curves
+from springbench.harness.report.charts.accuracy_charts import (
+    SourceLinks,
+    build_convergence_chart,
+    build_profile_chart,
+    build_scaling_chart,
+    build_time_chart,
+    build_work_precision_chart,
+)
+from springbench.harness.report.charts.chart_description import ChartDescription
+from springbench.harness.report.charts.engine_chart import build_engine_chart
+from springbench.harness.report.charts.liu2013_chart import build_liu2013_chart
+
+ChartBuilder = Callable[[AccuracyData, str | None], ChartDescription]
+
+_BUILDERS: dict[str, ChartBuilder] = {
+    "times": build_time_chart,
+    "work": build_work_precision_chart,
+    "profiles": build_profile_chart,
+    "growth": build_scaling_chart,
+    "engines": build_engine_chart,
+}
+
+
+def build_accuracy_chart(
+    name: str,
+    everything: AccuracyData,
+    newest_fingerprint: str | None = None,
+    link_source: SourceLinks = lambda curve: {},
+) -> ChartDescription:
+    """Build the chart with a name of CHART_NAMES; it has no frames if the rows have nothing of the kind.
+
+    Args:
+        name: name of the chart.
+        everything: data of an accuracy measurement.
+        newest_fingerprint: see `springbench.harness.report.charts.accuracy_charts`.
+        link_source: returns the links of a curve.
+    """
+    if name == "liu2013":
+        return build_liu2013_chart(everything, newest_fingerprint)
+    build = partial(build_convergence_chart, link_source=link_source) if name == "convergence" else _BUILDERS[name]
+    return build(without_short_curves(everything), newest_fingerprint)
+
+
+CHART_NAMES = ("convergence", *_BUILDERS, "liu2013")
+"""Names of the charts of an accuracy measurement."""

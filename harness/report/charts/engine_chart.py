@@ -1,0 +1,74 @@
+"""Chart of external engines: the Pareto front of each program over all its settings, with a frame for each mesh."""
+
+from __future__ import annotations
+
+from springbench.harness.report.accuracy.accuracy_data import (
+    AccuracyData,
+    WorkPoint,
+    describe_self_converged,
+    is_stale,
+)
+from springbench.harness.report.accuracy.engine_comparison import (
+    OWN_PROGRAM,
+    assign_program_styles,
+    meshes_with_engines,
+    pareto_fronts,
+)
+from springbench.harness.report.charts.accuracy_charts import ACCURACY_COMMAND, COST_LABEL, ERROR_LABEL
+from springbench.harness.report.charts.chart_description import ChartAxis, ChartDescription, ChartFrame, ChartSeries
+from springbench.harness.report.charts.figure_panels import AxisScale
+from springbench.harness.report.number_format import format_quantity
+from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle
+
+
+def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = None) -> ChartDescription:
+    """Build the chart; it has no frames if no engine was measured.
+
+    Args:
+        table: data of an accuracy measurement.
+        newest_fingerprint: see `springbench.harness.report.charts.accuracy_charts`.
+    """
+    styles = assign_program_styles(table.work_points)
+    frames: list[ChartFrame] = []
+    for mesh, works in meshes_with_engines(table.work_points).items():
+        fronts = {name: front for name, front in pareto_fronts(works).items() if front}
+        is_hollow = newest_fingerprint is None and any(is_stale(work) for front in fronts.values() for work in front)
+        frames.append(
+            ChartFrame(
+                group=("engines",),
+                name=(works[0].scene, str(works[0].size)),
+                subject=mesh,
+                title=f"{format_quantity(works[0].t_end)} s",
+                series=[_build_series(name, styles[name], front, newest_fingerprint) for name, front in fronts.items()],
+                notes=[
+                    "Each line is what no other setting of the same program beats in both time and error; "
+                    f"{OWN_PROGRAM}: of all its methods that were tried. Errors of 100 % and more are left out.",
+                    *(*describe_self_converged(works), *([STALE_NOTE] if is_hollow else [])),
+                ],
+            )
+        )
+    return ChartDescription(
+        title="Outside engines compared with ours",
+        note="springbench export-script CONFIG prints a script that repeats an engine's point without us.",
+        frames=frames,
+        x=(ChartAxis("seconds", AxisScale(COST_LABEL, "log", "time")),),
+        y=(ChartAxis("error", AxisScale(ERROR_LABEL, "log", "percent")),),
+        subject_key="scene",
+        hover=(("setting", "setting"), ("error", "relative error"), ("seconds", "seconds a simulated second")),
+        machine_words=", ".join(table.machine_words),
+        command=ACCURACY_COMMAND,
+    )
+
+
+def _build_series(name: str, style: SeriesStyle, front: list[WorkPoint], newest_fingerprint: str | None) -> ChartSeries:
+    columns = {
+        "seconds": [work.seconds_per_simulated_second for work in front],
+        "error": [work.error for work in front],
+        "setting": [work.setting_label for work in front],
+    }
+    stale = [
+        is_stale(work) if newest_fingerprint is None else work.source_fingerprint != newest_fingerprint
+        for work in front
+    ]
+    setting = "; ".join(columns["setting"])
+    return ChartSeries(name, style, columns, description=front[0].mesh_label, stale=stale, setting=setting)

@@ -1,0 +1,101 @@
+"""Charts for the results page: a chart description as JSON, which `static/chart.js` draws by Plotly.
+
+An item is a series with the columns of its points; it refers to its frame by number, as bands, lines and notes belong
+to frames. Axes and styles are in Plotly's terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from springbench.harness.report.charts.chart_description import (
+    ChartAxis,
+    ChartDescription,
+    ChartFrame,
+    ChartSeries,
+)
+from springbench.harness.report.charts.figure_panels import AxisScale, FloatArray
+from springbench.harness.report.site.data_scripts import round_number
+from springbench.harness.report.site.plotly_styles import plotly_style
+from springbench.harness.report.site.run_table import format_references
+
+
+def serialise_chart(chart: ChartDescription) -> dict[str, Any]:
+    """Return a chart as data that can be represented as JSON."""
+    pairs = [(number, frame, series) for number, frame in enumerate(chart.frames) for series in frame.series]
+    return {
+        "title": chart.title,
+        "note": chart.note,
+        "filters": [chart.subject_key],
+        "x": [_describe_axis(axis) for axis in chart.x],
+        "y": [_describe_axis(axis, {"autorange": "reversed"}) for axis in chart.y],
+        "hover": [list(pair) for pair in chart.hover],
+        "frames": [_describe_frame(frame) for frame in chart.frames],
+        "items": [_describe_series(chart, number, frame, series) for number, frame, series in pairs],
+        "styles": {series.label: plotly_style(series.style) for *_, series in pairs},
+        "citations": format_references(chart.citations.items()),
+        "command": chart.command,
+    }
+
+
+def _describe_axis(axis: ChartAxis, names_layout: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
+    """Describe a choice of an axis; `names_layout` is added to the layout of an axis of names."""
+    unit = " [s]" if axis.scale.tick_format == "time" else ""
+    more = names_layout if axis.scale.division == "names" else {}
+    title = ", ".join(filter(None, (axis.scale.label, axis.title))) + unit
+    return {"column": axis.column, "title": title, "axis": {**_plotly_axis(axis.scale), **more}}
+
+
+def _plotly_axis(scale: AxisScale) -> dict[str, Any]:
+    if scale.division == "names":
+        return {"type": "category", "categoryarray": list(scale.place_names)}
+    if scale.division != "linear":
+        return {"type": "log"}
+    return {"tickformat": ".0%", "rangemode": "tozero"} if scale.tick_format == "percent" else {}
+
+
+def _describe_frame(frame: ChartFrame) -> dict[str, Any]:
+    return {
+        "notes": list(frame.notes),
+        "x_label": frame.x_label,
+        "bands": {column: [list(band) for band in bands] for column, bands in frame.bands.items()},
+        "lines": {column: [list(line) for line in lines] for column, lines in frame.lines.items()},
+    }
+
+
+def _describe_series(chart: ChartDescription, number: int, frame: ChartFrame, series: ChartSeries) -> dict[str, Any]:
+    columns = {name: _describe_column(values) for name, values in series.columns.items()}
+    for axis in (*chart.x, *chart.y):
+        if axis.scale.division == "names" and axis.column in columns:
+            places = series.columns[axis.column]
+            columns[axis.column] = [_find_place_name(axis.scale, place) for place in places]
+    length = len(next(iter(columns.values())))
+    missing = {axis.column: [None] * length for axis in (*chart.x, *chart.y) if axis.column not in columns}
+    return {
+        "label": series.label,
+        "description": series.description,
+        chart.subject_key: frame.subject,
+        "panel": frame.title,
+        "frame": number,
+        "shape": "hv" if series.is_stepped else "" if series.is_connected else "points",
+        "scale": series.marker_scale,
+        "stale": np.broadcast_to(np.asarray(series.stale, bool), length).tolist(),
+        "status": series.status,
+        "callouts": {str(k): words for k, words in series.callouts.items()},
+        "parameters": "{}",
+        **series.links,
+        **columns,
+        **missing,
+    }
+
+
+def _find_place_name(scale: AxisScale, place: Any) -> str | None:
+    return None if place is None or np.isnan(place) else scale.place_names[round(place)]
+
+
+def _describe_column(values: Sequence[Any] | FloatArray) -> list[Any]:
+    plain = values.tolist() if isinstance(values, np.ndarray) else values
+    return [value if isinstance(value, str) else round_number(value) for value in plain]

@@ -1,0 +1,201 @@
+"""Charts as plain data: what a description holds, and that figures, sheets and the page draw the same."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from springbench.harness.report.accuracy.accuracy_data import AccuracyData
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy_report import draw_accuracy_report
+from springbench.harness.report.charts.accuracy_charts import build_convergence_chart
+from springbench.harness.report.charts.chart_description import (
+    ChartAxis,
+    ChartDescription,
+    ChartFrame,
+    ChartSeries,
+    select_curve_plots,
+)
+from springbench.harness.report.charts.chart_table import CHART_NAMES, build_accuracy_chart
+from springbench.harness.report.charts.figure_panels import AxisScale
+from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
+from springbench.harness.report.figures.figure_layout import compose_figure
+from springbench.harness.report.figures.figure_options import FigureOptions
+from springbench.harness.report.plot_style import PAGE_WIDTH, TEXT_COLOUR, SeriesStyle, assign_solver_styles
+from springbench.harness.report.site.chart_json import serialise_chart
+
+from tests import synthetic_accuracy_rows as made
+
+STYLE = SeriesStyle("#123456", "o")
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> AccuracyData:
+    """Three sizes of a scene, one step in another minimum, a doubtful step with failures, simulations."""
+    rows = []
+    for size in (6, 12, 24):
+        rows += made.build_snapshot_rows("net", size, "early", minima_count=2)
+        for solver in ("numba", "newton"):
+            index = int(size == 12 and solver == "newton")
+            rows += made.build_curve_rows("net", size, "early", solver, minimum_index=index)
+    rows += made.build_snapshot_rows("net", 6, "peak", certified=False)
+    rows += made.build_curve_rows("net", 6, "peak", "lbfgs", status="time-limit", reason="the limit of 5 s was reached")
+    rows.append(made.build_failure_row("net", 6, "peak", "dense", "unsupported", "knows springs </script> alone"))
+    rows += [*made.build_work_rows("net", 6), *made.build_liu2013_rows()]
+    return read_accuracy(made.write_accuracy_rows(tmp_path_factory.mktemp("charts"), rows))
+
+
+def find_frame(chart: ChartDescription, subject: str) -> ChartFrame:
+    return next(frame for frame in chart.frames if frame.subject.startswith(subject))
+
+
+def test_doubtful_references_early_ends_and_other_minima_are_stated(table: AccuracyData) -> None:
+    chart = build_accuracy_chart("convergence", table)
+    doubtful, other, sure = (find_frame(chart, words) for words in ("net 6, peak", "net 12", "net 24"))
+    said = " ".join(doubtful.notes)
+    assert "Reference not certified: the lowest known minimum is not certified." in said
+    assert "× Ended early (time-limit): lbfgs." in said
+    assert "(unsupported): dense" in said
+    assert {series.label: series.status for series in doubtful.series}["lbfgs"] == "time-limit"
+    assert "In minimum 1, higher than the lowest known; vertex errors refer to it: newton." in other.notes
+    labels = {series.label: [*series.callouts.values()] for series in other.series}
+    assert labels == {"numba": [], "newton": ["minimum 1"]}
+    assert not any("certified" in note or "minimum" in note for note in sure.notes)
+
+
+def test_an_early_end_is_a_cross_and_a_callout_a_ring_with_words(table: AccuracyData) -> None:
+    chart = build_accuracy_chart("convergence", table)
+    (plot,) = (one for one in select_curve_plots(chart) if one.group[2] == "peak" and one.name == ("gap", "time"))
+    figure = compose_figure([plot], "", FigureOptions())
+    crosses = [line for line in figure.axes[0].lines if line.get_marker() == "x"]
+    assert {line.get_color() for line in crosses} == {assign_solver_styles()["lbfgs"].color}
+    plots = [one for one in select_curve_plots(chart) if one.group[1] == "12" and one.name[1] == "iterations"]
+    shown = {one.name[0]: [words for curve in one.series for words in curve.callouts.values()] for one in plots}
+    assert shown == {"gap": ["minimum 1"], "largest": [], "stationarity": [], "metres": []}
+    figure = compose_figure(plots[:1], "", FigureOptions())
+    (ring,) = (line for line in figure.axes[0].lines if line.get_markerfacecolor() == "none")
+    assert ring.get_markeredgecolor() == TEXT_COLOUR
+    assert "minimum 1" in [text.get_text() for text in figure.axes[0].texts]
+
+
+def test_the_default_and_methods_that_do_not_minimise_are_marked(table: AccuracyData) -> None:
+    chart = build_accuracy_chart("work", table)
+    callouts = [words for frame in chart.frames for series in frame.series for words in series.callouts.values()]
+    assert callouts == ["the default"]
+    labels = {series.label for frame in chart.frames for series in frame.series}
+    assert labels == {"best of all", "numba", "hybrid", "xpbd †"}
+
+
+def test_growth_states_the_fitted_power(table: AccuracyData) -> None:
+    (frame,) = build_accuracy_chart("growth", table).frames
+    assert [series.label for series in frame.series] == ["numba n^1.00", "newton"], "two sizes give no power"
+    assert "Not reached by newton at 144 vertices." in frame.notes
+
+
+def test_the_paper_s_newton_is_drawn_by_time_alone(table: AccuracyData) -> None:
+    chart = build_accuracy_chart("liu2013", table)
+    plots = {one.name: one for one in select_curve_plots(chart, [chart.frames[0]])}
+    assert [*plots] == [("iterations",), ("time",)]
+    names = [[series.label for series in plots[name].series] for name in plots]
+    assert ["their Newton" in labels for labels in names] == [False, True]
+    assert all(labels[:2] == ["ours", "Liu et al. 2013"] for labels in names)
+
+
+@pytest.mark.parametrize("name", CHART_NAMES)
+def test_the_page_draws_the_numbers_of_the_figures(table: AccuracyData, name: str) -> None:
+    chart = build_accuracy_chart(name, table)
+    page = json.loads(json.dumps(serialise_chart(chart), allow_nan=False))
+    assert len(page["items"]) == sum(len(frame.series) for frame in chart.frames)
+    axes = {axis["column"]: axis for axis in (*page["x"], *page["y"])}
+    assert all(len({len(item[column]) for column in axes}) == 1 for item in page["items"]), "a column is missing"
+    for frame in chart.frames:
+        for plot in select_curve_plots(chart, [frame]):
+            for up in chart.y:
+                if up.name and up.name not in plot.name:
+                    continue
+                for curve in plot.series:
+                    values = [
+                        item[up.column]
+                        for item in page["items"]
+                        if item["label"] == curve.label and item[chart.subject_key] == frame.subject
+                    ]
+                    drawn = [None if np.isnan(y) else float(f"{y:.5g}") for y in curve.y]
+                    assert drawn in values, (curve.label, up.column)
+    assert all(axis["title"] for axis in axes.values())
+
+
+def test_a_band_and_notes_belong_to_their_frame_on_the_page(table: AccuracyData) -> None:
+    chart = build_accuracy_chart("convergence", table)
+    page = serialise_chart(chart)
+    at = chart.frames.index(find_frame(chart, "net 6, peak"))
+    assert {item["frame"] for item in page["items"] if item["label"] in ("lbfgs", "dense")} == {at}
+    assert any("not certified" in note for note in page["frames"][at]["notes"])
+    shaded = [frame["bands"] for frame in page["frames"] if frame["bands"]]
+    assert all(set(bands) == {"gap"} for bands in shaded)
+
+
+def build_small_chart(sizes: tuple[float, ...]) -> ChartDescription:
+    """Two solvers whose times have intervals, at these sizes."""
+    series = [
+        ChartSeries(
+            label,
+            STYLE,
+            {
+                "n": sizes,
+                "t": [cost * n for n in sizes],
+                "t_low": [0.9 * cost * n for n in sizes],
+                "t_high": [1.1 * cost * n for n in sizes],
+            },
+        )
+        for label, cost in (("slow", 2.0), ("fast", 1.0))
+    ]
+    frame = ChartFrame(("net",), ("step",), "net", "", series, lines={}, x_label="")
+    scales = AxisScale("vertices", "sizes"), AxisScale("wall time", "log", "time")
+    return ChartDescription("Time", "", [frame], (ChartAxis("n", scales[0]),), (ChartAxis("t", scales[1]),), "scene")
+
+
+def test_several_sizes_are_curves_with_their_intervals() -> None:
+    (plot,) = select_curve_plots(build_small_chart((10.0, 20.0)))
+    assert (plot.x.division, plot.y.division) == ("sizes", "log")
+    assert plot.series[0].lower is not None
+    assert plot.series[0].lower.tolist() == [18.0, 36.0]
+    assert not plot.series[0].is_horizontal
+
+
+def test_one_size_has_a_row_for_each_series_the_least_first() -> None:
+    (plot,) = select_curve_plots(build_small_chart((10.0,)))
+    assert (plot.x.label, plot.y.place_names) == ("wall time", ("fast", "slow"))
+    assert [(series.label, series.x.tolist(), series.y.tolist()) for series in plot.series] == [
+        ("fast", [10.0], [0.0]),
+        ("slow", [20.0], [1.0]),
+    ]
+    assert all(series.is_horizontal and not series.is_connected for series in plot.series)
+
+
+def test_panels_with_one_quantity_have_the_same_limits(table: AccuracyData) -> None:
+    chart = build_convergence_chart(table)
+    plots = [one for one in select_curve_plots(chart) if one.name == ("gap", "iterations") and "early" in one.group]
+    figure = compose_figure(plots[:2], "", FigureOptions(width_mm=180.0))
+    assert figure.axes[0].get_ylim() == figure.axes[1].get_ylim()
+
+
+def test_every_sheet_is_there_in_both_formats_and_nothing_half_written(tmp_path: Path) -> None:
+    files = draw_accuracy_report(made.write_accuracy_rows(tmp_path, [*made.build_work_rows("net", 6)]))
+    pictures = [path for path in files if path.suffix == ".png"]
+    stems = [path.relative_to(tmp_path / "report").with_suffix("").as_posix() for path in pictures]
+    assert stems == ["work/net-6"]
+    assert [path.with_suffix(".svg") for path in pictures] == [path for path in files if path.suffix == ".svg"]
+    assert not list(tmp_path.rglob(".*")), "no partial file is left"
+    for path in pictures:
+        with Image.open(path) as image:
+            assert image.width == PAGE_WIDTH
+            assert np.asarray(image.convert("L")).std() > 3, "an empty page has no variance"
+        assert "<svg" in path.with_suffix(".svg").read_text()[:1000]
+
+
+def test_the_same_chart_gives_the_same_vectors(tmp_path: Path) -> None:
+    once, again = (draw_chart_sheets(build_small_chart((1.0, 2.0)), tmp_path / name)[1] for name in ("once", "again"))
+    assert once.read_bytes() == again.read_bytes()
