@@ -29,9 +29,13 @@ def read_commands(heading: str) -> list[str]:
 
 
 def find_interpreters() -> list[str]:
-    """The supported interpreters of this machine other than this one, the present release of each."""
-    names = [f"python3.{minor}" for minor in (11, 12, 13, 14) if minor != sys.version_info.minor]
-    return [name for name in names if shutil.which(name) and subprocess.run([name, "-V"]).returncode == 0]
+    """The supported interpreters of this machine other than this one, in the path or installed by pyenv."""
+    found = list[str]()
+    for name in (f"python3.{minor}" for minor in (11, 12, 13, 14) if minor != sys.version_info.minor):
+        installed = sorted((Path.home() / ".pyenv" / "versions").glob(f"{name.removeprefix('python')}.*/bin/{name}"))
+        options = [*filter(None, [shutil.which(name)]), *map(str, installed)]
+        found += [one for one in options if subprocess.run([one, "-V"], capture_output=True).returncode == 0][:1]
+    return found
 
 
 def call(*command: str, folder: Path, path: str = "") -> str:
@@ -89,8 +93,9 @@ def test_the_light_list_leaves_out_the_libraries_of_recordings_and_pictures(scri
 
 def test_other_interpreters_of_this_machine_run_a_scene_and_a_study(scripts: Path, tmp_path: Path):
     (wheel,) = scripts.parents[1].glob("*.whl")
-    for name in find_interpreters():
-        call(name, "-m", "venv", name, folder=tmp_path)
+    for interpreter in find_interpreters():
+        name = Path(interpreter).name
+        call(interpreter, "-m", "venv", name, folder=tmp_path)
         bin_folder = tmp_path / name / "bin"
         install = ["uv", "pip", "install", "--quiet", "--python", str(bin_folder / "python"), f"{wheel}[gates]"]
         call(sys.executable, "-m", *install, folder=tmp_path)
