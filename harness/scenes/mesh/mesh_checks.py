@@ -414,7 +414,7 @@ def check_self_intersections(points: PointArray, triangles: IndexArray) -> list[
     through = np.unique(np.array([triangle for _, triangle in crossed], np.int64), axis=0)
     problem = f"edges that pass through triangles (self-intersections): {len(crossed):,}"
     fix = "`self-contact` needs a start without any"
-    crossing = np.array([edge for edge, _ in crossed], np.int64)
+    crossing = np.unique(np.array([edge for edge, _ in crossed], np.int64), axis=0)
     return [
         MeshFinding("self-intersections", len(crossed), problem, fix, edges=crossing, triangles=through),
     ]
