@@ -148,6 +148,17 @@ def test_the_command_prints_json_with_all_places(tmp_path):
     assert (seam["name"], seam["count"], seam["vertices"]) == ("coincident-vertices", 2, [1, 2, 3, 5])
 
 
+def test_attributes_that_are_no_numbers_are_reported(tmp_path):
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(
+        f"property float {x}\n" for x in ("x", "y", "z", "a", "b")
+    )
+    corners = "element face 1\nproperty list uchar int vertex_index\nend_header\n"
+    path = tmp_path / "mesh.ply"
+    path.write_text(f"{head}{corners}0 0 0 nan 1\n1 0 0 inf 2\n0 1 0 nan nan\n3 0 1 2\n")
+    assert json.loads(run_command(path, "--json")[1])["attributes"] == {"a": [], "b": [1, 2]}
+    assert "a without finite values, b 1 to 2" in run_command(path)[1]
+
+
 SCENE = """
 mesh: {kind: file, path: mesh.obj}
 mass: 1

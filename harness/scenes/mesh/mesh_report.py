@@ -255,10 +255,14 @@ def _collect_facts(cells: MeshCells, edges: IndexArray, triangles: IndexArray) -
         "is_manifold": bool((table.num_triangles <= 2).all()),
         "is_oriented": facing.is_consistent,
         "groups": {name: len(group) for name, group in sorted(groups.items())},
-        "attributes": {
-            name: [float(column.min()), float(column.max())] for name, column in sorted(cells.attributes.items())
-        },
+        "attributes": {name: _find_range(column) for name, column in sorted(cells.attributes.items())},
     }
+
+
+def _find_range(values: PointArray) -> list[float]:
+    """Return the smallest and the largest finite value; empty without any."""
+    finite = values[np.isfinite(values)]
+    return [float(finite.min()), float(finite.max())] if len(finite) else []
 
 
 def _summarise(values: PointArray) -> dict[str, float]:
@@ -297,7 +301,10 @@ def _format_facts(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "boundary", f"{len(loops):,} loops: {_shorten(lengths)}"
     yield "groups", _shorten([f"{name} {count:,}" for name, count in facts["groups"].items()], 4 * _MAX_LISTED)
     if facts["attributes"]:
-        ranges = [f"{name} {low:.3g} to {high:.3g}" for name, (low, high) in facts["attributes"].items()]
+        ranges = [
+            f"{name} {found[0]:.3g} to {found[1]:.3g}" if found else f"{name} without finite values"
+            for name, found in facts["attributes"].items()
+        ]
         yield "attributes", _shorten(ranges)
 
 
