@@ -155,6 +155,9 @@ def build_scene(spec: SceneSpec, size: int, integrator: str = "implicit-euler", 
     """
     spec = spec.load_plugins()
     mesh, method = _build_mesh(spec, size), find_integrator(integrator)
+    if spec.fabric is not None and mesh.dimension != 2:
+        problem = "is the material of a cloth, and this mesh is none; state `stretch` of the springs and `mass` instead"
+        raise InputError(InputMistake(problem, key="fabric"))
     mass = _compute_vertex_masses(spec, mesh)
     parts = [_build_contribution(spec, i, mesh, mass).adapt_to_integrator(method) for i in range(len(spec.effects))]
     _require_unique(spec, parts)

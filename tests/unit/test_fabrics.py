@@ -104,6 +104,13 @@ def test_what_a_scene_states_takes_precedence_over_its_fabric(tmp_path: Path):
             build_cloth(tmp_path, "kind: springs, stretch: 7", mass=text)
 
 
+@pytest.mark.parametrize("mesh", ["chain", "block"])
+def test_a_mesh_that_is_no_cloth_has_no_fabric(tmp_path: Path, mesh: str):
+    text = f"mesh: {{kind: {mesh}}}\nmass: 1\nfabric: royal-target\ntime_step: 0.1\nframes: 1\n"
+    with pytest.raises(InputError, match=r"fabric: is the material of a cloth"):
+        load_text(tmp_path, text + "effects: [{kind: springs}]\n")
+
+
 @pytest.mark.parametrize(
     ("mass", "effect", "needle"),
     [
