@@ -156,8 +156,8 @@ _TABLE = (
     (
         "wind-density",
         "harness/scenes/effects/wind_effect.py",
-        "            0.5\n            * wind.air_density",
-        "            1.0\n            * wind.air_density",
+        "0.5 * wind.air_density",
+        "1.0 * wind.air_density",
         f"{_U}/test_effect_wind.py",
     ),
 )
