@@ -135,6 +135,8 @@ class DeviceSolverState(SolverState):
 class DeviceSolver(IterativeSolver):
     """A method that is prepared on a device, with the device `columns` of its rows."""
 
+    can_leave_saddles: ClassVar[bool] = False  # a timed solve repeats the number of iterations alone
+
     device_columns: dict[str, Any]
 
     def device_state(self) -> dict[str, float | None]:

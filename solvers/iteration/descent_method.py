@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,13 @@ class DescentPoint(NamedTuple):
 
 
 class DescentMethod(Protocol):
-    """A method that yields one point after another; it ends with a stalled one."""
+    """A method that yields one point after another; it ends with a stalled one.
+
+    Attributes:
+        identifies_saddles: whether `can_terminate` distinguishes saddles from minima.
+    """
+
+    identifies_saddles: ClassVar[bool]
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points after `start`."""
@@ -208,6 +214,11 @@ class PreparedDescent(IterativeSolver):
         if not self.fixed_objective.has_barriers:
             return self
         return IdleContactSolver(self, replace(self, fixed_objective=self.fixed_objective.ignore_barriers()))
+
+    @property
+    def identifies_saddles(self) -> bool:
+        """Whether the method distinguishes saddles from minima."""
+        return self.method.identifies_saddles
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""

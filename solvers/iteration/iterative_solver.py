@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
 from operator import methodcaller
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,9 @@ from springbench.solvers.model.step_problem import (
     StopRule,
     Unsupported,
 )
+
+if TYPE_CHECKING:
+    from springbench.solvers.iteration.saddle_check import SaddleCheck
 
 _TERMINATION_REASONS = {
     iteration_loop.REASON_ITERATIONS: "max-iter",
@@ -120,10 +124,17 @@ class IterativeSolver(ABC):
             iteration as |p - LG(p)|, and "none" for a method that does not minimise, which does all iterations.
         supports_length_constraints: whether length constraints are supported; if not, `iterates` and `solve` raise
             Unsupported for a system that has any.
+        can_leave_saddles: whether a solve that ends at a saddle may start again from a lower point.
     """
 
     residual_iterate: ClassVar[ResidualIterate] = "returned"
     supports_length_constraints: ClassVar[bool] = False
+    can_leave_saddles: ClassVar[bool] = True
+
+    @property
+    def identifies_saddles(self) -> bool:
+        """Whether `SolverState.can_terminate` distinguishes saddles from minima; other methods get a `SaddleCheck`."""
+        return False
 
     @abstractmethod
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
@@ -153,23 +164,31 @@ class IterativeSolver(ABC):
                 limit, close = max(limit, stop.rtol * yardstick), stop.rtol <= _MINIMUM_CHECK_RTOL
             limits = LoopLimits(stop.max_iterations, limit, near, iteration_loop.RESIDUAL_EACH)
         count, residual, ended = self._iterate_to_roundoff(run, problem, limits, stop.roundoff_floor)
-        while (
-            close
-            and ended in (iteration_loop.REASON_TOLERANCE, iteration_loop.REASON_FLOOR)
-            and not run.can_terminate()
-        ):
+        while close and _has_converged(ended) and not run.can_terminate():
             left = limits._replace(max_iterations=stop.max_iterations - count)
             more, residual, ended = self._iterate_to_roundoff(run, problem, left, stop.roundoff_floor)
             count += more
             if not more and ended != iteration_loop.REASON_ITERATIONS:
                 ended = iteration_loop.REASON_STALLED
-        ended = _TERMINATION_REASONS[ended]
+        reason = _TERMINATION_REASONS[ended]
+        while (close and _has_converged(ended)) or ended == iteration_loop.REASON_STALLED:
+            lower = self._find_lower_point(problem, run.positions, count)
+            if lower is None:
+                break
+            if count >= stop.max_iterations or not self.can_leave_saddles:
+                reason = "saddle"
+                break
+            self.release_state(run)
+            run = self.init_state(problem, lower)
+            left = limits._replace(max_iterations=stop.max_iterations - count - 1)
+            more, residual, ended = self._iterate_to_roundoff(run, problem, left, stop.roundoff_floor)
+            count, reason = count + 1 + more, _TERMINATION_REASONS[ended]
         found = Solution(
             run.positions,
             count,
             residual,
             yardstick,
-            ended,
+            reason,
             run.velocity,
             self.residual_iterate,
             run.warm_start,
@@ -181,6 +200,22 @@ class IterativeSolver(ABC):
     def release_state(self, run: SolverState) -> None:
         """Take back the state of a solve that has ended, for a method whose next solve reuses it."""
         return
+
+    def _find_lower_point(self, problem: StepProblem, p: Positions, num_iterations: int) -> Positions | None:
+        """Return a point to which negative curvature leads from the end point p of a solve, or None."""
+        system = problem.system
+        if self.identifies_saddles or self.residual_iterate == "none" or system.length_constraints:
+            return None
+        if not self._saddle_checks or self._saddle_checks[0].system is not system:
+            from springbench.solvers.iteration.saddle_check import SaddleCheck  # for those who need it
+
+            self._saddle_checks[:] = [SaddleCheck(system)]
+        return self._saddle_checks[0].find_lower_point(problem, p, num_iterations)
+
+    @cached_property
+    def _saddle_checks(self) -> list[SaddleCheck]:
+        """The check of the last system, if any."""
+        return []
 
     def _initial_state(self, problem: StepProblem) -> SolverState:
         if problem.system.length_constraints and not self.supports_length_constraints:
@@ -261,6 +296,10 @@ class SubsteppingState(SolverState):
         self._num_substeps += num_iterations
         self.positions, self.velocity = self._step_in_substeps(self._problem, self._num_substeps)
         return num_iterations
+
+
+def _has_converged(ended: int) -> bool:
+    return ended in (iteration_loop.REASON_TOLERANCE, iteration_loop.REASON_FLOOR)
 
 
 def is_far_from_origin(p: Positions) -> bool:

@@ -280,6 +280,8 @@ class HybridIteration:
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
     """
 
+    identifies_saddles: ClassVar[bool] = True
+
     def __init__(
         self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated, is_small: bool
     ) -> None:

@@ -106,6 +106,8 @@ class NewtonCG(PrecisionOptions):
 class TruncatedNewtonIteration:
     """The iteration for one system; `compiled_cg` is the fused CG kernel, None if unavailable."""
 
+    identifies_saddles: ClassVar[bool] = False
+
     def __init__(
         self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "cholesky"
     ) -> None:

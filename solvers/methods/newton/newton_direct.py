@@ -103,6 +103,8 @@ class NewtonSolver:
 class NewtonIteration:
     """The iteration of Newton's method for one system."""
 
+    identifies_saddles: ClassVar[bool] = True
+
     def __init__(self, metric: ResidualMetric, indefinite: IndefiniteStrategy = "shift-schedule") -> None:
         self._metric, self._modification_rule = metric, REGULARISATION_RULES[indefinite]
         self._system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)

@@ -1,0 +1,149 @@
+"""The check whether a solve has ended at a saddle point, for methods that do not factorise the Hessian.
+
+Methods that follow gradients preserve symmetry, and so they may converge to a saddle; the residual does not show it.
+First a bound over springs and vertices rules out negative curvature, at the cost of one gradient; it succeeds where no
+spring is compressed by more than inertia resists. Else conjugate gradients search for a direction of negative curvature
+within a limited number of products with the Hessian (`springbench.solvers.kernels.curvature_search`). A search that
+finds none proves nothing.
+
+Negative curvature counts if it leads to a point that is lower by more than the round-off of the objective. So a valley
+of minima, along which the curvature is zero and round-off gives it a sign, is no saddle.
+
+Systems with length constraints are not checked: there the curvature within the constraints decides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.iteration.vertex_terms import compute_anchor_stiffness
+from springbench.solvers.kernels import curvature_search
+from springbench.solvers.kernels.curvature_search import EXHAUSTED_RATIO, CurvatureScratch
+from springbench.solvers.kernels.line_search_conditions import is_armijo_step
+from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
+from springbench.solvers.model.step_problem import Positions, StepProblem, System
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import VALUE_ROUNDOFF, Hessian, StepObjective
+
+_MIN_PRODUCTS = 32
+"""Number of products of any search. Saddles of the hard cases need 1 to 28; motion-burst, a block that turns, most."""
+
+_ITERATIONS_PER_PRODUCT = 16
+"""Iterations of the solve for each product beyond that number. A product takes a third of an iteration of L-BFGS."""
+
+_MAX_HALVINGS = 40
+"""Maximum number of halvings: from the extent of the mesh to a millionth of a millionth of it."""
+
+
+class SaddleCheck:
+    """The check of the end points of solves, for one system."""
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self._fixed_objective = FixedObjective(system)
+        self._anchor_stiffness = compute_anchor_stiffness(system)
+        self._negative_stiffness = np.empty(system.num_vertices)
+        self._scratch: CurvatureScratch | None = None
+
+    def find_lower_point(self, problem: StepProblem, p: Positions, num_iterations: int) -> Positions | None:
+        """Return a point to which negative curvature leads, or None if none was found.
+
+        Args:
+            problem: the step.
+            p: end point of the solve (n, 3) [m].
+            num_iterations: number of iterations of the solve, which limits the cost of the search.
+
+        Returns:
+            A lower point (n, 3) [m].
+        """
+        whole = self._fixed_objective
+        if not (whole.element_energy_indices or whole.other_energy_indices) and self._is_bounded(p, None, None):
+            return None
+        step = StepObjective(whole, problem)
+        hessian = step.hessian(p)
+        terms, linear, form, joined, curvature = hessian.kernel_arguments
+        if whole.element_energy_indices and not step.other_energies and self._is_bounded(p, joined, curvature):
+            return None
+        if self._scratch is None:
+            self._scratch = CurvatureScratch.from_size(self.system.num_vertices)
+        scratch, limit = self._scratch, max(_MIN_PRODUCTS, num_iterations // _ITERATIONS_PER_PRODUCT)
+        arguments = terms, linear, form, joined, curvature
+        if step.other_energies:
+            curvature_search.fill_preconditioner(*arguments, self._anchor_stiffness, scratch)
+            found = _InterpretedSearch(hessian, scratch).find_curvature(limit)
+        else:
+            found = curvature_search.search_compiled(arguments, self._anchor_stiffness, limit, scratch)
+        if not found < 0.0:
+            return None
+        size = float(np.abs(scratch.direction).max())
+        return _descend_along(step, p, scratch.direction / size, found / size**2)
+
+    def _is_bounded(self, p: Positions, joined: object, curvature: NDArray[np.float64] | None) -> bool:
+        return curvature_search.has_positive_bound(
+            self._fixed_objective.objective_terms,
+            self._anchor_stiffness,
+            joined,
+            curvature,
+            p,
+            self._negative_stiffness,
+        )
+
+
+class _InterpretedSearch(ConjugateGradientIteration):
+    """The search with energies that have no element-wise form."""
+
+    def __init__(self, hessian: Hessian, scratch: CurvatureScratch) -> None:
+        self._hessian, self._scratch = hessian, scratch
+        self._product = curvature_search.start_search(scratch)
+        self._limit = EXHAUSTED_RATIO * self._product
+
+    def find_curvature(self, max_products: int) -> float:
+        """Return the curvature [J] along the scratch's direction, 0 if none is negative."""
+        _, ended = self.run_iterations(self._product, max_products)
+        return curvature_search.measure_curvature(self._scratch) if ended == NEGATIVE_CURVATURE else 0.0
+
+    def update_direction(self, product: float, previous_product: float) -> float:
+        """Update the direction; return the curvature along it."""
+        curvature_search.update_direction(self._scratch, product / previous_product)
+        self._scratch.product[:] = self._hessian.matvec(self._scratch.direction)
+        return curvature_search.measure_curvature(self._scratch)
+
+    def update_iterate(self, product: float, curvature: float) -> float:
+        """Update the residual; return r'z."""
+        return curvature_search.update_residual(self._scratch, product / curvature)
+
+    def is_convex(self, curvature: float) -> bool:
+        """Return whether the curvature is positive beyond round-off."""
+        return curvature > 0.0
+
+    def is_converged(self, product: float) -> bool:
+        """Return whether the Krylov space is exhausted."""
+        return not product > self._limit
+
+
+def _descend_along(step: StepObjective, p: Positions, x: Positions, curvature: float) -> Positions | None:
+    """Return the lowest of the points p + t x and p - t x, for t the extent of the mesh, half of it, and so on.
+
+    Args:
+        step: the objective.
+        p: positions (n, 3) [m].
+        x: direction (n, 3) of negative curvature, with maximum 1.
+        curvature: second derivative along it [N/m].
+
+    Returns:
+        Positions (n, 3) [m]; None if no point is lower by more than round-off.
+    """
+    lowest, found = -VALUE_ROUNDOFF * step.problem.value_scale(p), None
+    slope, extent = float(np.einsum("ij,ij->", step.gradient(p), x)), float(np.ptp(p, axis=0).max(initial=0.0)) or 1.0
+    for d, slope_along in ((x, slope), (-x, -slope)):
+        before = np.inf
+        for halvings in range(_MAX_HALVINGS):
+            t = step.max_step_size(p, d, 0.5**halvings * extent)
+            q = step.apply_exact_pins(p + t * d)
+            change, noise = step.objective_change(p, q)
+            if change + noise < lowest and is_armijo_step(change, t, slope_along, curvature):
+                lowest, found = change + noise, q
+            elif before <= change and before < 0.0:
+                break
+            before = change
+    return found
