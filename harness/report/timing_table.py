@@ -124,7 +124,7 @@ select run_id, any_value(scene), any_value("size"), any_value(solver), any_value
     1e3 * median(seconds) filter (phase = 'local'),
     1e3 * median(seconds) filter (phase = 'global'),
     {SQL_EXPRESSIONS["num_iterations"]},
-    arg_min(termination_reason, list_position(['max-iter', 'stalled', 'converged', 'roundoff'],
+    arg_min(termination_reason, list_position(['max-iter', 'saddle', 'stalled', 'converged', 'roundoff'],
                                               termination_reason)) filter (
         termination_reason <> 'max-iter'
         or not coalesce(is_substepping, false) and coalesce(num_iterations >= max_iterations, true)),

@@ -159,7 +159,8 @@ RUN_COLUMNS = (
         "termination_reason",
         _TEXT,
         "",
-        "why the step's iteration ended: max-iter, stalled, converged or roundoff; the least favourable of its stages",
+        "why the step's iteration ended: max-iter, saddle, stalled, converged or roundoff; the least favourable of its "
+        "stages",
     ),
     ColumnSpec(
         "solver_phases",

@@ -334,7 +334,7 @@ def _is_solved(solution: Solution, atol: float) -> bool:
 
     A stalled solve is allowed a larger one, since round-off may prevent any further reduction.
     """
-    if solution.termination_reason == "stalled":
+    if solution.termination_reason in ("stalled", "saddle"):
         return solution.residual <= _STALL_FACTOR * atol
     return solution.termination_reason != "max-iter"
 

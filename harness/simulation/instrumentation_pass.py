@@ -40,7 +40,7 @@ from springbench.solvers.model.step_problem import Positions, PreparedSolver
 _ENERGY_TERMS = ("springs", "inertia", "force", "pins")
 """Terms of the objective that have their own columns."""
 
-_REASON_ORDER = ("max-iter", "stalled", "converged", "roundoff")
+_REASON_ORDER = ("max-iter", "saddle", "stalled", "converged", "roundoff")
 """Termination reasons of a solve, least desirable first."""
 
 

@@ -15,7 +15,6 @@ Systems with length constraints are not checked: there the curvature within the 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from springbench.solvers.iteration.vertex_terms import compute_anchor_stiffness
 from springbench.solvers.kernels import curvature_search
 from springbench.solvers.kernels.curvature_search import EXHAUSTED_RATIO, CurvatureScratch
@@ -42,6 +41,7 @@ class SaddleCheck:
         self.system = system
         self._fixed_objective = FixedObjective(system)
         self._anchor_stiffness = compute_anchor_stiffness(system)
+        self._linear_terms = np.empty((len(self._fixed_objective.springs.stiffness), 4))
         self._negative_stiffness = np.empty(system.num_vertices)
         self._scratch: CurvatureScratch | None = None
 
@@ -56,37 +56,33 @@ class SaddleCheck:
         Returns:
             A lower point (n, 3) [m].
         """
-        whole = self._fixed_objective
-        if not (whole.element_energy_indices or whole.other_energy_indices) and self._is_bounded(p, None, None):
-            return None
-        step = StepObjective(whole, problem)
-        hessian = step.hessian(p)
-        terms, linear, form, joined, curvature = hessian.kernel_arguments
-        if whole.element_energy_indices and not step.other_energies and self._is_bounded(p, joined, curvature):
+        whole, hessian = self._fixed_objective, None
+        anchor_stiffness, negative = self._anchor_stiffness, self._negative_stiffness
+        if whole.element_energy_indices or whole.other_energy_indices:
+            hessian = StepObjective(whole, problem).hessian(p)
+            terms, linear, _, joined, curvature = arguments = hessian.kernel_arguments
+            is_bounded = not whole.other_energy_indices and curvature_search.bound_by_elements(
+                terms, linear, joined, curvature, anchor_stiffness, negative
+            )
+        else:
+            terms, linear = whole.objective_terms, self._linear_terms
+            arguments = terms, linear, whole.quadratic_form, None, None
+            is_bounded = curvature_search.bound_by_springs(terms, p, anchor_stiffness, linear, negative)
+        if is_bounded:
             return None
         if self._scratch is None:
             self._scratch = CurvatureScratch.from_size(self.system.num_vertices)
         scratch, limit = self._scratch, max(_MIN_PRODUCTS, num_iterations // _ITERATIONS_PER_PRODUCT)
-        arguments = terms, linear, form, joined, curvature
-        if step.other_energies:
-            curvature_search.fill_preconditioner(*arguments, self._anchor_stiffness, scratch)
+        if hessian and whole.other_energy_indices:
+            curvature_search.fill_preconditioner(*arguments, anchor_stiffness, scratch)
             found = _InterpretedSearch(hessian, scratch).find_curvature(limit)
         else:
-            found = curvature_search.search_compiled(arguments, self._anchor_stiffness, limit, scratch)
+            found = curvature_search.search_compiled(arguments, anchor_stiffness, limit, scratch)
         if not found < 0.0:
             return None
-        size = float(np.abs(scratch.direction).max())
-        return _descend_along(step, p, scratch.direction / size, found / size**2)
-
-    def _is_bounded(self, p: Positions, joined: object, curvature: NDArray[np.float64] | None) -> bool:
-        return curvature_search.has_positive_bound(
-            self._fixed_objective.objective_terms,
-            self._anchor_stiffness,
-            joined,
-            curvature,
-            p,
-            self._negative_stiffness,
-        )
+        step, size = StepObjective(whole, problem), float(np.abs(scratch.direction).max())
+        lower = _find_lower_prediction(step, p)
+        return _descend_along(step, p, scratch.direction / size, found / size**2) if lower is None else lower
 
 
 class _InterpretedSearch(ConjugateGradientIteration):
@@ -121,6 +117,19 @@ class _InterpretedSearch(ConjugateGradientIteration):
         return not product > self._limit
 
 
+def _round_off(step: StepObjective, p: Positions) -> float:
+    """Return the round-off of the objective's value [J]."""
+    return VALUE_ROUNDOFF * step.problem.value_scale(p)
+
+
+def _find_lower_prediction(step: StepObjective, p: Positions) -> Positions | None:
+    """Return the inertial prediction if it is lower than p; a stiff system is slow to leave a saddle."""
+    fall = step.inertial_prediction()
+    change, noise = step.objective_change(p, fall)
+    is_lower = change + noise < -_round_off(step, p)
+    return fall if is_lower and step.max_step_size(p, fall - p) == 1.0 else None
+
+
 def _descend_along(step: StepObjective, p: Positions, x: Positions, curvature: float) -> Positions | None:
     """Return the lowest of the points p + t x and p - t x, for t the extent of the mesh, half of it, and so on.
 
@@ -133,7 +142,7 @@ def _descend_along(step: StepObjective, p: Positions, x: Positions, curvature: f
     Returns:
         Positions (n, 3) [m]; None if no point is lower by more than round-off.
     """
-    lowest, found = -VALUE_ROUNDOFF * step.problem.value_scale(p), None
+    lowest, found = -_round_off(step, p), None
     slope, extent = float(np.einsum("ij,ij->", step.gradient(p), x)), float(np.ptp(p, axis=0).max(initial=0.0)) or 1.0
     for d, slope_along in ((x, slope), (-x, -slope)):
         before = np.inf

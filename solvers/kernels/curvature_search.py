@@ -20,8 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
-from springbench.solvers.kernels.objective_kernels import spring_direction
-from springbench.solvers.kernels.spring_hessian import multiply_hessian, transverse_stiffness
+from springbench.solvers.kernels.spring_hessian import linearise_springs, multiply_hessian
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, compile_cg_loop
 
 CURVATURE_ROUNDOFF = 16.0 * np.finfo(np.float64).eps
@@ -41,7 +40,7 @@ class CurvatureScratch(NamedTuple):
         inverse_blocks: packed 3 x 3 blocks of the preconditioner (n, 6) [m/N], zero for fixed vertices.
         absolute_stiffness: sum of the absolute terms of the diagonal (n,) [N/m].
         start: right-hand side b (n, 3), not overwritten.
-        residual, direction, product: (n, 3); the direction is the one found.
+        residual, direction, product: (n, 3); the direction is the one found, the product also holds z.
     """
 
     inverse_blocks: NDArray[np.float64]
@@ -60,30 +59,46 @@ class CurvatureScratch(NamedTuple):
 
 
 @jit_kernel
-def has_positive_bound(terms, anchor_stiffness, joined, curvature, p, negative):
-    """Return whether the bound shows that the Hessian has no negative curvature.
+def bound_by_springs(terms, p, anchor_stiffness, linear, negative):
+    """Return whether the bound shows that springs, constant forms, inertia and pins have no negative curvature.
 
     Args:
         terms: objective terms.
-        anchor_stiffness: stiffness of inertia and pins (n,) [N/m], infinite at fixed vertices.
-        joined, curvature: elements and their Hessians, or None.
         p: positions (n, 3) [m].
+        anchor_stiffness: stiffness of inertia and pins (n,) [N/m], infinite at fixed vertices.
+        linear: output (m, 4), the springs as `linearise_springs` writes them.
         negative: scratch (n,).
     """
+    linearise_springs(terms, p, linear)
+    _add_spring_bounds(terms, linear, anchor_stiffness, negative)
+    return _is_outweighed(anchor_stiffness, negative)
+
+
+@jit_kernel
+def bound_by_elements(terms, linear, joined, curvature, anchor_stiffness, negative):
+    """Return the same with elements, `joined`, and their second derivatives (m, 6) [N/m]; None for none."""
+    _add_spring_bounds(terms, linear, anchor_stiffness, negative)
+    _add_element_bounds(joined, curvature, negative)
+    return _is_outweighed(anchor_stiffness, negative)
+
+
+@jit_inner
+def _add_spring_bounds(terms, linear, anchor_stiffness, negative):
     for v in range(len(negative)):
         negative[v] = 0.0
-    for e in range(len(terms.stiffness)):
-        i, j, k = terms.edges[e, 0], terms.edges[e, 1], terms.stiffness[e]
-        _, _, _, length = spring_direction(terms, e, p)
-        lateral = transverse_stiffness(k, terms.rest_length[e], k * (length - terms.rest_length[e]), length)
+    for e in range(len(linear)):
+        i, j, lateral = terms.edges[e, 0], terms.edges[e, 1], linear[e, 3]
         if lateral < 0.0 and i != j:
             negative[i] -= lateral if anchor_stiffness[j] == np.inf else 2.0 * lateral
             negative[j] -= lateral if anchor_stiffness[i] == np.inf else 2.0 * lateral
-    _add_element_bounds(joined, curvature, negative)
+
+
+@jit_inner
+def _is_outweighed(anchor_stiffness, negative):
+    positive = True
     for v in range(len(negative)):
-        if not (negative[v] == 0.0 or negative[v] < anchor_stiffness[v]):
-            return False
-    return True
+        positive &= negative[v] == 0.0 or negative[v] < anchor_stiffness[v]
+    return positive
 
 
 @jit_inner
@@ -233,14 +248,16 @@ def _start_search(scratch):
         for c in range(3):
             scratch.residual[v, c] = scratch.start[v, c]
             scratch.direction[v, c] = 0.0
-    return _preconditioned_product(scratch)
+    return _precondition_residual(scratch)
 
 
 @jit_inner
-def _preconditioned_product(scratch):
-    r, total = scratch.residual, 0.0
+def _precondition_residual(scratch):
+    """Write z to the product, which is of no more use, and return r'z."""
+    r, z, total = scratch.residual, scratch.product, 0.0
     for v in range(len(r)):
         z0, z1, z2 = _apply_block(scratch.inverse_blocks, v, r)
+        z[v, 0], z[v, 1], z[v, 2] = z0, z1, z2
         total += r[v, 0] * z0 + r[v, 1] * z1 + r[v, 2] * z2
     return total
 
@@ -253,10 +270,10 @@ def update_direction(scratch, ratio):
 
 @jit_inner
 def _update_direction(scratch, ratio):
-    p = scratch.direction
+    p, z = scratch.direction, scratch.product
     for v in range(len(p)):
-        z0, z1, z2 = _apply_block(scratch.inverse_blocks, v, scratch.residual)
-        p[v, 0], p[v, 1], p[v, 2] = z0 + ratio * p[v, 0], z1 + ratio * p[v, 1], z2 + ratio * p[v, 2]
+        for c in range(3):
+            p[v, c] = z[v, c] + ratio * p[v, c]
 
 
 @jit_kernel
@@ -285,7 +302,7 @@ def _update_residual(scratch, step_size):
     for v in range(len(scratch.residual)):
         for c in range(3):
             scratch.residual[v, c] -= step_size * scratch.product[v, c]
-    return _preconditioned_product(scratch)
+    return _precondition_residual(scratch)
 
 
 @jit_inner

@@ -289,8 +289,8 @@ class Solution:
         residual: |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices that the stop rule tested, at the iterate that
             `residual_iterate` names; nan for a method that does not minimise.
         initial_residual: residual at the current positions; nan without a tolerance.
-        termination_reason: "max-iter", "converged", "roundoff", or "stalled" if no step decreases
-            the objective.
+        termination_reason: "max-iter", "converged", "roundoff", "stalled" if no step decreases the objective, or
+            "saddle" at a saddle point that the solve cannot leave.
         velocity: (n, 3) [m/s], for a method that computes its own.
         residual_iterate: the iterate of the residual.
         warm_start: warm start of the next solve, of any shape.

@@ -27,9 +27,13 @@ def _to_run_times(run: RunRecord) -> RunTimes:
 
 
 def _describe_unconverged(run_records: Sequence[RunRecord]) -> Iterator[dict[str, Any]]:
-    """Describe how many runs ended a step at the iteration limit."""
+    """Describe how many runs ended a step at the iteration limit or at a saddle."""
     done = [run for run in run_records if run["status"] == "ok" and run["termination_reason"]]
-    short = [run for run in done if run["termination_reason"] == "max-iter"]
-    if short:
-        words = f"{len(short)} of {len(done)} runs ended a step at the limit of iterations: look at residuals."
-        yield {"text": words, "runs": [short[0]["run_id"]], "filter": {"termination_reason": "max-iter"}}
+    for reason, words in (
+        ("max-iter", "at the limit of iterations: look at residuals"),
+        ("saddle", "at a saddle, not a minimum: allow more iterations"),
+    ):
+        short = [run for run in done if run["termination_reason"] == reason]
+        if short:
+            text = f"{len(short)} of {len(done)} runs ended a step {words}."
+            yield {"text": text, "runs": [short[0]["run_id"]], "filter": {"termination_reason": reason}}
