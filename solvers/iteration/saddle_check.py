@@ -14,6 +14,8 @@ Systems with length constraints are not checked: there the curvature within the 
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from springbench.solvers.iteration.vertex_terms import compute_anchor_stiffness
 from springbench.solvers.kernels import curvature_search
@@ -43,10 +45,9 @@ class SaddleCheck:
         self._anchor_stiffness = compute_anchor_stiffness(system)
         self._linear_terms = np.empty((len(self._fixed_objective.springs.stiffness), 4))
         self._negative_stiffness = np.empty(system.num_vertices)
-        self._scratch: CurvatureScratch | None = None
 
     def find_lower_point(self, problem: StepProblem, p: Positions, num_iterations: int) -> Positions | None:
-        """Return a point to which negative curvature leads, or None if none was found.
+        """Return a lower point to which negative curvature leads, or None if none was found.
 
         Args:
             problem: the step.
@@ -54,7 +55,24 @@ class SaddleCheck:
             num_iterations: number of iterations of the solve, which limits the cost of the search.
 
         Returns:
-            A lower point (n, 3) [m].
+            Positions (n, 3) [m].
+        """
+        found = self.find_negative_curvature(problem, p, max(_MIN_PRODUCTS, num_iterations // _ITERATIONS_PER_PRODUCT))
+        if found is None:
+            return None
+        step = StepObjective(self._fixed_objective, problem)
+        lower = _find_lower_prediction(step, p)
+        return _descend_along(step, p, *found) if lower is None else lower
+
+    def find_negative_curvature(
+        self, problem: StepProblem, p: Positions, max_products: int
+    ) -> tuple[Positions, float] | None:
+        """Return a direction (n, 3) with maximum 1 and the negative curvature along it [N/m], or None.
+
+        Args:
+            problem: the step.
+            p: positions (n, 3) [m].
+            max_products: maximum number of products with the Hessian.
         """
         whole, hessian = self._fixed_objective, None
         anchor_stiffness, negative = self._anchor_stiffness, self._negative_stiffness
@@ -70,19 +88,18 @@ class SaddleCheck:
             is_bounded = curvature_search.bound_by_springs(terms, p, anchor_stiffness, linear, negative)
         if is_bounded:
             return None
-        if self._scratch is None:
-            self._scratch = CurvatureScratch.from_size(self.system.num_vertices)
-        scratch, limit = self._scratch, max(_MIN_PRODUCTS, num_iterations // _ITERATIONS_PER_PRODUCT)
+        scratch = self._scratch
         if hessian and whole.other_energy_indices:
             curvature_search.fill_preconditioner(*arguments, anchor_stiffness, scratch)
-            found = _InterpretedSearch(hessian, scratch).find_curvature(limit)
+            found = _InterpretedSearch(hessian, scratch).find_curvature(max_products)
         else:
-            found = curvature_search.search_compiled(arguments, anchor_stiffness, limit, scratch)
-        if not found < 0.0:
-            return None
-        step, size = StepObjective(whole, problem), float(np.abs(scratch.direction).max())
-        lower = _find_lower_prediction(step, p)
-        return _descend_along(step, p, scratch.direction / size, found / size**2) if lower is None else lower
+            found = curvature_search.search_compiled(arguments, anchor_stiffness, max_products, scratch)
+        size = float(np.abs(scratch.direction).max(initial=0.0))
+        return (scratch.direction / size, found / size**2) if found < 0.0 else None
+
+    @cached_property
+    def _scratch(self) -> CurvatureScratch:
+        return CurvatureScratch.from_size(self.system.num_vertices)
 
 
 class _InterpretedSearch(ConjugateGradientIteration):

@@ -1,4 +1,4 @@
-"""Saddles: steps that start at one end below it, at a minimum, and all hard scenes end at minima but for two."""
+"""Saddles: steps that start at one end below it, at a minimum, and no step at a saddle passes for solved."""
 
 from __future__ import annotations
 
@@ -22,7 +22,12 @@ from springbench.harness.scenes.mesh.solid_meshes import TowerMesh
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.simulation.time_loop import MotionState, build_problem, prepare, simulate_scene
 from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.newton_cg import NewtonCG
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
+from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
+from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
 from springbench.solvers.model.integrators import INTEGRATORS, Motion
 from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule
 
@@ -104,6 +109,36 @@ def test_a_saddle_is_left_the_same_way_twice_and_downwards(solver: Solver, saddl
     assert all(b <= a + slack for a, b in pairwise(map(given.value, one)))
 
 
+GRADIENT_METHODS = (Lbfgs(), NonlinearCG(), NewtonCG(), VertexBlockDescent())
+"""Methods that do not factorise the Hessian, one of each kind."""
+STOP_AT_SADDLE = StopRule(1000, 1e-6, atol=1e-3)
+"""At a saddle the residual to which a relative tolerance refers is round-off; that of a millimetre is hundreds of times
+this one."""
+gradient_methods = pytest.mark.parametrize("solver", GRADIENT_METHODS, ids=lambda s: type(s).__name__)
+
+
+@saddles
+@gradient_methods
+def test_a_method_without_a_factor_leaves_a_saddle_for_a_minimum(solver: Solver, saddle: str):
+    _, given = at_a_saddle(saddle, "implicit-euler")
+    start, solution = given.initial_guess, solver.prepare(given.system).solve(given, STOP_AT_SADDLE)
+    assert solution.termination_reason in ("converged", "roundoff")
+    assert at_the_bottom(given, solution.positions, saddle)
+    assert given.value(solution.positions) < given.value(start) - 1e-6 * given.value_scale(start)
+
+
+@saddles
+def test_a_solve_that_may_not_leave_a_saddle_says_so(saddle: str, monkeypatch):
+    _, given = at_a_saddle(saddle, "implicit-euler")
+    prepared = Lbfgs().prepare(given.system)
+    no_iteration = prepared.solve(given, replace(STOP_AT_SADDLE, max_iterations=0))
+    monkeypatch.setattr(PreparedAccelerated, "can_leave_saddles", False)
+    no_way = prepared.solve(given, STOP_AT_SADDLE)
+    for solution in (no_iteration, no_way):
+        assert solution.termination_reason == "saddle"
+        np.testing.assert_array_equal(solution.positions, given.initial_guess)
+
+
 def test_only_a_close_tolerance_asks_for_a_minimum():
     """Far from stationary points the Hessian tells nothing."""
     _, given = at_a_saddle("a chain pressed along its line", "implicit-euler")
@@ -164,3 +199,13 @@ def test_a_step_that_a_residual_would_end_too_early_ends_at_a_certified_minimum(
 def test_all_steps_of_a_hard_scene_end_at_certified_minima(case: str, solver: Solver):
     wrong = ends(case, solver, 10)
     assert not wrong or case in DEGENERATE, wrong
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", TELLING)
+def test_no_step_of_lbfgs_passes_for_solved_at_a_saddle(case: str):
+    spec = load_scene(CASES[case])
+    made = build_scene(spec, spec.default_size or 0)
+    for step in simulate_scene(made, prepare(made, Lbfgs()), STOP, initial_guess="previous", frames=3):
+        solved = step.solution.termination_reason in ("converged", "roundoff")
+        assert not (solved and compute_curvature(step.problem, step.solution.positions).is_saddle), step.index
