@@ -175,7 +175,7 @@ class IterativeSolver(ABC):
             lower = self._find_lower_point(problem, run.positions, count)
             if lower is None:
                 break
-            if count >= stop.max_iterations or not self.can_leave_saddles:
+            if count + 1 >= stop.max_iterations or not self.can_leave_saddles:
                 reason = "saddle"
                 break
             self.release_state(run)
