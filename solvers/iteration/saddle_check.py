@@ -74,12 +74,14 @@ class SaddleCheck:
             p: positions (n, 3) [m].
             max_products: maximum number of products with the Hessian.
         """
-        whole, hessian = self._fixed_objective, None
+        whole, hessian, is_compiled = self._fixed_objective, None, True
         anchor_stiffness, negative = self._anchor_stiffness, self._negative_stiffness
         if whole.element_energy_indices or whole.other_energy_indices:
-            hessian = StepObjective(whole, problem).hessian(p)
+            step = StepObjective(whole, problem)
+            hessian = step.hessian(p)
             terms, linear, _, joined, curvature = arguments = hessian.kernel_arguments
-            is_bounded = not whole.other_energy_indices and curvature_search.bound_by_elements(
+            is_compiled = _has_element_form(step, hessian)
+            is_bounded = is_compiled and curvature_search.bound_by_elements(
                 terms, linear, joined, curvature, anchor_stiffness, negative
             )
         else:
@@ -89,7 +91,7 @@ class SaddleCheck:
         if is_bounded:
             return None
         scratch = self._scratch
-        if hessian and whole.other_energy_indices:
+        if hessian and not is_compiled:
             curvature_search.fill_preconditioner(*arguments, anchor_stiffness, scratch)
             found = _InterpretedSearch(hessian, scratch).find_curvature(max_products)
         else:
@@ -100,6 +102,13 @@ class SaddleCheck:
     @cached_property
     def _scratch(self) -> CurvatureScratch:
         return CurvatureScratch.from_size(self.system.num_vertices)
+
+
+def _has_element_form(step: StepObjective, hessian: Hessian) -> bool:
+    """Return whether all energies that act have an element-wise form; barrier energies out of range do not act."""
+    return len(step.other_energies) == len(step.barrier_energies) and not any(
+        len(blocks.vertices) for blocks in hessian.barrier_hessian.pair_blocks
+    )
 
 
 class _InterpretedSearch(ConjugateGradientIteration):
