@@ -313,6 +313,7 @@ def study_convergence(
       RunFailed: the motion is unpredictable, or a given setting is not supported.
     """
     with machine_info.limit_threads(1):
+        _require_support(simulator, given)
         reference = _find_reference(simulator, store, error_requested, limits, print_message)
         settings = _order_settings(list_settings(given, num_doublings), given)
         results, end, iteration_seconds = list[SettingResult](), monotonic() + limits.search_time, 0.0
@@ -343,6 +344,16 @@ def study_convergence(
         find_largest_difference([one for one in results if one.setting in given], reference.measure_change),
         reference.min_error,
     )
+
+
+def _require_support(simulator: SettingSimulator, given: Sequence[StepSetting]) -> None:
+    """Raise RunFailed where a given setting is not supported, before the reference is made."""
+    for one in given:
+        try:
+            scene, solver, *_ = simulator.build_step(simulator.spec, one)
+            prepare(scene, solver)
+        except (Unsupported, NotPositiveDefinite) as error:
+            raise RunFailed(f"{simulator.name}, {one}: {error}") from None
 
 
 class StudyLimits(NamedTuple):

@@ -233,7 +233,9 @@ def test_vertices_are_matched_by_a_file_of_rest_positions_or_refused(tmp_path):
     with pytest.raises(InputError, match="are not the scene's, one to one"):
         align_submission(grader.scene, read, 1, 2.0 * scene["V"][order])
     unmatched = align_submission(grader.scene, read, 1)
-    assert any("no rest positions are given" in note for note in unmatched.notes)
+    assert any("no rest positions are given" in note and "as in another order" in note for note in unmatched.notes)
+    usual = align_submission(grader.scene, PositionSequence(path, p), 1)
+    assert not any("another order" in note for note in usual.notes)
 
 
 def test_times_of_another_time_step_are_refused(tmp_path):

@@ -26,6 +26,8 @@ from springbench.solvers.model.step_problem import Positions
 
 AXES = tuple(permutations(range(3)))
 """Orders of the axes; the first is the usual one."""
+IMPLAUSIBLE_STRETCH = 1.5
+"""Median stretch of springs after a step, from which on another order of vertices is suspected."""
 MATCH_FRACTION = 1e-3
 """Largest distance of two rest positions that are matched, relative to the diagonal of the bounding box."""
 START_FRACTION = 1e-9
@@ -219,7 +221,20 @@ def _choose_match(
         notes.append("vertices: taken in the scene's order, although frame 0 is not the scene's start")
     else:
         notes.append("vertices: taken in the scene's order; no rest positions are given to check it with (--rest FILE)")
+    if n > 1 and (length := _measure_stretch(scene, read.positions[0])) > IMPLAUSIBLE_STRETCH:
+        notes[-1] += (
+            f". The springs of the first frame are {length:.2g} times as long as at rest, in the median, as in another "
+            "order: give --rest FILE"
+        )
     return VertexMatch(np.arange(n), AXES[0])
+
+
+def _measure_stretch(scene: Scene, p: Positions) -> float:
+    """Measure the median length of springs at p (n, 3) [m], relative to their lengths at rest; 0 without springs."""
+    springs = scene.all_springs
+    i, j = springs.edges[springs.rest_length > 0.0].T
+    rest = springs.rest_length[springs.rest_length > 0.0]
+    return float(np.median(np.linalg.norm(p[i] - p[j], axis=1) / rest)) if len(rest) else 0.0
 
 
 def _describe_match(match: VertexMatch) -> str:
