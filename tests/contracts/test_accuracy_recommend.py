@@ -202,7 +202,7 @@ def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scen
 
 
 def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = module._build_study(
+    spec = module.build_study(
         scene, load_scene(scene), 4, StudyCandidates.from_goal(RecommendationGoal(max_error=0.1), None), 0.2, 60.0
     ).work[0]
     first, slow = [True], work_precision.simulate_scene
@@ -224,7 +224,7 @@ def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest
 
 def test_steps_that_a_solver_takes_within_a_frame_are_printed() -> None:
     path = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
-    spec = module._build_study(
+    spec = module.build_study(
         path, load_scene(path), 4, StudyCandidates.from_goal(RecommendationGoal(max_error=0.1), None), 0.2, 60.0
     ).work[0]
     spec = replace(spec, solver=SolverSpec("velocity-verlet", {}))

@@ -24,6 +24,7 @@ from time import monotonic
 from typing import Any
 
 from springbench.harness.config.accuracy_config import WorkSpec
+from springbench.solvers.registry import SOLVERS
 
 SLOWER = 1.5
 """Multiple of the best cost above which a method is given up; shorter steps may need fewer iterations each."""
@@ -131,7 +132,7 @@ def search(
         spec = one.grid[0].pop(0)
         row = measure(_limited(spec, best))
         measured += 1
-        found, cost = _outcome(row)
+        found, cost = _outcome(spec, row)
         if found <= error:
             best = min(best, cost)
         if not one.errors:
@@ -157,6 +158,17 @@ def search(
     return SearchSummary(measured, settings, {reason: count for reason, count in reasons.items() if count})
 
 
+def compute_cost(spec: WorkSpec, row: Mapping[str, Any]) -> float:
+    """Return the wall time per simulated second of a simulation's row, on an otherwise idle machine.
+
+    Where other programs interrupted a single thread of ours, its processor time is what it takes alone.
+    """
+    wall, cpu = row["seconds_per_simulated_second"], row.get("cpu_seconds")
+    if cpu and row.get("preempted") and spec.measurement.threads == 1 and spec.solver.name in SOLVERS:
+        return min(wall, cpu / spec.t_end)
+    return wall
+
+
 def is_measured(row: Mapping[str, Any]) -> bool:
     """Return whether a simulation ended well: its error is known, or too small for the reference."""
     has_time = row.get("seconds_per_simulated_second") is not None
@@ -169,9 +181,9 @@ def _slow(error: float) -> str:
     return f"they or their faster neighbours take {SLOWER:g} times as long as the best within {error:g}, or too long"
 
 
-def _outcome(row: Mapping[str, Any]) -> tuple[float, float]:
+def _outcome(spec: WorkSpec, row: Mapping[str, Any]) -> tuple[float, float]:
     """Return the error and the cost of a row, infinite if there are none; an unmeasurably small error is almost 0."""
-    cost = row["seconds_per_simulated_second"] if is_measured(row) else inf
+    cost = compute_cost(spec, row) if is_measured(row) else inf
     return row["error"] if row["status"] == "ok" else inf if cost == inf else float_info.min, cost
 
 

@@ -39,7 +39,14 @@ from springbench.harness.experiments.accuracy.accuracy_units import (
     load_reference_trajectory,
     open_reference_store,
 )
-from springbench.harness.experiments.accuracy.best_first import SLOWER, SearchSummary, is_measured, search
+from springbench.harness.experiments.accuracy.best_first import (
+    LEAST_LIMIT,
+    SLOWER,
+    SearchSummary,
+    compute_cost,
+    is_measured,
+    search,
+)
 from springbench.harness.experiments.accuracy.work_precision import build_work_rows
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
@@ -77,6 +84,14 @@ ENGINE_SUBSTEPS = [1, 2, 4, 8, 16, 32, 64, 128]
 """Substeps of outside engines in a frame."""
 ENGINE_ITERATIONS = [1, 4, 16]
 """Iterations of outside engines in a substep, of those that iterate."""
+_SEARCH_FRACTION = 0.75
+"""Part of the time for a search in which powers of two are measured; the rest is for step sizes between them."""
+_NUM_TUNED, _TUNING_ROUNDS = 8, 2
+"""Number of methods whose step sizes are tuned to a wall time, and how often."""
+_MAX_REFINEMENT = 8
+"""Largest number of steps that replace one, where the budget is far from used up."""
+_BUDGET_AIM = 0.95
+"""Fraction of a wall time at which a step size aims, because times scatter."""
 _MESSAGE_INTERVAL = 2.0
 """Interval between two messages about the reference [s]."""
 _ERROR_RTOL, _MAX_TIME_RATIO = 1e-6, 1.3
@@ -357,6 +372,10 @@ def recommend_method(
         summary = _measure_study(study, methods, failed_rows, goal, frame, folder, display, print_message, search_time)
         print_message(f"{path.stem} {size or ''}: {summary}")
         methods, failed_rows = read_methods()
+        if goal.frame_seconds is not None:
+            left = (1.0 - _SEARCH_FRACTION) * search_time
+            _tune_time_steps(read_methods, goal.frame_seconds / frame, t_end, folder, display, print_message, left)
+            methods, failed_rows = read_methods()
     within = goal.select_methods(methods, frame)
     if not within:
         raise RunFailed(_explain_no_method(methods, failed_rows, goal, frame, t_end, summary))
@@ -406,7 +425,7 @@ def _plan_study(
     if t_end is None:
         t_end = find_default_t_end(path, scene, size, max_error, reference_store, print_message)
     try:
-        study = _build_study(path, scene, size, candidates, t_end, time_limit)
+        study = build_study(path, scene, size, candidates, t_end, time_limit)
     except InputError as refused:  # the studies are ours; what is wrong came with an option
         raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
     _compute_reference(scene, size, max_error, t_end, reference_store, print_message)
@@ -497,10 +516,65 @@ def _measure_study(
         def look_up(spec: WorkSpec) -> dict[str, Any]:
             return known.get(spec.build_file_stem()) or failed.get(spec.compute_unit_id(here)) or measure(spec)
 
-        return search(study.work, error, best, look_up, search_time)
+        part = 1.0 if goal.frame_seconds is None else _SEARCH_FRACTION
+        return search(study.work, error, best, look_up, part * search_time)
 
 
-def _build_study(
+def _tune_time_steps(
+    read_methods: Callable[[], tuple[list[MeasuredMethod], list[dict[str, Any]]]],
+    cost_limit: float,
+    t_end: float,
+    folder: Path,
+    display: ProgressDisplay,
+    print_message: Callable[[str], None],
+    search_time: float,
+) -> None:
+    """Measure step sizes between powers of two that use up a wall time, of the methods that gain most by it.
+
+    The cost is proportional to the number of steps, the error to its power -1 at least.
+    """
+    end, done = monotonic() + search_time, set[str]()
+    for _ in range(_TUNING_ROUNDS):
+        methods, _ = read_methods()
+        known = {method.work_spec.build_file_stem() for method in methods} | done
+        specs = [one for one in _list_tuned_specs(methods, cost_limit, t_end) if one.build_file_stem() not in known]
+        if not specs or monotonic() > end:
+            return
+        print_message(f"tuning the time steps of {len(specs)} settings to the budget")
+        with open_measurement(specs, folder, display) as measure:
+            for spec in specs:
+                if monotonic() < end:
+                    measure(spec)
+                    done.add(spec.build_file_stem())
+
+
+def _list_tuned_specs(methods: Sequence[MeasuredMethod], cost_limit: float, t_end: float) -> list[WorkSpec]:
+    """List simulations whose step size uses up a cost limit [s/s], those with the least error predicted first."""
+    finest: dict[tuple[object, ...], MeasuredMethod] = {}
+    for method in methods:
+        key = (*method.kind, *method.work_spec.options.items())
+        within, before = method.seconds_per_simulated_second <= cost_limit, finest.get(key)
+        if within and (before is None or method.error < before.error):
+            finest[key] = method
+    predicted = list[tuple[float, WorkSpec]]()
+    for method in finest.values():
+        spec, slack = method.work_spec, _BUDGET_AIM * cost_limit / method.seconds_per_simulated_second
+        has_substeps = is_engine(load_target(SOLVER_TABLE[spec.solver.name]))
+        steps = spec.options["max_iterations"] if has_substeps else round(t_end / spec.case.scene.time_step)
+        more = min(int(slack * steps), _MAX_REFINEMENT * steps)
+        if more <= steps:
+            continue
+        if has_substeps:
+            spec = replace(spec, options={**spec.options, "max_iterations": more})
+        else:
+            spec = replace(spec, case=replace(spec.case, scene=spec.case.scene.with_time_step(t_end / more)))
+        limit = max(LEAST_LIMIT, BUDGET_RANGE * cost_limit * t_end)
+        spec = replace(spec, measurement=replace(spec.measurement, time_limit=limit))
+        predicted.append((method.error * steps / more, spec))
+    return [spec for _, spec in sorted(predicted, key=lambda pair: pair[0])[:_NUM_TUNED]]
+
+
+def build_study(
     path: Path, scene: SceneSpec, size: int, candidates: StudyCandidates, t_end: float, time_limit: float
 ) -> AccuracyPlan:
     """Build the study that is measured where no rows exist."""
@@ -571,7 +645,7 @@ def _build_measured_method(spec: WorkSpec, row: dict[str, Any], reference_error:
     return MeasuredMethod(
         spec,
         row["error"] if row["status"] == "ok" else reference_error,
-        row["seconds_per_simulated_second"],
+        compute_cost(spec, row),
         row["reference_kind"] or "integrated",
         row["solver_description"] or "",
         row.get("sweep") or "",

@@ -120,6 +120,6 @@ def _simulate_timed(
         iterations += step.num_iterations
         if not np.isfinite(p).all():
             raise DivergenceError(f"positions are not finite from frame {step.index} on")
-        if seconds > time_limit and step.index < frames:
+        if min(seconds, watch.process_seconds) > time_limit and step.index < frames:
             raise TimeLimitExceeded(f"the limit of {time_limit:g} s was reached in frame {step.index} of {frames}")
     return p, iterations, watch.build_columns("step", [seconds])
