@@ -21,6 +21,7 @@ from springbench.harness.experiments.accuracy import method_recommendation as mo
 from springbench.harness.experiments.accuracy import work_precision
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
+from springbench.harness.experiments.accuracy.best_first import compute_cost
 from springbench.harness.experiments.accuracy.method_recommendation import (
     MethodRecommendation,
     RecommendationGoal,
@@ -261,6 +262,29 @@ def test_a_budget_gets_the_least_error_within_it_and_what_half_and_twice_would_b
     for factor in (0.5, 1.0, 2.0):
         within = [one for one in found.measured_methods if one.seconds_per_simulated_second <= factor * costs[2]]
         assert tight.select_best(factor) == min(within, key=lambda method: method.error, default=None)
+
+
+def test_step_sizes_between_powers_of_two_use_up_a_budget(scene: Path) -> None:
+    """Of the methods within the budget, by as many steps as fit; those beyond it and those that fill it are left."""
+    spec = recommend(scene, 0.5)[0].best_method.work_spec
+    steps = round(spec.t_end / spec.case.scene.time_step)
+
+    def tuned(cost: float) -> list[int]:
+        method = module.MeasuredMethod(spec, 0.1, cost, "integrated", "")
+        found = module.list_tuned_specs([method], 1.0, spec.t_end)
+        return [round(one.t_end / one.case.scene.time_step) for one in found]
+
+    assert tuned(0.3) == [int(0.95 / 0.3 * steps)]
+    assert tuned(1e-6) == [8 * steps]
+    assert tuned(0.95) == tuned(1.1) == []
+
+
+def test_the_time_of_a_busy_machine_is_its_processor_time(scene: Path) -> None:
+    spec = replace(recommend(scene, 0.5)[0].best_method.work_spec, t_end=0.5)
+    row = {"seconds_per_simulated_second": 4.0, "cpu_seconds": 1.0, "preempted": True}
+    assert compute_cost(spec, row) == 2.0
+    assert compute_cost(spec, row | {"preempted": False}) == 4.0
+    assert compute_cost(replace(spec, solver=SolverSpec("mujoco", {})), row) == 4.0
 
 
 @pytest.mark.long

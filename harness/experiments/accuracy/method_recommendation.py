@@ -537,7 +537,7 @@ def _tune_time_steps(
     for _ in range(_TUNING_ROUNDS):
         methods, _ = read_methods()
         known = {method.work_spec.build_file_stem() for method in methods} | done
-        specs = [one for one in _list_tuned_specs(methods, cost_limit, t_end) if one.build_file_stem() not in known]
+        specs = [one for one in list_tuned_specs(methods, cost_limit, t_end) if one.build_file_stem() not in known]
         if not specs or monotonic() > end:
             return
         print_message(f"tuning the time steps of {len(specs)} settings to the budget")
@@ -548,7 +548,7 @@ def _tune_time_steps(
                     done.add(spec.build_file_stem())
 
 
-def _list_tuned_specs(methods: Sequence[MeasuredMethod], cost_limit: float, t_end: float) -> list[WorkSpec]:
+def list_tuned_specs(methods: Sequence[MeasuredMethod], cost_limit: float, t_end: float) -> list[WorkSpec]:
     """List simulations whose step size uses up a cost limit [s/s], those with the least error predicted first."""
     finest: dict[tuple[object, ...], MeasuredMethod] = {}
     for method in methods:
