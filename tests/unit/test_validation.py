@@ -56,6 +56,20 @@ def test_an_error_that_refinement_does_not_explain_is_named():
         assert validation_study.grade_closed_form(replace(honest, exact=exact), NEWTON)["verdict"] == verdict
 
 
+@pytest.mark.parametrize(
+    "values",
+    [(-4.9, -1e6, -1e15), (1.1, 2.7e18, 1.8e9), (1.0, 1.0, 2.0), (1.3, 1.2, 1.1), (1.0, float("nan"), float("nan"))],
+    ids=["diverges", "diverged", "jumps at the end", "moves steadily", "no number"],
+)
+def test_a_series_that_does_not_converge_explains_nothing(tmp_path: Path, values: tuple[float, ...]):
+    found = dict(zip((1, 2, 4), values, strict=True))
+    case = ClosedForm("x", "x [m]", "cells", (1, 2, 4), 1.0, 1.0, lambda level, solver: found[level])
+    row = validation_study.grade_closed_form(case, NEWTON)
+    assert row["verdict"] == validation_study.UNEXPLAINED
+    assert "unexplained" in format_validation_page([row], "newton")
+    assert all(path.is_file() for path in write_validation_page([row], "newton", tmp_path))
+
+
 def test_reference_solutions_have_their_limits():
     # A stiff strip drops by w L^4/(8 B); a stiff cable has the inextensible catenary's sag: 5 (sqrt(1 + x^2) - 1)/x.
     assert solve_elastica(0.1, 0.01)[0] == pytest.approx(0.01 * 0.1**4 / 8, rel=1e-6)

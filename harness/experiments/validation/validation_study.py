@@ -2,7 +2,8 @@
 
 A closed form is confirmed if the error of the finest level is at most what its discretisation explains: the difference
 of the two finest levels over 2^p - 1, p the order, times a safety factor (Roache 1994), plus the difference of the
-models and round-off.
+models and round-off. That estimate has a meaning only if the levels converge, with at least half the order. The error
+of a series that diverges, or that tends elsewhere at the last level, is not explained.
 """
 
 from __future__ import annotations
@@ -69,20 +70,24 @@ def grade_closed_form(case: ClosedForm, solver: Solver) -> dict[str, Any]:
         remark = case.remark(case.levels[-1], solver) if case.remark else ""
     except Unsupported as error:
         return row | {"verdict": REFUSED, "remark": str(error)}
+    if not np.isfinite(values).all():
+        return row | {"verdict": UNEXPLAINED, "remark": f"diverges: it gives {', '.join(f'{x:.3g}' for x in values)}"}
     errors = [abs(value - case.exact) for value in values]
     roundoff = ROUNDOFF_FRACTION * max(abs(case.exact), *map(abs, values))
-    discretisation = abs(values[-1] - values[-2]) / (2.0**case.order - 1.0)
-    explained = SAFETY_FACTOR * discretisation + case.model_error + roundoff
     coarse, fine = abs(values[1] - values[0]), abs(values[2] - values[1])
     is_resolved = fine > roundoff and coarse > roundoff
+    observed_order = float(np.log2(coarse / fine)) if is_resolved else None
+    converges = fine <= roundoff or (observed_order or 0.0) >= case.order / 2.0
+    discretisation = fine / (2.0**case.order - 1.0) if converges else 0.0
+    explained = SAFETY_FACTOR * discretisation + case.model_error + roundoff
     return row | {
         "values": values,
         "errors": errors,
         "discretisation_error": discretisation,
         "model_error": case.model_error,
         "explained_error": explained,
-        "observed_order": float(np.log2(coarse / fine)) if is_resolved else None,
-        "verdict": CONFIRMED if errors[-1] <= explained else UNEXPLAINED,
+        "observed_order": observed_order,
+        "verdict": CONFIRMED if converges and errors[-1] <= explained else UNEXPLAINED,
         "remark": remark,
     }
 
