@@ -118,15 +118,18 @@ def _load_runs(folder: Path, **requested: Any) -> list[RunSpec]:
     return load_config(path).list_runs()
 
 
+def list_short_runs(folder: Path, **options: Any) -> list[RunSpec]:
+    """One short run of each solver and mesh size, for each value of an option that is a list."""
+    scene = os.path.relpath(CONFIG_FOLDER / "scenes" / "hanging-cloth.yaml", folder)
+    given = {"scenes": [scene], "sizes": list(MESH_SIZES), "solvers": list(SOLVER_NAMES)}
+    return _load_runs(folder, **given, options=SHORT_OPTIONS | options)
+
+
 def _build_short_runs(count: int, folder: Path) -> list[RunSpec]:
     """So many short runs, whose kernels are compiled."""
-    scene = {"scenes": [os.path.relpath(CONFIG_FOLDER / "scenes" / "hanging-cloth.yaml", folder)]}
-    same = scene | {"sizes": list(MESH_SIZES), "solvers": list(SOLVER_NAMES)}
+    run_timed_sweep(list_short_runs(folder, max_iterations=1, frames=2), folder / "first", None)
     each = range(1, 1 + ceil(count / len(MESH_SIZES) / len(SOLVER_NAMES)))
-    run_timed_sweep(
-        _load_runs(folder, **same, options=SHORT_OPTIONS | {"iterations": 1, "frames": 2}), folder / "first", None
-    )
-    return _load_runs(folder, **same, options=SHORT_OPTIONS | {"iterations": list(each)})[:count]
+    return list_short_runs(folder, max_iterations=list(each))[:count]
 
 
 def _untimed_cost(cost: SweepCost, count: int) -> dict[str, float]:
