@@ -57,6 +57,7 @@ class LatencyRow:
         is_long: whether it takes minutes.
         value_key: key of the measured value in the JSON output; the wall time if empty.
         prepare: fills the folder of results before all repeats.
+        limit: what a profile shows to take most of the time, where the target is not reached.
     """
 
     description: str
@@ -68,6 +69,7 @@ class LatencyRow:
     is_long: bool = False
     value_key: str = ""
     prepare: Callable[[Path], None] | None = None
+    limit: str = ""
 
 
 def _copy_runs(results: Path) -> None:
@@ -87,14 +89,27 @@ _AGAIN_NUMBA, _AGAIN_HYBRID = (*_AGAIN, "--solver", "numba"), (*_AGAIN, "--solve
 _TO_ERROR = ("run", "hanging-cloth", "--size", "17", "--error", "1e-4", "--t-end", "0.1", "--results", "RESULTS")
 _CHAIN = ("run", "chain", "--size", "9", "--error", "1e-4", "--t-end", "0.5", "--results", "RESULTS")
 _SWEEP = ("run", str(QUICKSTART), "--results", "RESULTS")
+_WITHOUT_KERNELS: Any = {"cold": "compiled kernels", "environment": {"NUMBA_CACHE_DIR": "FOLDER"}}
 _IN_PROCESS = ("-m", "tests.bench.latency", "--in-process")
 
+_OF_A_RERUN = (
+    "imports and the picture: half in the processes that draw (PyVista, VTK, Matplotlib), a quarter Numba and SciPy"
+)
+
 LATENCY_ROWS = {
-    "sweep-again": LatencyRow("the same sweep again, all of it done", 0.7, _SWEEP, (_SWEEP,)),
-    "again-numba": LatencyRow("--rerun of a small run, numba", 2.5, _AGAIN_NUMBA, (_AGAIN_NUMBA,)),
-    "again-hybrid": LatencyRow("--rerun of a small run, hybrid", 3.5, _AGAIN_HYBRID, (_AGAIN_HYBRID,)),
-    "list": LatencyRow("list", 0.3, ("list",)),
-    "schema": LatencyRow("schema", 0.5, ("schema",)),
+    "sweep-again": LatencyRow(
+        "the same sweep again, all of it done",
+        0.7,
+        _SWEEP,
+        (_SWEEP,),
+        limit="imports: Typer with Pydantic, NumPy, PyArrow, DuckDB and Rich; a fifth reads rows",
+    ),
+    "again-numba": LatencyRow("--rerun of a small run, numba", 2.5, _AGAIN_NUMBA, (_AGAIN_NUMBA,), limit=_OF_A_RERUN),
+    "again-hybrid": LatencyRow(
+        "--rerun of a small run, hybrid", 3.5, _AGAIN_HYBRID, (_AGAIN_HYBRID,), limit=_OF_A_RERUN
+    ),
+    "list": LatencyRow("list", 0.3, ("list",), limit="three quarters import Typer and Pydantic"),
+    "schema": LatencyRow("schema", 0.5, ("schema",), limit="three quarters import Typer and Pydantic"),
     "query": LatencyRow(
         f"query on {NUM_STORED_RUNS:,} runs",
         0.8,
@@ -102,7 +117,13 @@ LATENCY_ROWS = {
         (_SWEEP,),
         prepare=_copy_runs,
     ),
-    "figure": LatencyRow("figure", 1.5, ("figure", "timing", "RESULTS/quickstart", "-o", "RESULTS/figures"), (_SWEEP,)),
+    "figure": LatencyRow(
+        "figure",
+        1.5,
+        ("figure", "timing", "RESULTS/quickstart", "-o", "RESULTS/figures"),
+        (_SWEEP,),
+        limit="Matplotlib: a third imports it, a third draws PDF, SVG and PNG, an eighth subsets the fonts of the PDF",
+    ),
     "preview": LatencyRow(
         "preview",
         1.5,
@@ -124,7 +145,11 @@ LATENCY_ROWS = {
         "chain of 9, 0.5 s to 1e-4, the chosen motion", 0.3e-3, (*_IN_PROCESS, "chain-motion"), value_key="seconds"
     ),
     "verlet-substep": LatencyRow(
-        "velocity Verlet, cloth of 17 a side, a substep", 4e-6, (*_IN_PROCESS, "verlet-substep"), value_key="seconds"
+        "velocity Verlet, cloth of 17 a side, a substep",
+        4e-6,
+        (*_IN_PROCESS, "verlet-substep"),
+        value_key="seconds",
+        limit="three fifths the compiled loop over springs, whose bits are fixed; the rest Python, once a frame",
     ),
     "overhead-share": LatencyRow(
         "share of processor time outside timed passes, 100 short runs",
@@ -137,25 +162,22 @@ LATENCY_ROWS = {
         "first run, numba",
         8.0,
         _AGAIN_NUMBA,
-        cold="compiled kernels",
-        environment={"NUMBA_CACHE_DIR": "FOLDER"},
         is_long=True,
+        **_WITHOUT_KERNELS,
     ),
     "first-run-hybrid": LatencyRow(
         "first run, hybrid",
         12.0,
         _AGAIN_HYBRID,
-        cold="compiled kernels",
-        environment={"NUMBA_CACHE_DIR": "FOLDER"},
         is_long=True,
+        **_WITHOUT_KERNELS,
     ),
     "first-error-search": LatencyRow(
         "first run --error 1e-4, hanging cloth of 17",
         12.0,
         _TO_ERROR,
-        cold="compiled kernels",
-        environment={"NUMBA_CACHE_DIR": "FOLDER"},
         is_long=True,
+        **_WITHOUT_KERNELS,
     ),
     "gates": LatencyRow(
         "the default gates", 240.0, ("-m", "pytest", "-q", "tests/bench", "--benchmark-only"), is_long=True
@@ -184,6 +206,7 @@ MEASUREMENT_SCHEMA = run_schema.build_schema(
         run_schema.ColumnSpec("description", pa.string(), "", "what the user does"),
         run_schema.ColumnSpec("cold", pa.string(), "", "what was cold"),
         run_schema.ColumnSpec("repeat", pa.int64(), "", "number of the measurement, from 0"),
+        run_schema.ColumnSpec("limit", pa.string(), "", "what takes most of the time, by a profile"),
         run_schema.ColumnSpec("wanted_seconds", pa.float64(), "s", "target of the value"),
         run_schema.ColumnSpec("value", pa.float64(), "s", "wall time, or what the row measures"),
         run_schema.ColumnSpec("wall_seconds", pa.float64(), "s", "wall time of the process"),
@@ -253,8 +276,9 @@ def measure_row(name: str, repeats: int, warm: Path) -> list[dict[str, Any]]:
             measured = measure_command(row.command, folder, row.environment, checked=not row.is_long)
             output = measured.pop("output")
             value = json.loads(output.splitlines()[-1])[row.value_key] if row.value_key else measured["wall_seconds"]
-            stated = {"row": name, "description": row.description, "cold": row.cold, "repeat": repeat}
-            found.append(stated | {"wanted_seconds": row.wanted_seconds, "value": value} | measured)
+            stated = {"row": name, "description": row.description, "cold": row.cold, "limit": row.limit}
+            numbers = {"repeat": repeat, "wanted_seconds": row.wanted_seconds, "value": value}
+            found.append(stated | numbers | measured)
     return found
 
 
