@@ -6,8 +6,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.report.accuracy.accuracy_data import AccuracyData
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy_report import draw_accuracy_report
@@ -19,13 +22,16 @@ from springbench.harness.report.charts.chart_description import (
     ChartSeries,
     select_curve_plots,
 )
-from springbench.harness.report.charts.chart_table import CHART_NAMES, build_accuracy_chart
+from springbench.harness.report.charts.chart_table import CHART_NAMES, build_accuracy_chart, build_compared_chart
 from springbench.harness.report.charts.figure_panels import AxisScale
+from springbench.harness.report.charts.published_curves import PUBLISHED_LABEL
 from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.figures.figure_layout import compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.plot_style import PAGE_WIDTH, TEXT_COLOUR, SeriesStyle, assign_solver_styles
 from springbench.harness.report.site.chart_json import serialise_chart
+from springbench.harness.results import row_store
+from springbench.harness.results.published_set import STUDY_FILE, TABLE_FILES
 
 from tests import synthetic_accuracy_rows as made
 
@@ -194,6 +200,48 @@ def test_every_sheet_is_there_in_both_formats_and_nothing_half_written(tmp_path:
             assert image.width == PAGE_WIDTH
             assert np.asarray(image.convert("L")).std() > 3, "an empty page has no variance"
         assert "<svg" in path.with_suffix(".svg").read_text()[:1000]
+
+
+def write_published_study(folder: Path, rows: list[dict]) -> Path:
+    """Write a published set of one study with these rows; returns its folder."""
+    home = folder / "published" / "study"
+    home.mkdir(parents=True)
+    rows = [row | {row_store.FILE_COLUMN: "0"} for row in rows]
+    schema = ACCURACY_SCHEMA.append(pa.field(row_store.FILE_COLUMN, pa.string()))
+    pq.write_table(pa.Table.from_pylist(rows, schema=schema), home / TABLE_FILES["accuracy"])
+    facts = {"config": "x.yaml", "is_timed": True, "runs": 1, "duration_seconds": 1.0, "command": "x"}
+    (home / STUDY_FILE).write_text(json.dumps(facts | {"machines": [{}], "files": {}}))
+    return home.parent
+
+
+def test_published_curves_are_grey_behind_those_of_the_same_step_and_solver(tmp_path: Path) -> None:
+    def build_rows(*solvers: str, slower: float = 1.0) -> list[dict]:
+        rows = []
+        for size in (6, 12):
+            rows += made.build_snapshot_rows("net", size, "early")
+            for solver in solvers if size == 6 else ("newton",):
+                rows += made.build_curve_rows("net", size, "early", solver)
+        rows += made.build_work_rows("net", 6, ("hybrid",))
+        return [row | {"seconds": [slower * t for t in row["seconds"]]} if row.get("seconds") else row for row in rows]
+
+    own = read_accuracy(made.write_accuracy_rows(tmp_path, build_rows("numba", "newton")))
+    published = write_published_study(tmp_path, build_rows("numba", "lbfgs", slower=3.0))
+    small, large = build_compared_chart("convergence", own, published=published).frames
+    assert [series.label for series in small.series] == [PUBLISHED_LABEL, "numba", "newton"]
+    grey, mine = small.series[:2]
+    assert grey.description.startswith("numba, published")
+    assert np.allclose(grey.columns["seconds"], 3.0 * np.asarray(mine.columns["seconds"]))
+    assert any("grey" in note for note in small.notes)
+    assert [series.label for series in large.series] == [PUBLISHED_LABEL, "newton"]
+    for name in ("times", "work"):
+        frame = build_compared_chart(name, own, published=published).frames[0]
+        assert frame.series[0].label == PUBLISHED_LABEL, "it is drawn first"
+    assert not any(
+        series.label == PUBLISHED_LABEL
+        for name in CHART_NAMES
+        for frame in build_compared_chart(name, own, published=tmp_path / "none").frames
+        for series in frame.series
+    )
 
 
 def test_the_same_chart_gives_the_same_vectors(tmp_path: Path) -> None:

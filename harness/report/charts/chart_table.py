@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from springbench.harness.report.accuracy.accuracy_data import AccuracyData, without_short_curves
 from springbench.harness.report.charts.accuracy_charts import (
@@ -17,6 +18,12 @@ from springbench.harness.report.charts.accuracy_charts import (
 from springbench.harness.report.charts.chart_description import ChartDescription
 from springbench.harness.report.charts.engine_chart import build_engine_chart
 from springbench.harness.report.charts.liu2013_chart import build_liu2013_chart
+from springbench.harness.report.charts.published_curves import (
+    COMPARED_CHARTS,
+    add_published_curves,
+    read_published_data,
+)
+from springbench.harness.results.published_set import PUBLISHED_FOLDER
 
 ChartBuilder = Callable[[AccuracyData, str | None], ChartDescription]
 
@@ -47,6 +54,29 @@ def build_accuracy_chart(
         return build_liu2013_chart(everything, newest_fingerprint)
     build = partial(build_convergence_chart, link_source=link_source) if name == "convergence" else _BUILDERS[name]
     return build(without_short_curves(everything), newest_fingerprint)
+
+
+def build_compared_chart(
+    name: str,
+    everything: AccuracyData,
+    newest_fingerprint: str | None = None,
+    link_source: SourceLinks = lambda curve: {},
+    published: Path = PUBLISHED_FOLDER,
+) -> ChartDescription:
+    """Build a chart as `build_accuracy_chart` does, with published curves in grey behind one's own.
+
+    Args:
+        name: name of the chart.
+        everything: data of an accuracy measurement.
+        newest_fingerprint: see `springbench.harness.report.charts.accuracy_charts`.
+        link_source: returns the links of a curve.
+        published: folder of the published set; without one nothing is added.
+    """
+    chart = build_accuracy_chart(name, everything, newest_fingerprint, link_source)
+    if name not in COMPARED_CHARTS:
+        return chart
+    others = [build_accuracy_chart(name, table) for table in read_published_data(everything, published)]
+    return add_published_curves(chart, others)
 
 
 CHART_NAMES = ("convergence", *_BUILDERS, "liu2013")

@@ -42,7 +42,9 @@ def add_direct_labels(axes: Sequence[Axes], panels: Sequence[FigurePanel], optio
         return False
     if panel.y.division == "names":
         return True
-    known = [series for series in panel.series if len(_end_point(series))]
+    ending = [series for series in panel.series if len(_end_point(series))]
+    plain = {series.label: series for series in ending if series.style.marker == "None"}
+    known = [*(series for series in ending if series.style.marker != "None"), *plain.values()]
     letters = max((len(series.label) for series in known), default=0)
     wide = 0.6 * options.small_font_size * letters + _LABEL_DISTANCE
     tall = options.width_mm / 25.4 * 72.0 * panel.aspect * 0.8

@@ -13,7 +13,7 @@ from springbench.harness.config.sweep_config import REPORT_TABLE
 from springbench.harness.errors import InputError, InputMistake, RunFailed, SpringbenchError, suggest_name
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.charts.chart_description import select_curve_plots
-from springbench.harness.report.charts.chart_table import build_accuracy_chart
+from springbench.harness.report.charts.chart_table import build_compared_chart
 from springbench.harness.report.charts.figure_panels import CellMap, FigurePanel, MeshPicture
 from springbench.harness.report.figures import (
     ablation_panels,
@@ -92,7 +92,7 @@ def _without_stale(
 def _list_accuracy_plots(name: str) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
     """Return a function that lists the plots of a chart of an accuracy measurement."""
     return _without_stale(
-        lambda folder: entries_from_panels(select_curve_plots(build_accuracy_chart(name, read_accuracy(folder))))
+        lambda folder: entries_from_panels(select_curve_plots(build_compared_chart(name, read_accuracy(folder))))
     )
 
 
