@@ -12,11 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from springbench.solvers.iteration.idle_contact import IdleContactSolver
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.kernels.line_search_conditions import (
@@ -79,6 +81,7 @@ def backtracking_line_search(
     initial_step: float = 1.0,
     directional_curvature: float = 0.0,
     relax_locally: Callable[[Positions], Positions] | None = None,
+    uses_rounded_slope: bool = False,
 ) -> DescentPoint | None:
     """Return the first point at initial_step, initial_step/2, ... with sufficient decrease, or None.
 
@@ -92,6 +95,8 @@ def backtracking_line_search(
         directional_curvature: second derivative along the direction [J], if a decrease is expected from it.
         relax_locally: relaxation that lowers the objective from given positions; its result is tried first at each
             point.
+        uses_rounded_slope: whether a decrease is also sufficient if it is by the slope along the rounded displacement:
+            the rounding of positions may absorb most of a displacement, as at stiff pins.
     """
     slope = inner_product(at.gradient, direction)
     t = step.max_step_size(at.positions, direction, initial_step)
@@ -109,6 +114,10 @@ def backtracking_line_search(
             gradient = step.gradient(p)
             if is_approximate_wolfe_step(abs(inner_product(gradient, direction)), slope, ARMIJO_FRACTION):
                 return DescentPoint(p, gradient)
+        if uses_rounded_slope and rise < 0.0:
+            rounded_slope = inner_product(at.gradient, p - at.positions)
+            if rounded_slope < 0.0 and is_armijo_step(rise, 1.0, rounded_slope, 0.0):
+                return DescentPoint(p, step.gradient(p))
         t *= 0.5
     return None
 
@@ -172,6 +181,23 @@ class ResidualMetric:
     def energy_roundoff(self, p: Positions) -> float:
         """Return a bound of g H^-1 g [J] for a gradient g due to rounding of the positions p (n, 3)."""
         return float(np.finfo(np.float64).eps * np.abs(p).max(initial=0.0)) ** 2 * self.unpinned_trace
+
+    def significant_vertices(self, p: Positions, decrease: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which vertices are of connected components whose decrease exceeds round-off.
+
+        Args:
+            p: positions (n, 3) [m].
+            decrease: predicted decrease of the objective at each vertex (n,) [J].
+        """
+        labels, largest = self._component_labels, np.zeros(len(p))
+        np.maximum.at(largest, labels, np.abs(p).max(axis=1, initial=0.0))
+        stiffness = np.bincount(labels, self._Q.diagonal() * self.system.unpinned_mask, minlength=len(p))
+        roundoff = stiffness * (np.finfo(np.float64).eps * largest) ** 2
+        return (np.bincount(labels, decrease, minlength=len(p)) > roundoff)[labels]
+
+    @cached_property
+    def _component_labels(self) -> NDArray[np.int32]:
+        return connected_components(self._Q, directed=False)[1]
 
     def solve(self, b: Positions) -> Positions:
         """Return Q^-1 b, (n, 3), zero at exactly pinned vertices."""

@@ -2,10 +2,12 @@
 
     q = D_k / D_(k-1),   remaining decrease = q D_k + q^2 D_k + ... = D_k q / (1 - q)
     switch if that per cost of a Newton step exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of a Newton step
+    unless  log(r_k / limit) / log(r_(k-1) / r_k) <= cost of a Newton step
 
-D_k is the decrease of the objective in the k-th group of rounds. Costs are counted in groups, from the numbers of
-entries and operations, and not measured by a clock: equal solves then make equal decisions. Once a Newton step has been
-measured, its decrease per cost replaces the promise.
+D_k is the decrease of the objective in the k-th group of rounds, and r_k the residual after it: no switch pays if the
+rounds reach the limit of the residual within the cost of one Newton step. Costs are counted in groups, from the numbers
+of entries and operations, and not measured by a clock: equal solves then make equal decisions. Once a Newton step has
+been measured, its decrease per cost replaces the promise.
 """
 
 from __future__ import annotations
@@ -42,9 +44,10 @@ ROUND_STATE_DTYPE = np.dtype(
         ("is_unsuited", np.int64),  # whether the residual hardly decreased in the first iterations
         ("initial_residual", np.float64),  # [J^(1/2)]; negative: not yet known
         ("group_start", np.float64),  # decrease of the objective before the group [J]
+        ("group_residual", np.float64),  # residual before the group [J^(1/2)]; 0: not known
         ("gain", np.float64),  # decrease in the last group [J]; infinite before the first
         ("rival_gain", np.float64),  # decrease of the other methods per cost of a group [J]; 0: not measured
-        ("trial_iteration", np.int64),  # iterations from which on a promise counts
+        ("trial_iteration", np.float64),  # iterations from which on a promise counts
         ("newton_cost", np.float64),  # cost of a Newton step in groups
     ]
 )
@@ -65,16 +68,20 @@ def round_size(num_iterations):
 
 
 @register_jitable(**jit_inner_options)
-def _judge_round(now, decrease, residual):
+def _judge_round(now, decrease, residual, residual_limit):
     """Return SWITCH if another method promises more, else ITERATIONS."""
     if now.num_iterations == PROBE_ITERATIONS and residual > _FAST_RESIDUAL_RATIO * now.initial_residual:
         now.is_unsuited = 1
         return REASON_SWITCH
     if now.num_iterations < now.group_end:
         return REASON_ITERATIONS
-    before, gain = now.gain, decrease - now.group_start
-    now.gain, now.group_start = gain, decrease
+    before, gain, last_residual = now.gain, decrease - now.group_start, now.group_residual
+    now.gain, now.group_start, now.group_residual = gain, decrease, residual
     now.group_end = now.num_iterations + GROUP_ITERATIONS
+    if 0.0 < residual_limit < residual < last_residual:
+        left = np.log(residual / residual_limit) / np.log(last_residual / residual)  # groups
+        if left <= now.newton_cost:
+            return REASON_ITERATIONS
     if gain <= 0.0 or gain < now.rival_gain:
         return REASON_SWITCH
     promises = now.num_iterations >= now.trial_iteration and now.newton_cost * (before - gain) < before
@@ -99,7 +106,7 @@ def build_rounds(
     def iterate(state: Any, rounds: Any, limits: Any) -> Any:
         now, count, found, ended = rounds[0], 0, np.nan, REASON_ITERATIONS
         if now.initial_residual < 0.0:
-            now.initial_residual = residual(state)
+            now.initial_residual = now.group_residual = residual(state)
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
             size = round_size(now.num_iterations)
             done = run_unchecked(state, size)
@@ -108,7 +115,9 @@ def build_rounds(
             found = residual(state)
             ended = check_residual(found, limits)
             if ended == REASON_ITERATIONS:
-                ended = _judge_round(now, decrease(state), found) if done == size else REASON_STALLED
+                ended = (
+                    _judge_round(now, decrease(state), found, limits.residual_limit) if done == size else REASON_STALLED
+                )
         return count, found, ended
 
     return iterate

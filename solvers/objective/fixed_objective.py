@@ -40,10 +40,11 @@ class FixedObjective:
         other_energy_indices: indices of energies without one.
         forms_with_force: indices of quadratic forms with a force, or with one that changes from step to step.
         projective_indices: indices of projective energies other than springs.
+        has_inertia: whether each vertex has inertia.
     """
 
     def __init__(self, system: System) -> None:
-        self.system = system
+        self.system, self.has_inertia = system, bool((system.inertia_diagonal > 0.0).all())
         self.springs = Springs.from_parts([e for e in system.energies if isinstance(e, Springs)])
         self.objective_terms = objective_kernels.ObjectiveTerms.from_system(system, self.springs)
         self.quadratic_form: QuadraticForm | None = None

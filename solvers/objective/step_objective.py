@@ -103,9 +103,12 @@ class StepObjective:
     def inertial_prediction(self) -> Positions:
         """Return the positions (n, 3) under inertia and external force alone, pinned vertices on their targets."""
         problem, h = self.problem, self.problem.system.inertia_diagonal[:, None]
-        p = problem.inertial_target + np.divide(
-            problem.external_force, h, out=np.zeros_like(problem.external_force), where=h > 0.0
-        )
+        if self.fixed_objective.has_inertia:
+            p = problem.inertial_target + problem.external_force / h
+        else:
+            p = problem.inertial_target + np.divide(
+                problem.external_force, h, out=np.zeros_like(problem.external_force), where=h > 0.0
+            )
         p[problem.system.pins.vertices] = problem.pin_targets
         return p
 

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.reference.exact_lengths import StationarityEvaluator
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
@@ -19,6 +25,8 @@ from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
 from tests.scene_builders import build_cloth, build_first_problem, build_random_problem
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 
 def stiff(ratio: float) -> StepProblem:
@@ -170,3 +178,49 @@ def test_a_failed_factorisation_counts_by_the_operations_before_it_fails():
     blocks[n] = np.eye(3)
     assert graph.factorise(blocks)
     assert graph.num_factorisations == least + 1.0
+
+
+def test_the_shift_approaches_the_smallest_one_that_has_a_factor():
+    """Where the model is accurate, a smaller shift is tried; a failed attempt brings the next one closer."""
+    shift, smallest, attempts = InertiaShift(0.0, 1e3), 1.7, list[float]()
+
+    def attempt(value: float) -> float | None:
+        attempts.append(value)
+        return value if value >= smallest else None
+
+    for _ in range(30):
+        assert shift.find_smallest(attempt) == shift.value
+        shift.can_reduce = True
+    assert smallest <= shift.value < 1.05 * smallest
+    assert len(attempts) < 2.1 * 30
+
+
+def test_a_shift_beyond_the_largest_one_is_infinite_until_the_model_is_accurate():
+    shift = InertiaShift(0.0, 10.0)
+    assert shift.find_smallest(lambda value: value if value == np.inf else None) == np.inf
+    assert shift.find_smallest(lambda value: value) == np.inf
+    shift.can_reduce = True
+    assert shift.find_smallest(lambda value: value) == 10.0
+
+
+@pytest.mark.parametrize(("case", "frames"), [("numbers-micrometres", 8), ("scales-cubes-1e9-m-apart", 2)])
+def test_round_off_of_some_vertices_does_not_stop_the_others(case, frames):
+    """Stiff pins that cannot move by less than their last digit, and a cube whose last digit is a tenth of a micron."""
+    made, found = build_scene(load_scene(CONFIGS / "hard" / f"{case}.yaml"), 0), StationarityEvaluator()
+    steps = simulate_scene(
+        made, prepare(made, HybridNewton()), StopRule(300, 1e-6), initial_guess="previous", frames=frames
+    )
+    for step in steps:
+        for problem, solution in step.stages:
+            assert found(problem, solution.positions).above_roundoff <= 1.1e-6
+
+
+def test_no_newton_step_is_taken_where_lbfgs_is_sooner_at_the_limit():
+    """Without a limit of the residual L-BFGS gives way to Newton's method, which promises the whole rest."""
+    given, prepared = stiff(10.0), HybridNewton().prepare(stiff(10.0).system)
+    endless = prepared.solve(given, StopRule(60)).solver_phases
+    limited = prepared.solve(given, StopRule(300, 1e-3)).solver_phases
+    assert endless is not None
+    assert limited is not None
+    assert "newton" in endless
+    assert set(limited) == {"lbfgs"}

@@ -68,6 +68,7 @@ def test_a_study_gains_the_runs_of_its_parts(checkout: Path) -> None:
         result = CliRunner().invoke(app, [*arguments, "--published", str(study.parent)])
         assert result.exit_code == 0, result.output
         assert read_study(study).metadata["runs"] == 13
+        assert read_study(study).read_table("rows").num_rows == 26
 
 
 def test_a_study_that_is_too_large_leaves_the_published_one_as_it_is(

@@ -74,7 +74,7 @@ def write_study(
     by_part = [_read_part(part) for part in parts]
     made = _read_measurements(provenance) if provenance else None
     found = {
-        table: _drop_missing_software(_keep_newest_runs(pa.concat_tables(several, promote_options="permissive")))
+        table: _drop_missing_software(_join_newest_runs(several))
         for table in ("measurements", *_TABLES)
         if (several := [tables[table] for tables in by_part if table in tables])
     }
@@ -170,16 +170,31 @@ def _read_part(part: Path) -> dict[str, pa.Table]:
     return {table: rows for table in _TABLES if (rows := _read_table(part / table)) is not None}
 
 
-def _keep_newest_runs(rows: pa.Table) -> pa.Table:
-    """Keep the newest rows of each run that was executed several times, by its key on any machine."""
-    names = [name for name in (*published_set.RUN_KEYS, "run_id", "started_at") if name in rows.column_names]
-    if "run_id" not in names:
-        return rows
-    newest: dict[tuple[Any, ...], tuple[str, str]] = {}
-    for row in rows.select(names).to_pylist():
-        key = tuple(row.get(name) for name in published_set.RUN_KEYS)
-        newest[key] = max(newest.get(key, ("", "")), (str(row.get("started_at")), row["run_id"]))
-    return rows.filter(pc.is_in(rows["run_id"], pa.array([run for _, run in newest.values()])))
+def _join_newest_runs(parts: Sequence[pa.Table]) -> pa.Table:
+    """Join tables, with the newest execution alone of each run, by its key on any machine; of equal ones the last."""
+    names = [*published_set.RUN_KEYS, "run_id", "started_at"]
+    newest: dict[tuple[Any, ...], tuple[str, str, int]] = {}
+    executions = list[list[tuple[tuple[Any, ...], tuple[str, str, int]]]]()
+    for number, part in enumerate(parts):
+        found = part.select([name for name in names if name in part.column_names]).to_pylist()
+        if "run_id" not in part.column_names:
+            return pa.concat_tables(parts, promote_options="permissive")
+        executions.append(
+            [
+                (
+                    tuple(row.get(name) for name in published_set.RUN_KEYS),
+                    (str(row.get("started_at")), row["run_id"], number),
+                )
+                for row in found
+            ]
+        )
+        for key, execution in executions[-1]:
+            newest[key] = max(newest.get(key, execution), execution)
+    tables = [
+        part.filter(pa.array([execution == newest[key] for key, execution in rows], pa.bool_()))
+        for part, rows in zip(parts, executions, strict=True)
+    ]
+    return pa.concat_tables(tables, promote_options="permissive")
 
 
 def _read_table(folder: Path) -> pa.Table | None:

@@ -17,13 +17,14 @@ L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32: the i
 bandwidth, and directions need no more digits. The start is the better of the initial guess and the inertial prediction.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
-last run. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
+last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
 last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it
 has no Cholesky factor, predicted tensions follow, and the exact method is tried again after a cost that doubles with
 each attempt that decreases the objective less than the others did meanwhile. A step of the exact method delivers if the
 Hessian is unmodified and the decrease agrees with the quadratic model; then the next step promises more than any other
-method, and the exact method continues until a step does not deliver. Costs are counted, not measured by a clock: in
-groups of L-BFGS iterations, from the numbers of springs, entries and operations of the factors and from the
+method, and the exact method continues until a step does not deliver. An indefinite Hessian gets the smallest multiple
+of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`). Costs are counted, not measured by a
+clock: in groups of L-BFGS iterations, from the numbers of springs, entries and operations of the factors and from the
 factorisations made. Equal solves so make equal decisions and have bitwise equal results, on any machine and under any
 load. `Solution.solver_phases` explains them.
 
@@ -38,6 +39,7 @@ continues.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, cast
@@ -69,7 +71,8 @@ from springbench.solvers.kernels.iteration_loop import (
 )
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import cache_symbolic_analysis
 from springbench.solvers.methods.local_global.accelerated_local_global import AcceleratedState
-from springbench.solvers.methods.newton.hessian_regularisation import ShiftScheduleRule
+from springbench.solvers.methods.newton.hessian_regularisation import ShiftScheduleRule, factorise_shifted
+from springbench.solvers.methods.newton.inertia_shift import MODEL_DECREASE_FRACTION, InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import (
     escape_saddle,
     is_positive_definite,
@@ -92,11 +95,17 @@ _CACHED_ENTRIES = 2**15
 and the residuals of L-BFGS are exact."""
 
 _FIRST_PATIENCE = 10.0
-"""Cost in Newton steps after which the exact method is tried again, at first: attempts take a tenth of the cost."""
+"""Multiple of the cost of an attempt after which the exact method is tried again, at first."""
 
 _MODEL_RANGE = (0.3, 0.7)
 """Range of the decrease, as a fraction of the slope, in which a step agrees with the quadratic model: half of it for a
 full step on a quadratic function, three quarters for half a step."""
+
+_MEASURED_STEPS = 3
+"""Number of consecutive steps of a Newton method whose decrease per cost is compared: single steps vary widely."""
+
+_MAX_SHIFT = 1e3
+"""Largest multiple of the inertia that is added to an exact Hessian; then its negative parts are reduced instead."""
 
 _LBFGS_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), (2e5, 0.023, 20.0)
 """Costs of an L-BFGS iteration (constant, per spring, per entry of the factor) and of a Newton step (constant, per
@@ -244,14 +253,16 @@ class _HybridState(SolverState):
 
 
 class _MeasuredRule(ShiftScheduleRule):
-    """The shift schedule, which also measures the step of the exact method.
+    """The smallest multiple of the inertia, or else the shift schedule; measures the steps of the exact method.
 
     Attributes:
         is_delivered: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
         is_exact_only: whether only the unmodified Hessian may be factorised.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, inertia_diagonal: NDArray[np.float64]) -> None:
+        """Create the rule with the diagonal of the inertia (3f,) [N/m]."""
+        self._inertia_diagonal, self._shift = inertia_diagonal, InertiaShift(0.0, _MAX_SHIFT)
         self._level: int | None = None
         self.is_delivered = self.is_exact_only = False
 
@@ -260,12 +271,19 @@ class _MeasuredRule(ShiftScheduleRule):
         if self.is_exact_only:
             self._level = 0 if hessian.factorise() else None
         else:
-            self._level = super().factorise_hessian(hessian, at, diagonal)
+            self._level = self._shift.find_smallest(lambda shift: self._factorise_shifted(hessian, diagonal, shift))
         return self._level
+
+    def _factorise_shifted(self, hessian: Hessian, diagonal: NDArray[np.float64], shift: float) -> int | None:
+        """Factorise with a multiple of the inertia added, or by the shift schedule if it is infinite."""
+        if shift == np.inf:
+            return factorise_shifted(hessian, diagonal, first_level=1)
+        return int(shift > 0.0) if hessian.factorise(1.0, shift * self._inertia_diagonal) else None
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         slope = inner_product(at.gradient, at.positions - to.positions)
         fall, (low, high) = objective_decrease(step, at, to), _MODEL_RANGE
+        self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
         self.is_delivered = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
 
 
@@ -285,7 +303,8 @@ class HybridIteration:
     def __init__(
         self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated, is_small: bool
     ) -> None:
-        self.metric, self.newton, self._lbfgs = metric, NewtonIteration(metric), lbfgs
+        self.metric, self._lbfgs = metric, lbfgs
+        self.newton = NewtonIteration(metric, has_local_roundoff=True)
         self.system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
         self.inertia_diagonal: NDArray[np.float64] = np.repeat(
             objective.system.inertia_diagonal[objective.system.free_vertices], 3
@@ -353,10 +372,12 @@ class _Approach:
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = method.start_lbfgs(step, start)
         self._point, self._rounds = DescentPoint(start, start), init_rounds(method.newton_cost)
-        self._rule, self._steepest = _MeasuredRule(), 0.0
+        self._rule, self._steepest = _MeasuredRule(method.inertia_diagonal), 0.0
         self._predicting: PredictedTensionNewton | None = None
         self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
+        self._name, self._recent_steps = "", deque[tuple[float, float]](maxlen=_MEASURED_STEPS)  # [J], cost
         self._is_trial_due, self._patience, self._spent, self._fallen = False, _FIRST_PATIENCE, 0.0, 0.0
+        self._trial_cost = _FIRST_PATIENCE * method.newton_cost  # spent by the others until the exact method is tried
 
     def iterate_points(self) -> Iterator[DescentPoint]:
         """Yield the points of the method that promises most, up to a stalled one or an escape from a saddle."""
@@ -364,6 +385,9 @@ class _Approach:
             point = self._escape() if self._control.must_escape else None
             if point is None:
                 name = self._choose_method()
+                if name != self._name:
+                    self._name = name
+                    self._recent_steps.clear()
                 if name == "lbfgs":
                     point = self._run_lbfgs()
                 else:
@@ -388,7 +412,7 @@ class _Approach:
         if self._run is None:
             self._run = self._method.start_lbfgs(step, self._point.positions)
             rounds["group_start"], rounds["group_end"] = 0.0, rounds["num_iterations"] + GROUP_ITERATIONS
-            rounds["gain"] = np.inf
+            rounds["gain"], rounds["group_residual"] = np.inf, 0.0
         if step.barrier_energies:  # each round is checked for collisions
             limits = limits._replace(max_iterations=1)
         before, floor = (
@@ -445,20 +469,23 @@ class _Approach:
         fall = objective_decrease(self._step, self._point, to)
         cost = self._method.newton_cost * num_factorisations
         self._control.add_phase(name, int(to.positions is not self._point.positions), num_factorisations)
+        if fall == 0.0:
+            self._recent_steps.clear()
+        self._recent_steps.append((fall, cost))
+        total_fall, total_cost = map(sum, zip(*self._recent_steps, strict=True))
         if fall > 0.0 or name == "newton" or self._is_trial_due:
-            self._gains[name] = fall / cost if cost > 0.0 else 0.0
+            self._gains[name] = total_fall / total_cost if total_cost > 0.0 else 0.0
         if name == "newton":
             others = self._fallen / self._spent if self._spent > 0.0 else 0.0
             is_better = self._rule.is_delivered or self._gains["newton"] > others
             self._patience = _FIRST_PATIENCE if is_better else 2.0 * self._patience
             self._is_trial_due, self._spent, self._fallen = False, 0.0, 0.0
             rounds = self._rounds
-            rounds["trial_iteration"] = rounds["num_iterations"] + int(
-                GROUP_ITERATIONS * self._patience * self._method.newton_cost
-            )
+            self._trial_cost = self._patience * (cost or self._method.newton_cost)
+            rounds["trial_iteration"] = rounds["num_iterations"] + GROUP_ITERATIONS * self._trial_cost
         else:
             self._spent, self._fallen = self._spent + cost, self._fallen + fall
-            self._is_trial_due |= self._spent >= self._patience * self._method.newton_cost
+            self._is_trial_due |= self._spent >= self._trial_cost
 
     def _escape(self) -> DescentPoint | None:
         """Return a lower point next to the saddle point at which the iteration is, or None."""

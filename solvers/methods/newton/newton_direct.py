@@ -105,7 +105,23 @@ class NewtonIteration:
 
     identifies_saddles: ClassVar[bool] = True
 
-    def __init__(self, metric: ResidualMetric, indefinite: IndefiniteStrategy = "shift-schedule") -> None:
+    def __init__(
+        self,
+        metric: ResidualMetric,
+        indefinite: IndefiniteStrategy = "shift-schedule",
+        *,
+        has_local_roundoff: bool = False,
+    ) -> None:
+        """Create the iteration.
+
+        Args:
+            metric: norm of residuals.
+            indefinite: name of the regularisation.
+            has_local_roundoff: whether round-off is determined locally: a step whose decrease is round-off in total
+                moves the connected components in which it is not, e.g. those near the origin, and the line search uses
+                the slope along the rounded displacement.
+        """
+        self._has_local_roundoff = has_local_roundoff
         self._metric, self._modification_rule = metric, REGULARISATION_RULES[indefinite]
         self._system_diagonal: NDArray[np.float64] = np.repeat(metric.free_diagonal, 3)
         self._friction_search = make_friction_search(metric)
@@ -157,6 +173,10 @@ class NewtonIteration:
         fall = -inner_product(at.gradient, direction)
         steepest = max(fall, steepest)
         known = fall > self._metric.energy_roundoff(at.positions)
+        if not known and self._has_local_roundoff:
+            falls = -np.einsum("ij,ij->i", at.gradient, direction)
+            is_significant = self._metric.significant_vertices(at.positions, falls)
+            known, direction = bool(is_significant.any()), np.where(is_significant[:, None], direction, 0.0)
         slight = fall <= _SADDLE_SLOPE_RATIO * steepest
         if level > 0 and (slight or not known) and type(rule) is not ShiftScheduleRule:
             return self.next_point(step, at, steepest, ShiftScheduleRule())
@@ -165,7 +185,7 @@ class NewtonIteration:
             found = self._search_direction(step, at, direction, level == 0)
         if found is None and level > 0:
             found = escape_saddle(step, at, hessian, self._system_diagonal) or (
-                backtracking_line_search(step, at, direction) if known else None
+                self._backtrack(step, at, direction) if known else None
             )
         if found is not None:
             rule.record_step(step, hessian, at, found)
@@ -176,10 +196,13 @@ class NewtonIteration:
     ) -> DescentPoint | None:
         """Return a lower point along a direction, or None; `exact` means an unmodified Hessian."""
         if self._friction_search is None or not exact or not step.has_contact_elements:
-            return backtracking_line_search(step, at, direction)
+            return self._backtrack(step, at, direction)
         return self._friction_search.watchdog_search(
             step, at, direction, lambda point: self._exact_newton_direction(step, point)
         )
+
+    def _backtrack(self, step: StepObjective, at: DescentPoint, direction: Positions) -> DescentPoint | None:
+        return backtracking_line_search(step, at, direction, uses_rounded_slope=self._has_local_roundoff)
 
     @staticmethod
     def _exact_newton_direction(step: StepObjective, at: DescentPoint) -> Positions | None:

@@ -3,11 +3,7 @@
     H(t) = M/dt^2 + sum_e k nn' + t_e/l_e (I - nn'),   (H(t) + s M/dt^2) d = -grad g(p)
     t_e <- k_e (l_e + n (A d)_e - r_e)
 
-`springbench.solvers.methods.newton.hybrid_newton` gives the motivation. If H(t) is not positive
-definite, a step along unstable
-modes is longer the closer s is to the smallest value that has a factor (More and Sorensen 1983). So a smaller s is
-tried after each step that allows it. The ratio of reduction is squared if there was a factor; otherwise its square root
-is taken. So s approaches the smallest value in a few steps, and then tracks it.
+`springbench.solvers.methods.newton.hybrid_newton` gives the motivation, `inertia_shift` the choice of s.
 """
 
 from __future__ import annotations
@@ -23,19 +19,17 @@ from springbench.solvers.iteration.descent_method import (
     inner_product,
 )
 from springbench.solvers.kernels.line_search_conditions import is_armijo_step
+from springbench.solvers.methods.newton.inertia_shift import MODEL_DECREASE_FRACTION, InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.model.step_problem import Positions
 from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
-_MODEL_DECREASE_FRACTION = 0.25
-"""The quadratic model counts as accurate if a full step decreases the objective by this fraction of the linear
-prediction; for a quadratic function the fraction is one half."""
-
 _QUADRATIC_SLOPE_RATIO = 0.1
 """Near a minimum a Newton step leaves at most this fraction of the slope."""
 
-_MIN_SHIFT, _MAX_SHIFT, _SHIFT_RATIO = 0.1, 10.0, 4.0
-"""Smallest and largest multiple of the inertia that is added, if any, and the initial ratio of its reduction."""
+
+_MAX_SHIFT = 10.0
+"""Largest multiple of the inertia that is added; then the negative parts of the springs are dropped instead."""
 
 
 class RelaxationMethod(Protocol):
@@ -58,7 +52,7 @@ class PredictedTensionNewton:
         self._method, self._step = method, step
         self._first_point: DescentPoint | None = origin
         self._predicted_tensions = np.zeros(len(step.fixed_objective.springs.stiffness))
-        self._shift, self._shift_ratio, self._slope, self._can_reduce_shift = np.inf, _SHIFT_RATIO, -np.inf, False
+        self._shift, self._slope = InertiaShift(np.inf, _MAX_SHIFT), -np.inf
 
     def compute_first_step(self, at: DescentPoint) -> tuple[DescentPoint, float, bool]:
         """Return a lower point by the true tensions, the decrease [J], and whether it lies off a saddle point."""
@@ -68,11 +62,12 @@ class PredictedTensionNewton:
         if descent is None:
             return at, 0.0, False
         self._slope = -inner_product(at.gradient, descent)
-        following = backtracking_line_search(step, at, -descent) or at
-        self._can_reduce_shift = objective_decrease(step, at, following) > -_MODEL_DECREASE_FRACTION * self._slope
+        following = backtracking_line_search(step, at, -descent, uses_rounded_slope=True) or at
+        is_accurate = objective_decrease(step, at, following) > -MODEL_DECREASE_FRACTION * self._slope
+        self._shift.can_reduce = is_accurate
         curvature = probe_negative_curvature(step, following, hessian, self._method.system_diagonal)
         following = curvature or following
-        if self._can_reduce_shift:
+        if is_accurate:
             self._first_point, self._predicted_tensions = (
                 None,
                 step.linearise_tensions(following.positions, np.zeros_like(descent)),
@@ -84,7 +79,7 @@ class PredictedTensionNewton:
         step, at = self._step, self._first_point or point
         self._first_point = None
         hessian = step.hessian(at.positions)
-        descent = self._solve_regularised(hessian, at.gradient)
+        descent = self._shift.find_smallest(lambda shift: self._solve_shifted(hessian, at.gradient, shift))
         if descent is None:
             return point, 0.0, True
         direction = -descent
@@ -96,30 +91,12 @@ class PredictedTensionNewton:
         length, following, is_sufficient = self._line_search(at, direction, slope)
         if following is None:
             return point, 0.0, True
-        self._can_reduce_shift = is_sufficient or self._shift == np.inf
+        self._shift.can_reduce = is_sufficient or self._shift.value == np.inf
         self._predicted_tensions += length * (predicted - self._predicted_tensions)
         gain = objective_decrease(step, point, following)
         if gain == 0.0:
             return point, 0.0, at is point
-        return following, gain, self._shift == 0.0 and is_sufficient and slope >= _QUADRATIC_SLOPE_RATIO * before
-
-    def _solve_regularised(self, hessian: Hessian, b: Positions) -> Positions | None:
-        """Solve with the regularised Hessian.
-
-        The shift is reduced if the model was accurate in the previous step, and increased while there is no factor.
-        """
-        if self._can_reduce_shift and self._shift > 0.0:
-            less = min(self._shift / self._shift_ratio, _MAX_SHIFT)
-            less = less if less >= _MIN_SHIFT else 0.0
-            solution = self._solve_shifted(hessian, b, less)
-            if solution is not None:
-                self._shift, self._shift_ratio = less, min(_SHIFT_RATIO, self._shift_ratio**2)
-                return solution
-            self._shift_ratio = self._shift_ratio**0.5 if self._shift < np.inf else _SHIFT_RATIO
-        while (solution := self._solve_shifted(hessian, b, self._shift)) is None and self._shift < np.inf:
-            self._shift, self._shift_ratio = max(_MIN_SHIFT, _SHIFT_RATIO * self._shift), _SHIFT_RATIO
-            self._shift = self._shift if self._shift <= _MAX_SHIFT else np.inf
-        return solution
+        return following, gain, self._shift.value == 0.0 and is_sufficient and slope >= _QUADRATIC_SLOPE_RATIO * before
 
     def _solve_shifted(self, hessian: Hessian, b: Positions, shift: float) -> Positions | None:
         """Solve with a multiple of the inertia added; an infinite one drops negative transverse parts instead."""
@@ -132,12 +109,12 @@ class PredictedTensionNewton:
         """Return the step size, the new point, and whether the decrease agrees with the model."""
         step = self._step
         p = step.apply_exact_pins(at.positions + direction)
-        if step.objective_change(at.positions, p)[0] <= _MODEL_DECREASE_FRACTION * slope:
+        if step.objective_change(at.positions, p)[0] <= MODEL_DECREASE_FRACTION * slope:
             return 1.0, DescentPoint(p, step.gradient(p)), True
         relaxed = self._method.relax_point(step, p)
         if is_armijo_step(step.objective_change(at.positions, relaxed.positions)[0], 1.0, slope, 0.0):
             return 1.0, relaxed, False
-        found = backtracking_line_search(step, at, direction)
+        found = backtracking_line_search(step, at, direction, uses_rounded_slope=True)
         if found is None:
             return 0.0, None, False
         length = inner_product(found.positions - at.positions, direction) / inner_product(direction, direction)
