@@ -18,6 +18,7 @@ doubtful choices is above 1.3.
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -196,6 +197,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", metavar="NAME", help="scenes (default: all ten)")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--search-time", type=float, default=60.0, help="time of each search [s]")
+    logging.getLogger("springbench").setLevel(logging.ERROR)  # each simulation warns of unusual values of its scene
     options, console, is_missed = parser.parse_args(), Console(width=160), False
     table = Table("scene", "ms a frame", "recommended", "its ms", "error", "best", "its ms", "error", "ratio", "to")
     table.box = SIMPLE_HEAD
