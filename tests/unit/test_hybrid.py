@@ -15,7 +15,7 @@ from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
-from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, PreparedHybrid
 from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
@@ -169,7 +169,9 @@ def test_a_solve_ends_at_the_first_of_its_iterates_that_satisfies_the_tolerance(
 
 
 def test_a_failed_factorisation_counts_by_the_operations_before_it_fails():
-    graph = HybridNewton().prepare(stiff(1.0).system).hybrid_iteration.factor
+    prepared = HybridNewton().prepare(stiff(1.0).system)
+    assert isinstance(prepared, PreparedHybrid)
+    graph = prepared.hybrid_iteration.factor
     n = graph._frontal_structure.diagonal_block  # pyright: ignore[reportPrivateUsage]
     blocks = np.zeros((graph._frontal_structure.block_index.max() + 1, 3, 3))  # pyright: ignore[reportPrivateUsage]
     assert not graph.factorise(blocks)
