@@ -68,7 +68,7 @@ class PageChart:
         form: bars by name, lines, or a heat map of shares.
         points: values, in the order of their appearance.
         x_label, y_label: quantities with units.
-        x_scale, y_scale: "log" or "linear".
+        x_scale, y_scale: "log" or "linear"; bars on a logarithmic axis are ratios and start at 1.
         highlights: series in colour; the others are grey. Empty: all of them.
         limit: a value that a line marks, and its meaning.
     """
@@ -123,10 +123,11 @@ def _format_value(chart: PageChart, value: float) -> str:
 def _draw_bars(ax: Axes, chart: PageChart) -> None:
     """Draw one horizontal bar per name, with its value at the end."""
     known = [(point, point.y) for point in chart.points if point.y is not None]
+    base = 1.0 if chart.x_scale == "log" else 0.0  # a ratio of 1, from which both directions are equally long
     for k, (point, value) in enumerate(known):
         name = point.series
         is_grey = bool(chart.highlights) and name not in chart.highlights
-        ax.barh(k, value, height=0.72, color=_GREY if is_grey else _ACCENTS[0])
+        ax.barh(k, value - base, left=base, height=0.72, color=_GREY if is_grey else _ACCENTS[0])
         if point.low is not None and point.high is not None:
             ax.plot([point.low, point.high], [k, k], color=TEXT_COLOUR, linewidth=1.0)
         end = max(value, point.high or value)
