@@ -6,6 +6,7 @@ Formulas: `springbench.harness.scenes.effects.wind_effect`.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_kernel
 
 _BLOCK_POINTS = 256
@@ -21,7 +22,13 @@ def compute_triangle_centres(p, triangles, out):
             out[e, k] = (p[a, k] + p[b, k] + p[c, k]) / 3.0
 
 
-def evaluate_gusts(late, angular_frequency, phase, mean, amplitude):
+def evaluate_gusts(
+    late: NDArray[np.float64],
+    angular_frequency: NDArray[np.float64],
+    phase: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    amplitude: float,
+) -> NDArray[np.float64]:
     """Return mean + amplitude * sum_w cos(angular_frequency_w late + phase_w), (k, 3).
 
     NumPy evaluates the cosines, by vector instructions where it has them.

@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
+from springbench.solvers.iteration.descent_method import DescentPoint, PreparedDescent, ResidualMetric
 from springbench.solvers.methods.newton.hessian_regularisation import (
     REGULARISATION_RULES,
     ClampRule,
@@ -169,6 +169,7 @@ def test_all_rules_descend_to_the_same_certified_minimum(rule, name):
     size = np.ptp(wanted.positions, axis=0).max()
     np.testing.assert_allclose(found.positions, wanted.positions, atol=1e-9 * size)
     _, at, _ = begun(replace(given, initial_guess=found.positions))
+    assert isinstance(prepared, PreparedDescent)
     assert prepared.method.can_terminate(StepObjective(FixedObjective(given.system), given), at)
 
 

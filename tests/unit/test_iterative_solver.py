@@ -195,6 +195,10 @@ class PreparedStepping(IterativeSolver):
     certain: int
     most: int = 1000
 
+    @property
+    def identifies_saddles(self) -> bool:
+        return True
+
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         return Stepping(self.certain, self.most)
 

@@ -48,6 +48,7 @@ def test_it_finds_the_minima_of_newtons_method_alone_in_less_than_half_of_the_it
 
 def test_settling_lowers_the_objective_and_leaves_a_minimum_where_it_is(scene, solved):
     prepared, objective = NewtonSolver().prepare(scene.system), FixedObjective(scene.system)
+    assert isinstance(prepared, PreparedDescent)
     settling, noise = FrictionGaussSeidel(prepared.metric), np.random.default_rng(0)
     lowered = 0
     for problem, solution in solved[20:]:

@@ -11,6 +11,7 @@ from springbench.harness.reference.hessian_curvature import build_free_hessian
 from springbench.solvers.iteration.saddle_check import SaddleCheck
 from springbench.solvers.iteration.vertex_terms import compute_anchor_stiffness
 from springbench.solvers.kernels import curvature_search
+from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Positions, StepProblem
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
@@ -80,6 +81,7 @@ def test_the_bound_of_a_single_spring_is_its_buckling_load(factor: float, bounde
     """Two vertices of mass m on a spring of length l: the smallest eigenvalue is m/h^2 - 2 k (r/l - 1)."""
     problem = build_random_problem(0, n=2, m=40, weights=())
     springs = problem.system.energies[0]
+    assert isinstance(springs, Springs)
     one = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])[:1]
     spring = replace(
         springs,

@@ -70,7 +70,11 @@ def test_it_becomes_a_mesh_and_what_was_cut_is_refused(tmp_path):
     assert len(mesh.triangles) == 6
     np.testing.assert_array_equal(mesh.attributes["heat"], HEAT)
     whole = path.read_bytes()
-    path.write_bytes(whole[: whole.rfind(b"</AppendedData>") - 200])
+    end = whole.rfind(b"</AppendedData>")
+    path.write_bytes(whole[: end - 200])
+    with pytest.raises(InputError, match=r"it does not end with </VTKFile>; the file was cut"):
+        FileMesh(path=path).build_mesh()
+    path.write_bytes(whole[: end - 200] + whole[end:])
     with pytest.raises(InputError, match=r"an array promises \d+ bytes, and \d+ are there; the file was cut"):
         FileMesh(path=path).build_mesh()
     path.write_bytes(whole.replace(b"vtkZLib", b"").replace(b'type="PolyData"', b'type="ImageData"'))

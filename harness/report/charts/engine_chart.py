@@ -61,14 +61,14 @@ def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = Non
 
 
 def _build_series(name: str, style: SeriesStyle, front: list[WorkPoint], newest_fingerprint: str | None) -> ChartSeries:
+    settings = [work.setting_label for work in front]
     columns = {
         "seconds": [work.seconds_per_simulated_second for work in front],
         "error": [work.error for work in front],
-        "setting": [work.setting_label for work in front],
+        "setting": settings,
     }
     stale = [
         is_stale(work) if newest_fingerprint is None else work.source_fingerprint != newest_fingerprint
         for work in front
     ]
-    setting = "; ".join(columns["setting"])
-    return ChartSeries(name, style, columns, description=front[0].mesh_label, stale=stale, setting=setting)
+    return ChartSeries(name, style, columns, description=front[0].mesh_label, stale=stale, setting="; ".join(settings))

@@ -52,10 +52,10 @@ def read_published_data(own: AccuracyData, published: Path = PUBLISHED_FOLDER) -
 @cache
 def _list_meshes(path: Path, modified_at: int) -> frozenset[tuple[str, int]]:
     """List the scenes and sizes of a table, which are read once for each state of the file."""
-    import pyarrow.parquet as pq
+    import duckdb
 
-    columns = pq.read_table(path, columns=["scene", "size"], partitioning=None).to_pydict()
-    return frozenset(zip(columns["scene"], columns["size"], strict=True))
+    meshes = duckdb.execute("SELECT DISTINCT scene, size FROM read_parquet(?)", [str(path)]).fetchall()
+    return frozenset((str(scene), int(size)) for scene, size in meshes)
 
 
 @cache

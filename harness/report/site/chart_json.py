@@ -44,9 +44,11 @@ def serialise_chart(chart: ChartDescription) -> dict[str, Any]:
 def _describe_axis(axis: ChartAxis, names_layout: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
     """Describe a choice of an axis; `names_layout` is added to the layout of an axis of names."""
     unit = " [s]" if axis.scale.tick_format == "time" else ""
-    more = names_layout if axis.scale.division == "names" else {}
+    layout = _plotly_axis(axis.scale)
+    if axis.scale.division == "names":
+        layout |= names_layout
     title = ", ".join(filter(None, (axis.scale.label, axis.title))) + unit
-    return {"column": axis.column, "title": title, "axis": {**_plotly_axis(axis.scale), **more}}
+    return {"column": axis.column, "title": title, "axis": layout}
 
 
 def _plotly_axis(scale: AxisScale) -> dict[str, Any]:
@@ -93,7 +95,7 @@ def _describe_series(chart: ChartDescription, number: int, frame: ChartFrame, se
 
 
 def _find_place_name(scale: AxisScale, place: Any) -> str | None:
-    return None if place is None or np.isnan(place) else scale.place_names[round(place)]
+    return None if place is None or np.isnan(place) else scale.place_names[round(float(place))]
 
 
 def _describe_column(values: Sequence[Any] | FloatArray) -> list[Any]:
