@@ -167,6 +167,8 @@ def describe_misnamed_file(head: bytes, size: int) -> str:
 
 def explain_unreadable_file(path: Path) -> str:
     """Describe an existing file that has the name of a data file but other content; "" for any other one."""
+    if not path.is_file():  # a pipe would not end
+        return ""
     try:
         with path.open("rb") as file:
             return describe_misnamed_file(file.read(HEAD_BYTES), path.stat().st_size)

@@ -48,9 +48,11 @@ def install_handler() -> None:
 
 
 def ignore_interrupts() -> None:
-    """Ignore Ctrl-C from here on."""
+    """Ignore Ctrl-C from here on, deferred interrupts included."""
     if signal.getsignal(signal.SIGINT) is _handle_interrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if sys.platform != "win32":
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 @contextmanager
@@ -70,8 +72,8 @@ def block_interrupts() -> Generator[None]:
 
 
 def is_interrupted() -> bool:
-    """Return whether Ctrl-C was received."""
-    return _interrupted
+    """Return whether Ctrl-C was received, be it deferred."""
+    return _interrupted or _deferrals > 0
 
 
 def exit_process() -> NoReturn:

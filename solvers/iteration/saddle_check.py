@@ -126,7 +126,7 @@ class _InterpretedSearch(ConjugateGradientIteration):
 
     def update_direction(self, product: float, previous_product: float) -> float:
         """Update the direction; return the curvature along it."""
-        curvature_search.update_direction(self._scratch, product / previous_product)
+        curvature_search.update_search_direction(self._scratch, product / previous_product)
         self._scratch.product[:] = self._hessian.matvec(self._scratch.direction)
         return curvature_search.measure_curvature(self._scratch)
 

@@ -263,7 +263,7 @@ def _precondition_residual(scratch):
 
 
 @jit_kernel
-def update_direction(scratch, ratio):
+def update_search_direction(scratch, ratio):
     """Set the direction to z + ratio times the direction."""
     _update_direction(scratch, ratio)
 

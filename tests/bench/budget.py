@@ -37,7 +37,7 @@ from springbench.harness.config.accuracy_config import WorkSpec
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
-from springbench.harness.experiments.accuracy.best_first import compute_cost, is_measured
+from springbench.harness.experiments.accuracy.best_first import compute_setting_cost, is_measured
 from springbench.harness.experiments.accuracy.method_recommendation import (
     BUDGET_REFERENCE_ERROR,
     RecommendationGoal,
@@ -115,7 +115,7 @@ def measure(spec: WorkSpec, trajectory: Any, frame: float) -> Choice:
     if not is_measured(row):
         return Choice(spec, inf, inf)
     error = row["error"] if row["status"] == "ok" else BUDGET_REFERENCE_ERROR
-    return Choice(spec, max(error, BUDGET_REFERENCE_ERROR), frame * compute_cost(spec, row))
+    return Choice(spec, max(error, BUDGET_REFERENCE_ERROR), frame * compute_setting_cost(spec, row))
 
 
 def screen(specs: Sequence[WorkSpec], trajectory: Any, question: Question, frame: float) -> list[Choice]:

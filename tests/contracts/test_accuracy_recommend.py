@@ -21,7 +21,7 @@ from springbench.harness.experiments.accuracy import method_recommendation as mo
 from springbench.harness.experiments.accuracy import work_precision
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
-from springbench.harness.experiments.accuracy.best_first import compute_cost
+from springbench.harness.experiments.accuracy.best_first import compute_setting_cost
 from springbench.harness.experiments.accuracy.method_recommendation import (
     MethodRecommendation,
     RecommendationGoal,
@@ -282,9 +282,9 @@ def test_step_sizes_between_powers_of_two_use_up_a_budget(scene: Path) -> None:
 def test_the_time_of_a_busy_machine_is_its_processor_time(scene: Path) -> None:
     spec = replace(recommend(scene, 0.5)[0].best_method.work_spec, t_end=0.5)
     row = {"seconds_per_simulated_second": 4.0, "cpu_seconds": 1.0, "preempted": True}
-    assert compute_cost(spec, row) == 2.0
-    assert compute_cost(spec, row | {"preempted": False}) == 4.0
-    assert compute_cost(replace(spec, solver=SolverSpec("mujoco", {})), row) == 4.0
+    assert compute_setting_cost(spec, row) == 2.0
+    assert compute_setting_cost(spec, row | {"preempted": False}) == 4.0
+    assert compute_setting_cost(replace(spec, solver=SolverSpec("mujoco", {})), row) == 4.0
 
 
 @pytest.mark.long

@@ -193,9 +193,9 @@ def test_the_plot_of_times_has_the_name_of_its_sweep(tmp_path: Path, monkeypatch
     def write_title(table: Any, path: Path, title: str, *_: Any) -> None:
         (tmp_path / "title.txt").write_text(title)
 
-    monkeypatch.setattr(timing_plot, "draw_timing_plot", write_title)  # also where it draws, a fork of this process
+    monkeypatch.setattr(timing_plot, "draw_timing_plot", write_title)
     made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, max_iterations: 5")
-    assert (result := ran(made)).exit_code == 0, result.output
+    assert (result := ran(made, "--in-process")).exit_code == 0, result.output
     assert (tmp_path / "title.txt").read_text() == "sweep"
 
 

@@ -158,7 +158,7 @@ def search(
     return SearchSummary(measured, settings, {reason: count for reason, count in reasons.items() if count})
 
 
-def compute_cost(spec: WorkSpec, row: Mapping[str, Any]) -> float:
+def compute_setting_cost(spec: WorkSpec, row: Mapping[str, Any]) -> float:
     """Return the wall time per simulated second of a simulation's row, on an otherwise idle machine.
 
     Where other programs interrupted a single thread of ours, its processor time is what it takes alone.
@@ -183,7 +183,7 @@ def _slow(error: float) -> str:
 
 def _outcome(spec: WorkSpec, row: Mapping[str, Any]) -> tuple[float, float]:
     """Return the error and the cost of a row, infinite if there are none; an unmeasurably small error is almost 0."""
-    cost = compute_cost(spec, row) if is_measured(row) else inf
+    cost = compute_setting_cost(spec, row) if is_measured(row) else inf
     return row["error"] if row["status"] == "ok" else inf if cost == inf else float_info.min, cost
 
 

@@ -43,7 +43,7 @@ from springbench.harness.experiments.accuracy.best_first import (
     LEAST_LIMIT,
     SLOWER,
     SearchSummary,
-    compute_cost,
+    compute_setting_cost,
     is_measured,
     search,
 )
@@ -645,7 +645,7 @@ def _build_measured_method(spec: WorkSpec, row: dict[str, Any], reference_error:
     return MeasuredMethod(
         spec,
         row["error"] if row["status"] == "ok" else reference_error,
-        compute_cost(spec, row),
+        compute_setting_cost(spec, row),
         row["reference_kind"] or "integrated",
         row["solver_description"] or "",
         row.get("sweep") or "",
