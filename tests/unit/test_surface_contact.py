@@ -211,6 +211,7 @@ def test_clearance_of_an_obstacle_far_away_is_nearly_its_distance_and_never_more
         distance = float(np.linalg.norm(q[:20, None] - q[None, 20:], axis=2).min())
         assert found == 0.0 or query.inflation_radius <= found <= distance
         assert found > 0.0 or distance < 1.0
+    p = rng.uniform(size=(40, 3)) - np.eye(3)[1] * np.repeat([0.0, 6.0], 20)[:, None]
     assert compute_aabb_clearance((0, 20), (20, 40), p, p + np.eye(3)[1] * (p[:, 1:2] < 0.0) * 9.0, query) == 0.0
 
 

@@ -62,7 +62,7 @@ def test_an_error_that_refinement_does_not_explain_is_named():
     ids=["diverges", "diverged", "jumps at the end", "moves steadily", "no number"],
 )
 def test_a_series_that_does_not_converge_explains_nothing(tmp_path: Path, values: tuple[float, ...]):
-    found = dict(zip((1, 2, 4), values, strict=True))
+    found: dict[int, float] = dict(zip((1, 2, 4), values, strict=True))
     case = ClosedForm("x", "x [m]", "cells", (1, 2, 4), 1.0, 1.0, lambda level, solver: found[level])
     row = validation_study.grade_closed_form(case, NEWTON)
     assert row["verdict"] == validation_study.UNEXPLAINED
