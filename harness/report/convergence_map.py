@@ -60,8 +60,9 @@ def draw_convergence_map(stem: Path, study: ConvergenceStudy, title: str, facts:
         x, y = np.arange(len(substeps)), np.arange(len(iterations))
         norm = BoundaryNorm(_COLOUR_BOUNDS, 256, extend="both")
         shown = np.where(np.isfinite(errors), errors, np.nan)
-        ax.pcolormesh(x, y, np.isnan(shown), cmap=_UNKNOWN_COLOURS, shading="nearest", edgecolors="white", lw=2)
-        ax.pcolormesh(x, y, shown, cmap="RdYlBu_r", norm=norm, shading="nearest", alpha=0.75, edgecolors="white", lw=2)
+        edges = [np.arange(count + 1) - 0.5 for count in (len(x), len(y))]  # of fields: a single row has a height, too
+        ax.pcolormesh(*edges, np.isnan(shown), cmap=_UNKNOWN_COLOURS, edgecolors="white", lw=2)
+        ax.pcolormesh(*edges, shown, cmap="RdYlBu_r", norm=norm, alpha=0.75, edgecolors="white", lw=2)
         lines, labels = list[Line2D](), list[str]()
         if len(x) > 1 and len(y) > 1 and np.isfinite(shown).sum() > 3:
             levels = [one for one in sorted({*ERROR_LEVELS, study.error_requested}) if np.nanmin(shown) <= one]
@@ -82,7 +83,7 @@ def draw_convergence_map(stem: Path, study: ConvergenceStudy, title: str, facts:
                 ax.text(i, j + 0.04, label + cost, ha="center", va="center", fontsize=8.5, color=colour)
         _mark_settings(ax, study, substeps, iterations)
         ax.set_xticks(x, [str(value) for value in substeps])
-        ax.set_yticks(y, [str(value) for value in iterations])
+        ax.set_yticks(y if any(iterations) else [])  # a method without iterations has one row, 0
         ax.yaxis.set_major_formatter(tick_formatter(lambda k: str(iterations[int(k)])))
         ax.set_xlabel("substeps of a frame", fontsize=9, loc="left")
         y_text = PANEL_TOP + 40

@@ -172,7 +172,9 @@ class ConvergenceStudy:
         for name in ("substeps", "iterations"):
             number: int = getattr(finest, name)
             fewer = [
-                one for one in known if one._replace(**{name: number}) == finest and 2 * getattr(one, name) <= number
+                one
+                for one in known
+                if one._replace(**{name: number}) == finest and 0 < 2 * getattr(one, name) <= number
             ]
             if not fewer:
                 continue

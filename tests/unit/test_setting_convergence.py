@@ -9,6 +9,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from springbench.harness.cli.commands.convergence import read_solver_options
@@ -78,7 +79,7 @@ def study_simulator(simulator: SettingSimulator, scene: Path, given: list[StepSe
 
 def synthetic(errors: dict[tuple[int, int], float], **how: Any) -> ConvergenceStudy:
     results = tuple(
-        SettingResult(StepSetting(*setting), error, 0.1, -0.02, 1e-3 * setting[0] * setting[1])
+        SettingResult(StepSetting(*setting), error, 0.1, -0.02, 1e-3 * setting[0] * max(1, setting[1]))
         for setting, error in errors.items()
     )
     changes = SettingChange(2.0, how.pop("substeps", 0.2)), SettingChange(2.0, how.pop("iterations", 0.03))
@@ -311,6 +312,14 @@ def test_a_map_marks_the_given_setting_and_the_iso_error_lines(tmp_path: Path):
     assert "given" in text
     assert "an error of 5" in text
     assert "diverged in" in text
+
+
+def test_a_map_of_a_single_row_has_colours(tmp_path: Path):
+    """MuJoCo has substeps and no iterations."""
+    drawn = synthetic({(s, 0): 0.3 / s for s in (1, 2, 4)}, given=[StepSetting(2, 0)])
+    image = plt.imread(draw_convergence_map(tmp_path / "map", drawn, "Is 2 converged?", [])[0])[..., :3]
+    coloured = np.ptp(image, axis=2) > 0.1
+    assert coloured.mean() > 0.03
 
 
 @pytest.mark.slow
