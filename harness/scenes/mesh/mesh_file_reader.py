@@ -91,7 +91,7 @@ def read_mesh_file(path: Path) -> MeshFileContent:
     if not what:
         try:
             with _restrict_file_access(path):
-                return _read_by_suffix(path)
+                return _read_by_suffix(path, content)
         except PermissionError:
             raise
         except Exception as error:
@@ -103,22 +103,22 @@ def read_mesh_file(path: Path) -> MeshFileContent:
     raise ValueError(f"{what}; the file was cut before its end, so write it once more")
 
 
-def _read_by_suffix(path: Path) -> MeshFileContent:
+def _read_by_suffix(path: Path, content: bytes) -> MeshFileContent:
     suffix = path.suffix.lower()
     if suffix == ".vtp":
-        return _convert_vtp(vtp_reader.read_vtp(path.read_bytes()))
+        return _convert_vtp(vtp_reader.read_vtp(content))
     if suffix == ".ply":
-        return _convert_polygons(ply_reader.read_ply(path.read_bytes()))
+        return _convert_polygons(ply_reader.read_ply(content))
     if suffix == ".off":
-        return _convert_polygons(off_reader.read_off(path.read_bytes()))
+        return _convert_polygons(off_reader.read_off(content))
     if suffix == ".stl":
-        points, triangles = stl_reader.read_stl(path.read_bytes())
+        points, triangles = stl_reader.read_stl(content)
         return MeshFileContent(points, [("triangle", triangles)], {}, {}, [np.arange(len(triangles))])
     if suffix in (".gltf", ".glb"):
         return _convert_gltf(gltf_reader.read_gltf(path))
-    if suffix == ".vtk" and _VTK_POLYDATA.search(path.read_bytes()[:_VTK_HEAD_BYTES]):
+    if suffix == ".vtk" and _VTK_POLYDATA.search(content[:_VTK_HEAD_BYTES]):
         return _convert_vtp(vtp_reader.read_vtp(_convert_legacy_polydata(path)))
-    if suffix == ".msh" and _GMSH_PARAMETRIC.search(path.read_bytes()):
+    if suffix == ".msh" and _GMSH_PARAMETRIC.search(content):
         raise ValueError("it has parametric nodes; save it without them (Mesh.SaveParametric = 0 in Gmsh)")
     raw = _read_with_meshio(path)
     blocks = [(block.type, np.array(block.data, np.int64)) for block in raw.cells if len(block.data)]

@@ -15,8 +15,8 @@ _KEYWORD = re.compile(rb"(ST)?C?N?(4?n?)OFF")
 
 def read_off(content: bytes) -> PolygonContent:
     """Read the contents of an OFF file; raise ValueError for a broken one."""
-    rows = [words for line in content.splitlines() if (words := line.partition(b"#")[0].split())]
-    numbers = [k for k, line in enumerate(content.splitlines(), 1) if line.partition(b"#")[0].split()]
+    lines = [(k, line.partition(b"#")[0].split()) for k, line in enumerate(content.splitlines(), 1)]
+    numbers, rows = [k for k, words in lines if words], [words for _, words in lines if words]
     if rows and (keyword := _KEYWORD.fullmatch(rows[0][0])):
         if keyword[2] or rows[0][1:2] == [b"BINARY"]:
             raise ValueError("it is a binary OFF file, or one of four dimensions; save it as text in three")
