@@ -155,7 +155,7 @@ def _build_convergence_series(
             "status": [curve.status] * len(seconds),
         },
         description=f"{curve.problem.problem_label}, {INITIAL_GUESS_LABELS[curve.initial_guess]}",
-        stale=_is_other(curve, newest_fingerprint),
+        stale=is_by_other_code(curve, newest_fingerprint),
         status=curve.status,
         callouts=callouts,
         links={"parameters": curve.parameters, **link_source(curve)},
@@ -179,7 +179,7 @@ def _describe_convergence(
             words = f"In minimum {curve.minimum_index}, higher than the lowest known; vertex errors refer to it"
             by.setdefault(words, []).append(curve.label)
     remarks += [f"{how}: {', '.join(labels)}." for how, labels in sorted(by.items())]
-    return [*remarks, *_describe_stale(curves, newest_fingerprint)]
+    return [*remarks, *describe_hollow_marks(curves, newest_fingerprint)]
 
 
 def build_time_chart(table: AccuracyData, newest_fingerprint: str | None = None) -> ChartDescription:
@@ -207,7 +207,7 @@ def build_time_chart(table: AccuracyData, newest_fingerprint: str | None = None)
                     series=[*_build_time_series(here, styles, newest_fingerprint)],
                     notes=[
                         *(f"{sentence}." for sentence in describe_excluded_steps(problems)),
-                        *_describe_stale(here, newest_fingerprint),
+                        *describe_hollow_marks(here, newest_fingerprint),
                     ],
                     sheet=mesh.replace(" ", "-"),
                 )
@@ -246,7 +246,7 @@ def _build_time_series(
                 styles[label],
                 columns,
                 description=f"{own[0].problem.mesh_label}, {many} step{'s' if many > 1 else ''}",
-                stale=any(_is_other(curve, newest_fingerprint) for curve in own),
+                stale=any(is_by_other_code(curve, newest_fingerprint) for curve in own),
                 links={"parameters": own[0].parameters},
             )
 
@@ -291,7 +291,7 @@ def build_work_precision_chart(table: AccuracyData, newest_fingerprint: str | No
                     ],
                     notes=[
                         *(*notes, "Grey: the least error that a budget buys, by any integrator."),
-                        *(*describe_self_converged(own), *_describe_stale(own, newest_fingerprint)),
+                        *(*describe_self_converged(own), *describe_hollow_marks(own, newest_fingerprint)),
                     ],
                     sheet=mesh.replace(" ", "-"),
                 )
@@ -344,7 +344,7 @@ def _build_step_size_series(
                 "time_step": [format_time_step(one.time_step) for one in members],
             },
             description=f"{members[0].mesh_label}, {members[0].integrator}, {stop}",
-            stale=[_is_other(one, newest_fingerprint) for one in members],
+            stale=[is_by_other_code(one, newest_fingerprint) for one in members],
             setting=stop,
             marker_scale=1.0 + 0.25 * tolerances.index(tolerance) if tolerance in tolerances else 0.75,
             callouts={k: "the default" for k, one in enumerate(members) if one is default},
@@ -426,7 +426,7 @@ def build_scaling_chart(table: AccuracyData, newest_fingerprint: str | None = No
         newest_fingerprint: see the module.
     """
     styles = _assign_styles(table.curves)
-    found = [one for one in fit_scalings(table, lambda c: _is_other(c, newest_fingerprint)) if one.vertices]
+    found = [one for one in fit_scalings(table, lambda c: is_by_other_code(c, newest_fingerprint)) if one.vertices]
     citations = {curve.label: curve.citation for curve in table.curves}
     frames: list[ChartFrame] = []
     for scene, guess in dict.fromkeys((one.scene, one.initial_guess) for one in found):
@@ -485,11 +485,14 @@ def _assign_styles(measured: Iterable[ConvergenceCurve | WorkPoint]) -> dict[str
     return assign_label_styles((one.label, one.solver) for one in measured)
 
 
-def _is_other(one: ConvergenceCurve | WorkPoint, newest_fingerprint: str | None) -> bool:
+def is_by_other_code(one: ConvergenceCurve | WorkPoint, newest_fingerprint: str | None) -> bool:
+    """Return whether a measurement is stale, as the module states."""
     return is_stale(one) if newest_fingerprint is None else one.source_fingerprint != newest_fingerprint
 
 
-def _describe_stale(measured: Iterable[ConvergenceCurve | WorkPoint], newest_fingerprint: str | None) -> list[str]:
+def describe_hollow_marks(
+    measured: Iterable[ConvergenceCurve | WorkPoint], newest_fingerprint: str | None
+) -> list[str]:
     """State what hollow marks mean; the page does that by itself."""
     return [STALE_NOTE] if newest_fingerprint is None and any(map(is_stale, measured)) else []
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 from springbench.harness.report.accuracy.accuracy_data import (
     AccuracyData,
     WorkPoint,
     describe_self_converged,
-    is_stale,
 )
 from springbench.harness.report.accuracy.engine_comparison import (
     OWN_PROGRAM,
@@ -14,11 +15,17 @@ from springbench.harness.report.accuracy.engine_comparison import (
     meshes_with_engines,
     pareto_fronts,
 )
-from springbench.harness.report.charts.accuracy_charts import ACCURACY_COMMAND, COST_LABEL, ERROR_LABEL
+from springbench.harness.report.charts.accuracy_charts import (
+    ACCURACY_COMMAND,
+    COST_LABEL,
+    ERROR_LABEL,
+    describe_hollow_marks,
+    is_by_other_code,
+)
 from springbench.harness.report.charts.chart_description import ChartAxis, ChartDescription, ChartFrame, ChartSeries
 from springbench.harness.report.charts.figure_panels import AxisScale
 from springbench.harness.report.number_format import format_quantity
-from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle
+from springbench.harness.report.plot_style import SeriesStyle
 
 
 def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = None) -> ChartDescription:
@@ -32,7 +39,6 @@ def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = Non
     frames: list[ChartFrame] = []
     for mesh, works in meshes_with_engines(table.work_points).items():
         fronts = {name: front for name, front in pareto_fronts(works).items() if front}
-        is_hollow = newest_fingerprint is None and any(is_stale(work) for front in fronts.values() for work in front)
         frames.append(
             ChartFrame(
                 group=("engines",),
@@ -43,7 +49,10 @@ def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = Non
                 notes=[
                     "Each line is what no other setting of the same program beats in both time and error; "
                     f"{OWN_PROGRAM}: of all its methods that were tried. Errors of 100 % and more are left out.",
-                    *(*describe_self_converged(works), *([STALE_NOTE] if is_hollow else [])),
+                    *(
+                        *describe_self_converged(works),
+                        *describe_hollow_marks(chain(*fronts.values()), newest_fingerprint),
+                    ),
                 ],
             )
         )
@@ -67,8 +76,5 @@ def _build_series(name: str, style: SeriesStyle, front: list[WorkPoint], newest_
         "error": [work.error for work in front],
         "setting": settings,
     }
-    stale = [
-        is_stale(work) if newest_fingerprint is None else work.source_fingerprint != newest_fingerprint
-        for work in front
-    ]
+    stale = [is_by_other_code(work, newest_fingerprint) for work in front]
     return ChartSeries(name, style, columns, description=front[0].mesh_label, stale=stale, setting="; ".join(settings))
