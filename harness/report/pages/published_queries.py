@@ -7,6 +7,8 @@ made when a query names them:
     <study>_outcomes   verified runs, one row each, classified by `springbench.harness.report.robustness`
     <study>_times      time and iteration of each curve to each gap of GAP_TARGETS, on steps with a certified minimum
     <study>_costs      cheapest simulation of each family of methods for each error, by mesh and stiffness number
+    <study>_ratios     least time of each external engine over that of the own methods, by scene and error
+    <study>_paper      own errors and those of Liu et al. 2013, by curve and iterations
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ import duckdb
 import pyarrow as pa
 from springbench.harness.errors import InputError
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy.engine_comparison import OWN_PROGRAM, compare_engines
+from springbench.harness.report.accuracy.liu2013_comparison import compare_with_paper
 from springbench.harness.report.accuracy.time_to_accuracy import GAP_TARGETS, find_time_to_accuracy, is_solvable
 from springbench.harness.report.accuracy.winner_map import build_winner_cells
 from springbench.harness.report.robustness import CORRECT, UNSUPPORTED, read_verified_runs
@@ -45,7 +49,7 @@ class PublishedQueries:
 
     def query_records(self, sql: str) -> list[dict[str, Any]]:
         """Return the rows of a query as dictionaries. Raises InputError if the query fails."""
-        for name, study, build in re.findall(r"\b((\w+)_(outcomes|times|costs))\b", sql):
+        for name, study, build in _COMPUTED_VIEW.findall(sql):
             if name not in self._computed and study in self._names:
                 self._computed.add(name)
                 rows = COMPUTED_VIEWS[build](self._names[study])
@@ -139,9 +143,31 @@ def list_costs(study: PublishedStudy) -> Sequence[dict[str, Any]]:
     ]
 
 
+def list_engine_ratios(study: PublishedStudy) -> Sequence[dict[str, Any]]:
+    """List the least time of each engine over that of the own methods, where both reach the error."""
+    with open_study_folder(study) as folder:
+        works = read_accuracy(folder).work_points
+    return [
+        {"scene": best.scene, "error": one.error, "engine": engine, "ratio": one.time_ratio(engine)}
+        for one in compare_engines(works)
+        for engine, best in one.fastest_by_program.items()
+        if engine != OWN_PROGRAM and one.time_ratio(engine)
+    ]
+
+
+def list_paper_errors(study: PublishedStudy) -> Sequence[dict[str, Any]]:
+    """List own relative errors and those of the paper, at the points that both have."""
+    with open_study_folder(study) as folder:
+        return [one._asdict() for one in compare_with_paper(read_accuracy(folder))]
+
+
 COMPUTED_VIEWS: dict[str, Callable[[PublishedStudy], Sequence[dict[str, Any]]]] = {
     "outcomes": list_outcomes,
     "times": list_times,
     "costs": list_costs,
+    "ratios": list_engine_ratios,
+    "paper": list_paper_errors,
 }
 """Functions that compute the rows of views, by the ends of their names."""
+
+_COMPUTED_VIEW = re.compile(rf"\b((\w+)_({'|'.join(COMPUTED_VIEWS)}))\b")
