@@ -171,9 +171,9 @@ def answer(question: Question, rounds: int, search_time: float, results: Path) -
     specs = build_study(path, scene, found.best_method.work_spec.case.size, candidates, t_end, 5.0).work
     trajectory = load_reference_trajectory(specs[0], store)
     screened = screen(specs, trajectory, question, scene.time_step)
-    asked = measure(found.best_method.work_spec, trajectory, scene.time_step)
-    hindsight = _keep_promising([asked, *screened], budget)
-    recommended, *others = take_turns([asked, *hindsight], trajectory, scene.time_step, rounds)
+    answer = measure(found.best_method.work_spec, trajectory, scene.time_step)
+    hindsight = _keep_promising([answer, *screened], budget)
+    recommended, *others = take_turns([answer, *hindsight], trajectory, scene.time_step, rounds)
     limit = max(budget, recommended.seconds)
     sure, within = (
         min((recommended, *(one for one in others if one.seconds <= part * limit)), key=_error) for part in (SURE, 1.0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from time import thread_time
 from unittest.mock import patch
@@ -46,9 +47,9 @@ def measure_shares(name: str, solver: str, frames: int, stop: StopRule) -> list[
     shares, iterations, seconds, bounded, saddles = [], [], [], 0, 0
 
     def measure(step: SimulationStep) -> tuple[float, float]:
-        solving = lambda: prepared.solve(step.problem, stop)  # noqa: E731
-        looking = lambda: check.find_lower_point(step.problem, step.solution.positions, step.num_iterations)  # noqa: E731
-        took = [(_seconds(solving), _seconds(looking)) for _ in range(ROUNDS)]
+        solve = partial(prepared.solve, step.problem, stop)
+        search = partial(check.find_lower_point, step.problem, step.solution.positions, step.num_iterations)
+        took = [(_seconds(solve), _seconds(search)) for _ in range(ROUNDS)]
         return min(whole for whole, _ in took), min(part for _, part in took)
 
     for step in simulate_scene(made, prepared, stop, initial_guess="previous", frames=frames):
