@@ -1,10 +1,11 @@
-"""What Newton's method does about indefinite Hessians: iterations, elements looked at, and CPU time of each rule.
+"""What Newton's method does about indefinite Hessians: iterations, elements examined, and CPU time of each rule.
 
-    python -m tests.bench.hessians [SCENE ...]
+    python -m tests.bench.hessians [SCENE ...] [--repeats 3] [--publish results/published/hessians]
 
-The scenes of `configs/hessians.yaml`, with its limits. Rules take turns, frame by frame, in one process. Elements that
-were looked at are stated as a part of all elements in all iterations, which `clamp` looks at; CPU time as a multiple of
-that of the default, without what it takes to prepare. A rule that needs all iterations in some frame is marked by >.
+The scenes of `configs/hessians.yaml`, with its limits. Rules alternate, frame by frame, in one process. The elements
+that a rule examines are stated as a share of all elements in all iterations, which `clamp` examines. CPU time is a
+multiple of that of the default, the median over the repeats, without what it takes to prepare. A rule that needs all
+iterations in some frame is marked by >.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
+from typing import Any
 from unittest.mock import patch
 
 from rich.box import SIMPLE_HEAD
@@ -31,44 +34,42 @@ from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.objective.psd_projection import ProjectedHessian, PsdProjection
 from springbench.solvers.objective.step_objective import Hessian
 
-SCENES = sorted((Path(__file__).parents[2] / "configs" / "hessians").glob("*.yaml"))
+from tests.bench.scripted_study import describe_moment, publish_rows
+
+CONFIG = Path(__file__).parents[2] / "configs" / "hessians.yaml"
+SCENES = sorted((CONFIG.parent / "hessians").glob("*.yaml"))
 STOP = StopRule(1000, 1e-6)
 RULES: tuple[IndefiniteStrategy, ...] = tuple(hessian_regularisation.REGULARISATION_RULES)
 
 
 @dataclass
 class Tally:
-    """What a rule took of a scene. elements: all of them in all iterations; looked: those that were looked at."""
+    """Work of a rule on a scene: iterations, CPU time [s], elements of all iterations, and those that it examined."""
 
     iterations: int = 0
     seconds: float = 0.0
     elements: int = 0
-    looked: int = 0
+    examined: int = 0
     ended: bool = True
-
-    def format_counts(self, against: Tally) -> str:
-        """The cell."""
-        looked = f" {100 * self.looked / self.elements:.0f} %" if self.looked else ""
-        return f"{'' if self.ended else '>'}{self.iterations}{looked} {self.seconds / against.seconds:.2f}"
 
 
 @contextmanager
 def counted() -> Iterator[list[int]]:
-    """How many elements each filtered Hessian looked at, from now on."""
-    looked: list[int] = []
+    """Yield a list that gains the number of elements that each projected Hessian examines."""
+    examined: list[int] = []
     filtered = Hessian.project_to_psd
 
     def counting(self: Hessian, by: PsdProjection) -> ProjectedHessian:
         found = filtered(self, by)
-        looked.append(found.num_examined)
+        examined.append(found.num_examined)
         return found
 
     with patch.object(Hessian, "project_to_psd", counting):
-        yield looked
+        yield examined
 
 
 def measured(path: Path) -> dict[IndefiniteStrategy, Tally]:
-    """A scene by each rule."""
+    """Solve a scene by each rule."""
     spec = load_scene(path)
     made = build_scene(spec, spec.default_size or 0)
     edges = sum(len(getattr(energy, "edges", ())) for energy in made.system.energies)
@@ -82,29 +83,59 @@ def measured(path: Path) -> dict[IndefiniteStrategy, Tally]:
     for _ in range(spec.frames):
         for rule, run in runs.items():
             tally = tallies[rule]
-            with counted() as looked:
+            with counted() as examined:
                 began = time.process_time()
                 solution = next(run).solution
                 tally.seconds += time.process_time() - began
-            tally.looked += sum(looked)
+            tally.examined += sum(examined)
             tally.iterations += solution.num_iterations
             tally.elements += solution.num_iterations * edges
             tally.ended &= solution.termination_reason != "max-iter"
     return tallies
 
 
+def list_rows(path: Path, repeat: int) -> list[dict[str, Any]]:
+    """Return the measurements of a scene, one row for each rule."""
+    return [
+        {
+            "scene": path.stem,
+            "strategy": rule,
+            "repeat": repeat,
+            "num_iterations": tally.iterations,
+            "is_converged": tally.ended,
+            "examined_share": tally.examined / tally.elements,
+            "cpu_seconds": tally.seconds,
+        }
+        for rule, tally in measured(path).items()
+    ]
+
+
+def format_cells(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield the cells of a scene: iterations, share of examined elements, and ratio of times."""
+    usual = {row["repeat"]: row["cpu_seconds"] for row in rows if row["strategy"] == "shift-schedule"}
+    for rule in RULES:
+        own = [row for row in rows if row["strategy"] == rule]
+        ratio = median(row["cpu_seconds"] / usual[row["repeat"]] for row in own)
+        share = f" {100 * own[0]['examined_share']:.0f} %" if own[0]["examined_share"] else ""
+        yield f"{'' if own[0]['is_converged'] else '>'}{own[0]['num_iterations']}{share} {ratio:.2f}"
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
-    table = Table("scene", *RULES, box=SIMPLE_HEAD)
-    scenes = parser.parse_args().scenes
+    parser.add_argument("--repeats", type=int, default=3, help="measurements of each scene")
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    options = parser.parse_args()
+    table, begin, rows = Table("scene", *RULES, box=SIMPLE_HEAD), describe_moment(), list[dict[str, Any]]()
     with limit_threads(1):
-        measured(scenes[0])  # compiles
-        for path in scenes:
-            found = measured(path)
-            table.add_row(path.stem, *(tally.format_counts(found["shift-schedule"]) for tally in found.values()))
+        measured(options.scenes[0])  # compiles
+        for path in options.scenes:
+            found = [row for repeat in range(options.repeats) for row in list_rows(path, repeat)]
+            table.add_row(path.stem, *format_cells(found))
+            rows += found
     Console(width=120).print(table)
+    publish_rows(options.publish, CONFIG, "python -m tests.bench.hessians", rows, begin)
 
 
 if __name__ == "__main__":

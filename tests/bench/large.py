@@ -1,13 +1,12 @@
-"""What large meshes take: processor time, memory, and what is left by the oracle, of the runs of a sweep, once each.
+"""Cost of large meshes: processor time, memory and residual of the runs of a sweep, once each.
 
-    python -m tests.bench.large [CONFIG] [--only WORDS]
+    python -m tests.bench.large [CONFIG] [--only WORDS] [--publish results/published/growth-large]
 
 CONFIG is `configs/growth-large.yaml` if left out; WORDS are of a run's scene, size, solver and first guess, in this
-order, as in "flag-in-wind 122". Each run has a process of its own, whose peak of memory is told, oracle included.
-Preparing and steps are timed apart, steps from the first on, after one iteration that warms up; a step's time is the
-mean over frames. `left` is the largest |Q^-1 grad g|_Q over the frames, relative to that at the frame's current
-positions, and `growth` the power of the vertices that a step's processor time grows with from the same solver's
-smallest mesh on.
+order, as in "flag-in-wind 122". Each run has a process of its own, whose peak of memory includes the reference
+evaluator. Preparing and steps are timed separately, after one iteration that warms up; a step's time is the mean over
+frames. The residual is the largest |Q^-1 grad g|_Q over the frames, relative to that at the frame's current positions.
+`growth` is the exponent of the vertices in a step's processor time, from the same solver's smallest mesh on.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from math import log
 from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from springbench.harness.config.config_loader import load_sweep
 from springbench.harness.config.sweep_config import RunSpec
@@ -31,28 +30,32 @@ from springbench.harness.simulation.time_loop import build_initial_state, build_
 from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
+from tests.bench.scripted_study import describe_moment, publish_rows
+
 GROWTH = Path(__file__).parents[2] / "configs" / "growth-large.yaml"
 
 
-class Took(NamedTuple):
-    """Of a run: vertices; processor seconds of preparing and of a step, wall seconds of a step; iterations of a step;
-    what is left; the peak of memory [GiB]."""
+class Cost(NamedTuple):
+    """Cost of a run: its vertices, processor seconds of preparing and of a step, wall seconds of a step, iterations of
+    a step, the largest relative residual, and the peak of memory [GiB]."""
 
     vertices: int
-    prepare: float
-    step: float
-    wall: float
-    iterations: float
-    left: float
-    peak: float
+    prepare_seconds: float
+    cpu_seconds: float
+    seconds: float
+    num_iterations: float
+    residual: float
+    peak_gib: float
 
 
-def took(run: RunSpec) -> Took:
-    """Do a run, and look at each of its steps when the clocks stand."""
+def measure_run(run: RunSpec) -> Cost:
+    """Execute a run; its residuals are evaluated while no clock runs."""
     with limit_threads(1):
         scene = build_scene(run.scene, run.size, run.integrator)
         stop = build_stop_rule(run.max_iterations, run.rtol)
-        assert isinstance(stop, StopRule), "a tolerance by the step's own error has no yardstick to be relative to"
+        assert isinstance(stop, StopRule), (
+            "a tolerance by the step error has no initial residual"
+        )
         began = process_time()
         prepared = prepare(scene, load_target(SOLVERS[str(run.solver.name)])(**run.solver.parameters))
         ready = process_time() - began
@@ -71,7 +74,7 @@ def took(run: RunSpec) -> Took:
             )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     frames = run.frames
-    return Took(len(scene.mesh.rest_positions), ready, step / frames, wall / frames, iterations / frames, left, peak)
+    return Cost(len(scene.mesh.rest_positions), ready, step / frames, wall / frames, iterations / frames, left, peak)
 
 
 def main() -> None:
@@ -79,19 +82,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("config", nargs="?", type=Path, default=GROWTH, metavar="CONFIG")
     parser.add_argument("--only", default="", metavar="WORDS")
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    smallest: dict[tuple[str, str, str], Took] = {}
-    print("run | vertices | prepare s | step s | wall s | iterations | left | peak GiB | growth")
+    smallest: dict[tuple[str, str, str], Cost] = {}
+    begin, rows = describe_moment(), list[dict[str, Any]]()
+    print("run | vertices | prepare s | step s | wall s | iterations | residual | peak GiB | growth")
     for run in load_sweep(options.config).list_runs():
         title = f"{run.title} {run.initial_guess}"
         if options.only not in title:
             continue
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-            t = alone.submit(took, run).result()
-        least = smallest.setdefault((run.scene_name, run.solver.name, run.initial_guess), t)
-        growth = f"{log(t.step / least.step) / log(t.vertices / least.vertices):.2f}" if least is not t else ""
-        line = f"{title} | {t.vertices:,} | {t.prepare:.2f} | {t.step:.3g} | {t.wall:.3g}"
-        print(f"{line} | {t.iterations:.1f} | {t.left:.2e} | {t.peak:.2f} | {growth}", flush=True)
+            cost = alone.submit(measure_run, run).result()
+        columns = {"scene": run.scene_name, "size": run.size, "solver": run.solver.name}
+        rows.append(columns | {"initial_guess": run.initial_guess} | cost._asdict())
+        least = smallest.setdefault((run.scene_name, run.solver.name, run.initial_guess), cost)
+        ratio = cost.cpu_seconds / least.cpu_seconds
+        growth = f"{log(ratio) / log(cost.vertices / least.vertices):.2f}" if least is not cost else ""
+        line = f"{title} | {cost.vertices:,} | {cost.prepare_seconds:.2f} | {cost.cpu_seconds:.3g} | {cost.seconds:.3g}"
+        print(f"{line} | {cost.num_iterations:.1f} | {cost.residual:.2e} | {cost.peak_gib:.2f} | {growth}", flush=True)
+    publish_rows(options.publish, options.config, "python -m tests.bench.large", rows, begin)
 
 
 if __name__ == "__main__":

@@ -27,14 +27,10 @@ from typing import Any
 import pyarrow as pa
 from rich.table import Table
 from springbench.harness.console import get_output_console
-from springbench.harness.experiments.archive.study_publication import (
-    summarise_provenance,
-    write_published_table,
-    write_study_file,
-)
-from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.results import parquet_rows, run_schema
-from springbench.harness.results.published_set import TABLE_FILES, compute_file_digest
+from springbench.harness.results.published_set import TABLE_FILES
+
+from tests.bench.scripted_study import describe_moment, publish_tables
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 QUICKSTART = CHECKOUT / "configs" / "quickstart.yaml"
@@ -358,25 +354,18 @@ def print_medians(measurements: Sequence[Mapping[str, Any]]) -> None:
 _NUMBERS = ("value", "wall_seconds", "cpu_seconds", "first_output_seconds")
 
 
-def publish_measurements(measurements: Sequence[Mapping[str, Any]], folder: Path) -> None:
-    """Write the measurements as a study of the published set; rows that were not measured now stay as they were."""
-    folder.mkdir(parents=True, exist_ok=True)
+def publish_measurements(measurements: Sequence[Mapping[str, Any]], folder: Path, begin: Mapping[str, Any]) -> None:
+    """Write the measurements as a published study; rows that were not measured now stay as they were."""
     path = folder / TABLE_FILES["measurements"]
     known = parquet_rows.read_rows([path], MEASUREMENT_SCHEMA).to_pylist() if path.exists() else []
     now = {one["row"] for one in measurements}
     earlier = [one for one in known if one["row"] not in now and one["row"] in LATENCY_ROWS]
     stated = [{**one, "limit": LATENCY_ROWS[one["row"]].limit} for one in (*earlier, *measurements)]
     rows = sorted(stated, key=lambda one: (list(LATENCY_ROWS).index(one["row"]), one["repeat"]))
-    write_published_table(path, pa.Table.from_pylist([dict(one) for one in rows], MEASUREMENT_SCHEMA))
-    metadata = {
-        "config": os.path.relpath(QUICKSTART, folder.resolve()),
-        "config_digest": compute_file_digest(QUICKSTART),
-        "command": "python -m tests.bench.latency",
-        "is_timed": True,
-        **summarise_provenance([build_provenance_columns()]),
-        "runs": len(rows),
-    }
-    write_study_file(folder, metadata)
+    table = pa.Table.from_pylist([dict(one) for one in rows], MEASUREMENT_SCHEMA)
+    publish_tables(
+        folder, QUICKSTART, "python -m tests.bench.latency", {"measurements": table}, [begin, describe_moment()]
+    )
 
 
 def main() -> None:
@@ -392,14 +381,14 @@ def main() -> None:
         print(json.dumps(IN_PROCESS[options.in_process]()))
         return
     names = options.only or [name for name, row in LATENCY_ROWS.items() if not row.is_long]
-    measurements = list[dict[str, Any]]()
+    measurements, begin = list[dict[str, Any]](), describe_moment()
     with TemporaryDirectory() as temporary:
         warm = (options.results or Path(temporary)).resolve()
         for number, name in enumerate(names):
             print(f"[{number + 1}/{len(names)}] {name}: {LATENCY_ROWS[name].description}", file=sys.stderr, flush=True)
             measurements += measure_row(name, options.repeats, warm)
             if options.publish:
-                publish_measurements(measurements, options.publish)
+                publish_measurements(measurements, options.publish, begin)
     print_medians(measurements)
 
 

@@ -1,17 +1,17 @@
 """What conjugate gradients are preconditioned by: iterations, and products with the Hessian, of each preconditioner.
 
-    python -m tests.bench.preconditioners [SCENE ...]
+    python -m tests.bench.preconditioners [SCENE ...] [--publish results/published/preconditioners]
 
 Scenes of `configs/hessians`, three steps each, to residuals of 1e-6, by `newton-cg` and `pncg`. A cell is iterations,
 and of `newton-cg` the products with the Hessian that these took, which are what a step costs but for the
-preconditioner. What did not get there in all steps is marked by >. All are exact counts.
+preconditioner. A solver that did not converge in all steps is marked by >. All are exact counts.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 from unittest.mock import patch
 
 from rich.box import SIMPLE_HEAD
@@ -28,14 +28,19 @@ from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
 from springbench.solvers.model.step_problem import Positions, Solver, StopRule
 from springbench.solvers.objective.step_objective import Hessian
 
-FOLDER = Path(__file__).parents[2] / "configs" / "hessians"
-SCENES = tuple(FOLDER / f"{name}-pressed-0.yaml" for name in ("block", "cloth-100", "cloth-1e4"))
+from tests.bench.scripted_study import describe_moment, publish_rows
+
+CONFIG = Path(__file__).parents[2] / "configs" / "hessians.yaml"
+SCENES = tuple(CONFIG.with_suffix("") / f"{name}-pressed-0.yaml" for name in ("block", "cloth-100", "cloth-1e4"))
 STOP = StopRule(5000, 1e-6)
 NAMES: tuple[PreconditionerName, ...] = get_args(PreconditionerName)
 
 
-def format_counts(path: Path, solver: Solver) -> str:
-    """The cell of a scene and a solver."""
+SOLVERS: dict[str, type[NewtonCG] | type[NonlinearCG]] = {"newton-cg": NewtonCG, "pncg": NonlinearCG}
+
+
+def count_work(path: Path, solver: Solver) -> dict[str, Any]:
+    """Count the iterations of a solver on a scene, and its products with the Hessian."""
     spec = load_scene(path)
     made = build_scene(spec, spec.default_size or 0)
     products, multiply = [0], Hessian.matvec
@@ -49,20 +54,34 @@ def format_counts(path: Path, solver: Solver) -> str:
         for step in simulate_scene(made, prepare(made, solver), STOP, initial_guess="previous", frames=spec.frames):
             iterations += step.solution.num_iterations
             ended &= step.solution.termination_reason != "max-iter"
-    took = f"{'' if ended else '>'}{iterations}"
-    return took if isinstance(solver, NonlinearCG) else f"{took}, {products[0]}"
+    return {"num_iterations": iterations, "num_products": products[0], "is_converged": ended}
+
+
+def format_counts(row: dict[str, Any]) -> str:
+    """Format the cell of a scene, a solver and a preconditioner."""
+    iterations = f"{'' if row['is_converged'] else '>'}{row['num_iterations']}"
+    return iterations if row["solver"] == "pncg" else f"{iterations}, {row['num_products']}"
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
-    table = Table("scene", "solver", *NAMES, box=SIMPLE_HEAD)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    options = parser.parse_args()
+    table, begin, rows = Table("scene", "solver", *NAMES, box=SIMPLE_HEAD), describe_moment(), list[dict[str, Any]]()
     with limit_threads(1):
-        for path in parser.parse_args().scenes:
-            for name, solver in (("newton-cg", NewtonCG), ("pncg", NonlinearCG)):
-                table.add_row(path.stem, name, *(format_counts(path, solver(preconditioner=by)) for by in NAMES))
+        for path in options.scenes:
+            for name, solver in SOLVERS.items():
+                found = [
+                    {"scene": path.stem, "solver": name, "preconditioner": by}
+                    | count_work(path, solver(preconditioner=by))
+                    for by in NAMES
+                ]
+                table.add_row(path.stem, name, *map(format_counts, found))
+                rows += found
     Console(width=120).print(table)
+    publish_rows(options.publish, CONFIG, "python -m tests.bench.preconditioners", rows, begin, is_timed=False)
 
 
 if __name__ == "__main__":

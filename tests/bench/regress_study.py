@@ -7,7 +7,6 @@ python -m tests.bench.regress_study live RESULTS CONFIG      real tests of the s
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -23,12 +22,6 @@ from rich.table import Table
 from springbench.harness.cli.shared_options import ErrorReportingGroup
 from springbench.harness.console import get_output_console, print_message, split_wide_table
 from springbench.harness.errors import InputError
-from springbench.harness.experiments.archive.study_publication import (
-    summarise_provenance,
-    write_published_table,
-    write_study_file,
-)
-from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.experiments.regression import git_worktrees
 from springbench.harness.experiments.regression.confidence_sequence import SequentialTest
 from springbench.harness.experiments.regression.revision_comparison import (
@@ -38,7 +31,7 @@ from springbench.harness.experiments.regression.revision_comparison import (
 )
 from springbench.harness.experiments.regression.revision_process import GitRevision
 from springbench.harness.results import parquet_rows
-from springbench.harness.results.published_set import TABLE_FILES, compute_file_digest
+from springbench.harness.results.published_set import TABLE_FILES
 
 from tests.bench.live_study import run_live_study, summarise_live_study
 from tests.bench.replay_study import (
@@ -50,6 +43,7 @@ from tests.bench.replay_study import (
     replay_comparison,
     replay_tests,
 )
+from tests.bench.scripted_study import describe_moment, publish_tables
 
 app = typer.Typer(
     cls=ErrorReportingGroup,
@@ -201,21 +195,13 @@ def rename_tools(row: dict[str, Any]) -> dict[str, Any]:
 
 def publish_rates(folder: Path, samples: Sequence[Path], rates: Sequence[dict[str, Any]]) -> None:
     """Write blocks and rates as a study of the published set; the date is that of the replay."""
-    folder.mkdir(parents=True, exist_ok=True)
-    blocks = parquet_rows.read_rows(samples, RECORD_SCHEMA)
-    write_published_table(folder / TABLE_FILES["blocks"], blocks)
-    write_published_table(folder / TABLE_FILES["rates"], pa.Table.from_pylist([rename_tools(row) for row in rates]))
-    config = Path("configs/scenes/hanging-cloth.yaml")
-    metadata = {
-        "config": os.path.relpath(config.resolve(), folder.resolve()),
-        "config_digest": compute_file_digest(config),
-        "command": f"python -m tests.bench.regress_study replay {folder / TABLE_FILES['blocks']}",
-        "is_timed": True,
-        **summarise_provenance([build_provenance_columns() | {"load_average": row["load_average"]} for row in rates]),
-        "runs": len(blocks),
+    tables = {
+        "blocks": parquet_rows.read_rows(samples, RECORD_SCHEMA),
+        "rates": pa.Table.from_pylist([rename_tools(row) for row in rates]),
     }
-    write_study_file(folder, metadata)
-    print_message(f"published in {folder}")
+    moments = [describe_moment() | {"load_average": row["load_average"]} for row in rates]
+    command = f"python -m tests.bench.regress_study replay {folder / TABLE_FILES['blocks']}"
+    publish_tables(folder, Path("configs/scenes/hanging-cloth.yaml"), command, tables, moments)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,81 @@
+"""Publish what a script measures, as a study of the published set."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from springbench.harness.console import print_message
+from springbench.harness.experiments.archive.study_publication import (
+    summarise_provenance,
+    write_published_table,
+    write_study_file,
+)
+from springbench.harness.experiments.provenance import build_provenance_columns
+from springbench.harness.results.published_set import TABLE_FILES, compute_file_digest
+
+
+def describe_moment() -> dict[str, Any]:
+    """Describe machine, commit, date and load of this moment; a script calls it when it begins."""
+    return build_provenance_columns() | {"load_average": os.getloadavg()[0]}
+
+
+def publish_tables(
+    folder: Path,
+    config: Path,
+    command: str,
+    tables: Mapping[str, pa.Table],
+    moments: Sequence[Mapping[str, Any]],
+    *,
+    is_timed: bool = True,
+) -> None:
+    """Write tables and what made them as a published study.
+
+    Args:
+        folder: folder of the study; its name is that of the view in templates of pages.
+        config: config or scene that was measured.
+        command: command that repeats the study.
+        tables: tables by their names in TABLE_FILES.
+        moments: values of `describe_moment`, of which the first and the last give dates and load.
+        is_timed: whether times are among the results.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, table in tables.items():
+        write_published_table(folder / TABLE_FILES[name], table)
+    metadata = {
+        "config": os.path.relpath(config.resolve(), folder.resolve()),
+        "config_digest": compute_file_digest(config),
+        "command": command,
+        "is_timed": is_timed,
+        **summarise_provenance(moments),
+        "runs": max(map(len, tables.values())),
+    }
+    write_study_file(folder, metadata)
+    print_message(f"published in {folder}")
+
+
+def publish_rows(
+    folder: Path | None,
+    config: Path,
+    command: str,
+    rows: Sequence[Mapping[str, Any]],
+    begin: Mapping[str, Any],
+    *,
+    is_timed: bool = True,
+) -> None:
+    """Write rows of measurements as a published study, or nothing without a folder.
+
+    Args:
+        folder: folder of the study, or None.
+        config: config or scene that was measured.
+        command: command that repeats the study.
+        rows: one mapping for each measurement; a column's type is that of its first value.
+        begin: value of `describe_moment` when the script began.
+        is_timed: whether times are among the results.
+    """
+    if folder:
+        tables = {"measurements": pa.Table.from_pylist([dict(row) for row in rows])}
+        publish_tables(folder, config, command, tables, [begin, describe_moment()], is_timed=is_timed)
