@@ -1,6 +1,6 @@
 """XPBD and MGPBD beside each other, where papers measure them: in the dual.
 
-    python -m tests.bench.duals [--setup]
+    python -m tests.bench.duals [--setup] [--publish results/published/duals] [PROBLEM ...]
 
 What the tensions of springs are off by, |K^1/2 C - K^-1/2 t|, over what it is where a step begins (MGPBD draws
 |C - t/k|, which is the same where all springs are alike): how many iterations it takes to a hundredth, a thousandth, a
@@ -17,7 +17,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -41,6 +41,7 @@ from springbench.solvers.methods.position_based.xpbd import PreparedXpbd, Xpbd
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StepProblem, StopRule
 
+from tests.bench.scripted_study import describe_moment, publish_rows
 from tests.scene_builders import build_first_problem, build_test_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -160,23 +161,51 @@ def course(run: Iterator[Reached], most: int) -> Course:
     return found
 
 
-def courses(name: str) -> list[str]:
-    """The row of a problem."""
+def measure_courses(name: str) -> list[dict[str, Any]]:
+    """Measure a problem: a row for each method, with its iterations to LEVELS and its distance from the minimum."""
     stated = PROBLEMS[name]()
     minimum = NewtonSolver().prepare(stated.system).solve(stated, StopRule(2000, 1e-9)).positions
     way = float(np.abs(minimum - stated.current_positions).max())
-    plain, global_ = course(xpbd(stated), MOST["xpbd"]), course(mgpbd(stated, MultigridXpbd()), MOST["mgpbd"])
-    row = [name, f"{len(require_only_springs(stated.system, name).edges):,}"]
-    for found in (plain, global_):
-        row.append(", ".join("-" if (k := found.until(level)) is None else f"{k:,}" for level in LEVELS))
-        row.append(f"{np.abs(found.end - minimum).max() / way:.1e}")
-    row.insert(3, f"{plain.misfits[STALL - 1]:.2g}" if len(plain.misfits) >= STALL else "-")
-    row.append(f"{np.mean(global_.linear):.0f}")
-    a, b = plain.until(LEVELS[0]), global_.until(LEVELS[0])
-    if b is None:
-        return [*row, "-"]
-    ratio = global_.seconds[b - 1] / plain.seconds[-1 if a is None else a - 1]
-    return [*row, f"{'<' if a is None else ''}{ratio:.2g}"]
+    found = {
+        "xpbd": course(xpbd(stated), MOST["xpbd"]),
+        "mgpbd": course(mgpbd(stated, MultigridXpbd()), MOST["mgpbd"]),
+    }
+    springs = len(require_only_springs(stated.system, name).edges)
+
+    def describe(method: str, one: Course) -> dict[str, Any]:
+        counts = [one.until(level) for level in LEVELS]
+        return {
+            "problem": name,
+            "springs": springs,
+            "method": method,
+            **{f"iterations_to_{level:g}".replace("-", "_"): k for level, k in zip(LEVELS, counts, strict=True)},
+            "stalled_misfit": one.misfits[STALL - 1] if len(one.misfits) >= STALL else None,
+            "end_error": float(np.abs(one.end - minimum).max() / way),
+            "linear_iterations": float(np.mean(one.linear)),
+            "reaches_first_level": counts[0] is not None,
+            "cpu_seconds": one.seconds[(counts[0] or len(one.seconds)) - 1],
+        }
+
+    return [describe(method, one) for method, one in found.items()]
+
+
+def format_courses(rows: list[dict[str, Any]]) -> list[str]:
+    """Format the line of a problem."""
+    plain, multigrid = rows
+    counts = [[row[key] for key in row if key.startswith("iterations_to_")] for row in rows]
+    texts = [", ".join("-" if k is None else f"{k:,}" for k in some) for some in counts]
+    ratio = f"{'' if plain['reaches_first_level'] else '<'}{multigrid['cpu_seconds'] / plain['cpu_seconds']:.2g}"
+    return [
+        plain["problem"],
+        f"{plain['springs']:,}",
+        texts[0],
+        "-" if plain["stalled_misfit"] is None else f"{plain['stalled_misfit']:.2g}",
+        f"{plain['end_error']:.1e}",
+        texts[1],
+        f"{multigrid['end_error']:.1e}",
+        f"{multigrid['linear_iterations']:.0f}",
+        ratio if multigrid["reaches_first_level"] else "-",
+    ]
 
 
 def setups(name: str) -> list[str]:
@@ -201,6 +230,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--setup", action="store_true")
     parser.add_argument("names", nargs="*", default=list(PROBLEMS), metavar="PROBLEM")
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     given = parser.parse_args()
     by = "to 1e-2, 1e-3, 1e-6"
     columns = (
@@ -208,10 +238,19 @@ def main() -> None:
         *("linear iterations", "time, over xpbd's"),
     )
     table = Table(*(("step", *MADE) if given.setup else columns), box=SIMPLE_HEAD)
+    begin, rows = describe_moment(), list[dict[str, Any]]()
     with limit_threads(1):
         for name in given.names:
-            table.add_row(*(setups if given.setup else courses)(name))
+            if given.setup:
+                table.add_row(*setups(name))
+            else:
+                found = measure_courses(name)
+                table.add_row(*format_courses(found))
+                rows += found
     Console(width=150).print(table)
+    if rows:
+        config = CONFIGS / CLOTHS["cloth, 100,000 N/m, 32"][0]
+        publish_rows(given.publish, config, "python -m tests.bench.duals", rows, begin)
 
 
 if __name__ == "__main__":

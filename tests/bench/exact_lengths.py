@@ -1,6 +1,6 @@
 """What augmented vertex block descent keeps of lengths in few iterations (Giles, Diaz and Yuksel 2025).
 
-    python -m tests.bench.exact_lengths
+    python -m tests.bench.exact_lengths [--publish results/published/exact-lengths]
 
 Three tables. A pendulum of 50 links with a bob that is 50,000 times as heavy as a link's vertex, let go level (as in
 figures 7 and 8 of the paper): by how much of its length the worst link is off, mean and largest over two seconds of
@@ -11,7 +11,9 @@ that pendulum takes and reads.
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import replace
+from pathlib import Path
 from time import thread_time
 from typing import Any
 
@@ -36,7 +38,10 @@ from springbench.solvers.model.energies import spring_energy
 from springbench.solvers.model.energies.augmented_lagrangian import concatenate_constraints, length_errors
 from springbench.solvers.model.step_problem import PreparedSolver, Solver, StepProblem, StopRule
 
+from tests.bench.scripted_study import describe_moment, publish_rows
 from tests.scene_builders import build_test_scene
+
+CHAIN = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
 
 FRAME, LINKS, HEAVY = 1 / 60, 50, 50_000.0
 FIRST = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
@@ -72,9 +77,8 @@ def errors(made: Scene, solver: Solver, iterations: int, seconds: float) -> tupl
     return float(found.mean()), float(found.max()), float(fallen.max() / lengths.max_length.sum())
 
 
-def swinging() -> Table:
-    """The first table."""
-    table = Table("method", "iterations", "mean", "largest", "fall", box=SIMPLE_HEAD)
+def swinging() -> list[dict[str, Any]]:
+    """Measure the pendulum: rows with the method, its iterations, the errors of lengths, and the bob's fall."""
     exact, firm = (pendulum(k, ChainMesh()) for k in ("exact", FIRM))
     stiff, stiffer = (
         pendulum(HEAVY * 9.81 * LINKS / by, ChainMesh()) for by in (1e-3, 1e-4)
@@ -87,14 +91,17 @@ def swinging() -> Table:
         ("vbd, spectral_radius: 0, stretches .001", stiff, Vbd(spectral_radius=0.0)),
         ("vbd, spectral_radius: 0, stretches .0001", stiffer, Vbd(spectral_radius=0.0)),
     ]
-    for name, made, solver in of:
-        for iterations in (5, 20, 100):
-            table.add_row(name, str(iterations), *(f"{x:.2g}" for x in errors(made, solver, iterations, 2.0)))
-    return table
+    names = ("mean_length_error", "max_length_error", "fall")
+    return [
+        {"scene": "pendulum", "method": name, "num_iterations": iterations}
+        | dict(zip(names, errors(made, solver, iterations, 2.0), strict=True))
+        for name, made, solver in of
+        for iterations in (5, 20, 100)
+    ]
 
 
-def ratios() -> Table:
-    """The second table."""
+def ratios() -> list[dict[str, Any]]:
+    """Measure the chain of two stiffnesses: rows with the method, its iterations, and its error over the sag."""
     chain = build_test_scene(
         ChainMesh(), SpringsEffect(stretch=1e4, scaling_rule="fixed"), GravityEffect(), ENDS,
         EtherDragEffect(decay_rate=2.0),
@@ -113,21 +120,23 @@ def ratios() -> Table:
 
     wanted = end(NewtonSolver(), 200)
     sag = np.abs(wanted - chain.mesh.rest_positions).max()
-    table = Table("method", "iterations", "off, over the sag", box=SIMPLE_HEAD)
-    for name, solver in {
+    methods: dict[str, Solver] = {
         "avbd, softened": Avbd(ramp_spring_stiffness=True),
         "vbd, spectral_radius: 0": Vbd(spectral_radius=0.0),
         "vbd": Vbd(),
         "xpbd": Xpbd(),
-    }.items():
-        for iterations in (1, 5, 100):
-            table.add_row(name, str(iterations), f"{np.abs(end(solver, iterations) - wanted).max() / sag:.1e}")
-    return table
+    }
+    return [
+        {"scene": "two stiffnesses", "method": name, "num_iterations": iterations}
+        | {"sag_error": float(np.abs(end(solver, iterations) - wanted).max() / sag)}
+        for name, solver in methods.items()
+        for iterations in (1, 5, 100)
+    ]
 
 
-def costs() -> Table:
-    """The third table."""
-    table = Table("method", "CPU time of an iteration, over vbd's", "bytes", box=SIMPLE_HEAD)
+def costs() -> list[dict[str, Any]]:
+    """Measure an iteration on the pendulum: rows with its CPU time over that of `vbd`, and the bytes that it reads."""
+    rows = list[dict[str, Any]]()
     exact, firm, stiff = (pendulum(k, ChainMesh()) for k in ("exact", FIRM, HEAVY * 9.81 * LINKS / 1e-3))
     usual = None
     for name, made, solver in (
@@ -138,8 +147,10 @@ def costs() -> Table:
         prepared = solver.prepare(made.system)
         took = _of_one(prepared, build_problem(made, build_initial_state(made), "inertial"))
         usual = usual or took
-        table.add_row(name, f"{took / usual:.1f}", f"{_bytes(prepared):,}")
-    return table
+        rows.append(
+            {"scene": "one iteration", "method": name, "cpu_ratio": took / usual, "num_bytes": _bytes(prepared)}
+        )
+    return rows
 
 
 def _of_one(prepared: PreparedSolver, stated: StepProblem) -> float:
@@ -174,11 +185,27 @@ def _size(x: Any) -> int:
     return sum(map(_size, x)) if isinstance(x, tuple) else int(getattr(x, "nbytes", 0))
 
 
+def build_table(rows: list[dict[str, Any]]) -> Table:
+    """Build a table of rows with the same columns."""
+    table = Table(*(name.replace("_", " ") for name in rows[0]), box=SIMPLE_HEAD)
+    for row in rows:
+        table.add_row(*(f"{cell:.2g}" if isinstance(cell, float) else str(cell) for cell in row.values()))
+    return table
+
+
 def main() -> None:
     """Print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    options = parser.parse_args()
+    begin = describe_moment()
     with limit_threads(1):
-        for table in (swinging(), ratios(), costs()):
-            Console(width=120).print(table)
+        tables = swinging(), ratios(), costs()
+    for rows in tables:
+        Console(width=120).print(build_table(rows))
+    publish_rows(
+        options.publish, CHAIN, "python -m tests.bench.exact_lengths", [row for rows in tables for row in rows], begin
+    )
 
 
 if __name__ == "__main__":

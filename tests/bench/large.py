@@ -53,9 +53,7 @@ def measure_run(run: RunSpec) -> Cost:
     with limit_threads(1):
         scene = build_scene(run.scene, run.size, run.integrator)
         stop = build_stop_rule(run.max_iterations, run.rtol)
-        assert isinstance(stop, StopRule), (
-            "a tolerance by the step error has no initial residual"
-        )
+        assert isinstance(stop, StopRule), "a tolerance by the step error has no initial residual"
         began = process_time()
         prepared = prepare(scene, load_target(SOLVERS[str(run.solver.name)])(**run.solver.parameters))
         ready = process_time() - began

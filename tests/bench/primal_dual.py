@@ -1,6 +1,6 @@
 """Primal and dual descent beside each other, by ratios of stiffness and of mass (Macklin, Erleben and Mueller 2020).
 
-    python -m tests.bench.primal_dual
+    python -m tests.bench.primal_dual [--publish results/published/primal-dual]
 
 A chain of 17 vertices that hangs straight, its first step: every second spring of 1,000 N/m is so many times as
 stiff, or the last vertex of a chain of 100,000 N/m is so many times as heavy. Primal methods change positions vertex
@@ -12,9 +12,11 @@ stays straight, so what XPBD tends to is the minimum.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import argparse
 from dataclasses import replace
 from itertools import islice
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -32,8 +34,10 @@ from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
 from springbench.solvers.model.energies import spring_energy
 from springbench.solvers.model.step_problem import Solver, StepProblem, StopRule
 
+from tests.bench.scripted_study import describe_moment, publish_rows
 from tests.scene_builders import build_first_problem, build_test_scene
 
+CHAIN = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
 RATIOS = (1.0, 10.0, 100.0, 1e3, 1e4)
 METHODS: dict[str, Solver] = {
     "primal, Jacobi: jgs2, neighbour_rings: 0": Jgs2(neighbour_rings=0),
@@ -74,23 +78,28 @@ def iterations(solver: Solver, stated: StepProblem) -> int | None:
     return None
 
 
-def row(name: str, problems: Iterator[StepProblem]) -> list[str]:
-    """Of a method."""
-    found = (iterations(METHODS[name], stated) for stated in problems)
-    return [name, *("–" if k is None else f"{k:,}" for k in found)]
-
-
 def main() -> None:
     """Print both tables."""
-    columns = tuple(f"{ratio:,.0f}" for ratio in RATIOS)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    options = parser.parse_args()
+    begin, rows = describe_moment(), list[dict[str, Any]]()
+    problems = {
+        "stiffer springs": [hanging(1e3, stiffer=ratio) for ratio in RATIOS],
+        "a heavier end": [hanging(1e5, heavier=ratio) for ratio in RATIOS],
+    }
     with limit_threads(1):
-        stiffer, heavier = Table("stiffer springs, by", *columns), Table("a heavier end, by", *columns)
-        for name in METHODS:
-            stiffer.add_row(*row(name, (hanging(1e3, stiffer=ratio) for ratio in RATIOS)))
-            heavier.add_row(*row(name, (hanging(1e5, heavier=ratio) for ratio in RATIOS)))
-        for table in stiffer, heavier:
-            table.box = SIMPLE_HEAD
+        for title, stated in problems.items():
+            table = Table(f"{title}, by", *(f"{ratio:,.0f}" for ratio in RATIOS), box=SIMPLE_HEAD)
+            for name, solver in METHODS.items():
+                counts = [iterations(solver, one) for one in stated]
+                table.add_row(name, *("–" if count is None else f"{count:,}" for count in counts))
+                rows += [
+                    {"ratio_of": title, "ratio": ratio, "method": name, "num_iterations": count}
+                    for ratio, count in zip(RATIOS, counts, strict=True)
+                ]
             Console(width=120).print(table)
+    publish_rows(options.publish, CHAIN, "python -m tests.bench.primal_dual", rows, begin, is_timed=False)
 
 
 if __name__ == "__main__":

@@ -72,10 +72,11 @@ def publish_rows(
         folder: folder of the study, or None.
         config: config or scene that was measured.
         command: command that repeats the study.
-        rows: one mapping for each measurement; a column's type is that of its first value.
+        rows: one mapping for each measurement; a column that a row lacks is empty in it.
         begin: value of `describe_moment` when the script began.
         is_timed: whether times are among the results.
     """
     if folder:
-        tables = {"measurements": pa.Table.from_pylist([dict(row) for row in rows])}
+        names = dict.fromkeys(name for row in rows for name in row)
+        tables = {"measurements": pa.table({name: [row.get(name) for row in rows] for name in names})}
         publish_tables(folder, config, command, tables, [begin, describe_moment()], is_timed=is_timed)

@@ -1,0 +1,88 @@
+"""Processor time of methods on one step, to a residual and for each iteration, interleaved.
+
+    python -m tests.bench.iteration_costs [--repeats 5] [--publish results/published/iteration-costs]
+
+The first step of the scenes of `configs/claims.yaml`, to residuals of 1e-3 and 1e-4. All methods alternate in one
+process on one thread, without what they take to prepare. A method that takes seconds stops after 50 iterations, which
+suffices for the time of one.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from statistics import median
+from time import thread_time
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from springbench.harness.config.config_loader import load_sweep
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare
+from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.registry import SOLVERS, load_target
+
+from tests.bench.scripted_study import describe_moment, publish_rows
+
+CONFIG = Path(__file__).parents[2] / "configs" / "claims.yaml"
+METHODS = ("numba", "newton", "hybrid", "lbfgs", "a-jacobi", "vbd", "jgs2")
+RESIDUALS = (1e-3, 1e-4)
+MAX_ITERATIONS = {"jgs2": 50}
+"""Iteration limit of methods that take seconds."""
+
+
+def measure_scenes(repeats: int) -> list[dict[str, Any]]:
+    """Measure all methods on each scene of the config; one row for each solve."""
+    rows = list[dict[str, Any]]()
+    for scene_name, run in {run.scene_name: run for run in load_sweep(CONFIG).list_runs()}.items():
+        scene = build_scene(run.scene, run.size)
+        problem = build_problem(scene, build_initial_state(scene), "previous")
+        solvers = {name: prepare(scene, load_target(SOLVERS[name])()) for name in METHODS}
+        for solver in solvers.values():
+            solver.solve(problem, StopRule(2))  # compiles
+        for repeat in range(repeats):
+            for rtol in RESIDUALS:
+                for name, solver in solvers.items():
+                    stop = StopRule(MAX_ITERATIONS.get(name, 5000), rtol)
+                    began = thread_time()
+                    solution = solver.solve(problem, stop)
+                    seconds = thread_time() - began
+                    rows.append(
+                        {
+                            "scene": scene_name,
+                            "size": run.size,
+                            "solver": name,
+                            "residual_rtol": rtol,
+                            "repeat": repeat,
+                            "num_iterations": solution.num_iterations,
+                            "is_converged": solution.termination_reason == "converged",
+                            "cpu_seconds": seconds,
+                        }
+                    )
+    return rows
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    options = parser.parse_args()
+    begin = describe_moment()
+    with limit_threads(1):
+        rows = measure_scenes(options.repeats)
+    table = Table("scene", "residual", "solver", "iterations", "ms", "µs an iteration", box=SIMPLE_HEAD)
+    for scene, rtol, name in dict.fromkeys((row["scene"], row["residual_rtol"], row["solver"]) for row in rows):
+        some = [row for row in rows if (row["scene"], row["residual_rtol"], row["solver"]) == (scene, rtol, name)]
+        seconds, count = median(row["cpu_seconds"] for row in some), some[0]["num_iterations"]
+        iterations = f"{'' if some[0]['is_converged'] else '>'}{count}"
+        table.add_row(scene, f"{rtol:g}", name, iterations, f"{1e3 * seconds:.3g}", f"{1e6 * seconds / count:.3g}")
+    Console(width=120).print(table)
+    publish_rows(options.publish, CONFIG, "python -m tests.bench.iteration_costs", rows, begin)
+
+
+if __name__ == "__main__":
+    main()
