@@ -1,6 +1,6 @@
 """A step of four layers that all touch, by our solvers beside a Newton-IPC with ipctk, in turns on one thread.
 
-    python -m tests.bench.newton_ipc [--size 64] [--rounds 3]
+    python -m tests.bench.newton_ipc [--sizes 24 64] [--rounds 3] [--publish results/published/newton-ipc]
 
 A cloth folded into four layers (`tests.bench.pairs`), at rest as folded, is thrown at 0.1 m/s onto its lowest layer,
 which is held: one step of 1/30 s, to a residual |Q^-1 grad g|_Q of a thousandth of that at its start. Told is how many
@@ -21,6 +21,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -50,7 +51,8 @@ from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.pairs import Folded, folded, seconds
+from tests.bench.pairs import CONFIG, Folded, folded, seconds
+from tests.bench.scripted_study import describe_moment, publish_rows
 
 OURS = ("hybrid", "newton", "lbfgs")
 TOLERANCE, MOST = 1e-3, 500
@@ -221,50 +223,66 @@ def ours(problem: StepProblem, name: str) -> Callable[[], Solved | None]:
     return solve
 
 
+def measure_size(size: int, num_rounds: int) -> tuple[list[dict[str, Any]], dict[str, float]]:
+    """Measure a size: a row for each round and solver, and the shares of Newton-IPC's time."""
+    made = folded(size)
+    mesh, k = made.mesh, np.full(len(made.p), STIFFNESS)
+    surface = CollisionMesh.from_rest_shape(
+        mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, made.min_distance, made.dhat
+    )
+    problem = stated(made, SelfContact(surface))
+    bare = replace(problem, system=without_barriers(problem.system))
+    barrier = Ipctk(made, STIFFNESS, surface)
+    theirs = stated(made, barrier)
+    # All is done once, and so compiled and in the caches.
+    there, count = newton_ipc(theirs)()
+    ends = {name: (ours(problem, name)(), ours(bare, name)())[0] for name in OURS}
+    barrier.spent.clear()
+    rows, total = list[dict[str, Any]](), 0.0
+    for number in range(num_rounds):  # each prepares again: a step stores what it finds out about its matrix's pattern
+        other = seconds(newton_ipc(theirs))
+        total += other
+        for name, end in ends.items():
+            row = {"size": size, "solver": name, "round": number, "newton_ipc_iterations": count}
+            if end is not None:
+                own, without_contact = seconds(ours(problem, name)), seconds(ours(bare, name))
+                row |= {"num_iterations": end[1], "time_ratio": other / own, "contact_ratio": own / without_contact}
+                row |= {"end_distance": float(np.linalg.norm(end[0] - there, axis=1).max() / made.dhat)}
+            rows.append(row)
+    return rows, {name: spent / total for name, spent in barrier.spent.items()}
+
+
 def main() -> None:
-    """Time and tell."""
+    """Print a table for each size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--size", type=int, default=64)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[24, 64])
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     options, console = parser.parse_args(), Console(highlight=False)
-    with limit_threads(1):
-        made = folded(options.size)
-        mesh, k = made.mesh, np.full(len(made.p), STIFFNESS)
-        surface = CollisionMesh.from_rest_shape(
-            mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, made.min_distance, made.dhat
+    begin, rows = describe_moment(), list[dict[str, Any]]()
+    for size in options.sizes:
+        with limit_threads(1):
+            found, shares = measure_size(size, options.rounds)
+        columns = ("", "iterations", "Newton-IPC takes", "between", "steps without contact", "ranges from its end")
+        title = (
+            f"{size} x {size}: Newton-IPC in {found[0]['newton_ipc_iterations']} iterations; {describe_machine().cpu}"
         )
-        problem = stated(made, SelfContact(surface))
-        bare = replace(problem, system=without_barriers(problem.system))
-        barrier = Ipctk(made, STIFFNESS, surface)
-        theirs = stated(made, barrier)
-        # All is done once, and so compiled and in the caches.
-        there, count = newton_ipc(theirs)()
-        ends = {name: (ours(problem, name)(), ours(bare, name)())[0] for name in OURS}
-        barrier.spent.clear()
-        # Each round prepares anew, for what a step has found out about the pattern of its matrix is kept.
-        rounds = [
-            (
-                seconds(newton_ipc(theirs)),
-                {name: (seconds(ours(problem, name)), seconds(ours(bare, name))) for name in OURS if ends[name]},
-            )
-            for _ in range(options.timed_trajectories)
-        ]
-    title = f"{options.size} x {options.size}: Newton-IPC in {count} iterations; {describe_machine().cpu}"
-    columns = ("", "iterations", "Newton-IPC takes", "between", "steps without contact", "ranges from its end")
-    table = Table(*columns, title=title, box=SIMPLE_HEAD)
-    for name, end in ends.items():
-        if end is None:
-            table.add_row(name, f"not in {MOST}")
-            continue
-        ratios = sorted(other / took[name][0] for other, took in rounds)
-        longer = median(took[name][0] / took[name][1] for _, took in rounds)
-        away = np.linalg.norm(end[0] - there, axis=1).max() / made.dhat
-        between = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
-        table.add_row(name, f"{end[1]}", f"{median(ratios):.2f} times", between, f"{longer:.1f}", f"{away:.2g}")
-    total = sum(other for other, _ in rounds)
-    parts = sorted(((spent / total, name) for name, spent in barrier.spent.items()), reverse=True)
-    console.print(table)
-    console.print(f"Of Newton-IPC's time: {', '.join(f'{name} {part:.0%}' for part, name in parts)}; the rest is ours.")
+        table = Table(*columns, title=title, box=SIMPLE_HEAD)
+        for name in OURS:
+            own = [row for row in found if row["solver"] == name]
+            if "time_ratio" not in own[0]:
+                table.add_row(name, f"not in {MOST}")
+                continue
+            ratios = sorted(row["time_ratio"] for row in own)
+            longer, away = median(row["contact_ratio"] for row in own), own[0]["end_distance"]
+            between = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
+            counts = f"{own[0]['num_iterations']}"
+            table.add_row(name, counts, f"{median(ratios):.2f} times", between, f"{longer:.1f}", f"{away:.2g}")
+        console.print(table)
+        parts = ", ".join(f"{name} {share:.0%}" for name, share in sorted(shares.items(), key=lambda one: -one[1]))
+        console.print(f"Of Newton-IPC's time: {parts}; the rest is ours.")
+        rows += found
+    publish_rows(options.publish, CONFIG, "python -m tests.bench.newton_ipc", rows, begin)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Contact by pairs beside ipctk, in turns on one thread: cloth folded into four layers that all touch.
 
-    python -m tests.bench.pairs [--sizes 64 128] [--rounds 5]
+    python -m tests.bench.pairs [--sizes 64 128] [--rounds 5] [--publish results/published/pairs]
 
 Gaps are 4 mm at 64 vertices a side and go with the spacing; they are felt up to 5/4 of that. Told is how many times as
 long ipctk takes, by CPU times: in the middle, and the least and the most of the rounds. Both have the same pairs in
@@ -17,6 +17,7 @@ import argparse
 import time
 from collections.abc import Callable
 from itertools import cycle
+from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
@@ -32,6 +33,9 @@ from springbench.solvers.contact.collision_mesh import CollisionMesh
 from springbench.solvers.contact.contact_potential import SelfContact
 from springbench.solvers.model.step_problem import Positions
 
+from tests.bench.scripted_study import describe_moment, publish_rows
+
+CONFIG = Path(__file__).parents[2] / "configs" / "contact.yaml"
 GAP, LAYERS = 0.004, 4
 """At 64 vertices a side [m]."""
 
@@ -143,7 +147,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128])
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     options, console = parser.parse_args(), Console()
+    begin, rows = describe_moment(), list[dict[str, Any]]()
     with limit_threads(1):
         for size in options.sizes:
             made = folded(size)
@@ -154,6 +160,7 @@ def main() -> None:
                     one_of()
                 both = [(seconds(work), seconds(other[name])) for _ in range(options.rounds)]
                 ratios = sorted(b / a for a, b in both)
+                rows += [{"size": size, "operation": name, "time_ratio": ratio} for ratio in ratios]
                 ends = f"{ratios[0]:.2f} and {ratios[-1]:.2f}"
                 table.add_row(name, f"{median(ratios):.2f} times", ends, f"{1e3 * min(a for a, _ in both):.3g}")
             in_range = len(contact.hessian_blocks(made.p).vertices)
@@ -161,6 +168,7 @@ def main() -> None:
                 f"{size} x {size}: {in_range:,} contacts in range, by ipctk {pairs:,}; {describe_machine().cpu}"
             )
             console.print(table)
+    publish_rows(options.publish, CONFIG, "python -m tests.bench.pairs", rows, begin)
 
 
 if __name__ == "__main__":
