@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write, explain_unreadable_file
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.report.speed.speed_figures import MACHINE_SOLVER
 from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
 
 DROPPED_COLUMNS = frozenset(
@@ -171,27 +172,26 @@ def _read_part(part: Path) -> dict[str, pa.Table]:
 
 
 def _join_newest_runs(parts: Sequence[pa.Table]) -> pa.Table:
-    """Join tables, with the newest execution alone of each run, by its key on any machine; of equal ones the last."""
-    names = [*published_set.RUN_KEYS, "run_id", "started_at"]
+    """Join tables, with the newest execution alone of each run or unit; of equal ones the last.
+
+    A run is identified by its key on any machine, a unit of another table by the name of its file. Measurements have
+    neither: all are joined.
+    """
+    names = [*published_set.RUN_KEYS, "run_id", "started_at", row_store.FILE_COLUMN]
     newest: dict[tuple[Any, ...], tuple[str, str, int]] = {}
-    executions = list[list[tuple[tuple[Any, ...], tuple[str, str, int]]]]()
+    executions = list[list[tuple[tuple[Any, ...], tuple[str, int]]]]()
     for number, part in enumerate(parts):
-        found = part.select([name for name in names if name in part.column_names]).to_pylist()
-        if "run_id" not in part.column_names:
+        executions.append([])
+        if not {"run_id", row_store.FILE_COLUMN} & set(part.column_names):
             return pa.concat_tables(parts, promote_options="permissive")
-        executions.append(
-            [
-                (
-                    tuple(row.get(name) for name in published_set.RUN_KEYS),
-                    (str(row.get("started_at")), row["run_id"], number),
-                )
-                for row in found
-            ]
-        )
-        for key, execution in executions[-1]:
+        for row in part.select([name for name in names if name in part.column_names]).to_pylist():
+            run_id = row.get("run_id")
+            key = tuple(map(row.get, published_set.RUN_KEYS)) if run_id else (row[row_store.FILE_COLUMN],)
+            execution = (str(row.get("started_at")), run_id or "", number)
             newest[key] = max(newest.get(key, execution), execution)
+            executions[-1].append((key, execution[1:]))
     tables = [
-        part.filter(pa.array([execution == newest[key] for key, execution in rows], pa.bool_()))
+        part.filter(pa.array([execution == newest[key][1:] for key, execution in rows], pa.bool_()))
         for part, rows in zip(parts, executions, strict=True)
     ]
     return pa.concat_tables(tables, promote_options="permissive")
@@ -257,6 +257,8 @@ def _describe_command(tables: Mapping[str, pa.Table], config: Path) -> str:
     if "measurements" in tables:
         return f"measurements of {config.parent.name}/{config.name}"
     command = next(name for table, name in _COMMANDS.items() if table in tables)
+    if command == "run" and MACHINE_SOLVER in pc.unique(tables["rows"]["solver"]).to_pylist():
+        command = "roofline"
     return f"springbench {command} {config.parent.name}/{config.name}"
 
 
