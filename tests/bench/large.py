@@ -1,6 +1,6 @@
 """Cost of large meshes: processor time, memory and residual of the runs of a sweep, once each.
 
-    python -m tests.bench.large [CONFIG] [--only WORDS] [--publish results/published/growth-large]
+    python -m tests.bench.large [CONFIG] [--only WORDS] [--sizes SIZE ...] [--publish results/published/growth-large]
 
 CONFIG is `configs/growth-large.yaml` if left out; WORDS are of a run's scene, size, solver and first guess, in this
 order, as in "flag-in-wind 122". Each run has a process of its own, whose peak of memory includes the reference
@@ -80,6 +80,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("config", nargs="?", type=Path, default=GROWTH, metavar="CONFIG")
     parser.add_argument("--only", default="", metavar="WORDS")
+    parser.add_argument("--sizes", nargs="*", type=int, help="mesh sizes; all by default")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
     smallest: dict[tuple[str, str, str], Cost] = {}
@@ -87,7 +88,7 @@ def main() -> None:
     print("run | vertices | prepare s | step s | wall s | iterations | residual | peak GiB | growth")
     for run in load_sweep(options.config).list_runs():
         title = f"{run.title} {run.initial_guess}"
-        if options.only not in title:
+        if options.only not in title or run.size not in (options.sizes or [run.size]):
             continue
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
             cost = alone.submit(measure_run, run).result()
