@@ -1,6 +1,6 @@
 """Of what the price of bending consists for Newton's method: fill, factorisations and motion.
 
-    python -m tests.bench.bending [--sizes 33 64] [--frames 8]
+    python -m tests.bench.bending [--sizes 33 64] [--frames 8] [--publish results/published/bending]
 
 The hanging cloth with bending and without it advances step by step in turn, to a relative residual of 1e-6, on one
 thread. All columns are ratios, with bending over without, or counts of both.
@@ -28,6 +28,8 @@ from springbench.harness.experiments.ablation.iteration_overhead import NUM_WARM
 from springbench.harness.simulation.time_loop import simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.step_problem import StopRule
+
+from tests.bench.scripted_study import describe_moment, publish_rows
 
 PRICES = Path(__file__).parents[2] / "configs" / "prices.yaml"
 STOP, NUM_REPEATS = StopRule(5000, 1e-6), 7
@@ -69,7 +71,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[33, 64])
     parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
+    begin, rows = describe_moment(), list[dict[str, Any]]()
     table = Table("a side", "iteration", "entries", "flops", "factor", "factorisations", "iterations", box=SIMPLE_HEAD)
     table.title = "bending over no bending, newton"
     with limit_threads(1):
@@ -80,16 +84,19 @@ def main() -> None:
                     run.run_step(is_counted=k >= NUM_WARMUP_STEPS)
             bent, plain = runs
             iteration = bent.seconds / bent.num_iterations * plain.num_iterations / plain.seconds
-            ratios = (
-                iteration,
-                bent.factor.nonzeros / plain.factor.nonzeros,
-                bent.factor.flops / plain.factor.flops,
-                bent.measure_factorisation() / plain.measure_factorisation(),
-            )
-            each = [f"{run.num_factorisations / run.num_iterations:.2f}" for run in runs]
+            ratios = {
+                "iteration_time_ratio": iteration,
+                "entries_ratio": bent.factor.nonzeros / plain.factor.nonzeros,
+                "flops_ratio": bent.factor.flops / plain.factor.flops,
+                "factor_time_ratio": bent.measure_factorisation() / plain.measure_factorisation(),
+            }
+            per_iteration = [run.num_factorisations / run.num_iterations for run in runs]
+            rows.append({"size": size, **ratios, "factorisation_ratio": per_iteration[0] / per_iteration[1]})
+            each = [f"{count:.2f}" for count in per_iteration]
             steps = [f"{run.num_iterations / options.frames:.1f}" for run in runs]
-            table.add_row(str(size), *(f"{x:.2f}" for x in ratios), " and ".join(each), " and ".join(steps))
+            table.add_row(str(size), *(f"{x:.2f}" for x in ratios.values()), " and ".join(each), " and ".join(steps))
     Console(width=120).print(table)
+    publish_rows(options.publish, PRICES, "python -m tests.bench.bending", rows, begin)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,17 @@
 """What an iteration costs with an effect, over one without: each effect by each solver, side by side.
 
-    python -m tests.bench.effects [--size 33] [--rounds 3] [--frames 8] [SOLVER ...]
+    python -m tests.bench.effects [--size 33] [--rounds 3] [--frames 8] [--effects all] [--publish FOLDER] [SOLVER ...]
 
 The hanging cloth is simulated to a tolerance of 1e-6 (see
-`springbench.harness.experiments.ablation.iteration_overhead`). Each cell tells the
-price, how it is reached (ms an iteration) and the limit that it is to keep.
+`springbench.harness.experiments.ablation.iteration_overhead`). Each cell states the ratio, the time of an iteration and
+the limit of the ratio. `--publish results/published/all-effects` is the study of all effects together.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -20,6 +21,8 @@ from springbench.harness.execution.machine_info import limit_threads
 from springbench.harness.experiments.ablation.iteration_overhead import measure_overhead, prepare_scene
 from springbench.solvers.model.step_problem import StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
+
+from tests.bench.scripted_study import describe_moment, publish_rows
 
 PRICES = Path(__file__).parents[2] / "configs" / "prices.yaml"
 STOP = StopRule(5000, 1e-6)
@@ -56,7 +59,9 @@ def main() -> None:
     for name, given in (("--size", 33), ("--rounds", 3), ("--frames", 8)):
         parser.add_argument(name, type=int, default=given)
     parser.add_argument("--effects", nargs="*", default=list(KINDS))
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
+    begin, rows = describe_moment(), list[dict[str, Any]]()
     whole = load_scene(PRICES)
     table = Table(
         box=SIMPLE_HEAD, title=f"an iteration with the effect over one without, {options.size} vertices a side"
@@ -75,10 +80,13 @@ def main() -> None:
                     cells.append("refused")
                     continue
                 ratio, limit = found.ratio_interval.estimate, LIMITS[solver][KINDS[effect]]
+                rows.append({"effect": effect, "solver": solver, "size": options.size, "time_ratio": ratio})
                 beyond = "" if ratio <= limit else " !"
                 cells.append(f"{ratio:.2f} ({1e3 * found.seconds:.3g} ms; limit {limit:g}{beyond})")
             table.add_row(effect, *cells)
     Console(width=200).print(table)
+    command = f"python -m tests.bench.effects --size {options.size} --effects {' '.join(options.effects)}"
+    publish_rows(options.publish, PRICES, command, rows, begin)
 
 
 if __name__ == "__main__":
