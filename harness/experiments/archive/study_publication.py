@@ -25,12 +25,16 @@ from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.report.speed.speed_figures import MACHINE_SOLVER
 from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
 
+_FACTOR_COLUMNS = ("flops_per_solve", "factor_bytes", "nnz_factor")
+"""Columns that only a comparison with the limits of the machine uses."""
+
 DROPPED_COLUMNS = frozenset(
     (
         *("positions_digest", "recording_digest", "recording_path", "node_id", "source_fingerprint", "sweep"),
         *("wall_seconds_check", "wall_seconds_sum", "phases_consistent", "energy_springs", "energy_inertia"),
         *("energy_force", "energy_pins", "energy_effects", "energy_gain", "energy_available", "max_strain"),
-        *("strain_p99", "flops_per_solve", "factor_bytes", "nnz_system", "nnz_factor", "nnz_hessian_factor"),
+        *("strain_p99", "nnz_system", "nnz_hessian_factor"),
+        *_FACTOR_COLUMNS,
     )
 )
 """Columns that are left out: digests of files that are not published, checks that a run has passed, and provenance.
@@ -87,6 +91,7 @@ def write_study(
     with TemporaryDirectory(dir=published, prefix=".") as temporary:
         for table, rows in found.items():
             left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed or _ran_alone(rows) else _TIME_COLUMNS)
+            left_out -= frozenset(_FACTOR_COLUMNS if _has_machine_limits(rows) else ())
             write_published_table(Path(temporary) / published_set.TABLE_FILES[table], _drop_columns(rows, left_out))
         older = list(folder.glob("*.parquet"))
         size = sum(path.stat().st_size for path in published.rglob("*.parquet") if path not in older)
@@ -232,6 +237,10 @@ def _ran_alone(rows: pa.Table) -> bool:
     return "num_concurrent_runs" in rows.column_names and set(rows["num_concurrent_runs"].to_pylist()) <= {1, None}
 
 
+def _has_machine_limits(rows: pa.Table) -> bool:
+    return "solver" in rows.column_names and MACHINE_SOLVER in pc.unique(rows["solver"]).to_pylist()
+
+
 def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:
     """Return the table without columns of these names and without empty columns."""
     selected = [name for name in rows.column_names if name not in names and rows[name].null_count < len(rows)]
@@ -257,7 +266,7 @@ def _describe_command(tables: Mapping[str, pa.Table], config: Path) -> str:
     if "measurements" in tables:
         return f"measurements of {config.parent.name}/{config.name}"
     command = next(name for table, name in _COMMANDS.items() if table in tables)
-    if command == "run" and MACHINE_SOLVER in pc.unique(tables["rows"]["solver"]).to_pylist():
+    if command == "run" and _has_machine_limits(tables["rows"]):
         command = "roofline"
     return f"springbench {command} {config.parent.name}/{config.name}"
 
