@@ -175,7 +175,7 @@ def _bytes(prepared: Any) -> int:
             prepared.constraint_relaxation,
         )
         if isinstance(prepared, PreparedXpbd)
-        else (made.colour_packets, made.vertex_elements.around, made.anchor_stiffness)
+        else (made.colour_packets, made.vertex_elements.incident_elements, made.anchor_stiffness)
     )
     duals = 7 * 8 * len(prepared.min_stiffness) if isinstance(prepared, PreparedAugmentedVertexBlockDescent) else 0
     return _size(through) + duals + 24 * prepared.system.num_vertices
