@@ -4,7 +4,8 @@
 
 A vertex of 1 kg at rest on a slope of 1:2 slides for a second, or sticks. n steps of implicit Euler lead
 n (n + 1)/2 dt^2 g (sin - mu cos) down the slope, the exact motion g (sin - mu cos) t^2/2. What sticks creeps at
-tan/mu times `eps_v`. The thickness of contact is halved for a sheet that sinks onto a ball (`tests.contact_refinement`).
+tan/mu times `eps_v`. The thickness of contact is halved for a sheet that
+sinks onto a ball (`tests.contact_refinement`).
 """
 
 from __future__ import annotations
