@@ -12,7 +12,7 @@ A template is a Jinja2 file next to its page: `hard-cases.md.j2` makes `hard-cas
                        and orders the series, the other options are those of `PageChart`
     figure(name, title, kind, study, alt, panels)
                        a link to a picture of a kind that `springbench figure` draws
-    provenance(study)  command, machine, date and commit of a study, in one line
+    provenance(study)  command, machine, load, date and commit of a study, in one line
     typed(date, commit)
                        a remark on numbers that stand in the template, and not yet in the published set
 
@@ -122,7 +122,9 @@ class _PageFields:
         )
         requested = about.get("requested_runs")
         count = f"{about['runs']:,}" + (f" of {requested:,}" if requested else "")
-        return f"Data: `{about['command']}`, {count} runs, {where}, {date}, commit {commits}."
+        loads = [f"{load:.0f}" for load in about.get("load_average", ())]
+        load = f", load {' to '.join(dict.fromkeys(loads))}" if loads else ""
+        return f"Data: `{about['command']}`, {count} runs, {where}{load}, {date}, commit {commits}."
 
     def _add_picture(self, name: str, alt: str, digest: str, draw_png: Callable[[], bytes]) -> str:
         path = self.page.parent / PICTURE_FOLDER / f"{name}.png"
