@@ -22,7 +22,7 @@ TEMPLATE = """# Runs
 {{ bars("iterations", "All take 50",
 "SELECT solver AS series, avg(num_iterations) AS y FROM dummy GROUP BY ALL ORDER BY 1", "Iterations by solver") }}
 
-{{ provenance("dummy") }} {{ typed("2026-01-02", "abc") }}
+{{ provenance("dummy") }}
 """
 
 SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [sparse, dense]\n"

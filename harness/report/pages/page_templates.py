@@ -13,8 +13,6 @@ A template is a Jinja2 file next to its page: `hard-cases.md.j2` makes `hard-cas
     figure(name, title, kind, study, alt, panels)
                        a link to a picture of a kind that `springbench figure` draws
     provenance(study)  command, machine, load, date and commit of a study, in one line
-    typed(date, commit)
-                       a remark on numbers that stand in the template, and not yet in the published set
 
 and the filters `percent`, `sig(digits)` and `count`.
 """
@@ -154,7 +152,6 @@ def render_page(template: Path, queries: PublishedQueries) -> RenderedPage:
         "table": fields.build_table,
         "figure": fields.add_figure,
         "provenance": fields.describe_study,
-        "typed": _mark_typed,
         "has_study": queries.studies.__contains__,
     }
     for form in ("bars", "lines", "heatmap"):
@@ -178,10 +175,6 @@ def _bind_form(fields: _PageFields, form: Any) -> Callable[..., str]:
         return fields.add_chart(form, name, title, sql, alt, **options)
 
     return add_chart_of_form
-
-
-def _mark_typed(date: str, commit: str) -> str:
-    return f"*Measured on {date} at {commit}; not yet in the published set.*"
 
 
 def _build_point(row: Mapping[str, Any]) -> ChartPoint:
