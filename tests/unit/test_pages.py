@@ -7,11 +7,19 @@ import pytest
 from springbench.harness.cli.main import app
 from springbench.harness.experiments.archive import study_publication
 from springbench.harness.report.pages.page_files import check_pages, write_pages
+from springbench.harness.report.pages.published_queries import PublishedQueries
+from springbench.harness.results import parquet_rows
 from springbench.harness.results.published_set import read_study
+from springbench.harness.results.run_schema import RUN_SCHEMA
 from typer.testing import CliRunner
 
+from tests.bench.scripted_study import describe_moment, publish_rows
 from tests.contracts.hostile import scene
+from tests.synthetic_accuracy_rows import build_work_rows, write_accuracy_rows
+from tests.synthetic_results import write_result_rows, write_speed_results
 from tests.synthetic_run_rows import write_dummy_runs
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 TEMPLATE = """# Runs
 
@@ -69,6 +77,48 @@ def test_a_study_gains_the_runs_of_its_parts(checkout: Path) -> None:
         assert result.exit_code == 0, result.output
         assert read_study(study).metadata["runs"] == 13
         assert read_study(study).read_table("rows").num_rows == 26
+
+
+def test_units_of_a_newer_part_replace_those_of_the_same_file(tmp_path: Path) -> None:
+    for part, error, date in (("older", 0.2, "2026-01-01"), ("newer", 0.1, "2026-01-02")):
+        rows = [row | {"error": error, "started_at": date} for row in build_work_rows("net", 10)]
+        write_accuracy_rows(tmp_path / part, rows)
+    more = [row | {"started_at": "2026-01-02"} for row in build_work_rows("net", 24)]
+    write_accuracy_rows(tmp_path / "newer", more)  # a file that the older part has not
+    study = study_publication.write_study(
+        [tmp_path / "older", tmp_path / "newer"], CONFIGS / "engines.yaml", tmp_path / "published", lambda line: None
+    )
+    units = study.read_table("accuracy").to_pylist()
+    assert {(row["size"], row["error"]) for row in units if row["size"] == 10} == {(10, 0.1)}
+    assert len(units) == len(rows) + len(more)
+
+
+def test_speedups_of_a_published_roofline_study_are_a_view(tmp_path: Path) -> None:
+    write_speed_results(tmp_path / "speed")
+    for path in (tmp_path / "speed" / "rows").glob("sparse-*"):
+        rows = parquet_rows.read_rows([path], RUN_SCHEMA).to_pylist()
+        write_result_rows(path, [row | {"solver": "cholmod"} for row in rows])
+    study = study_publication.write_study(
+        [tmp_path / "speed"], CONFIGS / "speed.yaml", tmp_path / "published", lambda line: None
+    )
+    assert study.metadata["command"] == "springbench roofline configs/speed.yaml"
+    queries = PublishedQueries(tmp_path / "published")
+    rows = queries.query_records("SELECT * FROM speed_speedups WHERE baseline = 'cholmod' AND solver = 'numba'")
+    assert {(row["size"], row["candidate"]) for row in rows} == {
+        (size, f"numba {linear}") for size in (8, 16, 32) for linear in ("auto", "supernodal")
+    }
+    assert {round(row["speedup"], 3) for row in rows if row["candidate"] == "numba auto"} == {round(4 / 3, 3)}
+
+
+def test_rows_of_a_script_are_a_study_with_what_made_them(tmp_path: Path) -> None:
+    begin = describe_moment()
+    rows = [{"solver": "newton", "ratio": 1.5}, {"solver": "vbd", "ratio": None, "reason": "not there"}]
+    publish_rows(tmp_path / "ratios", CONFIGS / "speed.yaml", "python -m tests.bench.ratios", rows, begin)
+    study = read_study(tmp_path / "ratios")
+    assert study.metadata["command"] == "python -m tests.bench.ratios"
+    assert len(study.metadata["load_average"]) == len(study.metadata["started"]) == 2
+    found = PublishedQueries(tmp_path).query_records("SELECT solver, ratio, reason FROM ratios ORDER BY solver")
+    assert found == [rows[0] | {"reason": None}, rows[1]]
 
 
 def test_a_study_that_is_too_large_leaves_the_published_one_as_it_is(
