@@ -6,7 +6,7 @@ Three tables. A pendulum of 50 links with a bob that is 50,000 times as heavy as
 figures 7 and 8 of the paper): by how much of its length the worst link is off, mean and largest over two seconds of
 frames of 1/60 s, and how far the bob falls. A chain of 11 springs between fixed ends, every second one 10,000 times as
 stiff (as in figure 4): how far it is after four seconds from where it should be, over its sag. What an iteration of
-that pendulum takes and reads.
+that pendulum takes.
 """
 
 from __future__ import annotations
@@ -30,9 +30,8 @@ from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.time_loop import build_initial_state, build_problem, simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
-from springbench.solvers.methods.position_based.xpbd import PreparedXpbd, Xpbd, XpbdSmallSteps
+from springbench.solvers.methods.position_based.xpbd import Xpbd, XpbdSmallSteps
 from springbench.solvers.methods.vertex_block.avbd import AugmentedVertexBlockDescent as Avbd
-from springbench.solvers.methods.vertex_block.avbd import PreparedAugmentedVertexBlockDescent
 from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent as Vbd
 from springbench.solvers.model.energies import spring_energy
 from springbench.solvers.model.energies.augmented_lagrangian import concatenate_constraints, length_errors
@@ -135,7 +134,7 @@ def ratios() -> list[dict[str, Any]]:
 
 
 def costs() -> list[dict[str, Any]]:
-    """Measure an iteration on the pendulum: rows with its CPU time over that of `vbd`, and the bytes that it reads."""
+    """Measure an iteration on the pendulum: rows with its CPU time over that of `vbd`."""
     rows = list[dict[str, Any]]()
     exact, firm, stiff = (pendulum(k, ChainMesh()) for k in ("exact", FIRM, HEAVY * 9.81 * LINKS / 1e-3))
     usual = None
@@ -147,9 +146,7 @@ def costs() -> list[dict[str, Any]]:
         prepared = solver.prepare(made.system)
         took = _of_one(prepared, build_problem(made, build_initial_state(made), "inertial"))
         usual = usual or took
-        rows.append(
-            {"scene": "one iteration", "method": name, "cpu_ratio": took / usual, "num_bytes": _bytes(prepared)}
-        )
+        rows.append({"scene": "one iteration", "method": name, "cpu_ratio": took / usual})
     return rows
 
 
@@ -162,27 +159,6 @@ def _of_one(prepared: PreparedSolver, stated: StepProblem) -> float:
         return (thread_time() - begun) / 1000
 
     return min(once() for _ in range(5))
-
-
-def _bytes(prepared: Any) -> int:
-    """Of the arrays that an iteration goes through, each once, and the positions [B]."""
-    made = getattr(prepared, "made", prepared)
-    through = (
-        (
-            prepared.coloured_constraints,
-            prepared.constraint_relaxation,
-            prepared.vertex_compliance,
-            prepared.constraint_relaxation,
-        )
-        if isinstance(prepared, PreparedXpbd)
-        else (made.colour_packets, made.vertex_elements.incident_elements, made.anchor_stiffness)
-    )
-    duals = 7 * 8 * len(prepared.min_stiffness) if isinstance(prepared, PreparedAugmentedVertexBlockDescent) else 0
-    return _size(through) + duals + 24 * prepared.system.num_vertices
-
-
-def _size(x: Any) -> int:
-    return sum(map(_size, x)) if isinstance(x, tuple) else int(getattr(x, "nbytes", 0))
 
 
 def build_table(rows: list[dict[str, Any]]) -> Table:
