@@ -83,6 +83,7 @@ class ChartFrame:
         bands, lines: shaded ranges and marked values, by column of y.
         notes: sentences about these series.
         x_label: label of the horizontal axis, if it is not that of the chart.
+        x_names: names of the positions along a horizontal axis of names, if they are not those of the chart.
         sheet: name of the sheet that shows the frame; empty for the sheet of the chart.
     """
 
@@ -95,6 +96,7 @@ class ChartFrame:
     lines: Mapping[str, Sequence[MarkedValue]] = field(default_factory=dict[str, Sequence[MarkedValue]])
     notes: Sequence[str] = ()
     x_label: str = ""
+    x_names: tuple[str, ...] = ()
     sheet: str = ""
 
 
@@ -147,7 +149,8 @@ def select_curve_plots(
 def _build_plot(
     chart: ChartDescription, frame: ChartFrame, across: ChartAxis, up: ChartAxis, series: list[CurveSeries]
 ) -> CurvePlot:
-    scales = across.scale._replace(label=frame.x_label or across.scale.label), up.scale
+    named = frame.x_label or across.scale.label, frame.x_names or across.scale.place_names
+    scales = across.scale._replace(label=named[0], place_names=named[1]), up.scale
     if across.scale.division == "sizes" and len({float(x) for one in series for x in one.x}) == 1:
         scales = up.scale, AxisScale("", "names", place_names=tuple(one.label for one in _sort_by_value(series)))
         series = [_lay_down(one, k) for k, one in enumerate(_sort_by_value(series))]

@@ -63,6 +63,7 @@ def _describe_frame(frame: ChartFrame) -> dict[str, Any]:
     return {
         "notes": list(frame.notes),
         "x_label": frame.x_label,
+        "x_names": list(frame.x_names),
         "bands": {column: [list(band) for band in bands] for column, bands in frame.bands.items()},
         "lines": {column: [list(line) for line in lines] for column, lines in frame.lines.items()},
     }
@@ -73,7 +74,8 @@ def _describe_series(chart: ChartDescription, number: int, frame: ChartFrame, se
     for axis in (*chart.x, *chart.y):
         if axis.scale.division == "names" and axis.column in columns:
             places = series.columns[axis.column]
-            columns[axis.column] = [_find_place_name(axis.scale, place) for place in places]
+            names = (frame.x_names if axis in chart.x else ()) or axis.scale.place_names
+            columns[axis.column] = [_find_place_name(names, place) for place in places]
     length = len(next(iter(columns.values())))
     missing = {axis.column: [None] * length for axis in (*chart.x, *chart.y) if axis.column not in columns}
     return {
@@ -94,8 +96,8 @@ def _describe_series(chart: ChartDescription, number: int, frame: ChartFrame, se
     }
 
 
-def _find_place_name(scale: AxisScale, place: Any) -> str | None:
-    return None if place is None or np.isnan(place) else scale.place_names[round(float(place))]
+def _find_place_name(names: Sequence[str], place: Any) -> str | None:
+    return None if place is None or np.isnan(place) else names[round(float(place))]
 
 
 def _describe_column(values: Sequence[Any] | FloatArray) -> list[Any]:

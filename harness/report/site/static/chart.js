@@ -42,7 +42,7 @@ springbench.chart = (() => {
     const hollow = item[x.column].map((_, k) => older(item, k));
     return {
       x: item[x.column], y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
-      mode: item.joined || mark.symbol === "none" ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
+      mode: mark.symbol === "none" ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
       line: { color: ink, dash: mark.dash, width: 1.7, shape: shape === "hv" ? "hv" : undefined },
       // The number of markers per line is limited, whatever the number of its points.
       marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.large ? 13 : 8 * (item.scale ?? 1), maxdisplayed: points ? 0 : shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
@@ -115,8 +115,9 @@ springbench.chart = (() => {
       layout[`yaxis${tail}`] = { ...style, ...range(y), title: { ...style.title, text: k && !narrow ? "" : y.title }, domain: up, anchor: `x${tail}`, matches: k ? "y" : undefined, showticklabels: !k || narrow };
       if (panel && n > 0) layout.annotations.push({ text: `<b>${panel}</b>`, x: across[0], y: up[1], yshift: 22, xref: "paper", yref: "paper", showarrow: false, xanchor: "left", font: { size: 13, color: css("--ink") } });
       const here = items.filter(item => (item.panel ?? "") === panel && !hidden.has(item.label)), extra = marks(chart, here, x, y, tail);
-      const label = items.find(item => (item.panel ?? "") === panel && chart.frames?.[item.frame].x_label);
-      if (label) layout[`xaxis${tail}`].title.text = chart.frames[label.frame].x_label;
+      const frame = chart.frames?.[items.find(item => (item.panel ?? "") === panel).frame];
+      if (frame?.x_label) layout[`xaxis${tail}`].title.text = frame.x_label;
+      if (frame?.x_names.length) layout[`xaxis${tail}`].categoryarray = frame.x_names;
       layout.shapes.push(...extra.shapes);
       layout.annotations.push(...extra.annotations);
       for (const item of here) {
