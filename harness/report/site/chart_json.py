@@ -26,13 +26,14 @@ from springbench.harness.report.site.run_table import format_references
 def serialise_chart(chart: ChartDescription) -> dict[str, Any]:
     """Return a chart as data that can be represented as JSON."""
     pairs = [(number, frame, series) for number, frame in enumerate(chart.frames) for series in frame.series]
+    formats = {axis.column: axis.scale.tick_format for axis in (*chart.x, *chart.y)}
     return {
         "title": chart.title,
         "note": chart.note,
         "filters": [chart.subject_key],
         "x": [_describe_axis(axis) for axis in chart.x],
         "y": [_describe_axis(axis, {"autorange": "reversed"}) for axis in chart.y],
-        "hover": [list(pair) for pair in chart.hover],
+        "hover": [[column, words, formats.get(column, "")] for column, words in chart.hover],
         "frames": [_describe_frame(frame) for frame in chart.frames],
         "items": [_describe_series(chart, number, frame, series) for number, frame, series in pairs],
         "styles": {series.label: plotly_style(series.style) for *_, series in pairs},
@@ -43,20 +44,24 @@ def serialise_chart(chart: ChartDescription) -> dict[str, Any]:
 
 def _describe_axis(axis: ChartAxis, names_layout: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
     """Describe a choice of an axis; `names_layout` is added to the layout of an axis of names."""
-    unit = " [s]" if axis.scale.tick_format == "time" else ""
     layout = _plotly_axis(axis.scale)
     if axis.scale.division == "names":
         layout |= names_layout
-    title = ", ".join(filter(None, (axis.scale.label, axis.title))) + unit
-    return {"column": axis.column, "title": title, "axis": layout}
+    title = ", ".join(filter(None, (axis.scale.label, axis.title)))
+    return {"column": axis.column, "title": title, "format": axis.scale.tick_format, "axis": layout}
+
+
+_TIME_TICKS = {"tickformat": "$~s"}
+"""Ticks of a time with SI prefixes, such as 5ms; the page's currency is the second."""
 
 
 def _plotly_axis(scale: AxisScale) -> dict[str, Any]:
     if scale.division == "names":
         return {"type": "category", "categoryarray": list(scale.place_names)}
+    ticks = _TIME_TICKS if scale.tick_format == "time" else {}
     if scale.division != "linear":
-        return {"type": "log"}
-    return {"tickformat": ".0%", "rangemode": "tozero"} if scale.tick_format == "percent" else {}
+        return {"type": "log", **ticks, **({"tickmode": "array"} if scale.division == "sizes" else {})}
+    return {"tickformat": ".0%", "rangemode": "tozero"} if scale.tick_format == "percent" else {**ticks}
 
 
 def _describe_frame(frame: ChartFrame) -> dict[str, Any]:

@@ -1,22 +1,25 @@
 // Line and point charts for all plots: by Plotly, with a custom legend, tooltip and keyboard control.
 "use strict";
 springbench.chart = (() => {
-  const { element, script, own, number, colour, glyph, keep, where } = springbench;
+  const { element, script, own, number, percent, time, colour, glyph, keep, where } = springbench;
   const tip = element("div.tip", { hidden: true, role: "tooltip" });
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
 
-  const figure = value => (typeof value === "string" ? value : number(value));
+  const figure = (value, format) => (typeof value === "string" ? value : format === "time" ? time(value) : format === "percent" ? percent(value) : number(value));
   const older = (item, k) => Boolean(Array.isArray(item.stale) ? item.stale[k] : item.stale);
 
   function told(chart, item, k) {
-    const rows = chart.hover.map(([column, words]) => {
+    const rows = chart.hover.map(([column, words, format]) => {
       const value = at(item, column, k);
-      return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, figure(value)));
+      return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, figure(value, format)));
     });
     if (older(item, k)) rows.push(element("tr", {}, element("td", {}, "code"), element("td", {}, "other than the newest rows'")));
     return [element("b", {}, item.label), item.description, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
   }
+
+  // Plotly omits a tick suffix between powers of ten; so times are formatted with seconds as the currency, such as 5ms.
+  const SECONDS = { en: { format: { currency: ["", "s"] } } };
 
   // Next to the point and inside the window, never wider than a tooltip.
   function show(x, y, content) {
@@ -34,7 +37,7 @@ springbench.chart = (() => {
     const mark = own(chart.styles, item.label), ink = colour(mark.color), shape = item.shape ?? chart.shape, points = shape === "points";
     const ends = ["", "_low", "_high"].map(end => item[`${x.column}${end}`]), upright = ["", "_low", "_high"].map(end => item[`${y.column}${end}`]);
     // Intervals of many points would cover their line.
-    const bars = some => (some[1] && some[2] && some[0].length <= 24 ? {
+    const bars = some => (some[1] && some[2] && (points || some[0].length <= 24) ? {
       type: "data", symmetric: false, color: ink, thickness: 1.2, width: 3,
       array: some[2].map((v, k) => v - some[0][k]), arrayminus: some[1].map((v, k) => some[0][k] - v),
     } : undefined);
@@ -99,14 +102,20 @@ springbench.chart = (() => {
       annotations: [], shapes: [], font: { family: getComputedStyle(document.body).fontFamily, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
     };
     const traces = [], gap = narrow ? 0.16 : 0.05, n = panels.length;
-    // Over few decades 1, 2 and 5 are labelled, over more only the powers of ten.
+    // Over few decades 1, 2 and 5 are labelled if there is space, over more only the powers of ten.
     const room = axis => (axis === y ? (narrow ? 330 : plot.clientHeight) / 42 : plot.clientWidth / (narrow ? 1 : panels.length) / 70);
     const range = axis => {
       if (axis.axis.type !== "log") return axis.axis;
       let [low, high] = [Infinity, 0];
       for (const item of items) for (const v of item[axis.column]) if (v > 0) [low, high] = [Math.min(low, v), Math.max(high, v)];
       const decades = Math.log10(high / low);
-      return { ...axis.axis, dtick: decades > 2.4 ? Math.max(1, Math.ceil(decades / room(axis))) : "D2" };
+      if (axis.axis.tickmode === "array") {
+        // A tick at each size, the largest first, if there is space for its label.
+        const sizes = [...new Set(items.flatMap(item => item[axis.column]))].filter(v => v > 0).sort((a, b) => b - a), ticks = [];
+        for (const v of sizes) if (!ticks.length || Math.log10(ticks.at(-1) / v) * room(axis) >= decades) ticks.push(v);
+        return { ...axis.axis, tickvals: ticks, ticktext: ticks.map(v => number(v)) };
+      }
+      return { ...axis.axis, dtick: 3 * decades > Math.min(7.2, room(axis)) ? Math.max(1, Math.ceil(decades / room(axis))) : "D2" };
     };
     panels.forEach((panel, k) => {
       const tail = k ? k + 1 : "", size = (1 + gap) / n - gap, low = k * (size + gap);
@@ -126,7 +135,7 @@ springbench.chart = (() => {
       }
     });
     zoom(layout, where().query.get(zoomKey));
-    await Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true, showTips: false });
+    await Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true, showTips: false, locales: SECONDS });
     plot.removeAllListeners("plotly_hover");
     plot.removeAllListeners("plotly_unhover");
     plot.removeAllListeners("plotly_click");
@@ -140,12 +149,12 @@ springbench.chart = (() => {
     });
     plot.on("plotly_unhover", hide);
     plot.on("plotly_click", ({ points: [p] }) => { if (p.data.meta) onPoint(p.data.meta.item, p.pointNumber); });
-    keys(plot, chart, onPoint);
+    keys(plot, chart, x, y, onPoint);
   }
 
   // Left and right move along a line, up and down to the next line, Enter opens the point, plus and minus zoom, Home
   // resets the zoom.
-  function keys(plot, chart, onPoint) {
+  function keys(plot, chart, x, y, onPoint) {
     let line = -1, k = 0;
     plot.onkeydown = event => {
       const lines = plot.data.map((one, number) => [one, number]).filter(([one]) => one.meta);
@@ -165,7 +174,7 @@ springbench.chart = (() => {
         }
         const full = plot._fullData[curve], box = plot.getBoundingClientRect(), axes = [plot._fullLayout[full.xaxis.replace("x", "xaxis")], plot._fullLayout[full.yaxis.replace("y", "yaxis")]];
         show(axes[0]._offset + axes[0].d2p(one.x[k]) + box.left, axes[1]._offset + axes[1].d2p(one.y[k]) + box.top, told(chart, one.meta.item, k));
-        springbench.tell(`${one.name}: ${figure(one.x[k])}, ${figure(one.y[k])}`);
+        springbench.tell(`${one.name}: ${figure(one.x[k], x.format)}, ${figure(one.y[k], y.format)}`);
       } else return;
       event.preventDefault();
     };
@@ -190,5 +199,5 @@ springbench.chart = (() => {
     });
   }
 
-  return { draw, legend, hide };
+  return { draw, legend, hide, figure };
 })();

@@ -133,6 +133,7 @@
   function csv(items, x, y) {
     const quote = v => (v === null || v === undefined ? "" : /[",]/.test(String(v)) ? `"${String(v).replaceAll('"', '""')}"` : v);
     const lines = items.flatMap(item => item[x.column].map((value, k) => [item.label, item.description, value, item[y.column][k]].map(quote).join(",")));
-    return [["solver", "what", x.title, y.title].map(quote).join(","), ...lines].join("\n") + "\n";
+    const named = axis => axis.title + (axis.format === "time" ? " [s]" : "");
+    return [["solver", "what", named(x), named(y)].map(quote).join(","), ...lines].join("\n") + "\n";
   }
 })();
