@@ -174,6 +174,15 @@ def test_an_unknown_study_is_answered_by_the_known_ones(tmp_path: Path) -> None:
     assert command("compare", tmp_path, "--published", tmp_path / "nothing").exit_code == 2
 
 
+def test_a_large_entry_is_refused(tmp_path: Path) -> None:
+    entry = tmp_path / "entries" / "mine.zip"
+    entry.parent.mkdir()
+    entry.write_bytes(b"0" * (2**20 + 1))
+    result = command("reproduce", "entries", "--published", tmp_path)
+    assert result.exit_code == 1
+    assert "takes 1,048,577 bytes" in result.output
+
+
 def test_a_tenth_is_drawn_by_its_seed() -> None:
     items = list(range(95))
     assert draw_sample(items, None) == items

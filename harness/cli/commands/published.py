@@ -20,6 +20,9 @@ PublishedOption = Annotated[Path, typer.Option(help="Folder of the published set
 ALL_STUDIES, ENTRIES = "all", "entries"
 """Names that stand for every study, and for the archives that others have contributed."""
 
+MAX_ENTRY_BYTES = 2**20
+"""Largest contributed archive: it is part of every clone."""
+
 
 def publish_study(
     results: Annotated[
@@ -158,5 +161,10 @@ def _verify_entries(folder: Path, seed: int | None) -> int:
     codes: list[int] = []
     for path in archives:
         print_message(f"{path.name}:")
-        codes.append(verify_one_archive(path, seed, with_user_code=True))
+        if (size := path.stat().st_size) > MAX_ENTRY_BYTES:
+            limit = f"at most {MAX_ENTRY_BYTES:,} are part of a clone"
+            print_message(f"takes {size:,} bytes, and {limit}; run its sweep with `record: false, pictures: false`")
+            codes.append(1)
+        else:
+            codes.append(verify_one_archive(path, seed, with_user_code=True))
     return _choose_exit_code(codes)
