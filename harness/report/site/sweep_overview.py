@@ -19,6 +19,7 @@ import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.optional_parts import RECORDINGS
+from springbench.harness.report.charts.speed_chart import build_speed_chart
 from springbench.harness.report.device_speedup import summarise_table as of_devices
 from springbench.harness.report.site import (
     ablation_charts,
@@ -26,11 +27,13 @@ from springbench.harness.report.site import (
     robustness_chart,
     row_provenance,
     run_table,
-    speed_chart,
 )
+from springbench.harness.report.site.chart_json import serialise_chart
 from springbench.harness.report.site.failure_causes import FailedRun, group_failures
 from springbench.harness.report.site.run_findings import describe_runs
 from springbench.harness.report.site.sweep_folders import SweepFolder, find_benchmark_files
+from springbench.harness.report.speed.speed_figures import compute_speed_figures, has_machine_limits
+from springbench.harness.report.speed.speed_table import describe_speed
 from springbench.harness.results import parquet_rows, row_store
 
 PrintMessage = Callable[[str], None]
@@ -134,9 +137,12 @@ def _build_run_section(
     findings = [
         {"text": words} for words in of_devices(table, row_provenance.find_config(folder.path))
     ] + describe_runs(found)
-    if speed_chart.has_machine_limits(table):
-        scripts["speed"], speed_findings = speed_chart.build_speed_chart(table)
-        findings = [{"text": words} for words in speed_findings]
+    if has_machine_limits(table):
+        candidates = compute_speed_figures(table)
+        citations = dict(zip(*(table[name].to_pylist() for name in ("solver", "citation")), strict=True))
+        newest = row_provenance.find_newest_fingerprint(table)
+        scripts["speed"] = serialise_chart(build_speed_chart(candidates, newest, citations))
+        findings = [{"text": words} for words in describe_speed(candidates)]
     outcomes: dict[str, Any] = {}
     if robustness_chart.has_verification(table):
         scripts["hard"] = robustness_chart.build_robustness_chart(folder)
