@@ -67,7 +67,7 @@ def _build_frame(gate: BenchmarkHistory, title: str) -> ChartFrame:
         title=title,
         series=[*_build_series(gate)],
         notes=[found, *([f"{DIRTY_MARK}: with changes beyond the commit."] if is_dirty else [])],
-        x_names=_distinguish_commits(gate.points),
+        place_names={"commit": _distinguish_commits(gate.points)},
     )
 
 

@@ -57,7 +57,7 @@ def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = Non
             )
         )
     return ChartDescription(
-        title="Outside engines compared with ours",
+        title="Outside engines compared with springbench",
         note="springbench export-script CONFIG prints a script that repeats an engine's point without us.",
         frames=frames,
         x=(ChartAxis("seconds", AxisScale(COST_LABEL, "log", "time")),),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from springbench.harness.report.charts.chart_description import ChartDescription, ChartFrame, select_curve_plots
-from springbench.harness.report.charts.figure_panels import CurvePlot
+from springbench.harness.report.charts.figure_panels import CurvePlot, FigurePanel, merge_cell_maps
 from springbench.harness.report.figures.figure_files import write_images
 from springbench.harness.report.figures.figure_layout import MILLIMETRES_PER_INCH, compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
@@ -25,14 +25,21 @@ _MAX_LONE_COLUMNS = 4
 def draw_chart_sheets(chart: ChartDescription, stem: Path) -> list[Path]:
     """Draw the sheets of a chart as PNG and SVG, and return the files.
 
+    Its maps are on its own sheet, one below the other.
+
     Args:
         chart: the chart.
         stem: path of the chart's own sheet without suffix; a folder for the other sheets.
     """
     paths: list[Path] = []
-    for sheet in dict.fromkeys(frame.sheet for frame in chart.frames):
+    maps = merge_cell_maps(chart.maps)
+    sheets = [*(frame.sheet for frame in chart.frames), *([""] if maps else [])]
+    for sheet in dict.fromkeys(sheets):
         frames = [frame for frame in chart.frames if frame.sheet == sheet]
-        panels, columns = _arrange_plots(chart, frames)
+        plots, columns = _arrange_plots(chart, frames)
+        panels: list[FigurePanel] = [*plots, *([] if sheet else maps)]
+        if maps and not sheet:
+            columns = 1 if plots else None
         if panels:
             figure = compose_figure(panels, chart.title, SHEET_OPTIONS, columns)
             target = stem / sheet if sheet else stem
@@ -56,4 +63,4 @@ def _arrange_plots(chart: ChartDescription, frames: Sequence[ChartFrame]) -> tup
         (count,) = counts
         return plots, count if len(rows) > 1 or count <= _MAX_LONE_COLUMNS else 3
     rows = [[plot for frame in frames for plot in select_curve_plots(chart, [frame], [axis])] for axis in shown]
-    return [plot for row in rows for plot in row], max(map(len, rows))
+    return [plot for row in rows for plot in row], max(map(len, rows), default=None)

@@ -1,7 +1,7 @@
 """Charts for the results page: a chart description as JSON, which `static/chart.js` draws by Plotly.
 
 An item is a series with the columns of its points; it refers to its frame by number, as bands, lines and notes belong
-to frames. Axes and styles are in Plotly's terms.
+to frames. Axes and styles are in Plotly's terms. Cell maps are tables, which `static/map.js` shows.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from springbench.harness.report.charts.chart_description import (
     ChartFrame,
     ChartSeries,
 )
-from springbench.harness.report.charts.figure_panels import AxisScale, FloatArray
+from springbench.harness.report.charts.figure_panels import AxisScale, CellMap, FloatArray
+from springbench.harness.report.plot_style import STALE_NOTE
 from springbench.harness.report.site.data_scripts import round_number
 from springbench.harness.report.site.plotly_styles import plotly_style
 from springbench.harness.report.site.run_table import format_references
@@ -35,10 +36,24 @@ def serialise_chart(chart: ChartDescription) -> dict[str, Any]:
         "y": [_describe_axis(axis, {"autorange": "reversed"}) for axis in chart.y],
         "hover": [[column, words, formats.get(column, "")] for column, words in chart.hover],
         "frames": [_describe_frame(frame) for frame in chart.frames],
+        "maps": [_describe_map(one) for one in chart.maps],
         "items": [_describe_series(chart, number, frame, series) for number, frame, series in pairs],
-        "styles": {series.label: plotly_style(series.style) for *_, series in pairs},
+        "styles": {series.label: plotly_style(series.style) for *_, series in reversed(pairs)},
         "citations": format_references(chart.citations.items()),
         "command": chart.command,
+    }
+
+
+def _describe_map(cell_map: CellMap) -> dict[str, Any]:
+    """Describe a map; a cell refers to its class by number."""
+    labels = [outcome.label for outcome in cell_map.outcomes]
+    return {
+        "title": ", ".join(filter(None, (cell_map.subject, cell_map.title))),
+        "outcomes": [outcome._asdict() for outcome in cell_map.outcomes],
+        "cells": [
+            [one.row, one.column, labels.index(one.outcome), one.marked_text, one.reason, one.run_id, one.is_stale]
+            for one in cell_map.cells
+        ],
     }
 
 
@@ -66,9 +81,9 @@ def _plotly_axis(scale: AxisScale) -> dict[str, Any]:
 
 def _describe_frame(frame: ChartFrame) -> dict[str, Any]:
     return {
-        "notes": list(frame.notes),
+        "notes": [note for note in frame.notes if note != STALE_NOTE],  # the page explains hollow marks by itself
         "x_label": frame.x_label,
-        "x_names": list(frame.x_names),
+        "place_names": {column: list(names) for column, names in frame.place_names.items()},
         "bands": {column: [list(band) for band in bands] for column, bands in frame.bands.items()},
         "lines": {column: [list(line) for line in lines] for column, lines in frame.lines.items()},
     }
@@ -79,12 +94,13 @@ def _describe_series(chart: ChartDescription, number: int, frame: ChartFrame, se
     for axis in (*chart.x, *chart.y):
         if axis.scale.division == "names" and axis.column in columns:
             places = series.columns[axis.column]
-            names = (frame.x_names if axis in chart.x else ()) or axis.scale.place_names
+            names = frame.place_names.get(axis.column, axis.scale.place_names)
             columns[axis.column] = [_find_place_name(names, place) for place in places]
     length = len(next(iter(columns.values())))
     missing = {axis.column: [None] * length for axis in (*chart.x, *chart.y) if axis.column not in columns}
     return {
         "label": series.label,
+        "style": plotly_style(series.style),
         "description": series.description,
         chart.subject_key: frame.subject,
         "panel": frame.title,

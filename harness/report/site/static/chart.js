@@ -34,7 +34,7 @@ springbench.chart = (() => {
   addEventListener("hashchange", hide);
 
   function trace(chart, item, x, y, panel, tail) {
-    const mark = own(chart.styles, item.label), ink = colour(mark.color), shape = item.shape ?? chart.shape, points = shape === "points";
+    const mark = item.style ?? own(chart.styles, item.label), ink = colour(mark.color), shape = item.shape ?? chart.shape, points = shape === "points";
     const ends = ["", "_low", "_high"].map(end => item[`${x.column}${end}`]), upright = ["", "_low", "_high"].map(end => item[`${y.column}${end}`]);
     // Intervals of many points would cover their line.
     const bars = some => (some[1] && some[2] && (points || some[0].length <= 24) ? {
@@ -48,7 +48,7 @@ springbench.chart = (() => {
       mode: mark.symbol === "none" ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
       line: { color: ink, dash: mark.dash, width: 1.7, shape: shape === "hv" ? "hv" : undefined },
       // The number of markers per line is limited, whatever the number of its points.
-      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.large ? 13 : 8 * (item.scale ?? 1), maxdisplayed: points ? 0 : shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
+      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: 8 * (item.scale ?? 1), maxdisplayed: points ? 0 : shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes || mark.symbol === "line-ns" ? 1.6 : 0)), color: ink } },
     };
   }
 
@@ -64,11 +64,15 @@ springbench.chart = (() => {
   function marks(chart, items, x, y, tail) {
     const shapes = [], annotations = [], frames = new Set(items.map(item => chart.frames?.[item.frame]));
     const log = (axis, v) => (axis.axis.type === "log" ? Math.log10(v) : v);
-    for (const frame of frames) {
-      for (const [low, high] of frame?.bands[y.column] || []) shapes.push({ type: "rect", layer: "below", xref: `x${tail} domain`, yref: `y${tail}`, x0: 0, x1: 1, y0: y.axis.type === "log" ? Math.max(low, high * 1e-20) : low, y1: high, line: { width: 0 }, fillcolor: css("--hair") });
-      for (const [at, words] of frame?.lines[y.column] || []) {
-        shapes.push({ type: "line", layer: "below", xref: `x${tail} domain`, yref: `y${tail}`, x0: 0, x1: 1, y0: at, y1: at, line: { width: 1, dash: "dash", color: css("--muted") } });
-        if (words) annotations.push({ text: words, xref: `x${tail} domain`, yref: `y${tail}`, x: 1, y: log(y, at), xanchor: "right", yanchor: "bottom", showarrow: false, font: { size: 12, color: css("--muted") } });
+    for (const frame of frames) for (const [name, other, axis] of [["x", "y", x], ["y", "x", y]]) {
+      const whole = { layer: "below", [`${other}ref`]: `${other}${tail} domain`, [`${name}ref`]: `${name}${tail}`, [`${other}0`]: 0, [`${other}1`]: 1 };
+      // A band from 0 has no lower end on a logarithmic axis: it begins below all data.
+      const least = high => Math.min(high, ...items.flatMap(item => item[axis.column].filter(v => v > 0))) / 2;
+      for (const [low, high] of frame?.bands[axis.column] || []) shapes.push({ ...whole, type: "rect", [`${name}0`]: axis.axis.type === "log" ? Math.max(low, least(high)) : low, [`${name}1`]: high, line: { width: 0 }, fillcolor: css("--hair") });
+      for (const [at, words] of frame?.lines[axis.column] || []) {
+        shapes.push({ ...whole, type: "line", [`${name}0`]: at, [`${name}1`]: at, line: { width: 1, dash: "dash", color: css("--muted") } });
+        const place = name === "y" ? { xanchor: "right", yanchor: "bottom" } : { xanchor: "left", yanchor: "top", textangle: -90 };
+        if (words) annotations.push({ text: words, [`${other}ref`]: `${other}${tail} domain`, [`${name}ref`]: `${name}${tail}`, [other]: 1, [name]: log(axis, at), ...place, showarrow: false, font: { size: 12, color: css("--muted") } });
       }
     }
     for (const item of y === chart.y?.[0] ? items : []) for (const [k, words] of Object.entries(item.callouts || {})) {
@@ -126,7 +130,7 @@ springbench.chart = (() => {
       const here = items.filter(item => (item.panel ?? "") === panel && !hidden.has(item.label)), extra = marks(chart, here, x, y, tail);
       const frame = chart.frames?.[items.find(item => (item.panel ?? "") === panel).frame];
       if (frame?.x_label) layout[`xaxis${tail}`].title.text = frame.x_label;
-      if (frame?.x_names.length) layout[`xaxis${tail}`].categoryarray = frame.x_names;
+      for (const [name, axis] of [["x", x], ["y", y]]) if (frame?.place_names[axis.column]) layout[`${name}axis${tail}`].categoryarray = frame.place_names[axis.column];
       layout.shapes.push(...extra.shapes);
       layout.annotations.push(...extra.annotations);
       for (const item of here) {
