@@ -44,10 +44,10 @@ from springbench.harness.cli.shared_options import (
     ResultsOption,
     RowsOption,
     VerifyOption,
+    build_command_class,
     describe_config,
     require_output_file,
 )
-from springbench.harness.config.cli_options import build_command_class
 from springbench.harness.console import get_error_console, get_output_console, show_activity, split_wide_table
 from springbench.harness.console import print_message as _say
 from springbench.harness.errors import InputError, InputMistake

@@ -29,10 +29,6 @@ ROWS = (
 
 GIVEN = {
     (
-        "springbench.harness.config.cli_options",
-        "springbench.harness.cli.main",
-    ): "the options' wrapper calls the command",
-    (
         "springbench.harness.schema.config_document",
         "springbench.harness.scenes.vertex_selectors",
     ): "the models of what a document says check their fields",
