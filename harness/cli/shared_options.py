@@ -1,4 +1,4 @@
-"""Shared command-line options, options of runs from their model, and a command group that reports errors as messages."""
+"""Shared command-line options, options of runs from their model, and a command group that reports errors."""
 
 from __future__ import annotations
 

@@ -37,11 +37,11 @@ from springbench.harness.experiments.source_fingerprint import (
     load_solver_class,
 )
 from springbench.harness.experiments.sweep_plan import RunFiles
-from springbench.harness.recording.obstacle_properties import list_obstacles
 from springbench.harness.recording.recorder_interface import (
     FrameSamples,
     RecordedFrame,
     RecordingInfo,
+    list_obstacles,
 )
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.gradient_check import measure_gradient_errors
@@ -52,7 +52,7 @@ from springbench.harness.results.quantities import compute_ms_per_step
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.spring_stiffness import compute_modulus_exponent
-from springbench.harness.simulation import timing_rows
+from springbench.harness.simulation import timing_pass
 from springbench.harness.simulation.auto_tolerance import build_stop_rule
 from springbench.harness.simulation.device_stepping import build_device_columns as device_columns
 from springbench.harness.simulation.energy_balance import EnergyGrowth
@@ -153,7 +153,7 @@ def _run_passes(
         where = device_columns(measured.prepared)
     timing_session.finish_timing()
     by_frame, stands = _run_instrumentation_pass(run, files, scene, measured, settings, tick, positions)
-    rows = rows or timing_rows.build_timing_rows(measured)
+    rows = rows or timing_pass.build_timing_rows(measured)
     require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.rtol, float))
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.stats.items()}
     facts |= {
@@ -196,7 +196,7 @@ def _measure_rows(
     scene: Scene, solver: Solver, settings: SteppingSettings, tick: ProgressCallback
 ) -> tuple[RunMeasurement, list[dict[str, Any]]]:
     measured = measure_run(scene, solver, settings, tick)
-    return measured, timing_rows.build_timing_rows(measured)
+    return measured, timing_pass.build_timing_rows(measured)
 
 
 def _run_error_controlled(
@@ -295,7 +295,7 @@ def _run_instrumentation_pass(
             from springbench.harness.recording.recording_check import require_recorded_frames
 
             ended = {name: stands[name] for name in ("status", "reason")} if stands["status"] != "ok" else None
-            recorder.finish_recording(timing_rows.compute_milliseconds(measured, run.frames), ended)
+            recorder.finish_recording(timing_pass.compute_milliseconds(measured, run.frames), ended)
             due = {frame: scene.compute_time(frame) for frame in samples.frames}
             motion = samples.positions | {run.frames: measured.final_positions}
             found[run.frames]["recording_digest"] = require_recorded_frames(
