@@ -30,8 +30,8 @@ from springbench.harness.recording.recording_reader import (
     read_triangles,
 )
 from springbench.harness.recording.strain_scale import compute_strain_colours, widen_range
-from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.recording.viewer_blueprint import build_panels, build_plot, build_scene_view
+from springbench.harness.scenes.spring_strains import compute_strains
 
 _QUANTITIES = {
     "/residual/log10": "log10 residual [J^(1/2)]",

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.harness.recording.recorder_interface import RecordedFrame, RunRecorder
-from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.spring_strains import compute_strains
 from springbench.harness.simulation.energy_balance import (
     BLOW_UP_FACTOR,
     DissipationBudget,
