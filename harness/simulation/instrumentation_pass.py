@@ -107,7 +107,7 @@ def observe_run(
     positions_out: NDArray[np.float64] | None,
     sample_frame: Callable[[int, Positions], None] | None = None,
     verify_step: Callable[[SimulationStep], dict[str, Any]] | None,
-    tick: Callable[[], None],
+    tick: Callable[[str], None],
     clock: AbstractContextManager[None] = NO_CLOCK,
 ) -> dict[int, dict[str, Any]]:
     """Simulate a run's frames and return the solution columns of its rows by frame.
@@ -121,7 +121,7 @@ def observe_run(
       positions_out: output array for the positions after each step, (frames, n, 3) [m].
       sample_frame: called with each frame and its positions (n, 3) [m].
       verify_step: returns the accuracy columns of each step.
-      tick: called after each step.
+      tick: called with the name of the pass after each step.
       clock: context within which each step is computed.
 
     Raises:
@@ -168,7 +168,7 @@ def observe_run(
                 curve = trace_convergence(prepared, step.problem, norm, shown)
                 looked.result()
                 recorder.record_convergence(step.index, curve.residuals, curve.objective)
-            tick()
+            tick("second pass")
         if looked:
             looked.result()
     return found

@@ -27,7 +27,13 @@ from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.auto_tolerance import StopCriterion
 from springbench.harness.simulation.device_stepping import wrap_device_solver
 from springbench.harness.simulation.solver_contract import SolverContract
-from springbench.harness.simulation.stopwatch import PHASE_SUM_RTOL, PhaseWatch, Stopwatch, check_phases
+from springbench.harness.simulation.stopwatch import (
+    PHASE_SUM_RTOL,
+    PhaseWatch,
+    Stopwatch,
+    check_phases,
+    retry_on_mismatch,
+)
 from springbench.harness.simulation.time_loop import SimulationStep, build_initial_state, prepare, simulate_scene
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solver
 
@@ -238,6 +244,15 @@ def iterate_steps(
 def hash_positions(p: Positions) -> str:
     """Return the SHA-256 of positions (n, 3), to compare two passes bitwise."""
     return hashlib.sha256(np.ascontiguousarray(p).tobytes()).hexdigest()
+
+
+@retry_on_mismatch
+def measure_rows(
+    scene: Scene, solver: Solver, settings: SteppingSettings, tick: Callable[[str], None]
+) -> tuple[RunMeasurement, list[dict[str, Any]]]:
+    """Measure a run as `measure_run` does, and build its timing rows; once more where two clocks do not agree."""
+    measured = measure_run(scene, solver, settings, tick)
+    return measured, build_timing_rows(measured)
 
 
 def build_timing_rows(measured: RunMeasurement) -> list[dict[str, Any]]:
