@@ -168,7 +168,8 @@ def _describe_convergence(
     """Describe doubts about the reference, stale curves, early ends and other minima."""
     remarks = [
         f"{format_count(problem.vertices)} vertices, {problem.integrator}, dt {format_time_step(problem.time_step)}, "
-        f"k dt²/m = {format_quantity(problem.stiffness_ratio)}."
+        f"k dt²/m = {format_quantity(problem.stiffness_ratio)}, "
+        f"mean rest length {format_quantity(problem.mean_rest_length)} m."
     ]
     remarks += [f"Reference not certified: {problem.uncertified_reason}."] if problem.uncertified_reason else []
     by: dict[str, list[str]] = {}
