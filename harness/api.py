@@ -31,8 +31,12 @@ from springbench.harness.config.typed_keys import (
 )
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.recording.local_origin import compute_local_origin, store_relative
-from springbench.harness.recording.obstacle_properties import build_obstacles_property, list_obstacles
-from springbench.harness.recording.recorder_interface import INTERSECTION_FREE_PROPERTY, RecordingReplay
+from springbench.harness.recording.recorder_interface import (
+    INTERSECTION_FREE_PROPERTY,
+    RecordingReplay,
+    build_obstacles_property,
+    list_obstacles,
+)
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.scenes.effects.effect_interface import SceneEffect
 from springbench.harness.scenes.mesh.mesh import Mesh

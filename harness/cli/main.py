@@ -44,10 +44,10 @@ from springbench.harness.cli.shared_options import (
     ResultsOption,
     RowsOption,
     VerifyOption,
+    build_command_class,
     describe_config,
     require_output_file,
 )
-from springbench.harness.config.cli_options import build_command_class
 from springbench.harness.console import get_error_console, get_output_console, show_activity, split_wide_table
 from springbench.harness.console import print_message as _say
 from springbench.harness.errors import InputError, InputMistake
@@ -250,8 +250,8 @@ def report(
     from springbench.harness.experiments.stale_results import find_stale_runs_in_folder
     from springbench.harness.report.device_speedup_plot import draw_device_speedups
     from springbench.harness.report.robustness import build_score_table
-    from springbench.harness.report.robustness_map import draw_robustness_maps
     from springbench.harness.report.site import update_page
+    from springbench.harness.report.sweep_sheets import draw_hard_case_sheets
 
     show_activity("reading the rows")
     for picture, words in draw_device_speedups(results):
@@ -261,7 +261,7 @@ def report(
             _say(f"what a device saves is drawn in {picture}")
     show_activity("writing the page")
     page = update_page(results, with_recordings=True, with_viewer=viewer, print_message=_say)
-    for picture, cells in draw_robustness_maps(results, find_stale_runs_in_folder):
+    for picture, cells in draw_hard_case_sheets(results, find_stale_runs_in_folder):
         get_output_console().print(split_wide_table(build_score_table(cells)))
         _say(f"the map is {picture}")
     _say(f"the page is {page}; a browser opens it, and needs no network for it")

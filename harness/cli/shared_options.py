@@ -1,9 +1,10 @@
-"""Shared command-line options, and a command group that reports errors without a traceback."""
+"""Shared command-line options, options of runs from their model, and a command group that reports errors."""
 
 from __future__ import annotations
 
 import os
 import sys
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +15,8 @@ from springbench.harness.console import enable_logging, print_message
 from springbench.harness.errors import InputError, SpringbenchError
 from springbench.harness.execution.optional_parts import find_part
 from springbench.harness.results import remote_storage
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
 
 SCENE_HELP = "Scene (YAML), or scene of the assignment (JSON), or name of a shipped scene."
 
@@ -87,3 +89,52 @@ class ErrorReportingGroup(TyperGroup):
         except MemoryError as error:
             print_message("springbench: there is not enough memory for this; take a smaller mesh")
             raise typer.Exit(1) from error
+
+
+def build_command_class(*names: str) -> type[TyperCommand]:
+    """Build a command class that also accepts options of a run.
+
+    The values are parsed as in a file and passed in `obj` of the command's context.
+
+    Args:
+        names: options to add; all of them if empty.
+    """
+
+    class Taking(TyperCommand):
+        _added: tuple[str, ...] = ()
+
+        def get_params(self, ctx: Any) -> Any:
+            if not self._added:
+                options = _build_options(names)
+                self._added = tuple(option.name for option in options)
+                self.params = [*self.params, *options]
+            return super().get_params(ctx)
+
+        def invoke(self, ctx: Any) -> Any:
+            from springbench.harness.schema.yaml_loader import parse_scalar
+
+            given = {name: ctx.params.pop(name) for name in self._added}
+            ctx.obj = {name: parse_scalar(text) for name, text in given.items() if text is not None}
+            return super().invoke(ctx)
+
+    return Taking
+
+
+def _build_options(names: tuple[str, ...]) -> list[Any]:
+    """Build the options that Typer creates for a function with such parameters."""
+    from springbench.harness.config.run_options import RUN_OPTIONS, describe_option
+
+    def function() -> None: ...
+
+    given_options = {
+        name: typer.Option(help=f"For a scene: {describe_option(name)}", metavar="VALUE")
+        for name in names or RUN_OPTIONS
+    }
+    stated = [
+        Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[str | None, option])
+        for name, option in given_options.items()
+    ]
+    vars(function)["__signature__"] = Signature(stated)
+    app = typer.Typer(add_completion=False)
+    app.command()(function)
+    return list(get_command(app).params)

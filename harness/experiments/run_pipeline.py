@@ -37,11 +37,11 @@ from springbench.harness.experiments.source_fingerprint import (
     load_solver_class,
 )
 from springbench.harness.experiments.sweep_plan import RunFiles
-from springbench.harness.recording.obstacle_properties import list_obstacles
 from springbench.harness.recording.recorder_interface import (
     FrameSamples,
     RecordedFrame,
     RecordingInfo,
+    list_obstacles,
 )
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.gradient_check import measure_gradient_errors
@@ -52,19 +52,19 @@ from springbench.harness.results.quantities import compute_ms_per_step
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.spring_stiffness import compute_modulus_exponent
-from springbench.harness.simulation import timing_rows
 from springbench.harness.simulation.auto_tolerance import build_stop_rule
 from springbench.harness.simulation.device_stepping import build_device_columns as device_columns
 from springbench.harness.simulation.energy_balance import EnergyGrowth
 from springbench.harness.simulation.instrumentation_pass import observe_run, require_finite
-from springbench.harness.simulation.stopwatch import retry_on_mismatch
 from springbench.harness.simulation.time_loop import prepare
 from springbench.harness.simulation.timing_pass import (
     RunMeasurement,
     StepError,
     SteppingSettings,
+    build_timing_rows,
+    compute_milliseconds,
     hash_positions,
-    measure_run,
+    measure_rows,
     prepare_untimed,
 )
 from springbench.solvers.jit import source_digest
@@ -149,11 +149,11 @@ def _run_passes(
         if run.timing == "none":
             measured, rows = prepare_untimed(scene, _build_solver(run)), None
         else:
-            measured, rows = _measure_rows(scene, _build_solver(run), settings, tick)
+            measured, rows = measure_rows(scene, _build_solver(run), settings, tick)
         where = device_columns(measured.prepared)
     timing_session.finish_timing()
     by_frame, stands = _run_instrumentation_pass(run, files, scene, measured, settings, tick, positions)
-    rows = rows or timing_rows.build_timing_rows(measured)
+    rows = rows or build_timing_rows(measured)
     require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.rtol, float))
     facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.stats.items()}
     facts |= {
@@ -189,14 +189,6 @@ def _build_formula_check_columns(scene: Scene, frames: int) -> dict[str, str]:
         return {"status": "ok", "formula_check": check}
     reason = f"a gradient differs from the derivative of its energy's value: {', '.join(wrong)}"
     return {"status": "wrong-gradient", "formula_check": check, "reason": f"{reason}; mend `add_gradient` or `value`"}
-
-
-@retry_on_mismatch
-def _measure_rows(
-    scene: Scene, solver: Solver, settings: SteppingSettings, tick: ProgressCallback
-) -> tuple[RunMeasurement, list[dict[str, Any]]]:
-    measured = measure_run(scene, solver, settings, tick)
-    return measured, timing_rows.build_timing_rows(measured)
 
 
 def _run_error_controlled(
@@ -283,7 +275,7 @@ def _run_instrumentation_pass(
             positions_out=stored,
             sample_frame=samples.add_frame if recorder else None,
             verify_step=_build_verifier(run, scene),
-            tick=lambda: tick("second pass"),
+            tick=tick,
             clock=measured.clock,
         )
         if measured.final_positions is not None and found[run.frames]["positions_digest"] != hash_positions(
@@ -295,7 +287,7 @@ def _run_instrumentation_pass(
             from springbench.harness.recording.recording_check import require_recorded_frames
 
             ended = {name: stands[name] for name in ("status", "reason")} if stands["status"] != "ok" else None
-            recorder.finish_recording(timing_rows.compute_milliseconds(measured, run.frames), ended)
+            recorder.finish_recording(compute_milliseconds(measured, run.frames), ended)
             due = {frame: scene.compute_time(frame) for frame in samples.frames}
             motion = samples.positions | {run.frames: measured.final_positions}
             found[run.frames]["recording_digest"] = require_recorded_frames(
@@ -326,7 +318,7 @@ def _find_first_diverged_frame(
             convergence_frames=(),
             positions_out=None,
             verify_step=None,
-            tick=lambda: None,
+            tick=lambda name: None,
         )
     except StepError as earlier:
         return build_failure_columns(earlier, solver_files)
@@ -355,7 +347,7 @@ def _record_before_failure(run: RunSpec, files: RunFiles, failure_row: dict[str,
             convergence_frames=(),
             positions_out=None,
             verify_step=None,
-            tick=lambda: None,
+            tick=lambda name: None,
         )
         recorder.finish_recording({})
 

@@ -29,7 +29,6 @@ from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
 from springbench.harness.experiments.accuracy.method_recommendation import find_engine_integrator
-from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.reference.equations_of_motion import NotIntegrable
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import REFERENCE_MARGIN, ReferenceTrajectory
@@ -58,6 +57,7 @@ from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import MeshSource, SceneSpec
+from springbench.harness.scenes.spring_strains import compute_strains
 from springbench.harness.simulation.energy_balance import compute_kinetic_energy
 from springbench.harness.simulation.time_loop import build_initial_state, prepare, simulate_scene
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, StopRule, Unsupported, is_lagged

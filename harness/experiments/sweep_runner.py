@@ -131,7 +131,7 @@ def run_sweep(
             )
         from springbench.harness.report.sweep_pictures import PictureJob, draw_sweep_pictures
 
-        table = parquet_rows.read_rows((p.files.rows_path for p in planned), required_columns=REQUIRED_COLUMNS)
+        table = parquet_rows.read_rows([p.files.rows_path for p in planned], required_columns=REQUIRED_COLUMNS)
         pictured = [PictureJob(p.run, p.files.recording_path, p.files.picture_path) for p in planned]
         draw = partial(
             draw_sweep_pictures,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -14,6 +14,7 @@ from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.solvers.model.step_problem import Positions
 
 if TYPE_CHECKING:
+    from springbench.harness.scenes.effects.effect_interface import SceneEffect
     from springbench.harness.scenes.surface_obstacles import AnySurface
 
 
@@ -170,3 +171,21 @@ class RecordingReplay:
         `frame` is the index among the recorded frames, counted from 0. The origin is added to the stored positions.
         """
         return self.positions[frame] + self.origin
+
+
+OBSTACLES_PROPERTY = "obstacles"
+"""Property of a recording that declares its obstacles in JSON, in the format of scene files."""
+
+
+def list_obstacles(effects: Iterable[SceneEffect]) -> tuple[AnySurface, ...]:
+    """Return the obstacles of a scene's effects, to be drawn with the mesh."""
+    return tuple(one for effect in effects for one in getattr(effect, "obstacles", ()))
+
+
+def build_obstacles_property(obstacles: Sequence[AnySurface]) -> dict[str, str]:
+    """Return the property that declares these obstacles; empty where there are none."""
+    return (
+        {OBSTACLES_PROPERTY: f"[{', '.join(one.model_dump_json(exclude_none=True) for one in obstacles)}]"}
+        if obstacles
+        else {}
+    )

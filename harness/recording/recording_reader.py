@@ -17,7 +17,7 @@ from collections.abc import Collection, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pyarrow as pa
@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from rerun.chunk import Chunk, LazyStore, RrdReader
 from springbench.harness.atomic_files import explain_unreadable_file
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.recording import chunk_cells
-from springbench.harness.recording.chunk_cells import read_cell
 from springbench.harness.recording.local_origin import read_origin
 from springbench.harness.recording.recorder_interface import LAYOUT_VERSION, RecordingReplay
 from springbench.harness.recording.recording_integrity import mark_verified, require_intact, scan_messages
@@ -146,7 +144,7 @@ def summarise_recording(path: Path) -> RecordingSummary:
             entities.add(chunk.entity_path)
             batch = chunk.to_record_batch()
             for name in chunk.timeline_names:
-                values = chunk_cells.read_timeline(batch, name)
+                values = read_timeline(batch, name)
                 times.setdefault(name, []).extend((values.min(), values.max()))
         title, facts = read_properties(source)
         frames = {index for index, _, _ in iterate_positions(source)}
@@ -242,11 +240,11 @@ def iterate_positions(
     for chunk in source.iterate_chunks(content="/scene/mesh", components=_POSITION_COMPONENTS):
         batch = chunk.to_record_batch()
         (name,) = set(_POSITION_COMPONENTS) & set(batch.schema.names)
-        for k, index in enumerate(chunk_cells.read_timeline(batch, "frame")):
+        for k, index in enumerate(read_timeline(batch, "frame")):
             if frames is None or index in frames:
                 yield (
                     int(index),
-                    float(chunk_cells.read_timeline(batch, "time")[k]),
+                    float(read_timeline(batch, "time")[k]),
                     read_cell(batch, name, k).reshape(-1, 3),
                 )
 
@@ -264,7 +262,7 @@ def read_properties(source: RecordingSource) -> tuple[str, dict[str, Any]]:
     for chunk in source.iterate_chunks(content="/__properties/**"):
         batch = chunk.to_record_batch()
         values: dict[str, Any] = {
-            name: chunk_cells.get_scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
+            name: get_scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
         }
         if chunk.entity_path == "/__properties/run":
             facts |= values  # what changed at the end comes last
@@ -277,9 +275,9 @@ def _read_scalars(source: RecordingSource) -> pa.Table:
     for chunk in source.iterate_chunks(content="/**", components=[_SCALAR_COMPONENT]):
         batch = chunk.to_record_batch()
         known: dict[str, Any] = {
-            name: chunk_cells.read_timeline(batch, name) for name in chunk.timeline_names if name in SCALAR_SCHEMA.names
+            name: read_timeline(batch, name) for name in chunk.timeline_names if name in SCALAR_SCHEMA.names
         }
-        values = chunk_cells.get_column(batch, _SCALAR_COMPONENT).flatten()
+        values = get_column(batch, _SCALAR_COMPONENT).flatten()
         if chunk.entity_path.rpartition("/")[0].endswith("/convergence"):  # a value for each of the frames
             frames, times = read_convergence_frames(source, chunk.entity_path)
             known = {
@@ -329,3 +327,53 @@ def _resolve_frame(path: Path, frame: int, known: NDArray[np.int64]) -> int:
         return frame
     have = f"frames {known[0]} to {known[-1]} are" if len(known) else "no frame is"
     raise InputError(InputMistake(f"there is no frame {frame}; {have} recorded", file=path, key="frame"))
+
+
+# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
+# pyarrow's stubs do not state the column types of a schema.
+
+
+def read_cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
+    """Return all numbers of one row of a component as a flat array.
+
+    Args:
+      batch: chunk of a recording.
+      name: name of the component.
+      row: index of the row.
+    """
+    values = get_scalar(batch, name, row).values
+    while pa.types.is_nested(values.type):
+        values = values.flatten()
+    return values.to_numpy()
+
+
+def read_timeline(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
+    """Return a timeline of a batch: frames, iterations, or times [s]."""
+    found = get_column(batch, timeline)
+    counts: NDArray[np.int64] = found.cast(pa.int64()).to_numpy()
+    return counts / 1e9 if pa.types.is_duration(found.type) else counts
+
+
+def get_column(batch: pa.RecordBatch, name: str) -> Any:
+    """Return a column, untyped.
+
+    pyarrow's stubs do not type arrays that depend on the schema.
+    """
+    return cast(Any, batch[name])
+
+
+def get_scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:
+    """Return one row of a column."""
+    return get_column(batch, name)[row]
+
+
+def replace_cells(batch: pa.RecordBatch, name: str, rows: Sequence[NDArray[Any]]) -> pa.RecordBatch:
+    """Return the batch with the numbers of a component replaced row by row.
+
+    Args:
+      batch: chunk of a recording.
+      name: name of the component.
+      rows: new numbers of each row, flat.
+    """
+    at = batch.schema.get_field_index(name)
+    return batch.set_column(at, batch.schema.field(at), pa.array(rows, batch.schema.field(at).type))

@@ -38,7 +38,6 @@ from springbench.harness.recording import curve_drawing, viewer_blueprint
 from springbench.harness.recording.camera_view import ViewExtent
 from springbench.harness.recording.force_arrows import ForceArrows
 from springbench.harness.recording.local_origin import build_origin_property, compute_local_origin, store_relative
-from springbench.harness.recording.obstacle_properties import build_obstacles_property
 from springbench.harness.recording.obstacle_shapes import ObstacleRecorder
 from springbench.harness.recording.partial_file import PartialFile
 from springbench.harness.recording.recorder_interface import (
@@ -46,6 +45,7 @@ from springbench.harness.recording.recorder_interface import (
     LAYOUT_VERSION,
     RecordedFrame,
     RecordingInfo,
+    build_obstacles_property,
 )
 from springbench.harness.recording.strain_scale import PIN_COLOUR, widen_range
 from springbench.harness.recording.strain_shading import StrainShading

@@ -17,7 +17,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
-from springbench.harness.recording import chunk_cells, curve_drawing
+from springbench.harness.recording import curve_drawing, recording_reader
 from springbench.harness.recording.camera_view import ViewExtent
 from springbench.harness.recording.partial_file import PartialFile
 from springbench.harness.recording.recording_reader import (
@@ -30,8 +30,8 @@ from springbench.harness.recording.recording_reader import (
     read_triangles,
 )
 from springbench.harness.recording.strain_scale import compute_strain_colours, widen_range
-from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.recording.viewer_blueprint import build_panels, build_plot, build_scene_view
+from springbench.harness.scenes.spring_strains import compute_strains
 
 _QUANTITIES = {
     "/residual/log10": "log10 residual [J^(1/2)]",
@@ -139,7 +139,7 @@ class _SourceRun:
         if chunk.entity_path in _QUANTITIES:
             batch = chunk.to_record_batch()
             if "Scalars:scalars" in batch.schema.names:
-                values = chunk_cells.get_column(batch, "Scalars:scalars").flatten().to_numpy()
+                values = recording_reader.get_column(batch, "Scalars:scalars").flatten().to_numpy()
                 known = values[np.isfinite(values)]
                 low, high = self.ranges.get(chunk.entity_path, (np.inf, -np.inf))
                 self.ranges[chunk.entity_path] = float(known.min(initial=low)), float(known.max(initial=high))
@@ -149,8 +149,10 @@ class _SourceRun:
         batch = chunk.to_record_batch() if self._anew and chunk.entity_path in _STRAIN_ENTITIES else None
         for places, painted in _COLOURED_COMPONENTS if batch else ():
             if batch and {places, painted} <= set(batch.schema.names):
-                rows = [self._compute_colours(chunk_cells.read_cell(batch, places, k)) for k in range(batch.num_rows)]
-                (chunk,) = Chunk.from_record_batch(chunk_cells.replace_cells(batch, painted, rows))
+                rows = [
+                    self._compute_colours(recording_reader.read_cell(batch, places, k)) for k in range(batch.num_rows)
+                ]
+                (chunk,) = Chunk.from_record_batch(recording_reader.replace_cells(batch, painted, rows))
         return chunk
 
     def _compute_colours(self, places: NDArray[np.float32]) -> NDArray[np.uint32]:
@@ -186,7 +188,7 @@ def read_residuals(source: RecordingSource) -> dict[int, list[float]]:
     found: dict[int, list[float]] = {}
     for chunk in source.iterate_chunks(content="/convergence/residual", components=["Scalars:scalars"]):
         frames, _ = read_convergence_frames(source, "/convergence/residual")
-        values = chunk_cells.get_column(chunk.to_record_batch(), "Scalars:scalars").flatten().to_numpy()
+        values = recording_reader.get_column(chunk.to_record_batch(), "Scalars:scalars").flatten().to_numpy()
         for frame, of in zip(frames.tolist(), values.reshape(-1, len(frames)).T, strict=True):
             found[frame] = of[~np.isnan(of)].tolist()
     return found

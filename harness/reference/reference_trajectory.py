@@ -30,6 +30,17 @@ class UnpredictableMotion(RunFailed):
     """The reference would be as uncertain as the error to be measured."""
 
 
+def compute_position_error(p: Positions, reference: Positions, free_vertices: NDArray[np.int64]) -> float:
+    """Return |p - reference|_F [m] over the free vertices, the error by which methods are compared.
+
+    Args:
+      p: positions (n, 3) [m].
+      reference: positions of the reference (n, 3) [m].
+      free_vertices: indices of the vertices that count.
+    """
+    return float(np.linalg.norm((p - reference)[free_vertices]))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceTrajectory:
     """Reference motion at some times.
@@ -61,7 +72,7 @@ class ReferenceTrajectory:
 
     def measure_error(self, k: int, p: Positions) -> float:
         """Measure the error of p (n, 3) [m] at times[k], relative to the displacement."""
-        return float(np.linalg.norm((p - self.positions[k])[self.free_vertices])) / float(self.displacement[k])
+        return compute_position_error(p, self.positions[k], self.free_vertices) / float(self.displacement[k])
 
     def require_accuracy(self, error: float) -> None:
         """Raise UnpredictableMotion where a relative error could not be distinguished from the reference's own."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from springbench.harness.errors import RunFailed
 from springbench.harness.reference.exact_lengths import StationarityEvaluator
-from springbench.harness.simulation.delegating_solver import DelegatingSolver
+from springbench.harness.simulation.solver_contract import DelegatingSolver
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, Solver, StepProblem, StopRule
 from springbench.solvers.registry import find_solver_info, find_solver_name, is_minimiser
 

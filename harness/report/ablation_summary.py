@@ -16,6 +16,8 @@ import pyarrow as pa
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
+from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.results import row_store
 from springbench.harness.results.parquet_rows import read_rows as read_rows
 
 ResultRow = Mapping[str, Any]
@@ -32,6 +34,20 @@ OVERHEAD_CAPTION = (
 def read_ablation(path: Path) -> list[dict[str, Any]]:
     """Return the rows of an ablation file."""
     return read_rows([path], pa.schema([])).to_pylist()
+
+
+def read_ablations(folder: Path, kind: str) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of each ablation that has rows of a kind, by the name of its file.
+
+    Raises:
+        InputError: if there are none.
+    """
+    found = {path.stem: read_ablation(path) for path in row_store.list_units(folder / "ablation")}
+    found = {name: rows for name, rows in found.items() if select_kind(rows, kind)}
+    if not found:
+        command = "springbench ablate SCENE" + (" --all-solvers" if kind == "overhead" else "")
+        raise InputError(InputMistake(f"holds nothing of that kind; wanted the rows of `{command}`", folder))
+    return found
 
 
 def select_kind(rows: Sequence[ResultRow], kind: str) -> list[ResultRow]:

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
-from springbench.harness.recording.obstacle_properties import OBSTACLES_PROPERTY
-from springbench.harness.recording.recorder_interface import RecordingReplay
+from springbench.harness.recording.recorder_interface import OBSTACLES_PROPERTY, RecordingReplay
 from springbench.harness.report.drawable_frames import framed_vertex_mask
 
 if TYPE_CHECKING:  # a recording without obstacles imports none of them

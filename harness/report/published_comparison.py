@@ -17,7 +17,7 @@ from rich.table import Table
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.published_set import RUN_KEYS, PublishedStudy, open_study_folder
-from springbench.harness.results.time_ratios import MethodTimeRatio, compute_time_ratios
+from springbench.harness.results.time_ratios import MethodTimeRatio, compute_time_ratios, list_step_times
 
 _IterationMeans = dict[tuple[Any, ...], float]
 
@@ -76,8 +76,9 @@ def _compare_with_study(own: Sequence[Mapping[str, Any]], study: PublishedStudy)
     mine = [row for row in own if (row["scene"], row["size"]) in places and row["phase"] == "step"]
     ratios: dict[tuple[Any, ...], MethodTimeRatio] = {}
     if study.is_timed:
-        ratios = {_build_key(one): one for one in compute_time_ratios(published)}
-    own_ratios = {_build_key(one): one for one in compute_time_ratios(row for row in mine if row["timing"] != "none")}
+        ratios = {_build_key(one): one for one in compute_time_ratios(list_step_times(published))}
+    timed = list_step_times(row for row in mine if row["timing"] != "none")
+    own_ratios = {_build_key(one): one for one in compute_time_ratios(timed)}
     iterations, own_iterations = _average_iterations(published), _average_iterations(mine)
     lines: list[ComparedMethod] = []
     for key, count in own_iterations.items():
@@ -85,7 +86,7 @@ def _compare_with_study(own: Sequence[Mapping[str, Any]], study: PublishedStudy)
         if there and here and here.reference != there.reference:
             here = there = None
         reference = here.reference[0] if here else ""
-        interval = (there.low, there.high) if there else None
+        interval = there.accepted_interval if there else None
         scene, size, solver = key[:3]
         lines.append(
             ComparedMethod(
@@ -105,7 +106,7 @@ def _compare_with_study(own: Sequence[Mapping[str, Any]], study: PublishedStudy)
 
 
 def _build_key(one: MethodTimeRatio) -> tuple[Any, ...]:
-    return one.scene, one.size, *one.method
+    return *one.task, *one.method
 
 
 def _average_iterations(rows: Iterable[Mapping[str, Any]]) -> _IterationMeans:

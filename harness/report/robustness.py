@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import pyarrow as pa
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
@@ -97,10 +98,12 @@ RUN_OUTCOMES = (
     UNSUPPORTED,
 )
 
+MOTION_MARK = "\u2248"
+"""Mark of runs that are correct by another motion than the reference."""
 MAP_NOTE = (
     "Numbers: the largest final residual |Q\u207b\u00b9 grad g|_Q of a step, over its value at the start of the step "
     "(or round-off); for methods that do not minimise, the largest distance from a converged run, in percent of the "
-    "scene's size. \u2248: right, by other minima than the reference. Shares: of the cases that a solver supports."
+    "scene's size. Shares: of the cases that a solver supports."
 )
 
 _CONVERGED_REASONS = ("converged", "roundoff")
@@ -235,6 +238,12 @@ def _natural_sort_key(name: str) -> list[tuple[int, str]]:
     return [(len(part.lstrip("0")) if k % 2 else 0, part) for k, part in enumerate(re.split(r"([0-9]+)", name))]
 
 
+def has_verification(table: pa.Table) -> bool:
+    """Return whether any of these rows was verified."""
+    columns = [table[name] for name in ("stationarity", "reference_distance") if name in table.column_names]
+    return any(column.null_count < len(column) for column in columns)
+
+
 class RunVerdict(NamedTuple):
     """Outcome of a run, with its worst error and the kind of that error; see `VerifiedRun` for the others."""
 
@@ -353,11 +362,6 @@ def score_solvers(cells: Sequence[VerifiedRun]) -> list[SolverScore]:
 def format_share(share: float | None) -> str:
     """Format a share in percent; empty for None."""
     return "" if share is None else f"{share:.0%}"
-
-
-def format_cell(cell: VerifiedRun) -> str:
-    """Format the worst error of a run, marked if it is correct by another motion than the reference."""
-    return f"{cell.error_text} \u2248".lstrip() if cell.has_other_motion else cell.error_text
 
 
 def map_headline(cells: Sequence[VerifiedRun], name: str) -> str:

@@ -1,11 +1,11 @@
 # pyright: reportUnknownMemberType=false
 # Jinja2's and Matplotlib's stubs do not type most members.
-"""Page of a validation: a table in Markdown, and a picture of errors by refinement and of textile tests."""
+"""Page of a validation: tables in Markdown, and pictures of errors by refinement and of textile tests."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ LIMITS = """What springs cannot do:
 
 
 def write_validation_page(rows: Sequence[dict[str, Any]], solver: str, folder: Path) -> list[Path]:
-    """Write `validation.json`, `validation.md` and `validation.png` to a folder.
+    """Write `validation.json`, `validation.md`, and the pictures `closed-forms.png` and `fabrics.png` to a folder.
 
     Args:
         rows: rows of `springbench validate`.
@@ -43,20 +43,33 @@ def write_validation_page(rows: Sequence[dict[str, Any]], solver: str, folder: P
         folder: existing folder.
     Returns: the paths of the files.
     """
-    paths = [folder / f"validation.{suffix}" for suffix in ("json", "md", "png")]
+    paths = [folder / f"validation.{suffix}" for suffix in ("json", "md")]
     listed = [{key: value for key, value in row.items() if key not in ("positions", "triangles")} for row in rows]
     with atomic_write(paths[0]) as partial:
         partial.write_text(json.dumps({"solver": solver, "rows": listed}, indent=1) + "\n", encoding="utf-8")
     with atomic_write(paths[1]) as partial:
         partial.write_text(format_validation_page(rows, solver), encoding="utf-8")
-    with atomic_write(paths[2]) as partial:
-        draw_validation(rows, solver, partial)
+    for name, draw in _PICTURES.items():
+        if drawn := _select_drawn_rows(rows, name):
+            paths.append(folder / name)
+            with atomic_write(paths[-1]) as partial:
+                draw(drawn, solver, partial)
     return paths
+
+
+def _select_drawn_rows(rows: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
+    """Return the rows of a picture: what was simulated of the closed forms, or of the textile tests."""
+    return [row for row in rows if ("errors" if name == CLOSED_FORMS_PICTURE else "bending_length") in row]
 
 
 def format_validation_page(rows: Sequence[dict[str, Any]], solver: str) -> str:
     """Format the page as Markdown."""
-    lines = [f"# Validation of `{solver}`", "", "![Errors by refinement, and textile tests](validation.png)", ""]
+    lines = [f"# Validation of `{solver}`", ""]
+    for name, alt in (
+        (CLOSED_FORMS_PICTURE, "Errors by refinement"),
+        (FABRICS_PICTURE, "Textile tests in their bands"),
+    ):
+        lines += [f"![{alt}]({name})", ""] if _select_drawn_rows(rows, name) else []
     forms = [row for row in rows if row["kind"] == "closed form"]
     if forms:
         lines += [
@@ -103,23 +116,37 @@ def _format_test(row: dict[str, Any]) -> str:
     )
 
 
-def draw_validation(rows: Sequence[dict[str, Any]], solver: str, path: Path) -> None:
-    """Draw the errors of closed forms by refinement, and the textile tests in their bands, to a PNG."""
-    forms = [row for row in rows if "errors" in row]
-    tests = [row for row in rows if "bending_length" in row]
+def draw_closed_forms(forms: Sequence[dict[str, Any]], solver: str, path: Path) -> None:
+    """Draw the errors of closed forms by refinement to a PNG, PAGE_WIDTH pixels wide."""
     with plt.rc_context(PAGE_RC):
         figure = plt.figure(figsize=(PAGE_WIDTH / PAGE_DPI, PAGE_HEIGHT / PAGE_DPI), dpi=PAGE_DPI)
-        figure.text(0.025, 0.95, f"Validation of {solver}", fontsize=20, weight="bold", va="center")
         count = sum(row["verdict"] == "confirmed" for row in forms)
-        inside = sum(row["verdict"] == "in band" for row in tests)
-        said = [f"{count} of {len(forms)} closed forms confirmed"] if forms else []
-        said += [f"{inside} of {len(tests)} fabrics in all bands"] if tests else []
-        figure.text(0.025, 0.91, "   ·   ".join(said), color=MUTED_COLOUR, va="center", fontsize=11)
-        _draw_forms(figure, forms, 0.74 if tests else 0.99)
-        for k, key in enumerate(("bending_length", "drape_coefficient") if tests else ()):
-            _draw_bands(figure.add_axes((0.83, 0.545 - 0.425 * k, 0.15, 0.28)), tests, key)
+        title = f"{solver}: {count} of {len(forms)} closed forms are confirmed"
+        figure.text(0.025, 0.94, title, fontsize=20, weight="bold", va="center")
+        _draw_forms(figure, forms, 0.99)
         figure.savefig(path, format="png")
         plt.close(figure)
+
+
+def draw_fabrics(tests: Sequence[dict[str, Any]], solver: str, path: Path) -> None:
+    """Draw textile tests in their bands to a PNG that is read at the width of a column, 85 mm."""
+    bending, drape = (sum(is_in_band(row[key]) for row in tests) for key in ("bending_length", "drape_coefficient"))
+    title = f"{solver}: of {len(tests)} fabrics {bending} bending lengths\n"
+    title += f"and {drape} drape coefficients lie in their bands"
+    with plt.rc_context({**PAGE_RC, "font.size": 8.5}):
+        figure = plt.figure(figsize=(5.2, 1.25 + 0.22 * len(tests)), dpi=200, layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        _draw_bands(left, tests, "bending_length")
+        _draw_bands(right, tests, "drape_coefficient")
+        figure.suptitle(title, x=0.015, ha="left", fontsize=10.5, weight="bold", color=TEXT_COLOUR)
+        figure.supxlabel("bar: published band; point: simulated", x=0.015, ha="left", fontsize=7.5, color=MUTED_COLOUR)
+        figure.savefig(path, format="png")
+        plt.close(figure)
+
+
+def is_in_band(measured: Mapping[str, float]) -> bool:
+    """Return whether a measured value lies in its published band."""
+    return measured["low"] <= measured["value"] <= measured["high"]
 
 
 def _draw_forms(figure: Any, forms: Sequence[dict[str, Any]], right: float) -> None:
@@ -160,12 +187,15 @@ def _draw_bands(axes: Any, tests: Sequence[dict[str, Any]], key: str) -> None:
     factor, title = (1e3, "bending length [mm]") if key == "bending_length" else (1.0, "drape coefficient [%]")
     for k, row in enumerate(reversed(tests)):
         band = {name: factor * value for name, value in row[key].items()}
-        is_inside = band["low"] <= band["value"] <= band["high"]
-        axes.plot([band["low"], band["high"]], [k, k], color=RULE_COLOUR, linewidth=9, solid_capstyle="butt")
-        axes.plot(band["value"], k, "o", color=FASTER_COLOUR if is_inside else WARNING_COLOUR, markersize=7)
-    axes.set_yticks(range(len(tests)), [row["name"].removeprefix("fabric ") for row in reversed(tests)], fontsize=8)
+        axes.plot([band["low"], band["high"]], [k, k], color=RULE_COLOUR, linewidth=7, solid_capstyle="butt")
+        colour = FASTER_COLOUR if is_in_band(band) else WARNING_COLOUR
+        axes.plot(band["value"], k, "o" if is_in_band(band) else "D", color=colour, markersize=5)
+    axes.set_yticks(range(len(tests)), [row["name"].removeprefix("fabric ") for row in reversed(tests)])
     axes.set_ylim(-0.6, len(tests) - 0.4)
     axes.set_xlim(left=0.0)
-    axes.tick_params(labelsize=8)
-    axes.set_title(title, fontsize=10, loc="left", color=TEXT_COLOUR)
-    axes.set_xlabel("bar: published band; point: simulated", fontsize=8)
+    axes.set_xlabel(title)
+
+
+CLOSED_FORMS_PICTURE, FABRICS_PICTURE = "closed-forms.png", "fabrics.png"
+_PICTURES = {CLOSED_FORMS_PICTURE: draw_closed_forms, FABRICS_PICTURE: draw_fabrics}
+"""Function that draws each picture."""

@@ -1,7 +1,8 @@
 """Comparison of repeated runs with published ones: outcome, iterations, residuals, and ratios of times.
 
 Bitwise equal columns are `identical`. A run is `close` if its outcome is the same and its iterations and residuals are
-within the tolerances below. Anything else `differs`. Milliseconds are never compared.
+within the tolerances below. Anything else `differs`. Milliseconds are never compared. A ratio of times that the load of
+a machine disturbed is `undecided`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, NamedTuple
 
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.published_set import RUN_KEYS
-from springbench.harness.results.time_ratios import MethodTimeRatio
+from springbench.harness.results.time_ratios import MethodTimes, compute_time_ratios
 
 ITERATION_TOLERANCE, ITERATION_SLACK = 0.1, 3
 """Relative and absolute difference of a step's iterations: where the descent left is round-off, single ones change."""
@@ -37,6 +38,7 @@ class AgreementLevel(Enum):
 
     IDENTICAL = "identical"
     CLOSE = "within tolerance"
+    UNDECIDED = "undecided"
     DIFFERENT = "differs"
 
 
@@ -182,18 +184,28 @@ def _find_first_iteration(curve: Mapping[int, float], level: float) -> tuple[flo
     return math.inf, 0.0
 
 
-def compare_time_ratios(
-    published: Sequence[MethodTimeRatio], repeated: Sequence[MethodTimeRatio]
-) -> list[RunAgreement]:
-    """Compare ratios of times; those that one side lacks are omitted.
+def compare_time_ratios(published: Sequence[MethodTimes], repeated: Sequence[MethodTimes]) -> list[RunAgreement]:
+    """Compare the ratios of times of the methods that both sides have, to the same reference method.
 
-    A ratio is close within the published interval.
+    A ratio is close within the accepted interval of the published one. Outside it is undecided if the load of a machine
+    delayed one of its times, or if its own interval reaches into the accepted one.
     """
-    known = {(one.scene, one.size, one.method, one.reference): one for one in published}
+    common = {(one.task, one.method) for one in published} & {(one.task, one.method) for one in repeated}
+    before, after = (
+        {(one.task, one.method, one.reference): one for one in compute_time_ratios(side)}
+        for side in ([one for one in times if (one.task, one.method) in common] for times in (published, repeated))
+    )
     found: list[RunAgreement] = []
-    for new in repeated:
-        if old := known.get((new.scene, new.size, new.method, new.reference)):
-            level = AgreementLevel.CLOSE if old.low <= new.ratio <= old.high else AgreementLevel.DIFFERENT
-            why = f"{old.ratio:.3g} published, in [{old.low:.3g}, {old.high:.3g}]; here {new.ratio:.3g}"
+    for key, new in after.items():
+        if old := before.get(key):
+            low, high = old.accepted_interval
+            why = f"{old.ratio:.3g} published, in [{low:.3g}, {high:.3g}]; here {new.ratio:.3g}"
+            level = AgreementLevel.DIFFERENT
+            if low <= new.ratio <= high:
+                level = AgreementLevel.CLOSE
+            elif old.is_preempted or new.is_preempted:
+                level, why = AgreementLevel.UNDECIDED, f"{why}; other processes interrupted it"
+            elif new.low <= high and new.high >= low:
+                level, why = AgreementLevel.UNDECIDED, f"{why}, [{new.low:.3g}, {new.high:.3g}] over its rounds"
             found.append(RunAgreement(new.title, level, why))
     return found

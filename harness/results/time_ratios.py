@@ -1,8 +1,8 @@
-"""Ratios of times to a reference method on the same scene: what may be compared between machines.
+"""Ratios of times to a reference method on the same task: what may be compared between machines.
 
 A ratio has an interval. Of runs it is the 95 % interval over the steps (`bootstrap_statistics.estimate_slowdown`), of
-whole simulations the range over the rounds. Both are widened by OTHER_MACHINE_FACTOR, because another processor has
-other vector units and caches.
+accuracy studies the range over the rounds. Another machine may leave the interval by OTHER_MACHINE_FACTOR, because it
+has other vector units and caches.
 """
 
 from __future__ import annotations
@@ -24,76 +24,109 @@ REFERENCE_SOLVERS = ("numba", "sparse", "hybrid", "newton")
 MethodKey = tuple[Any, ...]
 
 
-class MethodTimeRatio(NamedTuple):
-    """Time of a method over that of the reference method, with the interval in which a repetition must lie.
+class MethodTimes(NamedTuple):
+    """Times of a method on a task.
 
     Attributes:
-        scene, size: the scene.
-        method: values of `published_set.RUN_KEYS` after scene and size.
-        reference: those of the reference method.
+        task: scene and size; in accuracy studies also what is solved, and to which error.
+        method: what differs between the methods of a task; the solver comes first.
+        seconds: times by step or by round [s], positive.
+        is_paired_by_step: whether they are times of steps; rounds otherwise.
+        is_preempted: whether the load of the machine delayed them.
     """
 
-    scene: str
-    size: int
+    task: tuple[Any, ...]
+    method: MethodKey
+    seconds: Mapping[int, float]
+    is_paired_by_step: bool = True
+    is_preempted: bool = False
+
+
+class MethodTimeRatio(NamedTuple):
+    """Time of a method over that of the reference method of the same task.
+
+    Attributes:
+        task, method: as in `MethodTimes`.
+        reference: the reference method.
+        ratio, low, high: the ratio and its interval, measured on one machine.
+        is_preempted: whether the load of the machine delayed one of the two.
+    """
+
+    task: tuple[Any, ...]
     method: MethodKey
     reference: MethodKey
     ratio: float
     low: float
     high: float
+    is_preempted: bool = False
+
+    @property
+    def accepted_interval(self) -> tuple[float, float]:
+        """Interval in which the ratio of another machine must lie."""
+        return self.low / OTHER_MACHINE_FACTOR, self.high * OTHER_MACHINE_FACTOR
 
     @property
     def title(self) -> str:
-        """Scene, size, solver and reference solver, for messages."""
-        return f"{self.scene} {self.size or ''}: {self.method[0]} over {self.reference[0]}"
+        """Task, solver and reference solver, for messages."""
+        return f"{' '.join(str(part) for part in self.task if part)}: {self.method[0]} over {self.reference[0]}"
 
 
-def compute_time_ratios(rows: Iterable[Mapping[str, Any]]) -> list[MethodTimeRatio]:
-    """Compute the ratio of each method of a scene and size to the reference method there.
+MAX_PREEMPTED_SHARE = 0.1
+"""Largest share of interrupted steps of a run whose times count; the median of the others is right with more."""
+
+
+def list_step_times(rows: Iterable[Mapping[str, Any]]) -> list[MethodTimes]:
+    """List the shortest time of each step, by the methods of each scene and size.
 
     Args:
-        rows: rows of timed runs, or rows of the kind `work` of accuracy studies.
+        rows: rows of timed runs.
     """
-    times: dict[tuple[str, int], dict[MethodKey, dict[int, float]]] = {}
+    steps: dict[tuple[tuple[Any, ...], MethodKey], dict[int, list[Mapping[str, Any]]]] = {}
     for row in rows:
-        method = tuple(row.get(name) for name in RUN_KEYS[2:])
-        steps = times.setdefault((row["scene"], row["size"]), {}).setdefault(method, {})
-        for key, seconds in _list_times(row):
-            steps[key] = min(seconds, steps.get(key, seconds))
+        seconds = row.get("seconds")
+        if row["phase"] == "step" and row["frame"] is not None and seconds is not None and 0.0 < seconds < math.inf:
+            key = (row["scene"], row["size"]), tuple(row.get(name) for name in RUN_KEYS[2:])
+            steps.setdefault(key, {}).setdefault(row["frame"], []).append(row)
+    found: list[MethodTimes] = []
+    for (task, method), frames in steps.items():
+        seconds = {frame: min(row["seconds"] for row in rounds) for frame, rounds in frames.items()}
+        preempted = [bool(row.get("preempted")) for rounds in frames.values() for row in rounds]
+        found.append(MethodTimes(task, method, seconds, True, sum(preempted) > MAX_PREEMPTED_SHARE * len(preempted)))
+    return found
+
+
+def compute_time_ratios(times: Iterable[MethodTimes]) -> list[MethodTimeRatio]:
+    """Compute the ratio of each method of a task to the reference method there."""
+    tasks: dict[tuple[Any, ...], list[MethodTimes]] = {}
+    for one in times:
+        tasks.setdefault(one.task, []).append(one)
     found: list[MethodTimeRatio] = []
-    for (scene, size), methods in times.items():
-        timed = {method: steps for method, steps in methods.items() if steps}
-        reference = _choose_reference(list(timed))
+    for methods in tasks.values():
+        reference = _choose_reference(methods)
         found += [
-            _build_ratio(scene, size, (method, steps), (reference, timed[reference]))
-            for method, steps in timed.items()
-            if reference is not None and method != reference and steps.keys() & timed[reference].keys()
+            _build_ratio(one, reference)
+            for one in methods
+            if one is not reference and one.seconds.keys() & reference.seconds.keys()
         ]
     return found
 
 
-def _list_times(row: Mapping[str, Any]) -> list[tuple[int, float]]:
-    """List the times of a row by step, or by round of a whole simulation [s]."""
-    found: list[tuple[int, float]] = []
-    if row.get("kind") == "work":
-        found = list(enumerate(row["seconds"] or ()))
-    elif row.get("phase") == "step" and row["frame"] is not None and row["seconds"] is not None:
-        found = [(row["frame"], row["seconds"])]
-    return [(key, seconds) for key, seconds in found if 0.0 < seconds < math.inf]
-
-
-def _choose_reference(methods: Sequence[MethodKey]) -> MethodKey | None:
+def _choose_reference(methods: Sequence[MethodTimes]) -> MethodTimes:
     for solver in REFERENCE_SOLVERS:
-        if own := [method for method in methods if method[0] == solver]:
-            return min(own, key=str)
-    return min(methods, key=str, default=None)
+        if own := [one for one in methods if one.method[0] == solver]:
+            return min(own, key=lambda one: str(one.method))
+    return min(methods, key=lambda one: str(one.method))
 
 
-def _build_ratio(
-    scene: str, size: int, ours: tuple[MethodKey, dict[int, float]], theirs: tuple[MethodKey, dict[int, float]]
-) -> MethodTimeRatio:
-    found = bootstrap_statistics.estimate_slowdown(ours[1], theirs[1])
-    if len(ours[1].keys() & theirs[1].keys()) < 2:
-        middle = median(ours[1].values()) / median(theirs[1].values())
+def _build_ratio(ours: MethodTimes, theirs: MethodTimes) -> MethodTimeRatio:
+    common = ours.seconds.keys() & theirs.seconds.keys()
+    ratios = [ours.seconds[k] / theirs.seconds[k] for k in common]
+    if len(common) < 2:
+        middle = median(ours.seconds.values()) / median(theirs.seconds.values())
         found = bootstrap_statistics.ConfidenceInterval(middle, middle, middle)
-    low, high = found.low / OTHER_MACHINE_FACTOR, found.high * OTHER_MACHINE_FACTOR
-    return MethodTimeRatio(scene, size, ours[0], theirs[0], found.estimate, low, high)
+    elif ours.is_paired_by_step:
+        found = bootstrap_statistics.estimate_slowdown(ours.seconds, theirs.seconds)
+    else:
+        found = bootstrap_statistics.ConfidenceInterval(median(ratios), min(ratios), max(ratios))
+    is_preempted = ours.is_preempted or theirs.is_preempted
+    return MethodTimeRatio(ours.task, ours.method, theirs.method, *found, is_preempted)

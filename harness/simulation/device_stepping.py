@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from springbench.harness.simulation.delegating_solver import DelegatingSolver
+from springbench.harness.simulation.solver_contract import DelegatingSolver
 from springbench.harness.simulation.time_loop import AlternatingSolver, SimulationStep
 from springbench.solvers.iteration.device_interface import PreparedDeviceSolver, SolveEvents
 from springbench.solvers.model.step_problem import PreparedSolver, Solution, StepProblem, StopRule

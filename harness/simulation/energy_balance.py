@@ -63,8 +63,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
-from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.spring_strains import compute_strains
 from springbench.harness.simulation.adaptive_stepping import interpolate_hermite
 from springbench.harness.simulation.step_stages import StageSequence
 from springbench.harness.simulation.time_loop import (

@@ -1,6 +1,7 @@
 """Instrumentation pass of a run: repeats the steps and computes the columns of the solution.
 
-A second thread processes each step while the solver computes the next one, at most one step behind.
+The convergence of a solve is traced independently of the solver. A second thread processes each step while the solver
+computes the next one, at most one step behind.
 """
 
 from __future__ import annotations
@@ -9,14 +10,16 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from springbench.harness.recording.recorder_interface import RecordedFrame, RunRecorder
-from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.scenes.scene_builder import Scene
-from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
+from springbench.harness.scenes.spring_strains import compute_strains
 from springbench.harness.simulation.energy_balance import (
     BLOW_UP_FACTOR,
     DissipationBudget,
@@ -35,7 +38,57 @@ from springbench.harness.simulation.timing_pass import (
 )
 from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact
 from springbench.solvers.model.energies.augmented_lagrangian import length_errors
-from springbench.solvers.model.step_problem import Positions, PreparedSolver
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, ProjectiveEnergy, StepProblem, System
+from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix, energy_norm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConvergenceTrace:
+    """Convergence of a solve at the iterates 1, 2, ...
+
+    Attributes:
+      residuals: |p - previous p|_Q [J^(1/2)] over the unpinned vertices.
+      objective: objective [J].
+    """
+
+    residuals: list[float]
+    objective: list[float]
+
+
+class EnergyNorm:
+    """Norm |e|_Q [J^(1/2)] over the unpinned vertices, with a Q that is assembled here."""
+
+    def __init__(self, system: System) -> None:
+        projective = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
+        self._Q: csr_array = assemble_system_matrix(system, projective)
+        self._pinned = system.pins.vertices
+
+    def __call__(self, e: Positions) -> float:
+        """Compute the norm of a displacement (n, 3) [m]."""
+        e = e.copy()
+        e[self._pinned] = 0.0
+        return energy_norm(self._Q, e)
+
+
+def trace_convergence(
+    prepared: PreparedSolver, problem: StepProblem, norm: EnergyNorm, iterations: int
+) -> ConvergenceTrace:
+    """Trace the convergence of a solve over a number of iterations.
+
+    Args:
+      prepared: prepared solver.
+      problem: step problem.
+      norm: norm of the residuals.
+      iterations: number of iterations.
+    """
+    residuals, objective = list[float](), list[float]()
+    previous = problem.initial_guess.copy()
+    for p in islice(prepared.iterates(problem), iterations):
+        residuals.append(norm(p - previous))
+        objective.append(problem.value(p))
+        previous[:] = p
+    return ConvergenceTrace(residuals, objective)
+
 
 _ENERGY_TERMS = ("springs", "inertia", "force", "pins")
 """Terms of the objective that have their own columns."""
@@ -54,7 +107,7 @@ def observe_run(
     positions_out: NDArray[np.float64] | None,
     sample_frame: Callable[[int, Positions], None] | None = None,
     verify_step: Callable[[SimulationStep], dict[str, Any]] | None,
-    tick: Callable[[], None],
+    tick: Callable[[str], None],
     clock: AbstractContextManager[None] = NO_CLOCK,
 ) -> dict[int, dict[str, Any]]:
     """Simulate a run's frames and return the solution columns of its rows by frame.
@@ -68,7 +121,7 @@ def observe_run(
       positions_out: output array for the positions after each step, (frames, n, 3) [m].
       sample_frame: called with each frame and its positions (n, 3) [m].
       verify_step: returns the accuracy columns of each step.
-      tick: called after each step.
+      tick: called with the name of the pass after each step.
       clock: context within which each step is computed.
 
     Raises:
@@ -115,7 +168,7 @@ def observe_run(
                 curve = trace_convergence(prepared, step.problem, norm, shown)
                 looked.result()
                 recorder.record_convergence(step.index, curve.residuals, curve.objective)
-            tick()
+            tick("second pass")
         if looked:
             looked.result()
     return found

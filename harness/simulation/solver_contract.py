@@ -1,4 +1,4 @@
-"""Check of a solver's contract: types of its results, and no writes to its inputs.
+"""Wrapper of prepared solvers, and the check of a solver's contract: types of results, and no writes to inputs.
 
 The check is outside of timed code. Error messages state the line of the solver that its author can correct, not the
 line of the harness that failed.
@@ -15,10 +15,52 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.errors import RunFailed
 from springbench.harness.execution.error_location import locate_error
-from springbench.harness.simulation.delegating_solver import DelegatingSolver
 from springbench.solvers.iteration.iterative_solver import IterativeSolver
 from springbench.solvers.jit import source_digest
-from springbench.solvers.model.step_problem import PreparedSolver, Solution, Solver, StepProblem, StopRule, System
+from springbench.solvers.model.step_problem import (
+    Positions,
+    PreparedSolver,
+    Solution,
+    Solver,
+    StepProblem,
+    StopRule,
+    System,
+)
+
+
+class DelegatingSolver:
+    """Delegates the members of a prepared solver, except `solve`, which subclasses define."""
+
+    def __init__(self, prepared: PreparedSolver) -> None:
+        self._prepared = prepared
+
+    @property
+    def description(self) -> str:
+        """The solver's description."""
+        return self._prepared.description
+
+    @property
+    def stats(self) -> dict[str, float]:
+        """The solver's statistics."""
+        return self._prepared.stats
+
+    @property
+    def has_inner_solves(self) -> bool:
+        """Whether the solver iterates within the frames that it integrates itself."""
+        return getattr(self._prepared, "has_inner_solves", False)
+
+    def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """Return the solver's iterates."""
+        return self._prepared.iterates(problem)
+
+    def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """Return the solver's phases of an iteration."""
+        return self._prepared.iteration_phases(problem)
+
+    def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """Return the solver's residual at p."""
+        return self._prepared.residual_at(problem, p)
+
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -1,19 +1,25 @@
-"""Wall times of a run: preparation, whole steps, and the local and global step separately.
+"""Wall times of a run, and their rows: preparation, whole steps, and the local and global step separately.
 
 The timed passes record nothing. They follow an untimed pass in which the phases of each frame are timed separately,
 next to an iteration of its solve. This pass warms up all code that the steps use. The timed passes then repeat the
 whole simulation `rounds` times. All times are checked by a second clock (`PhaseWatch`). Where times do not matter
 (`prepare_untimed`), only the instrumentation pass is run.
+
+Whether phases add up to an iteration is decided by medians over the frames: of the sum of the phases' own medians, and
+of an iteration of a whole solve measured next to them. They need not add up where steps are compiled as a whole, or
+where a phase of some microseconds is mostly call overhead.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from time import perf_counter
+from typing import Any
 
 import numba
 import numpy as np
@@ -21,7 +27,13 @@ from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.auto_tolerance import StopCriterion
 from springbench.harness.simulation.device_stepping import wrap_device_solver
 from springbench.harness.simulation.solver_contract import SolverContract
-from springbench.harness.simulation.stopwatch import PhaseWatch, Stopwatch, check_phases
+from springbench.harness.simulation.stopwatch import (
+    PHASE_SUM_RTOL,
+    PhaseWatch,
+    Stopwatch,
+    check_phases,
+    retry_on_mismatch,
+)
 from springbench.harness.simulation.time_loop import SimulationStep, build_initial_state, prepare, simulate_scene
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solver
 
@@ -232,3 +244,61 @@ def iterate_steps(
 def hash_positions(p: Positions) -> str:
     """Return the SHA-256 of positions (n, 3), to compare two passes bitwise."""
     return hashlib.sha256(np.ascontiguousarray(p).tobytes()).hexdigest()
+
+
+@retry_on_mismatch
+def measure_rows(
+    scene: Scene, solver: Solver, settings: SteppingSettings, tick: Callable[[str], None]
+) -> tuple[RunMeasurement, list[dict[str, Any]]]:
+    """Measure a run as `measure_run` does, and build its timing rows; once more where two clocks do not agree."""
+    measured = measure_run(scene, solver, settings, tick)
+    return measured, build_timing_rows(measured)
+
+
+def build_timing_rows(measured: RunMeasurement) -> list[dict[str, Any]]:
+    """Build the timing columns, one row for each time; raises ClockMismatch."""
+    groups: dict[tuple[str, int | None], list[TimingSample]] = defaultdict(list)
+    for timing in measured.timings:
+        groups[timing.phase, measured.get_round(timing)].append(timing)
+    adds_up, found = _check_phase_sums(measured.timings), list[dict[str, Any]]()
+    for (phase, _), timings in groups.items():
+        rows: list[dict[str, Any]] = [
+            {
+                "phase": phase,
+                "frame": t.frame,
+                "round": t.round,
+                "seconds": t.seconds,
+                "phases_consistent": adds_up.get(phase),
+            }
+            | t.device_columns
+            for t in timings
+        ]
+        watch = measured.watches[phase, measured.get_round(timings[0])]
+        seen = watch.build_columns(phase, (row["seconds"] * t.num_calls for row, t in zip(rows, timings, strict=True)))
+        found += [row | seen for row in rows]
+    return found
+
+
+def _check_phase_sums(timings: list[TimingSample]) -> dict[str, bool]:
+    """Check whether all phases together take as long as an iteration; empty without phases."""
+    by_frame: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for t in timings:
+        if t.frame is not None and t.phase != "step":
+            by_frame[t.phase][t.frame].append(t.seconds)
+    medians = {
+        phase: np.array([np.median(times) for _, times in sorted(frames.items())]) for phase, frames in by_frame.items()
+    }
+    if ITERATION_PHASE not in medians:
+        return {}
+    iteration = medians.pop(ITERATION_PHASE)
+    ratio = float(np.median(sum(medians.values()) / iteration))
+    return dict.fromkeys([*medians, ITERATION_PHASE], bool(abs(ratio - 1.0) <= PHASE_SUM_RTOL))
+
+
+def compute_milliseconds(measured: RunMeasurement, frames: int) -> dict[str, list[float]]:
+    """Compute the median over the rounds of each phase in each frame [ms]."""
+    by_phase: dict[str, list[list[float]]] = {}
+    for t in measured.timings:
+        if t.frame is not None:
+            by_phase.setdefault(t.phase, [[] for _ in range(frames)])[t.frame - 1].append(1e3 * t.seconds)
+    return {phase: [float(np.median(times)) for times in series] for phase, series in by_phase.items()}

@@ -11,7 +11,7 @@ the slope must decrease instead.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
-from springbench.solvers.iteration.idle_contact import IdleContactSolver
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.kernels.line_search_conditions import (
     ARMIJO_FRACTION,
@@ -29,7 +28,7 @@ from springbench.solvers.kernels.line_search_conditions import (
 from springbench.solvers.linalg.direct_solvers import DenseCholesky
 from springbench.solvers.linalg.solver_selection import build_linear_solver
 from springbench.solvers.model import system_matrix_assembly
-from springbench.solvers.model.step_problem import Positions, PreparedSolver, ProjectiveEnergy, StepProblem, System
+from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
@@ -234,12 +233,6 @@ class PreparedDescent(IterativeSolver):
     method: DescentMethod
     description: str
     stats: dict[str, float]
-
-    def skip_idle_contact(self) -> PreparedSolver:
-        """Return the method that ignores barrier energies where they vanish; itself without barrier energies."""
-        if not self.fixed_objective.has_barriers:
-            return self
-        return IdleContactSolver(self, replace(self, fixed_objective=self.fixed_objective.ignore_barriers()))
 
     @property
     def identifies_saddles(self) -> bool:

@@ -18,8 +18,8 @@ from itertools import islice
 from typing import Protocol
 
 import numpy as np
-from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size
-from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, StepProblem, StopRule
+from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size, without_barriers
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, StepProblem, StopRule, System
 
 
 class ResidualSolver(PreparedSolver, Protocol):
@@ -84,6 +84,21 @@ class IdleContactSolver:
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the phases of an iteration with contact."""
         return self.with_contact.iteration_phases(problem)
+
+
+def skip_idle_contact(
+    with_contact: ResidualSolver, system: System, prepare_contact_free: Callable[[], PreparedSolver]
+) -> PreparedSolver:
+    """Return the method that ignores barrier energies where they vanish; itself for a system without them.
+
+    Args:
+        with_contact: the method, prepared for the system.
+        system: the system.
+        prepare_contact_free: returns the method without barrier energies, which accepts the same problems.
+    """
+    if without_barriers(system) is system:
+        return with_contact
+    return IdleContactSolver(with_contact, prepare_contact_free())
 
 
 class _Certificate:

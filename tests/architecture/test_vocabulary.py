@@ -46,7 +46,7 @@ COMMANDS = _split_words(
 )
 """Commands of the command line."""
 REQUIRED = _split_words(
-    "invoke emit filter finalize codegen enable disable flush load store shuffle save again search "
+    "invoke emit filter finalize codegen enable disable flush load store shuffle save again "
     "dot3 cross3 subtract3 start stop refresh"
 )
 """Methods whose names a base class of a library prescribes, and operations of vector registers and of LLVM."""

@@ -29,19 +29,11 @@ ROWS = (
 
 GIVEN = {
     (
-        "springbench.harness.config.cli_options",
-        "springbench.harness.cli.main",
-    ): "the options' wrapper calls the command",
-    (
         "springbench.harness.schema.config_document",
         "springbench.harness.scenes.vertex_selectors",
     ): "the models of what a document says check their fields",
     ("springbench.harness.schema.config_document", "springbench.harness.scenes.scene_spec"): "the same",
     ("springbench.harness.schema.config_document", "springbench.harness.scenes.effects.springs_effect"): "the same",
-    (
-        "springbench.harness.results.parquet_rows",
-        "springbench.harness.experiments.sweep_runner",
-    ): "paths, one after the other",
     (
         "springbench.solvers.contact.lagged_friction",
         "springbench.harness.reference.residual_audit",
@@ -50,14 +42,6 @@ GIVEN = {
         "springbench.solvers.contact.lagged_friction",
         "springbench.harness.simulation.solver_contract",
     ): "a solver whose inputs are compared after it",
-    (
-        "springbench.harness.simulation.stopwatch",
-        "springbench.harness.experiments.run_pipeline",
-    ): "what is measured once more where clocks do not agree",
-    (
-        "springbench.harness.simulation.instrumentation_pass",
-        "springbench.harness.experiments.run_pipeline",
-    ): "who is told of each step",
 }
 """The calls that lead up, each to what was given on the way down."""
 

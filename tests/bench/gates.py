@@ -157,7 +157,7 @@ def record(scene: Scene, prepared: PreparedSolver, frames: int, path: Path) -> P
         convergence_frames=(),
         positions_out=stored,
         verify_step=None,
-        tick=lambda: None,
+        tick=lambda name: None,
     )
     recorder.finish_recording({})
     return stored[-1]

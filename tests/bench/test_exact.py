@@ -121,7 +121,7 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
     ("solver", "size", "iterations", "saved", "once"),
     [
         ("newton", 16, [6, 5, 5], 19, 0),
-        ("newton", 32, [8, 23, 11], 90, 0),
+        ("newton", 32, [8, 21, 11], 86, 0),
         ("hybrid", 16, [28, 18, 27], 4, 0),
         ("hybrid", 32, [18, 32, 27], 16, 21),
     ],

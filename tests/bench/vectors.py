@@ -206,9 +206,9 @@ def of_block() -> Iterator[Case]:
         block_multifrontal.factorise_blocks,
         given(block_cholesky, "factorise_blocks", newton),
         tiles,
-        (2,),
+        (3,),
     )
-    yield Case("solve", block_multifrontal.solve_blocks, given(block_cholesky, "solve_blocks", newton), tiles, (2,))
+    yield Case("solve", block_multifrontal.solve_blocks, given(block_cholesky, "solve_blocks", newton), tiles, (3,))
 
 
 def of_rows() -> Iterator[Case]:

@@ -15,19 +15,20 @@ import pytest
 from springbench.harness.cli.commands.recommend import parse_duration
 from springbench.harness.cli.main import main
 from springbench.harness.config.config_loader import load_config, load_scene
+from springbench.harness.config.shipped_configs import locate_config
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.experiments.accuracy import method_recommendation as module
 from springbench.harness.experiments.accuracy import work_precision
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
-from springbench.harness.experiments.accuracy.best_first import compute_setting_cost
 from springbench.harness.experiments.accuracy.method_recommendation import (
     MethodRecommendation,
     RecommendationGoal,
     StudyCandidates,
     recommend_method,
 )
+from springbench.harness.experiments.accuracy.setting_grid import compute_setting_cost
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.folder_ownership import claim_folder
@@ -94,6 +95,8 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
     assert found.best_method.work_spec.case.scene.time_step == cheapest["time_step"]
     assert found.checked_method.error == found.best_method.error  # the same simulation gives the same positions
     assert found.checked_method.seconds_per_simulated_second > 0.0
+    command = found.best_method.format_command(locate_config("net"))
+    assert command.startswith("springbench run net "), "the name of a shipped scene, not its path"
     slower = replace(
         found,
         checked_method=replace(

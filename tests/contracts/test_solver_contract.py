@@ -8,7 +8,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
+from springbench.harness.simulation.instrumentation_pass import EnergyNorm, trace_convergence
 from springbench.solvers.linalg.direct_solvers import SparseLU
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.local_global.reference_local_global import (

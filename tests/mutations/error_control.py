@@ -37,9 +37,9 @@ _TABLE = (
     ),
     (
         "control-fallback",
-        _SEARCH,
-        "if found.error_estimated <= self._max_error:",
-        "if found.error_estimated < 10.0 * self._max_error:",
+        "harness/experiments/best_first_search.py",
+        "answer.error <= max_error",
+        "answer.error < 10.0 * max_error",
         _FORMULAS,
     ),
     (

@@ -51,7 +51,7 @@ MEASURING = (
     ),
     Mutation(
         "rows-scaled",
-        "harness/simulation/timing_rows.py",
+        "harness/simulation/timing_pass.py",
         '"seconds": t.seconds,',
         '"seconds": t.seconds / 1000,',
         (_UNIT_MEASURE,),
@@ -155,7 +155,7 @@ MEASURING = (
         ("sparse", "other colours"),
     ),
     Mutation(
-        "times-in-microseconds", "harness/recording/chunk_cells.py", "counts / 1e9", "counts / 1e6", (_RECORDINGS,)
+        "times-in-microseconds", "harness/recording/recording_reader.py", "counts / 1e9", "counts / 1e6", (_RECORDINGS,)
     ),
     Mutation(
         "recording-not-compared",

@@ -42,8 +42,8 @@ _TABLE = (
     (
         "repeated-ratio-of-one-side",
         _COMPARISON,
-        "if old.low <= new.ratio <= old.high",
-        "if old.low <= new.ratio",
+        "if low <= new.ratio <= high:",
+        "if low <= new.ratio:",
         f"{_TESTS}::test_a_ratio_agrees_within_the_published_interval",
     ),
     (

@@ -21,7 +21,7 @@ from springbench.harness.experiments.accuracy.convergence_curves import (
 from springbench.harness.experiments.accuracy.step_scales import compute_vertex_distances
 from springbench.harness.reference.certified_minimum import refine_minimum
 from springbench.harness.reference.reference_evaluator import ReferenceEvaluator, StationarityReading
-from springbench.harness.simulation.convergence_trace import EnergyNorm
+from springbench.harness.simulation.instrumentation_pass import EnergyNorm
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.step_problem import Positions, StepProblem

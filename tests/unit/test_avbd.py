@@ -20,7 +20,7 @@ from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.mesh.grid_mesh import NetMesh
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.simulation.delegating_solver import DelegatingSolver
+from springbench.harness.simulation.solver_contract import DelegatingSolver
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers import registry
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 from springbench.harness.config.accuracy_config import BenchmarkCase, MeasurementSettings, WorkSpec
 from springbench.harness.config.sweep_config import SolverSpec
-from springbench.harness.experiments.accuracy.best_first import LEAST_LIMIT, OUT_OF_TIME, SLOWER, search
+from springbench.harness.experiments.accuracy.setting_grid import LEAST_LIMIT, SLOWER, search_grid
+from springbench.harness.experiments.best_first_search import OUT_OF_TIME
 
 STEPS, TOLERANCES, SOLVERS = (0.4, 0.2, 0.1, 0.05, 0.025), (1e-1, 1e-2, 1e-3), ("a", "b", "c", "d", "e")
 
@@ -76,12 +77,12 @@ def test_the_choice_is_that_of_a_full_search():
     for seed in range(200):
         rows = table(seed)
         measure = Measured(rows)
-        omitted = search(specs(), 1e-2, inf, measure, 60.0)
+        omitted = search_grid(specs(), 1e-2, inf, measure, 60.0)
         assert measure.best(1e-2) == cheapest(rows, 1e-2), seed
         assert omitted.is_complete
-        assert omitted.measured == len(measure.found) == omitted.settings - sum(omitted.reasons.values())
+        assert omitted.num_trials == len(measure.found) == len(specs()) - sum(omitted.reasons.values())
         none += cheapest(rows, 1e-2) is None
-        measured += omitted.measured
+        measured += omitted.num_trials
     assert none < 50
     assert measured < 0.5 * 200 * len(specs())
 
@@ -89,7 +90,7 @@ def test_the_choice_is_that_of_a_full_search():
 def test_one_known_to_be_cheap_leaves_out_the_methods_that_are_slower_at_once():
     rows = {key(one): {"status": "ok", "error": 1.0, "seconds_per_simulated_second": 10.0} for one in specs()}
     measure = Measured(rows)
-    omitted = search(specs(), 1e-2, 1.0, measure, 60.0)
+    omitted = search_grid(specs(), 1e-2, 1.0, measure, 60.0)
     assert set(measure.found) == {(solver, 0.4, 0.1) for solver in SOLVERS}
     assert all(row["status"] == "time-limit" for row in measure.found.values())
     assert "take 1.5 times as long" in str(omitted)
@@ -99,7 +100,7 @@ def test_an_error_too_small_to_measure_meets_the_target_and_limits_the_others():
     exact = {"status": "uncertified", "error": None, "seconds_per_simulated_second": 1.0}
     slow = {"status": "ok", "error": 1.0, "seconds_per_simulated_second": 10.0}
     measure = Measured({key(one): exact if one.solver.name == "a" else slow for one in specs()})
-    search(specs(), 1e-2, inf, measure, 60.0)
+    search_grid(specs(), 1e-2, inf, measure, 60.0)
     assert {at[2] for at in measure.found if at[0] == "a"} == {0.1}, "smaller tolerances are left out"
     assert {at for at in measure.found if at[0] != "a"} == {(solver, 0.4, 0.1) for solver in SOLVERS[1:]}
 
@@ -112,14 +113,14 @@ def test_a_simulation_may_take_little_more_than_the_best(best: float, limit: flo
         given.append(spec.measurement.time_limit)
         return {"status": "unsupported"}
 
-    omitted = search(specs(), 1e-2, best, measure, 60.0)
+    omitted = search_grid(specs(), 1e-2, best, measure, 60.0)
     assert given == [limit] * len(SOLVERS)
     assert omitted.reasons == {"the solver does not support it": len(specs()) - len(SOLVERS)}
 
 
 def test_after_its_search_time_nothing_begins():
-    omitted = search(specs(), 1e-2, inf, Measured(table(0)), -1.0)
-    assert (omitted.measured, omitted.is_complete) == (0, False)
+    omitted = search_grid(specs(), 1e-2, inf, Measured(table(0)), -1.0)
+    assert (omitted.num_trials, omitted.is_complete) == (0, False)
     assert omitted.reasons == {OUT_OF_TIME: len(specs())}
 
 
@@ -137,6 +138,6 @@ def test_within_a_cost_the_choice_is_near_the_least_error_in_hindsight():
             return min((row["error"] for row in within), default=inf)
 
         measure = Measured(rows)
-        search(specs(), 0.0, 2.0 * limit / SLOWER, measure, 60.0)
+        search_grid(specs(), 0.0, 2.0 * limit / SLOWER, measure, 60.0)
         ratios.append(find_least(measure.found) / find_least(rows))
     assert max(ratios) <= 1.3

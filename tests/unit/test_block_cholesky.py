@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, coo_array, csr_array, diags_array
 from scipy.sparse.linalg import spsolve
+from springbench.harness.execution.machine_info import limit_threads
+from springbench.solvers.linalg.cholesky import block_cholesky
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 
 from tests.network_matrices import grid_springs
@@ -115,3 +118,42 @@ def test_the_count_of_entries_is_that_of_a_factor_in_blocks(A):
     factor = BlockCholesky(graph_of(A))
     # At least the lower triangle of the matrix, at most a full one.
     assert (9 * (len(A.indices) + n) // 2 - 3 * n) <= factor.nonzeros <= 3 * n * (3 * n + 1) // 2
+
+
+@pytest.fixture
+def always_by_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads share even small factorisations."""
+    monkeypatch.setattr(block_cholesky, "_MIN_THREADED_FLOPS", 0.0)
+
+
+def by_threads(A: bsr_array, values: NDArray[np.float64]) -> list[tuple[NDArray[np.float64] | None, float, bytes]]:
+    """The solution, the counted factorisations and another solve, for each number of threads."""
+    b, found = np.random.default_rng(3).normal(size=(len(A.indptr) - 1, 3)), []
+    for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):  # type: ignore[attr-defined]
+        with limit_threads(threads):
+            factor = BlockCholesky(graph_of(A))
+            x = factor.factorise_and_solve(values, b)
+            again = b if x is None else factor.solve(b)
+        found.append((x, factor.num_factorisations, again.tobytes()))
+    return found
+
+
+@pytest.mark.usefixtures("always_by_threads")
+@matrices
+def test_the_bits_do_not_depend_on_threads(A):
+    (first, *_), *others = by_threads(A, entries(A))
+    for x, _, again in others:
+        assert x is not None
+        assert first.tobytes() == x.tobytes() == again
+
+
+@pytest.mark.usefixtures("always_by_threads")
+@pytest.mark.parametrize("part", [0.0, 0.3, 0.7, 1.0])
+def test_what_a_failure_counts_does_not_depend_on_threads(part):
+    A = MATRICES["a sheet"]
+    values, rows = entries(A), np.repeat(np.arange(400), np.diff(A.indptr))
+    vertices = [int(part * 399), 200]  # whichever is eliminated first
+    values[(A.indices == rows) & np.isin(rows, vertices), 0, 0] *= -1.0
+    (x, count, _), *others = by_threads(A, values)
+    assert x is None
+    assert {count} == {count for _, count, _ in others}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
+from springbench.harness.report.ablation_summary import read_ablations
 from springbench.harness.report.accuracy.accuracy_data import AccuracyData
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy_report import draw_accuracy_report
+from springbench.harness.report.charts.ablation_charts import build_overhead_chart
 from springbench.harness.report.charts.accuracy_charts import build_convergence_chart
 from springbench.harness.report.charts.chart_description import (
     ChartAxis,
@@ -23,7 +26,16 @@ from springbench.harness.report.charts.chart_description import (
     select_curve_plots,
 )
 from springbench.harness.report.charts.chart_table import CHART_NAMES, build_accuracy_chart, build_compared_chart
-from springbench.harness.report.charts.figure_panels import AxisScale
+from springbench.harness.report.charts.figure_panels import (
+    AxisScale,
+    CellMap,
+    CellOutcome,
+    MapCell,
+    MarkedValue,
+    ShadedBand,
+    describe_stale_cells,
+    merge_cell_maps,
+)
 from springbench.harness.report.charts.published_curves import PUBLISHED_LABEL
 from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.figures.figure_layout import compose_figure
@@ -34,6 +46,7 @@ from springbench.harness.results import row_store
 from springbench.harness.results.published_set import STUDY_FILE, TABLE_FILES
 
 from tests import synthetic_accuracy_rows as made
+from tests import synthetic_results
 
 STYLE = SeriesStyle("#123456", "o")
 
@@ -143,6 +156,46 @@ def test_a_band_and_notes_belong_to_their_frame_on_the_page(table: AccuracyData)
     assert all(set(bands) == {"gap"} for bands in shaded)
 
 
+def test_a_map_on_the_page_has_the_cells_of_the_figure(tmp_path: Path) -> None:
+    rows = read_ablations(synthetic_results.write_ablation_results(tmp_path), "overhead")["cloth"]
+    chart = build_overhead_chart(rows)
+    (shown,), (drawn,) = serialise_chart(chart)["maps"], chart.maps
+    assert [cell[:2] for cell in shown["cells"]] == [[cell.row, cell.column] for cell in drawn.cells]
+    classes = [shown["outcomes"][cell[2]] for cell in shown["cells"]]
+    assert [(one["label"], one["color"]) for one in classes] == [(cell.outcome, cell.color) for cell in drawn.cells]
+    assert [cell[3] for cell in shown["cells"]] == [row["value_text"] for row in drawn.csv_rows()]
+
+
+def test_names_on_the_page_are_those_of_their_frame(tmp_path: Path) -> None:
+    rows = read_ablations(synthetic_results.write_ablation_results(tmp_path), "overhead")["cloth"]
+    page = serialise_chart(build_overhead_chart(rows))
+    assert page["items"][0]["effect"] == [*reversed(synthetic_results.EFFECT_NAMES)], "the most expensive first"
+    assert page["frames"][0]["place_names"] == {"effect": page["items"][0]["effect"]}
+
+
+def test_maps_with_the_same_columns_become_one() -> None:
+    def build_map(title: str, column: str, is_stale: bool) -> CellMap:
+        cells = [MapCell("row", column, "good", "#123456", "1", is_stale)]
+        notes = ["read it so", *describe_stale_cells(cells)]
+        return CellMap(("map",), (title,), "", title, cells, [CellOutcome("good", "#123456")], notes)
+
+    merged = merge_cell_maps([build_map("a", "x", True), build_map("b", "x", False), build_map("c", "y", False)])
+    assert [one.row_names for one in merged] == [["a: row", "b: row"], ["row"]]
+    assert merged[0].notes == ["read it so", "Dot: measured by other code than today's."]
+    assert merged[0].name == ("a", "b")
+
+
+def test_a_marked_value_of_x_is_an_upright_line() -> None:
+    chart = build_small_chart((10.0, 20.0))
+    bands, lines = {"n": [ShadedBand(0.0, 12.0, "small")]}, {"n": [MarkedValue(30.0, "m")]}
+    frame = replace(chart.frames[0], bands=bands, lines=lines)
+    (plot,) = select_curve_plots(replace(chart, frames=[frame]))
+    ax = compose_figure([plot], "", FigureOptions()).axes[0]
+    assert [30.0, 30.0] in [np.asarray(line.get_xdata()).tolist() for line in ax.lines]
+    assert ax.get_xlim()[1] > 30.0
+    assert serialise_chart(replace(chart, frames=[frame]))["frames"][0]["lines"] == {"n": [[30.0, "m"]]}
+
+
 def build_small_chart(sizes: tuple[float, ...]) -> ChartDescription:
     """Two solvers whose times have intervals, at these sizes."""
     series = [
@@ -192,7 +245,7 @@ def test_every_sheet_is_there_in_both_formats_and_nothing_half_written(tmp_path:
     files = draw_accuracy_report(made.write_accuracy_rows(tmp_path, [*made.build_work_rows("net", 6)]))
     pictures = [path for path in files if path.suffix == ".png"]
     stems = [path.relative_to(tmp_path / "report").with_suffix("").as_posix() for path in pictures]
-    assert stems == ["work/net-6"]
+    assert stems == ["work/net-6", "winners"]
     assert [path.with_suffix(".svg") for path in pictures] == [path for path in files if path.suffix == ".svg"]
     assert not list(tmp_path.rglob(".*")), "no partial file is left"
     for path in pictures:

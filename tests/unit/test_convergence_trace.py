@@ -7,7 +7,7 @@ from itertools import islice, pairwise
 
 import numpy as np
 import pytest
-from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
+from springbench.harness.simulation.instrumentation_pass import EnergyNorm, trace_convergence
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.local_global.prefactored import require_only_springs
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal

@@ -194,11 +194,12 @@ def test_without_a_title_its_words_and_the_origin_are_left_to_the_caption(result
 def test_a_gate_s_level_has_a_gap_where_it_changed(results: dict[str, Path]) -> None:
     figure, (panel,) = compose_kind("history", results["history"], FigureOptions())
     assert panel.subject == "test_step[cloth]", "the one that changed most"
-    stored, level = panel.series
+    stored, level, slower = panel.series
     assert len(stored.x) == 30
     known = np.isfinite(level.y)
     assert known.tolist() == [True, True, False] * 2
     assert level.y[3] / level.y[0] == pytest.approx(1.05, rel=0.01)
+    assert (slower.x.tolist(), slower.y.tolist()) == ([18.0], [level.y[3]])
     said = " ".join(text.get_text() for text in visible_texts(figure))
     assert re.search(r"Changed by \+[456]\.\d % at 00000", said)
     assert not figure_kinds.find_figure_kind("history").list_panels(results["timing"], lambda _: ())

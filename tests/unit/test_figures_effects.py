@@ -52,7 +52,7 @@ def test_the_dearest_effect_stands_first_all_last_and_round_off_of_one_is_no_pri
     values = {(cell.row, cell.column): (cell.outcome, cell.value_text, cell.is_stale) for cell in grid.cells}
     assert list(dict.fromkeys(cell.row for cell in grid.cells)) == ["gas", "bending", "wind", "all"]
     assert values["gas", "numba"] == ("2 to 3", "2.40", False)
-    assert values["wind", "numba"] == ("cannot be told from 1", "1.05", False)
+    assert values["wind", "numba"] == ("not distinguishable from 1", "1.05", False)
     assert values["bending", "dense"] == ("unsupported", "–", True)
     said = " ".join(text.get_text() for text in visible_texts(figure))
     assert "Dot: measured by other code than today's." in said

@@ -6,15 +6,15 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from rich.console import Console
+from springbench.harness.report.charts.speed_chart import build_speed_chart
+from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.figures.figure_layout import visible_texts
 from springbench.harness.report.figures.figure_options import FigureOptions
-from springbench.harness.report.plot_style import BACKGROUND_COLOUR, STALE_NOTE, assign_solver_styles
-from springbench.harness.report.speed import size_plot
+from springbench.harness.report.plot_style import STALE_NOTE, assign_solver_styles
 from springbench.harness.report.speed.speed_figures import compute_speed_figures as speed_figures
-from springbench.harness.report.speed.speed_plots import draw_speed_plots
 from springbench.harness.report.speed.speed_table import build_speed_table
 from springbench.harness.results import parquet_rows as base_rows
 from springbench.harness.results import row_store
@@ -79,17 +79,10 @@ def test_and_in_those_of_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     _, (panel,) = compose_kind("speed", folder, FigureOptions())
     assert {row["series"] for row in panel.csv_rows() if row["is_stale"]} == {"numba supernodal"}
     found = speed_figures(base_rows.read_rows(row_store.list_units(folder / "rows")))
-    pages: list[Figure] = []
-    monkeypatch.setattr(size_plot, "save_page", lambda page, path: pages.append(page))
-    draw_speed_plots(found, tmp_path)
-    drawn = [page for page in pages if page.axes[0].lines]
-    assert len(drawn) == 4, "the part of the limit is not known"
-    for page in drawn:
-        hollow = {
-            line.get_linestyle() for line in page.axes[0].lines if line.get_markerfacecolor() == BACKGROUND_COLOUR
-        }
-        assert hollow == {"None"}, "marks on top of their line"
-        assert STALE_NOTE in "\n".join(text.get_text() for text in page.texts)
+    chart = build_speed_chart(found)
+    assert STALE_NOTE in chart.frames[0].notes
+    assert {series.label for series in chart.frames[0].series if any(np.asarray(series.stale))} == {"numba supernodal"}
+    assert [path.name for path in draw_chart_sheets(chart, tmp_path / "speed")] == ["speed.png", "speed.svg"]
     table = Console(width=400, record=True, file=io.StringIO())
     table.print(build_speed_table(found))
     marked = [line for line in table.export_text().splitlines() if "by other code" in line]

@@ -15,8 +15,7 @@ import pytest
 import pyvista as pv
 from rich.console import Console
 from springbench.harness.errors import InputError, RunFailed
-from springbench.harness.recording.chunk_cells import read_cell
-from springbench.harness.recording.recording_reader import open_recording_source, read_replay
+from springbench.harness.recording.recording_reader import open_recording_source, read_cell, read_replay
 from springbench.harness.recording.side_by_side import LineStyle, write_side_by_side
 from springbench.harness.report import recording_inspection as module
 from springbench.harness.report.recording_inspection import find_recordings, inspect_recordings, view_recordings

@@ -17,7 +17,7 @@ import pytest
 from springbench.harness.errors import RunFailed
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
-from springbench.harness.simulation import timing_rows
+from springbench.harness.simulation import timing_pass
 from springbench.harness.simulation.stopwatch import PhaseWatch
 from springbench.harness.simulation.timing_pass import (
     ITERATION_PHASE,
@@ -134,14 +134,14 @@ def test_every_time_lies_within_what_its_watch_saw(seen):
 
 def test_rows_tell_both_clocks_and_that_a_solver_which_sleeps_was_interrupted(seen):
     _, measured, _ = seen
-    for row in timing_rows.build_timing_rows(measured):
+    for row in timing_pass.build_timing_rows(measured):
         assert row["wall_seconds_sum"] <= row["wall_seconds_check"] * (1 + 5e-4)
         assert row["cpu_seconds"] < row["wall_seconds_check"]
         assert row["preempted"]
     by_round = [
         {
             r["wall_seconds_sum"]
-            for r in timing_rows.build_timing_rows(measured)
+            for r in timing_pass.build_timing_rows(measured)
             if r["round"] == k and r["phase"] == "step"
         }
         for k in (0, 1)
@@ -167,7 +167,7 @@ def test_no_row_is_made_of_times_that_are_scaled(seen, phase: str):
         for key, watch in measured.watches.items()
     }
     with pytest.raises(RunFailed, match=f"the times of {phase} add up to"):
-        timing_rows.build_timing_rows(RunMeasurement(measured.prepared, scaled, busy, measured.final_positions))
+        timing_pass.build_timing_rows(RunMeasurement(measured.prepared, scaled, busy, measured.final_positions))
 
 
 PARTS = {
@@ -195,6 +195,6 @@ def test_rows_say_whether_phases_add_up_to_an_iteration(phases: dict[str, float]
         watch.wall_seconds = watch.process_seconds = watch.thread_seconds = watch.wall_seconds + t.seconds * t.num_calls
     found = {
         row["phase"]: row["phases_consistent"]
-        for row in timing_rows.build_timing_rows(RunMeasurement(Sleeper(), timings, watches, np.zeros((4, 3))))
+        for row in timing_pass.build_timing_rows(RunMeasurement(Sleeper(), timings, watches, np.zeros((4, 3))))
     }
     assert found == {"step": None, ITERATION_PHASE: expected} | dict.fromkeys(phases, expected)

@@ -203,6 +203,11 @@ def test_a_forged_column_does_not_hold(kind: str, repeated: tuple[list[Published
     assert any(re.search(said, line) for line in refuted), refuted
 
 
+def test_a_repetition_without_a_recording_has_another_id(repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
+    runs, new = repeated
+    assert claims_of(runs, [[row | {"run_id": "0" * 12} for row in found] for found in new]) == []
+
+
 def test_rows_that_are_missing_or_doubled_do_not_hold(repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
     runs, new = repeated
     for one, here in zip(runs, new, strict=True):

@@ -10,6 +10,7 @@ from springbench.harness.experiments import run_pipeline
 from springbench.harness.experiments.run_pipeline import execute_run
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.recording.recording_reader import summarise_recording
+from springbench.harness.simulation import timing_pass
 from springbench.harness.simulation.instrumentation_pass import require_finite
 from springbench.harness.simulation.timing_pass import StepError
 
@@ -30,7 +31,7 @@ def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, m
     def broken(*_):
         raise ZeroDivisionError("nothing to divide by")
 
-    monkeypatch.setattr(run_pipeline, "measure_run", broken)
+    monkeypatch.setattr(timing_pass, "measure_run", broken)
     (row,) = execute_run(spec, files, lambda phase: None)
     assert row["status"] == "failed"
     assert "ZeroDivisionError: nothing to divide by (test_run_pipeline.py:" in row["reason"]

@@ -9,12 +9,12 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from springbench.harness.config.config_loader import load_config
-from springbench.harness.experiments import run_pipeline as runs
 from springbench.harness.experiments.run_pipeline import execute_run
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.report.sweep_summary import SOLVED_RESIDUAL, summarise_sweep
 from springbench.harness.report.timing_table import read_run_times as runs_of
 from springbench.harness.results.run_schema import RUN_SCHEMA
+from springbench.harness.simulation import timing_pass
 
 from tests.plugin_solvers import SWEEP_OPTIONS, PluginSweep, write_plugin_solver
 
@@ -133,8 +133,8 @@ def test_checks_take_no_timed_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         seen.append(type(measured.prepared).__module__)
         return measured
 
-    sound = runs.measure_run
-    monkeypatch.setattr(runs, "measure_run", spied)
+    sound = timing_pass.measure_run
+    monkeypatch.setattr(timing_pass, "measure_run", spied)
     made = write_plugin_solver(tmp_path, monkeypatch)
     rows_of(made, tmp_path)
     assert seen == [made.solver_path.stem]

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.roofline.cpp_baseline import MALLOC_TUNABLES, CppBaseline, compile_baseline
-from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH
-from springbench.harness.report.speed.size_plot import CandidateLine, draw_size_plot
 from springbench.solvers.methods.local_global import cpp_backend
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 from springbench.solvers.model.step_problem import StopRule, Unsupported
@@ -100,18 +98,3 @@ def test_it_takes_the_same_steps_as_ours(program: Path, tmp_path: Path, tunables
         assert step >= local + global_ > 0.0
     # Two factorisations of a matrix with weights from 1e2 to 1e10: round-off in positions of a metre.
     np.testing.assert_allclose(running.close(), ours, rtol=0, atol=1e-11)
-
-
-@pytest.mark.parametrize("share", [False, True])
-def test_a_picture_has_its_size_whatever_is_in_it(tmp_path: Path, share: bool):
-    sizes = (100, 1024, 4096)
-    lines = [
-        CandidateLine(f"numba x{k}", "numba", "numba", sizes, (0.1 * k, 0.2 * k, 0.5 * k), (False,) * 3)
-        for k in range(1, 7)
-    ]
-    one = [CandidateLine("sparse", "sparse", "sparse", (100,), (0.3,), (True,))]
-    for name, series in (("full", lines), ("one", one), ("none", [])):
-        path = tmp_path / f"{name}.png"
-        draw_size_plot(path, "Title", ["fact"], series, is_share=share)
-        header = path.read_bytes()[16:24]
-        assert (int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")) == (PAGE_WIDTH, PAGE_HEIGHT)

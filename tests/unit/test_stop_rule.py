@@ -15,7 +15,7 @@ from springbench.harness.scenes.effects.pins_effect import PinsEffect as PinsEff
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
 from springbench.harness.scenes.mesh.grid_mesh import NetMesh
 from springbench.harness.scenes.scene_builder import Scene, build_scene
-from springbench.harness.simulation.convergence_trace import EnergyNorm, trace_convergence
+from springbench.harness.simulation.instrumentation_pass import EnergyNorm, trace_convergence
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.methods.local_global.prefactored import require_only_springs
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from springbench.harness.errors import InputError
-from springbench.harness.recording.obstacle_properties import build_obstacles_property
+from springbench.harness.recording.recorder_interface import build_obstacles_property
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect

@@ -125,7 +125,9 @@ def test_the_page_says_what_is_outside_a_band_and_what_springs_cannot_do(tmp_pat
     assert "| c | 20.0 | 10.0 to 30.0 | 70 | 20 to 60 | outside band: drape |" in page
     assert "What springs cannot do" in page
     paths = write_validation_page(ROWS, "newton", tmp_path)
-    assert [path.name for path in paths] == ["validation.json", "validation.md", "validation.png"]
+    assert [path.name for path in paths] == ["validation.json", "validation.md", "closed-forms.png", "fabrics.png"]
+    assert "![Textile tests in their bands](fabrics.png)" in page
+    assert "fabrics.png" not in format_validation_page(ROWS[:2], "newton"), "nothing of it was simulated"
     assert all(path.stat().st_size > 500 for path in paths)
     assert "positions" not in json.loads(paths[0].read_text())["rows"][2]
 

@@ -15,6 +15,7 @@ from springbench.harness.recording.recording_reader import read_replay
 from springbench.harness.reference.hessian_curvature import compute_curvature
 from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
 from springbench.harness.reference.step_verifier import StepVerifier, compute_reference_positions, is_minimum
+from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
 from springbench.harness.report.robustness import (
     CORRECT,
     DEGENERATE_MINIMUM,
@@ -27,12 +28,11 @@ from springbench.harness.report.robustness import (
     VerifiedRun,
     build_score_table,
     classify_run,
-    format_cell,
     map_headline,
     read_verified_runs,
     score_solvers,
 )
-from springbench.harness.report.robustness_map import draw_robustness_map
+from springbench.harness.report.sweep_sheets import draw_hard_case_sheets
 from springbench.harness.results import parquet_rows
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
@@ -218,7 +218,8 @@ def test_runs_that_end_at_other_minima_are_right_counted_and_marked():
     other = VerifiedRun("a", "b", *verdict, energy_excess=1e-3)
     same = VerifiedRun("c", "b", *classify_run([OK]), energy_excess=0.0)
     unknown = VerifiedRun("d", "b", *classify_run([OK | {"reference_distance": None}]), energy_excess=1e-12)
-    assert [format_cell(cell) for cell in (other, same, unknown)] == ["1e-7 \u2248", "1e-7", "1e-7"]
+    cells = [cell for one in build_hard_case_chart([other, same, unknown]).maps for cell in one.cells]
+    assert [cell.marked_text for cell in cells] == ["1e-7 \u2248", "1e-7", "1e-7"]
     (score,) = score_solvers([other, same, unknown])
     assert (score.correct_share, score.other_motion_count, score.lowest_energy_count) == (1.0, 1, 2)
 
@@ -248,8 +249,10 @@ def test_a_judged_sweep_becomes_a_map_whose_cells_name_their_runs(tmp_path: Path
     assert build_score_table(cells).row_count == 4
     assert newton.run_id
     assert next((tmp_path / "recordings").glob(f"*-{newton.run_id}.rrd"))
-    draw_robustness_map(cells, tmp_path / "map.png", "a map")
-    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+    ((picture, drawn),) = draw_hard_case_sheets(tmp_path, lambda folder: ())
+    assert drawn == cells
+    assert picture == tmp_path / "pictures" / "robustness.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_results_that_were_not_judged_are_refused(tmp_path: Path):

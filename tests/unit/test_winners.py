@@ -11,10 +11,9 @@ from springbench.harness.report.accuracy.accuracy_findings import summarise_find
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy.winner_map import NO_WINNER, WinnerCell, build_winner_cells, method_family
 from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot
+from springbench.harness.report.charts.winner_chart import build_winner_chart
 from springbench.harness.report.figures.figure_kinds import FIGURE_KINDS
-from springbench.harness.report.figures.winner_panels import winner_panels
 from springbench.harness.report.site.accuracy_charts import build_page_charts
-from springbench.harness.report.site.winner_chart import build_winner_chart
 
 from tests import synthetic_accuracy_rows as made
 from tests import synthetic_results
@@ -68,16 +67,15 @@ def test_the_cheapest_by_processor_time_within_the_error_wins(found):
     )
 
 
-def test_the_page_has_a_point_for_each_error_that_somebody_reaches(tmp_path: Path):
-    chart = build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path, ROWS)))
-    points = {(error, item["label"]) for item in chart["items"] for error in item["error"]}
+def test_the_map_has_a_winner_for_each_error_that_is_reached(tmp_path: Path):
+    (drawn,) = build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path, ROWS))).maps
     order = ("implicit, order 1", "linearly implicit", "linearly implicit", "implicit, order 2")
-    assert points == {(10.0**-k, name) for k, name in enumerate(order, 1)}
-    assert {item["panel"] for item in chart["items"]} == {"81 vertices"}
-    first = next(item for item in chart["items"] if item["label"] == order[0])
-    assert (first["runner_up_family"], first["lead_ratio"]) == (["linearly implicit"], ["3 times as much"])
-    assert "numba" in first["setting"][0]
-    assert not build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path / "one", ROWS[:1])))["items"], (
+    won = [(cell.row, cell.outcome) for cell in drawn.cells if cell.outcome != NO_WINNER]
+    assert won == [(f"1e-{k}", name) for k, name in enumerate(order, 1)]
+    assert drawn.title == "81 vertices"
+    assert "numba" in drawn.cells[0].reason
+    assert drawn.cells[0].reason.endswith("next: linearly implicit, 3 times as much")
+    assert not build_winner_chart(read_accuracy(made.write_accuracy_rows(tmp_path / "one", ROWS[:1]))).maps, (
         "one family alone wins nothing"
     )
 
@@ -98,11 +96,7 @@ def test_an_integrator_from_outside_is_a_family_by_its_name(tmp_path):
 
 
 def test_each_number_of_vertices_is_a_grid_of_errors_by_stiffness(tmp_path):
-    panels = [
-        panel
-        for entry in winner_panels(synthetic_results.write_winner_results(tmp_path))
-        if isinstance(panel := entry.build_panel(), CellMap)
-    ]
+    panels = build_winner_chart(read_accuracy(synthetic_results.write_winner_results(tmp_path))).maps
     assert [panel.title for panel in panels] == ["81 vertices", "289 vertices", "1\u2009089 vertices"]
     assert {len({cell.column for cell in panel.cells}) for panel in panels} == {5}
     assert {len({cell.row for cell in panel.cells}) for panel in panels} == {8}

@@ -50,8 +50,9 @@ def ablate(
     from springbench.harness.config.config_loader import load_config
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.ablation.ablation_unit import run_ablation
-    from springbench.harness.report.ablation_plot import draw_ablation_plot
     from springbench.harness.report.ablation_summary import build_ablation_table, read_ablation, summarise_ablation
+    from springbench.harness.report.charts.ablation_charts import build_effect_chart
+    from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
     from springbench.harness.report.site import refresh_results_page
     from springbench.harness.results.folder_ownership import claim_folder
 
@@ -73,16 +74,15 @@ def ablate(
         rerun_stale=rerun_stale,
         isolated=not in_process,
     )
-    rows, picture = read_ablation(path), folder / "pictures" / f"ablation-{path.stem}.png"
+    rows = read_ablation(path)
     if rows[0]["status"] != "ok":  # of the whole scene, with which all others are compared
         print_message(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
         raise typer.Exit(1)
     get_output_console().print(split_wide_table(build_ablation_table(rows)))
     for line in summarise_ablation(rows):
         print_message(line)
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    draw_ablation_plot(rows, picture)
-    print_message(f"rows are in {path}, the picture is {picture}")
+    paths = draw_chart_sheets(build_effect_chart({path.stem: rows}), folder / "pictures" / f"ablation-{path.stem}")
+    print_message(f"rows are in {path}" + (f", the picture is {paths[0]}" if paths else ""))
     refresh_results_page(results, folder, print_message)
 
 

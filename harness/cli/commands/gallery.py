@@ -57,8 +57,12 @@ def _simulate_tile(run: RunSpec, tick: ProgressCallback) -> Any:
     import numpy as np
     from springbench.harness.execution import machine_info
     from springbench.harness.recording.local_origin import compute_local_origin, store_relative
-    from springbench.harness.recording.obstacle_properties import build_obstacles_property, list_obstacles
-    from springbench.harness.recording.recorder_interface import INTERSECTION_FREE_PROPERTY, RecordingReplay
+    from springbench.harness.recording.recorder_interface import (
+        INTERSECTION_FREE_PROPERTY,
+        RecordingReplay,
+        build_obstacles_property,
+        list_obstacles,
+    )
     from springbench.harness.recording.strain_scale import DEFAULT_STRAIN_RANGE
     from springbench.harness.report.gallery_sheet import SceneTile
     from springbench.harness.scenes.scene_builder import build_scene

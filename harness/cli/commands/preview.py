@@ -41,8 +41,11 @@ def _draw_preview(run: RunSpec, path: Path, tick: ProgressCallback) -> list[str]
     import numpy as np
     from springbench.harness.execution import machine_info
     from springbench.harness.recording.local_origin import compute_local_origin, store_relative
-    from springbench.harness.recording.obstacle_properties import build_obstacles_property, list_obstacles
-    from springbench.harness.recording.recorder_interface import RecordingReplay
+    from springbench.harness.recording.recorder_interface import (
+        RecordingReplay,
+        build_obstacles_property,
+        list_obstacles,
+    )
     from springbench.harness.recording.strain_scale import DEFAULT_STRAIN_RANGE
     from springbench.harness.report.scene_preview import MarkedPoints, draw_scene_preview
     from springbench.harness.scenes.scene_builder import build_scene

@@ -20,6 +20,9 @@ PublishedOption = Annotated[Path, typer.Option(help="Folder of the published set
 ALL_STUDIES, ENTRIES = "all", "entries"
 """Names that stand for every study, and for the archives that others have contributed."""
 
+MAX_ENTRY_BYTES = 2**20
+"""Largest contributed archive: it is part of every clone."""
+
 
 def publish_study(
     results: Annotated[
@@ -74,7 +77,8 @@ def reproduce(
 ) -> None:
     """Repeat a published study here, and compare outcomes, iterations, residuals and ratios of times.
 
-    The same command resumes an interrupted repetition. Exit code 1: more runs differ than between processors.
+    The same command resumes an interrupted repetition. Exit code 1: more results differ than between processors; 3:
+    the load of this machine leaves too many ratios of times undecided.
     """
     from secrets import randbelow
 
@@ -90,14 +94,14 @@ def reproduce(
     durations = [(QUICK_SHARE if quick else 1.0) * (one.metadata["duration_seconds"] or 0.0) for one in studies]
     if len(studies) > 1:
         print_message(f"{len(studies)} studies, which took {_format_duration(sum(durations))} when they were published")
-    agrees = [_reproduce_one(one, took, results, chance, workers) for one, took in zip(studies, durations, strict=True)]
-    raise typer.Exit(0 if all(agrees) else 1)
+    codes = [_reproduce_one(one, took, results, chance, workers) for one, took in zip(studies, durations, strict=True)]
+    raise typer.Exit(_choose_exit_code(codes))
 
 
 def _reproduce_one(
     study: published_set.PublishedStudy, duration: float, results: Path, seed: int | None, workers: int | None
-) -> bool:
-    """Repeat one study, print what agrees, and return whether all of it does."""
+) -> int:
+    """Repeat one study, print what agrees, and return the exit code."""
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.archive.study_reproduction import reproduce_study
 
@@ -112,23 +116,36 @@ def _reproduce_one(
     return report_agreement(study.study_name, found.runs, found.ratios)
 
 
-def report_agreement(name: str, runs: Sequence[RunAgreement], ratios: Sequence[RunAgreement]) -> bool:
-    """Print the counts and all differences, and return whether the repetition agrees."""
+def report_agreement(name: str, runs: Sequence[RunAgreement], ratios: Sequence[RunAgreement]) -> int:
+    """Print the counts and all differences, and return the exit code: 0 agrees, 1 differs, 3 is undecided."""
     from springbench.harness.results.study_comparison import MAX_DIFFERING_SHARE, AgreementLevel
 
-    agrees = True
+    codes = [] if runs else [1]
     for what, found in (("runs", runs), ("ratios of times", ratios)):
-        different = [one for one in found if one.level is AgreementLevel.DIFFERENT]
-        for one in different:
-            print_message(f"  {one.title}: {one.explanation}")
+        counts = {level: sum(one.level is level for one in found) for level in AgreementLevel}
+        for one in found:
+            if one.level in (AgreementLevel.DIFFERENT, AgreementLevel.UNDECIDED):
+                print_message(f"  {one.title}: {one.explanation}")
         if found:
-            counts = ", ".join(f"{sum(one.level is level for one in found)} {level.value}" for level in AgreementLevel)
-            print_message(f"{name}: {len(found)} {what}: {counts}")
-        agrees = agrees and len(different) <= MAX_DIFFERING_SHARE * len(found)
-    agrees = agrees and bool(runs)
+            stated = [f"{count} {level.value}" for level, count in counts.items() if count]
+            print_message(f"{name}: {len(found)} {what}: {', '.join(stated)}")
+        limit = MAX_DIFFERING_SHARE * len(found)
+        different, undecided = counts[AgreementLevel.DIFFERENT], counts[AgreementLevel.UNDECIDED]
+        codes.append(1 if different > limit else 3 if different + undecided > limit else 0)
+    code = _choose_exit_code(codes)
     limit = f"at most {100 * MAX_DIFFERING_SHARE:g} % may differ between processors"
-    print_message(f"{name} {'agrees' if agrees else 'does not agree'} with the published results ({limit})")
-    return agrees
+    agreement = {
+        0: f"agrees with the published results ({limit})",
+        1: f"does not agree with the published results ({limit})",
+        3: "agrees in what could be compared; repeat the rest on an idle machine",
+    }
+    print_message(f"{name} {agreement[code]}")
+    return code
+
+
+def _choose_exit_code(codes: Sequence[int]) -> int:
+    """Return the least favourable exit code: 1 differs, 3 is undecided, 0 agrees."""
+    return next((code for code in (1, 3) if code in codes), 0)
 
 
 def _format_duration(seconds: float) -> str:
@@ -144,5 +161,10 @@ def _verify_entries(folder: Path, seed: int | None) -> int:
     codes: list[int] = []
     for path in archives:
         print_message(f"{path.name}:")
-        codes.append(verify_one_archive(path, seed, with_user_code=True))
-    return 1 if 1 in codes else 3 if 3 in codes else 0
+        if (size := path.stat().st_size) > MAX_ENTRY_BYTES:
+            limit = f"at most {MAX_ENTRY_BYTES:,} are part of a clone"
+            print_message(f"takes {size:,} bytes, and {limit}; run its sweep with `record: false, pictures: false`")
+            codes.append(1)
+        else:
+            codes.append(verify_one_archive(path, seed, with_user_code=True))
+    return _choose_exit_code(codes)

@@ -31,9 +31,10 @@ def roofline(
     from springbench.harness.config.run_options import AUTO
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.roofline.roofline_comparison import run_roofline
+    from springbench.harness.report.charts.speed_chart import build_speed_chart
+    from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
     from springbench.harness.report.site import refresh_results_page
     from springbench.harness.report.speed.speed_figures import compute_speed_figures
-    from springbench.harness.report.speed.speed_plots import draw_speed_plots
     from springbench.harness.report.speed.speed_table import build_speed_table, describe_speed
     from springbench.harness.results.folder_ownership import claim_folder
 
@@ -59,7 +60,7 @@ def roofline(
     get_output_console().print(split_wide_table(build_speed_table(found), key_columns=2))
     for line in describe_speed(found):
         print_message(line)
-    draw_speed_plots(found, folder / "pictures")
+    draw_chart_sheets(build_speed_chart(found), folder / "pictures" / "speed")
     print_message(f"rows and pictures are in {folder}")
     refresh_results_page(results, folder, print_message)
     raise typer.Exit(1 if any(f.status in ("failed", "diverged") for f in found) else 0)

@@ -25,6 +25,7 @@ from springbench.harness.config.accuracy_config import AccuracyConfig, Benchmark
 from springbench.harness.config.accuracy_loader import AccuracyPlan, expand_studies
 from springbench.harness.config.config_loader import find_scene_mistakes, load_scene
 from springbench.harness.config.run_options import RUN_OPTIONS, STEP_OPTIONS
+from springbench.harness.config.shipped_configs import get_config_name
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, InputMistake, RunFailed, suggest_name
@@ -39,15 +40,15 @@ from springbench.harness.experiments.accuracy.accuracy_units import (
     load_reference_trajectory,
     open_reference_store,
 )
-from springbench.harness.experiments.accuracy.best_first import (
+from springbench.harness.experiments.accuracy.setting_grid import (
     LEAST_LIMIT,
     SLOWER,
-    SearchSummary,
     compute_setting_cost,
     is_measured,
-    search,
+    search_grid,
 )
 from springbench.harness.experiments.accuracy.work_precision import build_work_rows
+from springbench.harness.experiments.best_first_search import SearchSummary
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
 from springbench.harness.reference.step_snapshot import build_exact_scene
@@ -252,7 +253,7 @@ class MeasuredMethod:
         given |= {"time-step": repr(u.case.scene.time_step), "frames": steps, **u.options}
         named_values = ((name.replace("_", "-"), value) for name, value in given.items() if value is not None)
         options = (part for name, value in named_values for part in (f"--{name}", str(value)))
-        return shlex.join(["springbench", "run", str(scene), *options])
+        return shlex.join(["springbench", "run", get_config_name(scene), *options])
 
 
 @dataclass(frozen=True, slots=True)
@@ -366,7 +367,7 @@ def recommend_method(
         return [one for one in methods if engine in (None, one.work_spec.solver.name)], failed_rows
 
     methods, failed_rows = read_methods()
-    summary: SearchSummary | None = None
+    summary: SearchSummary[Any] | None = None
     if goal.max_error is None or not any(one.sweep != study.name for one in goal.select_methods(methods, frame)):
         folder = claim_folder(results / study.name, path)
         summary = _measure_study(study, methods, failed_rows, goal, frame, folder, display, print_message, search_time)
@@ -491,7 +492,7 @@ def _measure_study(
     display: ProgressDisplay,
     print_message: Callable[[str], None],
     search_time: float,
-) -> SearchSummary:
+) -> SearchSummary[Any]:
     """Measure the methods that may be the best and have no rows. Raises InputError, WriteError."""
     known: dict[str, dict[str, Any]] = {
         method.work_spec.build_file_stem(): {
@@ -517,7 +518,7 @@ def _measure_study(
             return known.get(spec.build_file_stem()) or failed.get(spec.compute_unit_id(here)) or measure(spec)
 
         part = 1.0 if goal.frame_seconds is None else _SEARCH_FRACTION
-        return search(study.work, error, best, look_up, part * search_time)
+        return search_grid(study.work, error, best, look_up, part * search_time)
 
 
 def _tune_time_steps(
@@ -658,7 +659,7 @@ def _explain_no_method(
     goal: RecommendationGoal,
     frame: float,
     t_end: float,
-    summary: SearchSummary | None,
+    summary: SearchSummary[Any] | None,
 ) -> str:
     """Explain why no method keeps to the goal, and suggest what to change."""
     wanted = f"keeps to an error of {goal.reference_error:g} over {t_end:g} s"

@@ -442,7 +442,8 @@ def _verify_columns(original: PublishedRun, rerun_rows: list[ResultRow]) -> Veri
         )
     if fewer := {place for place in of_place if place[0] == "step"} - {_row_key(row) for row in original.step_rows}:
         return _build_failed_claim(what, f"{len(fewer)} steps are missing", original, rerun_rows)
-    names = [name for name in run_schema.RUN_SCHEMA.names if name not in IRREPRODUCIBLE_COLUMNS | {"positions_digest"}]
+    verified = {"positions_digest", "run_id"}  # the config confirms the id, which differs without a recording
+    names = [name for name in run_schema.RUN_SCHEMA.names if name not in IRREPRODUCIBLE_COLUMNS | verified]
     wrong = _find_differences([(row, of_place[_row_key(row)]) for row in original.rows], names)
     filled = [name for name in names if any(row[name] is not None for row in original.rows)]
     return (

@@ -113,9 +113,9 @@ def write_study(
             [row for rows in ([made] if made else found.values()) for row in _select_provenance(rows)]
         ),
     }
-    metadata["duration_seconds"] = round(
-        sum(_measure_duration(_select_provenance(rows)) for tables in by_part for rows in tables.values())
-    )
+    durations = [_measure_duration(_select_provenance(rows)) for tables in by_part for rows in tables.values()]
+    # Parts of a single run each state no time: that from the first to the last start is the best estimate.
+    metadata["duration_seconds"] = round(sum(durations)) or metadata["duration_seconds"]
     if made:
         metadata |= {"runs": sum(map(len, found.values())), "duration_seconds": None}
     study = write_study_file(folder, metadata)

@@ -1,14 +1,15 @@
 """Repeat a published study on this machine (`springbench reproduce`).
 
 All of its runs, or a tenth that is drawn at random, are executed in a folder of their own, without recordings and
-pictures. Steps of studies that publish no times are not timed. Runs that are complete there are not executed again.
+pictures. Of frozen steps a tenth is drawn, each with all of its solvers, so that times to an error have ratios. Steps
+of studies that publish no times are not timed. Runs that are complete there are not executed again.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +27,8 @@ from springbench.harness.experiments.experiment_units import choose_num_workers,
 from springbench.harness.experiments.provenance import build_specification_columns
 from springbench.harness.experiments.run_unit import RunUnit
 from springbench.harness.experiments.sweep_plan import plan_runs
+from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
+from springbench.harness.report.accuracy.error_times import list_curve_times, list_simulation_times
 from springbench.harness.report.robustness import classify_run
 from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.published_set import RUN_KEYS, PublishedStudy, open_study_folder
@@ -39,10 +42,15 @@ from springbench.harness.results.study_comparison import (
     group_curves,
     group_runs,
 )
-from springbench.harness.results.time_ratios import compute_time_ratios
+from springbench.harness.results.time_ratios import list_step_times
+from springbench.solvers.registry import OPTIONAL_SOLVERS
 
 QUICK_SHARE = 0.1
 """Share of the runs that `--quick` repeats."""
+
+
+RowPair = tuple[RunRows, RunRows]
+"""Rows of a published run and of the repeated one."""
 
 
 class StudyRepetition(NamedTuple):
@@ -135,14 +143,32 @@ def _reproduce_sweep(
     rows = parquet_rows.read_rows([p.files.rows_path for p in planned]).to_pylist()
     repeated: dict[str, list[Any]] = {run[0]["run_id"]: run for run in group_runs(rows).values()}
     machine = machine_info.describe_machine().machine_id
+    pairs = [(published[key], repeated[spec.compute_run_id(machine)]) for key, spec in zip(chosen, specs, strict=True)]
     found = [
-        compare_repeated_run(published[key], repeated[spec.compute_run_id(machine)], classify_outcome)
-        for key, spec in zip(chosen, specs, strict=True)
+        compare_repeated_run(old, new, classify_outcome) for old, new in omit_missing_software(pairs, print_message)
     ]
-    ratios = (
-        compare_time_ratios(compute_time_ratios(published_rows), compute_time_ratios(rows)) if study.is_timed else []
-    )
+    ratios = compare_time_ratios(list_step_times(published_rows), list_step_times(rows)) if study.is_timed else []
     return StudyRepetition(found, ratios)
+
+
+def omit_missing_software(pairs: Sequence[RowPair], print_message: Callable[[str], None]) -> list[RowPair]:
+    """Return the pairs of published and repeated rows without the solvers whose software is not installed here.
+
+    Such a solver is optional, and supports no repeated run, but a published one of them.
+    """
+    here = {new[0]["solver"] for _, new in pairs if new[0]["status"] != "unsupported"}
+    found: list[RowPair] = []
+    omitted: dict[str, list[str]] = {}
+    there = {old[0]["solver"] for old, _ in pairs if old[0]["status"] != "unsupported"}
+    missing = (there - here) & OPTIONAL_SOLVERS.keys()
+    for old, new in pairs:
+        if new[0]["solver"] in missing:
+            omitted.setdefault(new[0]["solver"], []).append(new[0]["reason"] or "")
+        else:
+            found.append((old, new))
+    for solver, reasons in sorted(omitted.items()):
+        print_message(f"{len(reasons)} runs of {solver} are not compared: {reasons[0]}")
+    return found
 
 
 def read_study_rows(study: PublishedStudy) -> list[dict[str, Any]]:
@@ -175,18 +201,24 @@ def _reproduce_accuracy(
 ) -> StudyRepetition:
     """Repeat an accuracy study: convergence of curves, errors of simulations, and ratios of their times."""
     plan = load_accuracy(study.config_path)
-    curves, work = draw_sample(plan.curves, seed), draw_sample(plan.work, seed)
-    files = run_accuracy_study(
-        replace(plan, curves=tuple(curves), work=tuple(work)), folder, display, print_message, rerun_stale=True
-    )
+    steps = set(draw_sample(list(dict.fromkeys(spec.build_problem_stem() for spec in plan.curves)), seed))
+    curves = tuple(spec for spec in plan.curves if spec.build_problem_stem() in steps)
+    plan = replace(plan, curves=curves, work=tuple(draw_sample(plan.work, seed)))
+    files = run_accuracy_study(plan, folder, display, print_message, rerun_stale=True)
     rows = parquet_rows.read_rows(files, ACCURACY_SCHEMA).to_pylist()
     table = study.read_table("accuracy").to_pylist()
-    before = group_curves(table)
-    found = [compare_repeated_curve(before[key], curve) for key, curve in group_curves(rows).items() if key in before]
-    published, repeated = ([row for row in some if row["kind"] == "work"] for some in (table, rows))
-    known = {_build_work_key(row): row for row in published}
-    found += [_compare_work(known[key], row) for row in repeated if (key := _build_work_key(row)) in known]
-    ratios = compare_time_ratios(compute_time_ratios(published), compute_time_ratios(repeated))
+    before, after = group_curves(table), group_curves(rows)
+    pairs = [(before[key], curve) for key, curve in after.items() if key in before]
+    found = [compare_repeated_curve(old, new) for old, new in omit_missing_software(pairs, print_message)]
+    published = {_build_work_key(row): row for row in table if row["kind"] == "work"}
+    repeated = {_build_work_key(row): row for row in rows if row["kind"] == "work"}
+    pairs = [([published[key]], [row]) for key, row in repeated.items() if key in published]
+    found += [_compare_work(old[0], new[0]) for old, new in omit_missing_software(pairs, print_message)]
+    with open_study_folder(study) as published_folder:
+        theirs = read_accuracy(published_folder)
+    ours = read_accuracy(folder, files)
+    ratios = compare_time_ratios(list_curve_times(theirs), list_curve_times(ours))
+    ratios += compare_time_ratios(*list_simulation_times(theirs, ours))
     return StudyRepetition(found, ratios)
 
 
@@ -194,11 +226,11 @@ ERROR_TOLERANCE = 0.05
 """Relative difference of the error of a whole simulation: round-off changes where adaptive steps end."""
 
 
-def _build_work_key(row: dict[str, Any]) -> tuple[Any, ...]:
+def _build_work_key(row: Mapping[str, Any]) -> tuple[Any, ...]:
     return (*(row.get(name) for name in RUN_KEYS), row["t_end"])
 
 
-def _compare_work(old: dict[str, Any], new: dict[str, Any]) -> RunAgreement:
+def _compare_work(old: Mapping[str, Any], new: Mapping[str, Any]) -> RunAgreement:
     title = f"{old['scene']} {old['size']} {old['solver']} {old['integrator']} {old['time_step']:.3g} s"
     if old["status"] != new["status"]:
         why = f"published as {old['status']!r}, here {new['status']!r}"

@@ -11,7 +11,7 @@ are compared by CPU seconds, including preparation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log, sqrt
 from time import perf_counter
@@ -21,12 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import RunFailed
+from springbench.harness.experiments.best_first_search import (
+    GiveUpRule,
+    SettingProposal,
+    SettingProposals,
+    TrialOutcome,
+    search_best_first,
+)
 from springbench.harness.experiments.error_control.candidate_methods import (
     ErrorTarget,
     Method,
     prepare_candidate_methods,
 )
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth, estimate_growth
+from springbench.harness.reference.reference_trajectory import compute_position_error
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import (
     StepObserver,
@@ -162,7 +170,7 @@ class SearchResult:
         The error is relative to the displacement and taken over the free vertices.
         """
         q = self.reference_trial.trajectory.positions
-        away, moved = (float(np.linalg.norm((x - q[-1])[free_vertices])) for x in (p, q[0]))
+        away, moved = (compute_position_error(x, q[-1], free_vertices) for x in (p, q[0]))
         return away / moved
 
 
@@ -213,6 +221,9 @@ def search_cheapest_method(
     return _MethodSearch(error_target, max_error, growth, print_message).find_cheapest(candidates)
 
 
+_MethodSetting = tuple[Method, float]
+
+
 class _MethodSearch:
     def __init__(
         self, error_target: ErrorTarget, error: float, growth: PerturbationGrowth, print_message: Callable[[str], None]
@@ -223,6 +234,7 @@ class _MethodSearch:
             growth,
             print_message,
         )
+        self._underflows = list[StepSizeUnderflow]()
         self._free_vertices = error_target.build_scene(error_target.frame_seconds, "substepping").system.free_vertices
 
     def find_cheapest(self, candidates: Sequence[tuple[str, SolverSpec]]) -> SearchResult:
@@ -245,7 +257,7 @@ class _MethodSearch:
         return SearchResult(best, promised, tolerance, closer, besides, note)
 
     @staticmethod
-    def _run_trial(method: Method, setting: float, time_limit: float = inf) -> Trial:
+    def _integrate_motion(method: Method, setting: float, time_limit: float = inf) -> Trial:
         """Run a method at a setting.
 
         The method is run twice where the first run is too short to be timed.
@@ -255,31 +267,46 @@ class _MethodSearch:
             paths.append(method.stepper.integrate_motion(setting, cpu_limit=time_limit))
         return Trial(method, setting, min(paths, key=lambda path: path.cpu_seconds), inf, method.stepper.order)
 
+    def _run_trial(
+        self, method: Method, setting: float, time_limit: float, reference_trial: Trial | None = None
+    ) -> TrialOutcome[Trial]:
+        """Run a method at a setting, and estimate its error where there is a reference trial."""
+        try:
+            trial = self._integrate_motion(method, setting, time_limit)
+        except TimeBudgetExceeded:
+            return TrialOutcome(is_late=True)
+        except StepSizeUnderflow as error:
+            self._underflows.append(error)
+            return TrialOutcome()
+        if reference_trial is None:  # the first trial of fixed steps may be far from the error
+            is_comparable = not method.stepper.has_fixed_step
+            return TrialOutcome(cost=trial.trajectory.cpu_seconds, limits_others=is_comparable, result=trial)
+        trial = self._estimate_error(trial, reference_trial)
+        return TrialOutcome(trial.error_estimated, trial.trajectory.cpu_seconds, result=trial)
+
     def _run_first_trials(self, methods: list[Method], step_atol: float) -> list[Trial]:
         """Run all methods and return the trials that are fast enough.
 
         The time limit is a multiple of the fastest time among methods that choose their steps by the error. The first
         trial of fixed steps may be far from it, and then its time limits nothing.
         """
-        found, stuck, limit = list[Trial](), list[StepSizeUnderflow](), _INITIAL_TIME_LIMIT
-        while methods and not found:
-            late = list[tuple[Method, float]]()
-            for method in methods:
-                try:
-                    found.append(self._run_trial(method, method.stepper.initial_setting(step_atol), limit))
-                    comparable = [one for one in found if not one.method.stepper.has_fixed_step]
-                    if comparable:
-                        cheapest = min(one.trajectory.cpu_seconds for one in comparable)
-                        limit = max(_MIN_TIME_LIMIT, _TIME_LIMIT_FACTOR * cheapest)
-                except StepSizeUnderflow as error:
-                    stuck.append(error)
-                except TimeBudgetExceeded:
-                    late.append((method, limit))
-            methods, limit = [method for method, _ in late], _TIME_LIMIT_GROWTH * limit
-            for method, given in late if found else ():
-                self._print_message(f"  {method}: given up after {given:.3g} s, for it is slower than others")
+        found, late = list[Trial](), dict[Method, float]()
+
+        def run_trial(asked: _MethodSetting, time_limit: float) -> TrialOutcome[Trial]:
+            late.pop(asked[0], None)
+            outcome = self._run_trial(*asked, time_limit)
+            if outcome.result:
+                found.append(outcome.result)
+            elif outcome.is_late:
+                late[asked[0]] = time_limit
+            return outcome
+
+        candidates = [(0.0, _propose_first_setting(one, one.stepper.initial_setting(step_atol))) for one in methods]
+        search_best_first(candidates, run_trial, inf, GiveUpRule(_TIME_LIMIT_FACTOR, _MIN_TIME_LIMIT))
         if not found:
-            raise stuck[0]
+            raise self._underflows[0]
+        for method, given in late.items():
+            self._print_message(f"  {method}: given up after {given:.3g} s, for it is slower than others")
         return found
 
     def _find_reference_trial(self, trials: list[Trial]) -> Trial:
@@ -300,14 +327,14 @@ class _MethodSearch:
         for _ in range(
             _MAX_REFERENCE_TRIALS
         ):  # where frames or stability rule the steps, a closer tolerance may change nothing
-            found = self._run_trial(best.method, follower.scale_setting(found.setting, part, order))
+            found = self._integrate_motion(best.method, follower.scale_setting(found.setting, part, order))
             if (
                 found.trajectory.num_accepted_steps / best.trajectory.num_accepted_steps
             ) ** order >= _MIN_REFERENCE_REFINEMENT:
                 break
         begun = self._estimate_error(best, found)
         if ERROR_AIM * self._max_error < begun.error_estimated < inf:
-            found = self._run_trial(
+            found = self._integrate_motion(
                 best.method,
                 follower.scale_setting(found.setting, ERROR_AIM * self._max_error / begun.error_estimated, order),
             )
@@ -316,7 +343,7 @@ class _MethodSearch:
     def _estimate_order(self, trial: Trial) -> float:
         """Estimate the order of fixed step sizes by doubling the step twice (Richardson)."""
         two, four = (
-            self._run_trial(trial.method, parts * trial.setting).trajectory.positions[-1] for parts in (2.0, 4.0)
+            self._integrate_motion(trial.method, parts * trial.setting).trajectory.positions[-1] for parts in (2.0, 4.0)
         )
         first, second = self._compute_distance(trial.trajectory.positions[-1], two), self._compute_distance(two, four)
         fell = log(first / second, 2.0) if 0.0 < first < inf and 0.0 < second < inf else inf
@@ -345,13 +372,13 @@ class _MethodSearch:
             return trial
         try:
             return _update_order(
-                trial, self._estimate_error(self._run_trial(trial.method, 2.0 * trial.setting), reference_trial)
+                trial, self._estimate_error(self._integrate_motion(trial.method, 2.0 * trial.setting), reference_trial)
             )
         except StepSizeUnderflow:
             return trial
 
     def _compute_distance(self, p: Positions, q: Positions) -> float:
-        return float(np.linalg.norm((p - q)[self._free_vertices]))
+        return compute_position_error(p, q, self._free_vertices)
 
     def _predict_cost(self, trial: Trial) -> float:
         """Predict the CPU seconds of a trial's method at the target error.
@@ -376,31 +403,45 @@ class _MethodSearch:
 
         A method that exceeds the predicted time of the next one by far is tried again after all others.
         """
-        nearest, times = list[Trial](), _MAX_COST_RATIO
-        while trials:
-            late = list[Trial]()
-            for one, after in zip(trials, [*trials[1:], trials[-1]], strict=True):
-                limit = times * max(_MIN_TIMED_SECONDS, self._predict_cost(one), self._predict_cost(after))
-                try:
-                    found, note = self._tune_setting(one, reference_trial, limit)
-                except TimeBudgetExceeded:
-                    self._print_message(f"  {one.method}: takes more than {limit:.3g} s")
-                    late.append(one)
-                    continue
-                if found.error_estimated <= self._max_error:
-                    return found, note
-                nearest.append(found)
-                self._print_message(
-                    f"  {one.method}: reaches {found.error_estimated:.1e}, and shorter steps come no nearer"
-                )
-            trials, times = late, _TIME_LIMIT_FACTOR * times
-        raise self._build_no_method_error(min(nearest, key=lambda one: one.error_estimated))
+        nearest, notes = list[Trial](), dict[Method, str]()
+        costs = [self._predict_cost(one) for one in trials]
 
-    def _tune_setting(self, trial: Trial, reference_trial: Trial, time_limit: float) -> tuple[Trial, str]:
+        def propose_settings(trial: Trial, cost: float, limit: float) -> SettingProposals[_MethodSetting, Trial]:
+            attempt = 0
+            while True:
+                tuned = yield from self._tune_setting(trial, cost, limit, attempt)
+                if tuned:
+                    found, notes[trial.method] = tuned
+                    if found.error_estimated > self._max_error:
+                        nearest.append(found)
+                        self._print_message(
+                            f"  {trial.method}: reaches {found.error_estimated:.1e}, and shorter steps come no nearer"
+                        )
+                    return TrialOutcome(found.error_estimated, found.trajectory.cpu_seconds, result=found)
+                self._print_message(f"  {trial.method}: takes more than {limit:.3g} s")
+                attempt, limit = attempt + 1, _TIME_LIMIT_FACTOR * limit
+
+        candidates = [
+            (cost, propose_settings(one, cost, _MAX_COST_RATIO * max(_MIN_TIMED_SECONDS, cost, after)))
+            for one, cost, after in zip(trials, costs, [*costs[1:], costs[-1]], strict=True)
+        ]
+        answer = search_best_first(
+            candidates,
+            lambda asked, limit: self._run_trial(*asked, limit, reference_trial),
+            self._max_error,
+            GiveUpRule(_MAX_COST_RATIO, _MAX_COST_RATIO * _MIN_TIMED_SECONDS),
+            ends_at_answer=True,
+        ).answer
+        if answer is None or answer.result is None:
+            raise self._build_no_method_error(min(nearest, key=lambda one: one.error_estimated))
+        return answer.result, notes[answer.result.method]
+
+    def _tune_setting(
+        self, trial: Trial, expected_cost: float, limit: float, attempt: int
+    ) -> Generator[SettingProposal[_MethodSetting], TrialOutcome[Trial], tuple[Trial, str] | None]:
         """Tune the setting of a method towards the target error, and return the nearest trial.
 
-        The second result says why the trial is much more accurate. Raises TimeBudgetExceeded beyond a limit of CPU
-        seconds.
+        The second result says why the trial is much more accurate. Returns None beyond a limit of CPU seconds.
         """
         best, above = None if trial.error_estimated > self._max_error else trial, None
         nearest, stalled = trial, 0
@@ -411,12 +452,14 @@ class _MethodSearch:
             if setting == trial.setting:
                 return trial, _STABILITY_NOTE
             before = trial
-            try:
-                trial = _update_order(
-                    before, self._estimate_error(self._run_trial(trial.method, setting, time_limit), reference_trial)
-                )
-            except StepSizeUnderflow:
+            # A setting that meets the error is made cheaper at once, before other methods are tried.
+            cost, repeated = (0.0, 0) if best else (expected_cost, attempt)
+            outcome = yield SettingProposal((trial.method, setting), cost, limit, repeated)
+            if outcome.result is None:
+                if outcome.is_late and best is None:
+                    return None
                 break
+            trial = _update_order(before, outcome.result)
             nearest = min(nearest, trial, key=lambda found: found.error_estimated)
             if trial.error_estimated > self._max_error:
                 shorter = (
@@ -462,6 +505,16 @@ class _MethodSearch:
             "ask for a larger --error or a shorter "
             "--t-end"
         )
+
+
+def _propose_first_setting(method: Method, setting: float) -> SettingProposals[_MethodSetting, Trial]:
+    """Propose one setting, with a larger limit each time that it takes longer."""
+    attempt, limit = 0, _INITIAL_TIME_LIMIT
+    while True:
+        outcome = yield SettingProposal((method, setting), 0.0, limit, attempt)
+        if not outcome.is_late:
+            return outcome
+        attempt, limit = attempt + 1, _TIME_LIMIT_GROWTH * limit
 
 
 def _update_order(before: Trial, after: Trial) -> Trial:

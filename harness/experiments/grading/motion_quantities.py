@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.experiments.grading.submission import SubmittedMotion
-from springbench.harness.recording.strain_shading import compute_strains
 from springbench.harness.reference.self_converged_trajectory import has_contact
 from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
 from springbench.harness.scenes.mesh.mesh_checks import build_edge_table
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.spring_strains import compute_strains
 from springbench.harness.simulation.energy_balance import compute_kinetic_energy
 from springbench.solvers.model.step_problem import is_lagged
 

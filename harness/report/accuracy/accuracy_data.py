@@ -107,6 +107,7 @@ class ConvergenceCurve:
         warm_seconds, cold_seconds: preparation time [s]; nan if unknown.
         minimum_index: minimum that was reached.
         status, reason: values of the rows.
+        is_preempted: whether other processes interrupted a round.
         recording_path: relative to the folder of the results, or "".
         source_fingerprint: code that the curve was measured by.
     """
@@ -129,6 +130,7 @@ class ConvergenceCurve:
     minimum_index: int | None
     status: str
     reason: str
+    is_preempted: bool
     recording_path: str
     source_fingerprint: str
 
@@ -142,6 +144,8 @@ class WorkPoint:
     Attributes:
         family, citation, is_minimiser, is_substepping: metadata of the solver.
         cpu_seconds_per_simulated_second: CPU time of the best round.
+        round_seconds: wall time of each round [s].
+        is_preempted: whether other processes interrupted a round.
         stiffness: k/m [1/s^2] of the median spring and the mean free vertex.
         source_fingerprint: code that the simulation was measured by.
     """
@@ -166,6 +170,8 @@ class WorkPoint:
     end_error_rms: float
     seconds_per_simulated_second: float
     cpu_seconds_per_simulated_second: float
+    round_seconds: tuple[float, ...]
+    is_preempted: bool
     vertices: int
     stiffness: float
     status: str

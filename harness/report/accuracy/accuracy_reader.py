@@ -176,6 +176,7 @@ def _build_curve(
         minimum_index=problem.minimum_index(rows[0]["minimum_id"]) if rows[0]["minimum_index"] is not None else None,
         status=bad["status"],
         reason=bad["reason"] or "",
+        is_preempted=any(row["preempted"] for row in rows),
         recording_path=next((row["recording_path"] for row in rows if row["recording_path"]), ""),
         source_fingerprint=rows[0]["source_fingerprint"] or "",
     )
@@ -199,6 +200,8 @@ def _build_work_point(row: _ResultRow, label: _RowLabeller) -> WorkPoint:
         end_error_rms=_float_or_nan(row["end_error_rms_m"]),
         seconds_per_simulated_second=_float_or_nan(row["seconds_per_simulated_second"]),
         cpu_seconds_per_simulated_second=_float_or_nan(row["cpu_seconds"]) / _float_or_nan(row["t_end"]),
+        round_seconds=tuple(row["seconds"] or ()),
+        is_preempted=bool(row["preempted"]),
         vertices=row["vertices"] or 0,
         stiffness=_float_or_nan(row["stiffness_ratio"]) / row["time_step"] ** 2,
         reason=row["reason"] or "",

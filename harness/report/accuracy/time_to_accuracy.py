@@ -30,10 +30,11 @@ _HALF_DECADES = tuple(10.0 ** (-k / 2) for k in range(1, 19))  # half decades, i
 class TimeToAccuracy:
     """Iteration and time at which a curve reached an accuracy.
 
-    The time is given as median and quartiles over the rounds [s].
+    The time is given as median and quartiles over the rounds, and for each round [s].
     """
 
     iteration: int
+    rounds: tuple[float, ...]
     seconds: float
     lower: float
     upper: float
@@ -63,7 +64,7 @@ def find_time_to_accuracy(curve: ConvergenceCurve, target: float) -> TimeToAccur
     if not np.isfinite(seconds).all():
         return None
     lower, middle, upper = np.quantile(seconds, (0.25, 0.5, 0.75))
-    return TimeToAccuracy(int(iteration), float(middle), float(lower), float(upper))
+    return TimeToAccuracy(int(iteration), tuple(seconds.tolist()), float(middle), float(lower), float(upper))
 
 
 def amortised_seconds(curve: ConvergenceCurve, target: float, steps: int | None = None) -> float:

@@ -123,7 +123,7 @@ def build_convergence_chart(
         ),
         subject_key="problem",
         hover=(
-            *(("iteration", "iteration"), ("seconds", "seconds"), ("gap", "gap"), ("stationarity", "stationarity")),
+            *(("iteration", "iteration"), ("seconds", "wall time"), ("gap", "gap"), ("stationarity", "stationarity")),
             *(("max_vertex_error", "largest error, rest lengths"), ("max_vertex_error_m", "largest error, m")),
             *(("minimum_index", "minimum reached"), ("status", "status")),
         ),
@@ -168,7 +168,8 @@ def _describe_convergence(
     """Describe doubts about the reference, stale curves, early ends and other minima."""
     remarks = [
         f"{format_count(problem.vertices)} vertices, {problem.integrator}, dt {format_time_step(problem.time_step)}, "
-        f"k dt²/m = {format_quantity(problem.stiffness_ratio)}."
+        f"k dt²/m = {format_quantity(problem.stiffness_ratio)}, "
+        f"mean rest length {format_quantity(problem.mean_rest_length)} m."
     ]
     remarks += [f"Reference not certified: {problem.uncertified_reason}."] if problem.uncertified_reason else []
     by: dict[str, list[str]] = {}
@@ -222,7 +223,7 @@ def build_time_chart(table: AccuracyData, newest_fingerprint: str | None = None)
         x=(ChartAxis("target", gaps),),
         y=tuple(ChartAxis(name, AxisScale("wall time", "log", "time"), name, words) for name, words in names.items()),
         subject_key="scene",
-        hover=(("gap", "gap"), *((name, f"seconds, {words}") for name, words in names.items())),
+        hover=(("gap", "gap"), *((name, f"wall time, {words}") for name, words in names.items())),
         **_shared_fields(table, {curve.label: curve.citation for curve in table.curves}),
     )
 
@@ -303,7 +304,7 @@ def build_work_precision_chart(table: AccuracyData, newest_fingerprint: str | No
         x=(ChartAxis("seconds", AxisScale(COST_LABEL, "log", "time")),),
         y=(ChartAxis("error", AxisScale(ERROR_LABEL, "log", "percent")),),
         subject_key="scene",
-        hover=(("time_step", "time step"), ("error", "relative error"), ("seconds", "seconds a simulated second")),
+        hover=(("time_step", "time step"), ("error", "relative error"), ("seconds", COST_LABEL)),
         **_shared_fields(table, {_label_work(work): work.citation for work in table.work_points}),
     )
 
@@ -457,7 +458,7 @@ def build_scaling_chart(table: AccuracyData, newest_fingerprint: str | None = No
         x=(ChartAxis("vertices", AxisScale("vertices", "sizes", "plain")),),
         y=(ChartAxis("seconds", AxisScale(f"wall time to a gap of {format_power(GAP_TARGET)}", "log", "time")),),
         subject_key="scene",
-        hover=(("vertices", "vertices"), ("seconds", "seconds"), ("exponent", "fitted power")),
+        hover=(("vertices", "vertices"), ("seconds", "wall time"), ("exponent", "fitted power")),
         **_shared_fields(table, {_label_scaling(one): citations[one.label] for one in found}),
     )
 

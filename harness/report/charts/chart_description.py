@@ -1,7 +1,7 @@
 """The description of a chart: named columns of numbers, and the axes that they may be drawn along.
 
-A builder makes one description of its rows. Matplotlib draws its curve plots (`select_curve_plots`) as figures and
-sheets; the results page draws its JSON (`springbench.harness.report.site.chart_json`) by Plotly.
+A builder makes one description of its rows, of curves or of cell maps. Matplotlib draws its panels (`select_panels`) as
+figures and sheets; the results page draws its JSON (`springbench.harness.report.site.chart_json`), curves by Plotly.
 """
 
 from __future__ import annotations
@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from springbench.harness.report.charts.figure_panels import (
     AxisScale,
+    CellMap,
     CurvePlot,
     CurveSeries,
+    FigurePanel,
     FloatArray,
     MarkedValue,
     ShadedBand,
@@ -53,7 +55,7 @@ class ChartSeries:
         description: what was measured, in words.
         stale: whether other code measured the points, in total or for each of them.
         status: "ok", or how the measurement ended; then a cross marks its end.
-        is_stepped, is_connected, marker_scale, setting: see `CurveSeries`.
+        is_stepped, is_connected, labels_points, marker_scale, setting: see `CurveSeries`.
         callouts: words at points, by index; drawn where the first quantity of y is shown.
         links: what the page offers for a point, such as a recording.
     """
@@ -66,6 +68,7 @@ class ChartSeries:
     status: str = "ok"
     is_stepped: bool = False
     is_connected: bool = True
+    labels_points: bool = False
     marker_scale: float = 1.0
     setting: str = ""
     callouts: Mapping[int, str] = field(default_factory=dict[int, str])
@@ -80,8 +83,9 @@ class ChartFrame:
         group, name: parts of the names of its panels, see `CurvePlot`.
         subject: what was measured, such as a scene; frames of one subject are shown side by side.
         title: what distinguishes the frame from the others of its subject.
-        bands, lines: shaded ranges and marked values, by column of y.
+        bands, lines: shaded ranges and marked values, by column of x or y.
         notes: sentences about these series.
+        place_names: names of the positions by column of x or y, if they are not those of the chart.
         x_label: label of the horizontal axis, if it is not that of the chart.
         sheet: name of the sheet that shows the frame; empty for the sheet of the chart.
     """
@@ -94,6 +98,7 @@ class ChartFrame:
     bands: Mapping[str, Sequence[ShadedBand]] = field(default_factory=dict[str, Sequence[ShadedBand]])
     lines: Mapping[str, Sequence[MarkedValue]] = field(default_factory=dict[str, Sequence[MarkedValue]])
     notes: Sequence[str] = ()
+    place_names: Mapping[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
     x_label: str = ""
     sheet: str = ""
 
@@ -107,6 +112,7 @@ class ChartDescription:
         note: how to read it, in sentences.
         frames: its frames, in the order of their appearance.
         x, y: quantities that it can be drawn along; the first ones are drawn by default.
+        maps: its cell maps.
         subject_key: what the subjects are: problem, scene, gap, curve or benchmark.
         hover: columns that are stated at a point, with their words.
         machine_words: provenance of the data.
@@ -116,14 +122,21 @@ class ChartDescription:
 
     title: str
     note: str
-    frames: Sequence[ChartFrame]
-    x: tuple[ChartAxis, ...]
-    y: tuple[ChartAxis, ...]
-    subject_key: str
+    frames: Sequence[ChartFrame] = ()
+    x: tuple[ChartAxis, ...] = ()
+    y: tuple[ChartAxis, ...] = ()
+    subject_key: str = "scene"
+    maps: Sequence[CellMap] = ()
     hover: Sequence[tuple[str, str]] = ()
     machine_words: str = ""
     citations: Mapping[str, str] = field(default_factory=dict[str, str])
     command: str = ""
+
+
+def select_panels(chart: ChartDescription) -> Iterator[FigurePanel]:
+    """Yield the maps of a chart, then its plots."""
+    yield from chart.maps
+    yield from select_curve_plots(chart)
 
 
 def select_curve_plots(
@@ -147,7 +160,11 @@ def select_curve_plots(
 def _build_plot(
     chart: ChartDescription, frame: ChartFrame, across: ChartAxis, up: ChartAxis, series: list[CurveSeries]
 ) -> CurvePlot:
-    scales = across.scale._replace(label=frame.x_label or across.scale.label), up.scale
+    names = [frame.place_names.get(axis.column, axis.scale.place_names) for axis in (across, up)]
+    scales = (
+        across.scale._replace(label=frame.x_label or across.scale.label, place_names=names[0]),
+        up.scale._replace(place_names=names[1]),
+    )
     if across.scale.division == "sizes" and len({float(x) for one in series for x in one.x}) == 1:
         scales = up.scale, AxisScale("", "names", place_names=tuple(one.label for one in _sort_by_value(series)))
         series = [_lay_down(one, k) for k, one in enumerate(_sort_by_value(series))]
@@ -161,6 +178,8 @@ def _build_plot(
         series=series,
         bands=frame.bands.get(up.column, ()),
         lines=frame.lines.get(up.column, ()),
+        x_bands=frame.bands.get(across.column, ()),
+        x_lines=frame.lines.get(across.column, ()),
         notes=frame.notes,
         machine_words=chart.machine_words,
     )
@@ -202,6 +221,7 @@ def _build_curve(one: ChartSeries, across: ChartAxis, up: ChartAxis, with_callou
         stale=np.broadcast_to(np.asarray(one.stale, bool), x.shape),
         is_stepped=one.is_stepped,
         is_connected=one.is_connected,
+        labels_points=one.labels_points,
         setting=one.setting,
         marker_scale=one.marker_scale,
         has_cross=one.status != "ok",

@@ -23,6 +23,7 @@ from springbench.harness.report.charts.published_curves import (
     add_published_curves,
     read_published_data,
 )
+from springbench.harness.report.charts.winner_chart import build_winner_chart
 from springbench.harness.results.published_set import PUBLISHED_FOLDER
 
 ChartBuilder = Callable[[AccuracyData, str | None], ChartDescription]
@@ -33,6 +34,7 @@ _BUILDERS: dict[str, ChartBuilder] = {
     "profiles": build_profile_chart,
     "growth": build_scaling_chart,
     "engines": build_engine_chart,
+    "winners": build_winner_chart,
 }
 
 

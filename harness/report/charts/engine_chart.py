@@ -57,13 +57,13 @@ def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = Non
             )
         )
     return ChartDescription(
-        title="Outside engines compared with ours",
+        title="Outside engines compared with springbench",
         note="springbench export-script CONFIG prints a script that repeats an engine's point without us.",
         frames=frames,
         x=(ChartAxis("seconds", AxisScale(COST_LABEL, "log", "time")),),
         y=(ChartAxis("error", AxisScale(ERROR_LABEL, "log", "percent")),),
         subject_key="scene",
-        hover=(("setting", "setting"), ("error", "relative error"), ("seconds", "seconds a simulated second")),
+        hover=(("setting", "setting"), ("error", "relative error"), ("seconds", COST_LABEL)),
         machine_words=", ".join(table.machine_words),
         command=ACCURACY_COMMAND,
     )

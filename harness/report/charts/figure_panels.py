@@ -6,7 +6,8 @@ The same panel is drawn, written as CSV, and reproduced by the script next to th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import groupby
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -67,7 +68,7 @@ class CurveSeries:
 
 
 class ShadedBand(NamedTuple):
-    """A shaded range of y, and its meaning."""
+    """A shaded range of values, and its meaning."""
 
     low: float
     high: float
@@ -75,9 +76,9 @@ class ShadedBand(NamedTuple):
 
 
 class MarkedValue(NamedTuple):
-    """A value of y that a line marks, and its meaning."""
+    """A value that a line marks, and its meaning."""
 
-    y: float
+    value: float
     label: str
 
 
@@ -89,6 +90,8 @@ class CurvePlot:
         group: parts of the name that identify the measurement, such as scene and size.
         name: parts of the name that identify the panel within the group; `--panels` selects by group and name.
         subject, title: the same in words.
+        bands, lines: shaded ranges and marked values of y.
+        x_bands, x_lines: those of x.
         notes: sentences at the foot of the figure.
         machine_words: provenance of the data.
     """
@@ -102,6 +105,8 @@ class CurvePlot:
     series: Sequence[CurveSeries]
     bands: Sequence[ShadedBand] = ()
     lines: Sequence[MarkedValue] = ()
+    x_bands: Sequence[ShadedBand] = ()
+    x_lines: Sequence[MarkedValue] = ()
     notes: Sequence[str] = ()
     machine_words: str = ""
     aspect: float = 0.72
@@ -112,10 +117,26 @@ class CurvePlot:
         return [row for series in self.series for row in _series_rows(":".join((*self.group, *self.name)), series)]
 
 
-class MapCell(NamedTuple):
-    """One cell of a map: row, column, outcome, colour and value.
+class CellOutcome(NamedTuple):
+    """An entry of a map's legend: label, colour and description."""
 
-    `is_stale` states whether other code measured it.
+    label: str
+    color: str
+    description: str = ""
+
+
+class MapCell(NamedTuple):
+    """One cell of a map.
+
+    Attributes:
+        row, column: names of its place.
+        outcome, color: its class, as in the legend.
+        value_text: its value; a map may have several lines in a cell.
+        is_stale: whether other code measured it.
+        mark: sign or words below or after the value, for cells that differ from others of their class.
+        reason: what the page states about the cell.
+        run_id: run that the page opens; empty for none.
+        is_framed: whether a frame emphasises the cell.
     """
 
     row: str
@@ -124,6 +145,19 @@ class MapCell(NamedTuple):
     color: str
     value_text: str
     is_stale: bool = False
+    mark: str = ""
+    reason: str = ""
+    run_id: str = ""
+    is_framed: bool = False
+
+    @property
+    def marked_text(self) -> str:
+        """The value with its mark."""
+        return f"{self.value_text} {self.mark}".strip()
+
+
+_CELL_COLUMNS = ("row", "column", "outcome", "color", "value_text", "is_stale")
+"""Columns of a map's CSV file."""
 
 
 def describe_stale_cells(cells: Sequence[MapCell]) -> list[str]:
@@ -137,7 +171,11 @@ def describe_stale_cells(cells: Sequence[MapCell]) -> list[str]:
 class CellMap:
     """Coloured cells in rows and columns.
 
-    `outcomes` are pairs of meaning and colour, in the order of the legend.
+    Attributes:
+        group, name, subject, title, notes, machine_words: see `CurvePlot`.
+        cells: cells, by rows.
+        outcomes: classes of cells, in the order of the legend.
+        row_label, column_label: quantities with units; empty for names.
     """
 
     group: tuple[str, ...]
@@ -145,13 +183,46 @@ class CellMap:
     subject: str
     title: str
     cells: Sequence[MapCell]
-    outcomes: Sequence[tuple[str, str]]
+    outcomes: Sequence[CellOutcome]
     notes: Sequence[str] = ()
     machine_words: str = ""
+    row_label: str = ""
+    column_label: str = ""
+
+    @property
+    def row_names(self) -> list[str]:
+        """Names of the rows, in their order."""
+        return list(dict.fromkeys(cell.row for cell in self.cells))
+
+    @property
+    def column_names(self) -> list[str]:
+        """Names of the columns, in their order."""
+        return list(dict.fromkeys(cell.column for cell in self.cells))
 
     def csv_rows(self) -> list[CsvRow]:
         """Return the data as rows of a CSV file."""
-        return [{"panel": ":".join((*self.group, *self.name)), **cell._asdict()} for cell in self.cells]
+        panel = ":".join((*self.group, *self.name))
+        return [{"panel": panel, **{key: getattr(cell, key) for key in _CELL_COLUMNS}} for cell in self.cells]
+
+
+def merge_cell_maps(maps: Sequence[CellMap]) -> list[CellMap]:
+    """Merge maps with the same columns into one, whose row names include the titles.
+
+    Args:
+        maps: maps, in order.
+    """
+    merged: list[CellMap] = []
+    for _, same in groupby(maps, key=lambda one: one.column_names):
+        first, *others = same
+        if others:
+            members = [first, *others]
+            cells = [cell._replace(row=f"{one.title}: {cell.row}") for one in members for cell in one.cells]
+            name = tuple(part for one in members for part in one.name)
+            own = [note for one in members for note in one.notes if note not in describe_stale_cells(one.cells)]
+            notes = [*dict.fromkeys(own), *describe_stale_cells(cells)]
+            first = replace(first, name=name, title="", cells=cells, notes=notes)
+        merged.append(first)
+    return merged
 
 
 @dataclass(frozen=True, slots=True, eq=False)

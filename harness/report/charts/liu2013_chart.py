@@ -61,7 +61,7 @@ def build_liu2013_chart(table: AccuracyData, newest_fingerprint: str | None = No
         y=(ChartAxis("error", AxisScale("relative error (g − g*) / (g₀ − g*)", "log", "power")),),
         subject_key="curve",
         hover=(
-            *(("iterations", "iterations"), ("error", "relative error"), ("seconds", "seconds")),
+            *(("iterations", "iterations"), ("error", "relative error"), ("seconds", "wall time")),
             *(("ratio", "ours over theirs"), ("frames", "our frames")),
         ),
         machine_words=", ".join(table.machine_words),

@@ -72,7 +72,8 @@ def _data_extent(panel: CurvePlot) -> tuple[FloatArray, FloatArray]:
         ends = [end for end in (series.lower, series.upper) if end is not None]
         found[0].extend([series.x, *(ends if series.is_horizontal else [])])
         found[1].extend([series.y, *([] if series.is_horizontal else ends)])
-    found[1].append(np.array([line.y for line in panel.lines], float))
+    for values, marked in zip(found, (panel.x_lines, panel.lines), strict=True):
+        values.append(np.array([line.value for line in marked], float))
     x, y = (np.concatenate([np.zeros(0), *values]) for values in found)
     return x[np.isfinite(x)], y[np.isfinite(y)]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from springbench.harness.report.charts.chart_description import ChartDescription, ChartFrame, select_curve_plots
-from springbench.harness.report.charts.figure_panels import CurvePlot
+from springbench.harness.report.charts.figure_panels import CurvePlot, FigurePanel, merge_cell_maps
 from springbench.harness.report.figures.figure_files import write_images
 from springbench.harness.report.figures.figure_layout import MILLIMETRES_PER_INCH, compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
@@ -16,18 +16,30 @@ SHEET_OPTIONS = FigureOptions(
     width_mm=PAGE_WIDTH / PAGE_DPI * MILLIMETRES_PER_INCH, formats=("png", "svg"), font_size=10.0
 )
 
+_MAX_WHOLE_FRAMES = 4
+"""Maximum number of frames of a sheet that shows all quantities of each."""
+_MAX_LONE_COLUMNS = 4
+"""Maximum number of plots of a single frame in one row."""
+
 
 def draw_chart_sheets(chart: ChartDescription, stem: Path) -> list[Path]:
     """Draw the sheets of a chart as PNG and SVG, and return the files.
+
+    Its maps are on its own sheet, one below the other.
 
     Args:
         chart: the chart.
         stem: path of the chart's own sheet without suffix; a folder for the other sheets.
     """
     paths: list[Path] = []
-    for sheet in dict.fromkeys(frame.sheet for frame in chart.frames):
+    maps = merge_cell_maps(chart.maps)
+    sheets = [*(frame.sheet for frame in chart.frames), *([""] if maps else [])]
+    for sheet in dict.fromkeys(sheets):
         frames = [frame for frame in chart.frames if frame.sheet == sheet]
-        panels, columns = _arrange_plots(chart, frames)
+        plots, columns = _arrange_plots(chart, frames)
+        panels: list[FigurePanel] = [*plots, *([] if sheet else maps)]
+        if maps and not sheet:
+            columns = 1 if plots else None
         if panels:
             figure = compose_figure(panels, chart.title, SHEET_OPTIONS, columns)
             target = stem / sheet if sheet else stem
@@ -38,12 +50,17 @@ def draw_chart_sheets(chart: ChartDescription, stem: Path) -> list[Path]:
 def _arrange_plots(chart: ChartDescription, frames: Sequence[ChartFrame]) -> tuple[list[CurvePlot], int | None]:
     """Return the plots by rows, and the number of columns; None if it is free.
 
-    Quantities of y are in rows if x has several too, otherwise in columns.
+    Quantities of y are in rows if x has several too, otherwise in columns. Many frames show the first one only.
     """
     shown = [axis for axis in chart.y if axis.is_on_sheets]
-    if len(shown) == 1:
-        return [*select_curve_plots(chart, frames, shown)], None
+    if len(shown) == 1 or len(frames) > _MAX_WHOLE_FRAMES:
+        return [*select_curve_plots(chart, frames, shown[:1])], None
     if len(chart.x) == 1:
-        return [*select_curve_plots(chart, frames, shown)], len(shown)
+        rows = [[*select_curve_plots(chart, [frame], shown)] for frame in frames]
+        plots, counts = [plot for row in rows for plot in row], {len(row) for row in rows if row}
+        if len(counts) != 1:  # a quantity is missing somewhere
+            return plots, None
+        (count,) = counts
+        return plots, count if len(rows) > 1 or count <= _MAX_LONE_COLUMNS else 3
     rows = [[plot for frame in frames for plot in select_curve_plots(chart, [frame], [axis])] for axis in shown]
-    return [plot for row in rows for plot in row], max(map(len, rows))
+    return [plot for row in rows for plot in row], max(map(len, rows), default=None)

@@ -52,10 +52,10 @@ def add_direct_labels(axes: Sequence[Axes], panels: Sequence[FigurePanel], optio
     fits = (
         len(known) * 1.3 * options.small_font_size <= tall and wide <= _MAX_WIDTH_SHARE * options.width_mm / 25.4 * 72.0
     )
-    if named and not fits:
+    if named:
         _label_points(axes[0], panel.series, options)
         return True
-    if not fits or not known or (not named and (panel.bands or len(known) > _MAX_LABELS)):
+    if not fits or not known or panel.bands or len(known) > _MAX_LABELS:
         return False
     _EndLabels(axes[0], known, options)
     return True
@@ -139,15 +139,16 @@ def _darken_colour(color: str) -> str:
 def _label_points(ax: Axes, series: Sequence[CurveSeries], options: FigureOptions) -> None:
     """Label single points without overlap.
 
-    A label is on a side of its point where it overlaps no other label and no other point.
+    A label is on a side of its point where it overlaps no other label and no other point, if possible not on its line.
     """
+    offsets = sorted(_LABEL_OFFSETS, key=lambda offset: offset[1] == 0.0)
     for one in series:
         for x, y in zip(one.x, one.y, strict=True):
             name = ax.annotate(
                 one.label, (x, y), (5, 0), textcoords="offset points", va="center", fontsize=options.small_font_size,
                 annotation_clip=False,
             )  # fmt: skip
-            setattr(name, "settle", lambda name=name: _place_label(ax, name))  # noqa: B010 as above
+            setattr(name, "settle", lambda name=name: _place_label(ax, name, offsets))  # noqa: B010 as above
 
 
 def _add_callouts(ax: Axes, series: Sequence[CurveSeries], options: FigureOptions) -> None:
@@ -161,7 +162,7 @@ def _add_callouts(ax: Axes, series: Sequence[CurveSeries], options: FigureOption
                 words, (x, y), (_CALLOUT_RADIUS, 0), textcoords="offset points", va="center",
                 fontsize=options.small_font_size, color=TEXT_COLOUR, annotation_clip=False,
             )  # fmt: skip
-            setattr(name, "settle", lambda name=name: _place_label(ax, name))  # noqa: B010 as above
+            setattr(name, "settle", lambda name=name: _place_label(ax, name, _LABEL_OFFSETS))  # noqa: B010 as above
 
 
 _LABEL_OFFSETS: tuple[tuple[float, float, Any], ...] = tuple(
@@ -178,7 +179,7 @@ _LABEL_OFFSETS: tuple[tuple[float, float, Any], ...] = tuple(
 )
 
 
-def _place_label(ax: Axes, name: Annotation) -> None:
+def _place_label(ax: Axes, name: Annotation, offsets: Sequence[tuple[float, float, Any]]) -> None:
     """Place a label on the first side without overlap.
 
     There it is inside the frame and overlaps no earlier label or point.
@@ -187,7 +188,7 @@ def _place_label(ax: Axes, name: Annotation) -> None:
     taken = [other.get_window_extent() for other in before]
     points = [ax.transData.transform(line.get_xydata()) for line in ax.lines if line.get_marker() not in ("None", "")]
     marks = np.concatenate([np.zeros((0, 2)), *points])
-    for dx, dy, ha in _LABEL_OFFSETS:
+    for dx, dy, ha in offsets:
         name.set_position((dx, dy))
         name.set_horizontalalignment(ha)
         box = name.get_window_extent()

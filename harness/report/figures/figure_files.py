@@ -122,7 +122,7 @@ def build_script(figure: Figure, panels: Sequence[FigurePanel], name: str, optio
         )
     if kind is CellMap:
         grids = [panel for panel in panels if isinstance(panel, CellMap)]
-        outcomes = dict(grids[0].outcomes)
+        outcomes = {one.label: one.color for one in grids[0].outcomes}
         return head + script_templates.CELL_MAP_TEMPLATE.format(outcomes=_format_literal(outcomes), **shared)
     pictures = [panel for panel in panels if isinstance(panel, MeshPicture)]
     titles = {":".join((*panel.group, *panel.name)): panel.title for panel in pictures}
@@ -138,11 +138,15 @@ def _describe_panel(panel: CurvePlot) -> tuple[str, dict[str, Any]]:
         for key, scale in (("x", panel.x), ("y", panel.y))
     }
     first = panel.series[0] if panel.series else None
-    how = {"steps": bool(first and first.is_stepped), "joined": bool(first is None or first.is_connected)}
-    lines = [(line.y, line.label) for line in panel.lines]
+    how: dict[str, Any] = {
+        "steps": bool(first and first.is_stepped),
+        "joined": bool(first is None or first.is_connected),
+    }
+    lines, upright = ([line.value for line in some] for some in (panel.lines, panel.x_lines))
     whole = " ".join(filter(None, (panel.subject, panel.title)))
     across = bool(first and first.is_horizontal)
-    return ":".join((*panel.group, *panel.name)), {"title": whole, **axes, **how, "across": across, "lines": lines}
+    how |= {"across": across, "lines": lines, "upright": upright}
+    return ":".join((*panel.group, *panel.name)), {"title": whole, **axes, **how}
 
 
 _MATPLOTLIB_SCALES = {"log": "log", "sizes": "log", "linear": "linear", "iterations": "symlog", "names": "linear"}

@@ -11,18 +11,17 @@ from typing import Any, NamedTuple
 
 from springbench.harness.config.sweep_config import REPORT_TABLE
 from springbench.harness.errors import InputError, InputMistake, RunFailed, SpringbenchError, suggest_name
+from springbench.harness.report.ablation_summary import read_ablations
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
-from springbench.harness.report.charts.chart_description import select_curve_plots
+from springbench.harness.report.charts.ablation_charts import build_effect_chart, build_overhead_chart
+from springbench.harness.report.charts.chart_description import ChartDescription, select_panels
 from springbench.harness.report.charts.chart_table import build_compared_chart
-from springbench.harness.report.charts.figure_panels import CellMap, FigurePanel, MeshPicture
-from springbench.harness.report.figures import (
-    ablation_panels,
-    benchmark_panels,
-    robustness_panels,
-    timing_panels,
-    winner_panels,
-)
+from springbench.harness.report.charts.figure_panels import CellMap, FigurePanel, MeshPicture, merge_cell_maps
+from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
+from springbench.harness.report.figures import benchmark_panels, timing_panels
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
+from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
+from springbench.harness.report.robustness import read_verified_runs
 from springbench.solvers.plugins.plugin_discovery import load_target
 
 
@@ -77,7 +76,7 @@ def _merge_cell_maps(entries: Sequence[PanelEntry]) -> list[FigurePanel]:
     panels = [entry.build_panel() for entry in entries]
     grids = [panel for panel in panels if isinstance(panel, CellMap)]
     rest = [panel for panel in panels if not isinstance(panel, CellMap)]
-    return [*rest, *([robustness_panels.merge_cell_maps(grids)] if grids else [])]
+    return [*rest, *merge_cell_maps(grids)]
 
 
 def _without_stale(
@@ -89,10 +88,30 @@ def _without_stale(
     return read
 
 
-def _list_accuracy_plots(name: str) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
-    """Return a function that lists the plots of a chart of an accuracy measurement."""
-    return _without_stale(
-        lambda folder: entries_from_panels(select_curve_plots(build_compared_chart(name, read_accuracy(folder))))
+def _list_accuracy_panels(name: str) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
+    """Return a function that lists the panels of a chart of an accuracy measurement."""
+    return _list_chart_panels(lambda folder: build_compared_chart(name, read_accuracy(folder)))
+
+
+def _list_chart_panels(
+    build_chart: Callable[[Path], ChartDescription],
+) -> Callable[[Path, timing_panels.StaleFinder], list[PanelEntry]]:
+    return _without_stale(lambda folder: entries_from_panels(select_panels(build_chart(folder))))
+
+
+def _build_effect_chart(folder: Path) -> ChartDescription:
+    return build_effect_chart(read_ablations(folder, "ablated"))
+
+
+def _build_overhead_chart(folder: Path) -> ChartDescription:
+    return build_overhead_chart([row for rows in read_ablations(folder, "overhead").values() for row in rows])
+
+
+def _list_hard_case_panels(folder: Path, find_stale: timing_panels.StaleFinder) -> list[PanelEntry]:
+    table = timing_panels.read_sweep_rows(folder)
+    provenance = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
+    return entries_from_panels(
+        select_panels(build_hard_case_chart(read_verified_runs(folder), find_stale(table), provenance))
     )
 
 
@@ -102,40 +121,42 @@ _GAP_PANELS = (("gap", "time"), ("gap", "iterations"))
 _PROFILE_PANELS = tuple(("performance", gap) for gap in ("1e-1", "1e-3", "1e-6"))
 
 FIGURE_KINDS: dict[str, FigureKind] = {
-    "convergence": FigureKind("Convergence", _ACCURACY_ROWS, _list_accuracy_plots("convergence"), _GAP_PANELS),
+    "convergence": FigureKind("Convergence", _ACCURACY_ROWS, _list_accuracy_panels("convergence"), _GAP_PANELS),
     "times": FigureKind(
         "Time to accuracy",
         _ACCURACY_ROWS,
-        _list_accuracy_plots("times"),
+        _list_accuracy_panels("times"),
         (("alone",), ("over-1",)),
     ),
-    "winners": FigureKind("The cheapest way to an error", _ACCURACY_ROWS, _without_stale(winner_panels.winner_panels)),
-    "engines": FigureKind(
-        "Outside engines beside ours", f"{_ACCURACY_ROWS}, with engines", _list_accuracy_plots("engines")
+    "winners": FigureKind(
+        "The cheapest way to an error", f"{_ACCURACY_ROWS}, by two families", _list_accuracy_panels("winners")
     ),
-    "work": FigureKind("Work and precision", _ACCURACY_ROWS, _list_accuracy_plots("work")),
-    "profiles": FigureKind("Profiles", _ACCURACY_ROWS, _list_accuracy_plots("profiles"), _PROFILE_PANELS),
-    "growth": FigureKind("Growth with size", _ACCURACY_ROWS, _list_accuracy_plots("growth")),
+    "engines": FigureKind(
+        "Outside engines compared with springbench", f"{_ACCURACY_ROWS}, with engines", _list_accuracy_panels("engines")
+    ),
+    "work": FigureKind("Work and precision", _ACCURACY_ROWS, _list_accuracy_panels("work")),
+    "profiles": FigureKind("Profiles", _ACCURACY_ROWS, _list_accuracy_panels("profiles"), _PROFILE_PANELS),
+    "growth": FigureKind("Growth with size", _ACCURACY_ROWS, _list_accuracy_panels("growth")),
     "liu2013": FigureKind(
         "Liu et al. 2013, reproduced",
         f"{_ACCURACY_ROWS}, of liu2013.yaml",
-        _list_accuracy_plots("liu2013"),
+        _list_accuracy_panels("liu2013"),
     ),
     "timing": FigureKind("Time a step", _SWEEP_ROWS, timing_panels.timing_panels, (("step",), ("prepare",))),
     "hard": FigureKind(
         "Hard cases",
         f"{_SWEEP_ROWS} with `verify: true`",
-        robustness_panels.robustness_panels,
+        _list_hard_case_panels,
         (("shares",),),
         _merge_cell_maps,
     ),
     "ablation": FigureKind(
-        "What effects cost", "rows of `springbench ablate SCENE`", _without_stale(ablation_panels.effect_cost_panels)
+        "What effects cost", "rows of `springbench ablate SCENE`", _list_chart_panels(_build_effect_chart)
     ),
     "prices": FigureKind(
         "The price of effects",
         "rows of `springbench ablate SCENE --all-solvers`",
-        _without_stale(ablation_panels.overhead_panels),
+        _list_chart_panels(_build_overhead_chart),
         (("map",),),
     ),
     "speed": FigureKind(

@@ -30,7 +30,6 @@ from springbench.harness.report.figures.axis_scales import thin_ticks
 from springbench.harness.report.figures.direct_labels import add_direct_labels
 from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.figures.panel_drawing import (
-    cell_map_names,
     draw_cell_map,
     draw_curve_plot,
     draw_mesh_picture,
@@ -146,8 +145,9 @@ def _compute_row_heights(
 def _compute_panel_height(panel: FigurePanel, head: int, width: float, room: float, options: FigureOptions) -> float:
     line = 1.45 * options.small_font_size / 72.0
     if isinstance(panel, CellMap):
-        rows, columns = cell_map_names(panel)
-        return line * len(rows) + 0.62 * options.small_font_size / 72.0 * max(map(len, columns)) + 2.0 * line
+        lines = 1.0 + max(cell.marked_text.count("\n") for cell in panel.cells)
+        above = 0.62 * options.small_font_size / 72.0 * max(map(len, panel.column_names))
+        return line * lines * len(panel.row_names) + above + (3.0 if panel.column_label else 2.0) * line
     if isinstance(panel, MeshPicture):
         return width / panel.aspect + line * (1 + len(panel.facts))
     if panel.y.division == "names":
@@ -297,14 +297,14 @@ def _collect_legend_entries(panels: Sequence[FigurePanel]) -> list[Any]:
     grids = [panel for panel in panels if isinstance(panel, CellMap)]
     if grids:
         used = {cell.outcome for grid in grids for cell in grid.cells}
-        return [Patch(color=color, label=words) for words, color in grids[0].outcomes if words in used]
+        return [Patch(color=one.color, label=one.label) for one in grids[0].outcomes if one.label in used]
     plots = [panel for panel in panels if isinstance(panel, CurvePlot) and panel.y.division != "names"]
     found: dict[str, CurveSeries] = {}
     for panel in plots:
         for series in sort_by_end_value(panel.series):
             found.setdefault(series.label, series)
     entries: list[Any] = [legend_handle(series) for series in found.values() if not series.labels_points]
-    bands = dict.fromkeys(band.label for panel in plots for band in panel.bands if band.label)
+    bands = dict.fromkeys(band.label for panel in plots for band in (*panel.bands, *panel.x_bands) if band.label)
     return entries + [Patch(color="#eceae6", label=words) for words in bands]
 
 

@@ -19,7 +19,7 @@ from matplotlib.transforms import ScaledTranslation
 from springbench.harness.report.accuracy.plot_sheet import marker_scale as enlarged
 from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot, CurveSeries, FloatArray, MeshPicture
 from springbench.harness.report.figures.axis_scales import frame_size_points, set_axis_scales
-from springbench.harness.report.figures.figure_options import FigureOptions
+from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
 from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEXT_COLOUR, SeriesStyle
 
 _LINE_WIDTH, _MARKER_SIZE, _MAX_MARKERS = 1.1, 3.6, 12
@@ -40,16 +40,12 @@ def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions, panels: 
         panels: all panels of the figure.
     """
     set_axis_scales(ax, panel, panels)
-    for band in panel.bands:
-        low, high = max(band.low, ax.get_ylim()[0]), min(band.high, ax.get_ylim()[1])
-        if low < high:
-            ax.axhspan(low, high, color=RULE_COLOUR, alpha=0.7, linewidth=0, zorder=0.5)
-    for marked in panel.lines:
-        ax.axhline(marked.y, color=MUTED_COLOUR, linewidth=0.6, linestyle=(0, (4, 2.5)), zorder=1)
-        place: Any = {"xycoords": ("axes fraction", "data"), "xytext": (-1, 2), "textcoords": "offset points"}
-        ax.annotate(
-            marked.label, (1.0, marked.y), ha="right", fontsize=options.small_font_size, color=MUTED_COLOUR, **place
-        )
+    for bands, limits, shade in ((panel.bands, ax.get_ylim(), ax.axhspan), (panel.x_bands, ax.get_xlim(), ax.axvspan)):
+        for band in bands:
+            low, high = max(band.low, limits[0]), min(band.high, limits[1])
+            if low < high:
+                shade(low, high, color=RULE_COLOUR, alpha=0.7, linewidth=0, zorder=0.5)
+    _draw_marked_values(ax, panel, options)
     if panel.x.division == "linear" and ax.get_xlim()[0] < 0.0 < ax.get_xlim()[1]:
         ax.axvline(0.0, color=MUTED_COLOUR, linewidth=0.5, zorder=1)
     for series in panel.series:
@@ -59,6 +55,20 @@ def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions, panels: 
     ax.grid(axis="x" if panel.y.division == "names" else "y", linewidth=0.4)
     ax.set_axisbelow(True)
     ax.set_xlabel(panel.x.label, loc="left", fontsize=options.small_font_size, labelpad=2)
+
+
+def _draw_marked_values(ax: Axes, panel: CurvePlot, options: FigureOptions) -> None:
+    """Draw dashed lines at marked values, with their labels at the right and at the top."""
+    line: Any = {"color": MUTED_COLOUR, "linewidth": 0.6, "linestyle": (0, (4, 2.5)), "zorder": 1}
+    words: Any = {"textcoords": "offset points", "fontsize": options.small_font_size, "color": MUTED_COLOUR}
+    for marked in panel.lines:
+        ax.axhline(marked.value, **line)
+        at: Any = {"xy": (1.0, marked.value), "xycoords": ("axes fraction", "data")}
+        ax.annotate(marked.label, **at, xytext=(-1, 2), ha="right", **words)
+    for marked in panel.x_lines:
+        ax.axvline(marked.value, **line)
+        at = {"xy": (marked.value, 1.0), "xycoords": ("data", "axes fraction")}
+        ax.annotate(marked.label, **at, xytext=(2, -1), va="top", rotation=90, **words)
 
 
 def _draw_curve(ax: Axes, series: CurveSeries, options: FigureOptions) -> None:
@@ -145,7 +155,7 @@ def draw_cell_map(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
         panel: map to draw.
         options: options of the figure.
     """
-    rows, columns = cell_map_names(panel)
+    rows, columns = panel.row_names, panel.column_names
     ax.set_xlim(0, len(columns))
     ax.set_ylim(len(rows), 0)
     for spine in ax.spines.values():
@@ -154,38 +164,38 @@ def draw_cell_map(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
     corner = ax.transData + ScaledTranslation(_DOT_INSET / 72.0, -_DOT_INSET / 72.0, ax.figure.dpi_scale_trans)
     for cell in panel.cells:
         x, y = columns.index(cell.column), rows.index(cell.row)
-        ax.add_patch(Rectangle((x + 0.04, y + 0.06), 0.92, 0.88, facecolor=cell.color, linewidth=0))
+        border: Any = {"edgecolor": TEXT_COLOUR, "linewidth": 1.6} if cell.is_framed else {"linewidth": 0}
+        ax.add_patch(Rectangle((x + 0.04, y + 0.06), 0.92, 0.88, facecolor=cell.color, **border))
         if cell.is_stale and mixed:
             ax.plot(x + 0.04, y + 0.06, "o", mfc="white", mec=TEXT_COLOUR, ms=2.6, mew=0.7, zorder=4, transform=corner)
     ax.set_yticks(np.arange(len(rows)) + 0.5, rows, fontsize=options.small_font_size)
     ax.set_xticks(np.arange(len(columns)) + 0.5, columns, fontsize=options.small_font_size, rotation=90)
     ax.tick_params(length=0, pad=2, labeltop=True, labelbottom=False, labelcolor=TEXT_COLOUR)
+    ax.xaxis.set_label_position("top")
+    ax.set_xlabel(panel.column_label, loc="left", fontsize=options.small_font_size, labelpad=2)
+    ax.set_ylabel(panel.row_label, loc="top", fontsize=options.small_font_size, labelpad=2)
 
 
 def write_cell_values(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
-    """Write the values of all cells if the longest one fits.
+    """Write the values of all cells, as large as the longest one fits; none if that is too small to read.
 
     The frame must have its final size.
     """
-    rows, columns = cell_map_names(panel)
-    longest = max((len(cell.value_text) for cell in panel.cells), default=0)
+    rows, columns = panel.row_names, panel.column_names
+    longest = max((len(line) for cell in panel.cells for line in cell.marked_text.split("\n")), default=0)
     width, _ = frame_size_points(ax)
-    if longest and longest * 0.64 * options.small_font_size < 0.9 * width / len(columns):
+    size = min(options.small_font_size, 0.9 * width / len(columns) / (0.7 * max(longest, 1)))
+    if longest and size >= MIN_FONT_SIZE:
         for cell in panel.cells:
             at = columns.index(cell.column) + 0.5, rows.index(cell.row) + 0.53
             ax.text(
                 *at,
-                cell.value_text,
+                cell.marked_text,
                 ha="center",
                 va="center",
-                fontsize=options.small_font_size,
+                fontsize=size,
                 color=contrasting_text_colour(cell.color),
             )
-
-
-def cell_map_names(panel: CellMap) -> tuple[list[str], list[str]]:
-    """Return the names of rows and of columns, in their order."""
-    return list(dict.fromkeys(c.row for c in panel.cells)), list(dict.fromkeys(c.column for c in panel.cells))
 
 
 def contrasting_text_colour(color: str) -> str:

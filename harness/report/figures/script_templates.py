@@ -47,8 +47,10 @@ for ax, (panel, how) in zip(axes.flat, PANELS.items()):
         else:
             ax.vlines(x, low, high, color=color, alpha=0.4)
         ax.plot([], [], color=color, marker=marker, linestyle=dash, markersize=3.6, label=label)
-    for y, words in how["lines"]:
+    for y in how["lines"]:
         ax.axhline(y, color="gray", linewidth=0.6, linestyle="--")
+    for x in how["upright"]:
+        ax.axvline(x, color="gray", linewidth=0.6, linestyle="--")
     ax.set(title=how["title"], xlabel=how["x"]["words"], ylabel=how["y"]["words"])
     ax.set(xscale=how["x"]["scale"], yscale=how["y"]["scale"])
     if how["x"]["names"]:

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.report.charts.chart_description import select_curve_plots
 from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, CurveSeries
+from springbench.harness.report.charts.speed_chart import build_speed_chart
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
 from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles
 from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
 from springbench.harness.report.speed import speed_figures
-from springbench.harness.report.speed.speed_plots import SPEED_PLOTS
 from springbench.harness.report.timing_table import RunTimes, label_runs, read_run_times
 from springbench.harness.results import parquet_rows, row_store
 
@@ -34,7 +35,7 @@ def read_sweep_rows(folder: Path) -> pa.Table:
     if not units:
         raise InputError(InputMistake("holds no rows of runs; wanted those of `springbench run CONFIG`", folder))
     table = parquet_rows.read_rows(units, required_columns=_REQUIRED_COLUMNS)
-    if speed_figures.MACHINE_SOLVER in table["solver"].unique().to_pylist():
+    if speed_figures.has_machine_limits(table):
         raise InputError(InputMistake("holds rows of `springbench roofline`; ask for the kind speed", folder))
     return table
 
@@ -115,57 +116,11 @@ def _build_size_series(
 
 
 def speed_panels(folder: Path) -> list[PanelEntry]:
-    """Build panels of phase times and of the reached share of the limit."""
+    """Build the panels of a speed report."""
     units = row_store.list_units(folder / "rows")
     table = parquet_rows.read_rows(units, required_columns=_REQUIRED_COLUMNS) if units else None
-    if table is None or speed_figures.MACHINE_SOLVER not in table["solver"].unique().to_pylist():
+    if table is None or not speed_figures.has_machine_limits(table):
         raise InputError(
             InputMistake("holds no speed report; wanted the rows of `springbench roofline CONFIG`", folder)
         )
-    found = [one for one in speed_figures.compute_speed_figures(table) if one.status == "ok"]
-    provenance = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
-    marked = assign_label_styles((one.label, one.solver) for one in found)
-    plots: list[CurvePlot] = []
-    for scene in dict.fromkeys(one.scene for one in found):
-        for picture in SPEED_PLOTS:
-            unit = 1.0 if picture.is_share else 1e-3
-            points = [(f, unit * v) for f in found if f.scene == scene and (v := picture.get_value(f)) is not None]
-            if points:
-                series, scales = _build_speed_series(points, marked)
-                shown = _SHARE_SCALE if picture.is_share else _TIME_SCALE
-                x, y = (shown if scale is _VALUE_SCALE else scale for scale in scales)
-                title = picture.title.replace("Milliseconds ", "")
-                hollow = [STALE_NOTE] if any(one.is_stale for one, _ in points) else []
-                plots.append(
-                    CurvePlot(
-                        (scene,), (picture.stem,), scene, title, x, y, series, notes=hollow, machine_words=provenance
-                    )
-                )
-    return entries_from_panels(plots)
-
-
-_VALUE_SCALE, _SHARE_SCALE, _TIME_SCALE = (
-    AxisScale(""),
-    AxisScale("part of the limit", "linear", "percent"),
-    AxisScale("time", "log", "time"),
-)
-
-
-def _build_speed_series(
-    points: Sequence[tuple[speed_figures.SpeedFigures, float]], styles: dict[str, SeriesStyle]
-) -> tuple[list[CurveSeries], tuple[AxisScale, ...]]:
-    each: dict[str, list[tuple[float, float, bool]]] = {}
-    for one, value in sorted(points, key=lambda point: point[0].vertices):
-        each.setdefault(one.label, []).append((float(one.vertices), value, one.is_stale))
-    lone = len({one.vertices for one, _ in points}) == 1
-    if lone:
-        each = dict(sorted(each.items(), key=lambda pair: pair[1][0][1]))
-    series: list[CurveSeries] = []
-    for k, (label, members) in enumerate(each.items()):
-        n, values, older = (np.array(side) for side in zip(*members, strict=True))
-        x, y = (values, np.full(len(n), float(k))) if lone else (n, values)
-        series.append(CurveSeries(label, styles[label], x, y, stale=older, is_connected=not lone))
-    return series, (_VALUE_SCALE, AxisScale("", "names", place_names=tuple(each))) if lone else (
-        _VERTEX_SCALE,
-        _VALUE_SCALE,
-    )
+    return entries_from_panels(select_curve_plots(build_speed_chart(speed_figures.compute_speed_figures(table))))

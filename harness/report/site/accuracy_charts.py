@@ -10,9 +10,7 @@ from typing import Any
 
 from springbench.harness.report.accuracy.accuracy_data import AccuracyData, ConvergenceCurve, without_short_curves
 from springbench.harness.report.accuracy.snapshot_pictures import find_closest_solve, snapshot_picture_path
-from springbench.harness.report.charts.accuracy_charts import ACCURACY_COMMAND
 from springbench.harness.report.charts.chart_table import CHART_NAMES, build_compared_chart
-from springbench.harness.report.site import winner_chart
 from springbench.harness.report.site.chart_json import serialise_chart
 
 
@@ -33,8 +31,7 @@ def build_page_charts(everything: AccuracyData, folder: Path) -> dict[str, dict[
     newest = everything.newest_fingerprint
     charts = {name: build_compared_chart(name, everything, newest, link_source) for name in CHART_NAMES}
     made = {name: serialise_chart(chart) for name, chart in charts.items()}
-    made["winners"] = winner_chart.build_winner_chart(everything) | {"command": ACCURACY_COMMAND}
-    return {name: chart for name, chart in made.items() if chart["items"]}
+    return {name: chart for name, chart in made.items() if chart["items"] or chart["maps"]}
 
 
 def _find_mesh_pictures(table: AccuracyData, folder: Path) -> dict[str, dict[str, str]]:

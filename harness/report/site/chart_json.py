@@ -1,7 +1,7 @@
 """Charts for the results page: a chart description as JSON, which `static/chart.js` draws by Plotly.
 
 An item is a series with the columns of its points; it refers to its frame by number, as bands, lines and notes belong
-to frames. Axes and styles are in Plotly's terms.
+to frames. Axes and styles are in Plotly's terms. Cell maps are tables, which `static/map.js` shows.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from springbench.harness.report.charts.chart_description import (
     ChartFrame,
     ChartSeries,
 )
-from springbench.harness.report.charts.figure_panels import AxisScale, FloatArray
+from springbench.harness.report.charts.figure_panels import AxisScale, CellMap, FloatArray
+from springbench.harness.report.plot_style import STALE_NOTE
 from springbench.harness.report.site.data_scripts import round_number
 from springbench.harness.report.site.plotly_styles import plotly_style
 from springbench.harness.report.site.run_table import format_references
@@ -26,43 +27,63 @@ from springbench.harness.report.site.run_table import format_references
 def serialise_chart(chart: ChartDescription) -> dict[str, Any]:
     """Return a chart as data that can be represented as JSON."""
     pairs = [(number, frame, series) for number, frame in enumerate(chart.frames) for series in frame.series]
+    formats = {axis.column: axis.scale.tick_format for axis in (*chart.x, *chart.y)}
     return {
         "title": chart.title,
         "note": chart.note,
         "filters": [chart.subject_key],
         "x": [_describe_axis(axis) for axis in chart.x],
         "y": [_describe_axis(axis, {"autorange": "reversed"}) for axis in chart.y],
-        "hover": [list(pair) for pair in chart.hover],
+        "hover": [[column, words, formats.get(column, "")] for column, words in chart.hover],
         "frames": [_describe_frame(frame) for frame in chart.frames],
+        "maps": [_describe_map(one) for one in chart.maps],
         "items": [_describe_series(chart, number, frame, series) for number, frame, series in pairs],
-        "styles": {series.label: plotly_style(series.style) for *_, series in pairs},
+        "styles": {series.label: plotly_style(series.style) for *_, series in reversed(pairs)},
         "citations": format_references(chart.citations.items()),
         "command": chart.command,
     }
 
 
+def _describe_map(cell_map: CellMap) -> dict[str, Any]:
+    """Describe a map; a cell refers to its class by number."""
+    labels = [outcome.label for outcome in cell_map.outcomes]
+    return {
+        "title": ", ".join(filter(None, (cell_map.subject, cell_map.title))),
+        "outcomes": [outcome._asdict() for outcome in cell_map.outcomes],
+        "cells": [
+            [one.row, one.column, labels.index(one.outcome), one.marked_text, one.reason, one.run_id, one.is_stale]
+            for one in cell_map.cells
+        ],
+    }
+
+
 def _describe_axis(axis: ChartAxis, names_layout: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
     """Describe a choice of an axis; `names_layout` is added to the layout of an axis of names."""
-    unit = " [s]" if axis.scale.tick_format == "time" else ""
     layout = _plotly_axis(axis.scale)
     if axis.scale.division == "names":
         layout |= names_layout
-    title = ", ".join(filter(None, (axis.scale.label, axis.title))) + unit
-    return {"column": axis.column, "title": title, "axis": layout}
+    title = ", ".join(filter(None, (axis.scale.label, axis.title)))
+    return {"column": axis.column, "title": title, "format": axis.scale.tick_format, "axis": layout}
+
+
+_TIME_TICKS = {"tickformat": "$~s"}
+"""Ticks of a time with SI prefixes, such as 5ms; the page's currency is the second."""
 
 
 def _plotly_axis(scale: AxisScale) -> dict[str, Any]:
     if scale.division == "names":
         return {"type": "category", "categoryarray": list(scale.place_names)}
+    ticks = _TIME_TICKS if scale.tick_format == "time" else {}
     if scale.division != "linear":
-        return {"type": "log"}
-    return {"tickformat": ".0%", "rangemode": "tozero"} if scale.tick_format == "percent" else {}
+        return {"type": "log", **ticks, **({"tickmode": "array"} if scale.division == "sizes" else {})}
+    return {"tickformat": ".0%", "rangemode": "tozero"} if scale.tick_format == "percent" else {**ticks}
 
 
 def _describe_frame(frame: ChartFrame) -> dict[str, Any]:
     return {
-        "notes": list(frame.notes),
+        "notes": [note for note in frame.notes if note != STALE_NOTE],  # the page explains hollow marks by itself
         "x_label": frame.x_label,
+        "place_names": {column: list(names) for column, names in frame.place_names.items()},
         "bands": {column: [list(band) for band in bands] for column, bands in frame.bands.items()},
         "lines": {column: [list(line) for line in lines] for column, lines in frame.lines.items()},
     }
@@ -73,11 +94,13 @@ def _describe_series(chart: ChartDescription, number: int, frame: ChartFrame, se
     for axis in (*chart.x, *chart.y):
         if axis.scale.division == "names" and axis.column in columns:
             places = series.columns[axis.column]
-            columns[axis.column] = [_find_place_name(axis.scale, place) for place in places]
+            names = frame.place_names.get(axis.column, axis.scale.place_names)
+            columns[axis.column] = [_find_place_name(names, place) for place in places]
     length = len(next(iter(columns.values())))
     missing = {axis.column: [None] * length for axis in (*chart.x, *chart.y) if axis.column not in columns}
     return {
         "label": series.label,
+        "style": plotly_style(series.style),
         "description": series.description,
         chart.subject_key: frame.subject,
         "panel": frame.title,
@@ -94,8 +117,8 @@ def _describe_series(chart: ChartDescription, number: int, frame: ChartFrame, se
     }
 
 
-def _find_place_name(scale: AxisScale, place: Any) -> str | None:
-    return None if place is None or np.isnan(place) else scale.place_names[round(float(place))]
+def _find_place_name(names: Sequence[str], place: Any) -> str | None:
+    return None if place is None or np.isnan(place) else names[round(float(place))]
 
 
 def _describe_column(values: Sequence[Any] | FloatArray) -> list[Any]:

@@ -21,7 +21,7 @@ from springbench.harness.report.plot_style import (
 _PLOTLY_SYMBOLS: dict[Any, str] = {
     "None": "none", "o": "circle", "s": "square", "^": "triangle-up", "v": "triangle-down", "<": "triangle-left",
     ">": "triangle-right", "D": "diamond", "d": "diamond-tall", "P": "cross", "X": "x", "p": "pentagon",
-    "h": "hexagon", "*": "star", "H": "hexagon2", "8": "octagon",
+    "h": "hexagon", "*": "star", "H": "hexagon2", "8": "octagon", "|": "line-ns",
     STAR_MARKERS[0]: "star-diamond", STAR_MARKERS[1]: "hexagram", STAR_MARKERS[2]: "star-triangle-up",
     STAR_MARKERS[3]: "star-square",
     STAR_MARKERS[4]: "star-triangle-down", CORNER_MARKERS[0]: "triangle-nw", CORNER_MARKERS[1]: "triangle-ne",

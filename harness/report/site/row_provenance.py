@@ -35,6 +35,12 @@ def collect_provenance(table: pa.Table, unit: str) -> list[dict[str, Any]]:
     return [dict(zip(names, row, strict=True)) for row in query_table(_PROVENANCE_QUERY.format(unit=unit), table)]
 
 
+def find_newest_fingerprint(table: pa.Table) -> str:
+    """Return the fingerprint of the code that wrote the newest row; "" if it is unknown."""
+    dated = zip(*(table[name].to_pylist() for name in ("started_at", "source_fingerprint")), strict=True)
+    return max(((started or "", code or "") for started, code in dated), default=("", ""))[1]
+
+
 def find_config(folder: Path) -> str:
     """Find the config of a sweep's folder, as a path for a command line.
 

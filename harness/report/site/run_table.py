@@ -15,15 +15,13 @@ from springbench.harness.report.plot_style import assign_label_styles
 from springbench.harness.report.site.data_scripts import encode_column
 from springbench.harness.report.site.plotly_styles import plotly_style
 from springbench.harness.report.site.sweep_folders import SweepFolder
+from springbench.harness.report.speed.speed_figures import MACHINE_SOLVER
 from springbench.harness.report.table_queries import query_records
 from springbench.harness.report.timing_table import label_runs, read_run_times
 from springbench.harness.results import parquet_rows, row_store
 from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 
 RunRecord = dict[str, Any]
-
-MACHINE_SOLVER = "machine"
-"""Solver column of rows that belong to no solver: the limits of the machine itself, in a speed report."""
 
 _REQUIRED_COLUMNS = ("run_id", "scene", "size", "solver", "phase", "status")
 

@@ -19,18 +19,23 @@ import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.optional_parts import RECORDINGS
+from springbench.harness.report.ablation_summary import select_kind, summarise_ablation
+from springbench.harness.report.charts.ablation_charts import build_effect_chart, build_overhead_chart
+from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
+from springbench.harness.report.charts.speed_chart import build_speed_chart
 from springbench.harness.report.device_speedup import summarise_table as of_devices
+from springbench.harness.report.robustness import has_verification, map_headline, read_verified_runs
 from springbench.harness.report.site import (
-    ablation_charts,
     frame_scripts,
-    robustness_chart,
     row_provenance,
     run_table,
-    speed_chart,
 )
+from springbench.harness.report.site.chart_json import serialise_chart
 from springbench.harness.report.site.failure_causes import FailedRun, group_failures
 from springbench.harness.report.site.run_findings import describe_runs
 from springbench.harness.report.site.sweep_folders import SweepFolder, find_benchmark_files
+from springbench.harness.report.speed.speed_figures import compute_speed_figures, has_machine_limits
+from springbench.harness.report.speed.speed_table import describe_speed
 from springbench.harness.results import parquet_rows, row_store
 
 PrintMessage = Callable[[str], None]
@@ -134,14 +139,19 @@ def _build_run_section(
     findings = [
         {"text": words} for words in of_devices(table, row_provenance.find_config(folder.path))
     ] + describe_runs(found)
-    if speed_chart.has_machine_limits(table):
-        scripts["speed"], speed_findings = speed_chart.build_speed_chart(table)
-        findings = [{"text": words} for words in speed_findings]
+    if has_machine_limits(table):
+        candidates = compute_speed_figures(table)
+        citations = dict(zip(*(table[name].to_pylist() for name in ("solver", "citation")), strict=True))
+        newest = row_provenance.find_newest_fingerprint(table)
+        scripts["speed"] = serialise_chart(build_speed_chart(candidates, newest, citations))
+        findings = [{"text": words} for words in describe_speed(candidates)]
     outcomes: dict[str, Any] = {}
-    if robustness_chart.has_verification(table):
-        scripts["hard"] = robustness_chart.build_robustness_chart(folder)
-        outcomes = robustness_chart.outcomes_by_run(scripts["hard"])
-        findings = [{"text": f"{scripts['hard']['headline']}.", "plot": "hard"}, *findings[-1:]]
+    if has_verification(table):
+        cells = read_verified_runs(folder.path)
+        stale_ids = {run["run_id"] for run in found if run["staleness"] == "stale"}
+        scripts["hard"] = serialise_chart(build_hard_case_chart(cells, stale_ids))
+        outcomes = {cell.run_id: {"label": cell.outcome.label, "reason": cell.reason} for cell in cells}
+        findings = [{"text": f"{map_headline(cells, folder.name)}.", "plot": "hard"}, *findings[-1:]]
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     _mark_recordings(folder, data_folder, found, with_recordings, print_message)
     scripts["runs"] = run_table.build_run_script(folder, found, outcomes)
@@ -247,11 +257,24 @@ def _build_ablation_section(
     folder: SweepFolder, data_folder: Path, with_recordings: bool, print_message: PrintMessage
 ) -> _PageSection:
     table = _read_rows(folder, "ablation", print_message)
-    scripts, words = ablation_charts.build_ablation_charts(table.to_pylist())
+    ablations: dict[str, list[dict[str, Any]]] = {}
+    for row in table.to_pylist():
+        ablations.setdefault(row[row_store.FILE_COLUMN], []).append(row)
+    rows = [row for some in ablations.values() for row in some]
+    newest = row_provenance.find_newest_fingerprint(table)
+    charts = {"ablation": build_effect_chart(ablations, newest), "prices": build_overhead_chart(rows, newest)}
+    scripts = {name: serialise_chart(chart) for name, chart in charts.items() if chart.frames or chart.maps}
+    words = [
+        f"{whole['scene']}: {sentence}"
+        for some in ablations.values()
+        for whole in select_kind(some, "full-scene")
+        if whole["status"] == "ok"
+        for sentence in summarise_ablation(some)
+    ]
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     findings = [{"text": f"{one}.", "chapter": "Effects"} for one in words]
     return _PageSection(
-        dict(scripts),
+        scripts,
         plots,
         findings,
         [],

@@ -1,1 +1,1 @@
-"""Reports on the rows of `springbench roofline`: figures, a table, and plots against size."""
+"""Reports on the rows of `springbench roofline`: figures and a table."""

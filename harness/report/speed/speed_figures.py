@@ -154,6 +154,11 @@ class MachineLimits:
         return RooflineLimit(binds, seconds[binds])
 
 
+def has_machine_limits(table: pa.Table) -> bool:
+    """Return whether rows belong to a speed report, which contains the machine's own limits."""
+    return MACHINE_SOLVER in table["solver"].unique().to_pylist()
+
+
 def compute_speed_figures(table: pa.Table) -> list[SpeedFigures]:
     """Compute the figures of all candidates in the rows, in their order.
 

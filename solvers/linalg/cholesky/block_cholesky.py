@@ -8,6 +8,9 @@ error: H is not positive definite.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
@@ -19,20 +22,35 @@ from springbench.solvers.linalg.cholesky.block_multifrontal import (
     factorise_blocks,
     solve_blocks,
 )
+from springbench.solvers.linalg.cholesky.factorisation_schedule import FactorisationSchedule, plan_schedule
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import SymbolicFactor, analyse_graph
+from springbench.solvers.linalg.cholesky.thread_team import ThreadTeam
 from springbench.solvers.model.step_problem import Unsupported
 from springbench.solvers.simd.front_tiles import TILE_COLUMNS, TILE_ROWS
 
 _NO_RIGHT_HAND_SIDE = np.empty((0, 3))
 
+_MIN_THREADED_FLOPS = 5e6
+"""Operations of a factorisation from which a second thread pays off."""
+
 _MIN_FACTORISATION = 0.2
 """Cost of assembling a matrix whose factorisation fails at once, as a fraction of a factorisation."""
+
+
+class _Workspace(NamedTuple):
+    """What a number of threads needs: its schedule, scratch memory and shared state, and their number or None."""
+
+    schedule: FactorisationSchedule
+    scratch: FactorisationScratch
+    team: ThreadTeam
+    threads: int | None
 
 
 class BlockCholesky:
     """Cholesky factorisation of H for one pattern of blocks.
 
-    Factorisations and solves share their arrays, so that they cannot run concurrently.
+    Factorisations and solves share their arrays, so that they cannot run concurrently. They use Numba's number of
+    threads; the result does not depend on it.
 
     Attributes:
         nonzeros: entries of L, including the diagonal.
@@ -56,12 +74,12 @@ class BlockCholesky:
         f = self._frontal_structure
         below = np.diff(f.member_start) - f.num_columns
         w, h = 3.0 * f.num_columns, 3.0 * below
-        self._cumulative_flops = np.cumsum(w * (w * w / 3.0 + w * h + h * h))
-        self.flops = float(self._cumulative_flops[-1]) if len(w) else 0.0
+        self._flops = w * (w * w / 3.0 + w * h + h * h)
+        self._update_sizes = (3 * below + 1) * round_up_rows(3 * below)
+        self.flops = float(self._flops.sum())
         self.num_factorisations = 0.0
-        room = _required_stack_size(f, 3 * below * round_up_rows(3 * below))
-        n, supernodes = len(pointers) - 1, len(f.num_columns)
-        needs, free = 8.0 * (f.panel_start[-1] + 2 * room), memory.compute_memory_limit()
+        schedule, updates = self._plan(1)
+        needs, free = 8.0 * (f.panel_start[-1] + updates), memory.compute_memory_limit()
         if needs > free:
             raise Unsupported(
                 f"a factor of the Hessian has {self.nonzeros:,} entries and takes "
@@ -69,10 +87,33 @@ class BlockCholesky:
                 f"where {memory.format_bytes(free)} may be taken; take numba or newton-cg, or a coarser mesh"
             )
         self._panels = np.zeros(f.panel_start[-1] + TILE_ROWS)
-        waiting, filled, runs = (np.zeros(k, np.int64) for k in ((2, supernodes + 1), 3, (2, n + 1)))
-        front = np.zeros(int((round_up_rows(3 * f.num_columns) + round_up_rows(3 * below)).max(initial=0)) + TILE_ROWS)
-        stacks, triangles = np.zeros((2, room)), np.zeros((PANEL_DEPTH // TILE_COLUMNS, TILE_COLUMNS, TILE_COLUMNS))
-        self._scratch = FactorisationScratch(front, stacks, waiting, filled, np.zeros(TILE_COLUMNS), triangles, runs)
+        self._workspaces = {1: self._allocate(schedule, updates, 1)}
+
+    def _plan(self, threads: int) -> tuple[FactorisationSchedule, int]:
+        """Return the schedule for a number of threads, and the entries of its updates."""
+        f = self._frontal_structure
+        return plan_schedule(f.parent, self._flops, 3 * f.num_columns, self._update_sizes, PANEL_DEPTH, threads)
+
+    def _allocate(self, schedule: FactorisationSchedule, updates: int, threads: int) -> _Workspace:
+        f, groups = self._frontal_structure, len(schedule.group_start) - 2
+        members = np.diff(f.member_start)
+        rows = round_up_rows(3 * f.num_columns) + round_up_rows(3 * (members - f.num_columns))
+        scratch = FactorisationScratch(
+            np.zeros((threads, int(rows.max(initial=0)) + TILE_ROWS)),
+            np.zeros(updates),
+            np.zeros(groups + 1, np.int64),
+            np.zeros((threads, TILE_COLUMNS)),
+            np.zeros((threads, PANEL_DEPTH // TILE_COLUMNS, TILE_COLUMNS, TILE_COLUMNS)),
+            np.zeros((threads, 2, int(members.max(initial=0)) + 1), np.int64),
+        )
+        return _Workspace(schedule, scratch, ThreadTeam.from_task_count(groups), threads if threads > 1 else None)
+
+    def _current_workspace(self) -> _Workspace:
+        """Return the workspace for Numba's number of threads, one if a second does not pay off."""
+        threads = numba.get_num_threads() if self.flops >= _MIN_THREADED_FLOPS else 1
+        if threads not in self._workspaces:
+            self._workspaces[threads] = self._allocate(*self._plan(threads), threads)
+        return self._workspaces[threads]
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
         """Factorise H, with blocks (b, 3, 3) in the graph's order.
@@ -83,18 +124,17 @@ class BlockCholesky:
         return self._factorise(values, _NO_RIGHT_HAND_SIDE)
 
     def _factorise(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> bool:
-        found = factorise_blocks(self._frontal_structure, values, self._panels, x, self._scratch)
-        done = 1.0
-        if not found:
-            fronts = int(self._scratch.stack_sizes[2])
-            done = float(self._cumulative_flops[fronts - 1]) / self.flops if fronts else 0.0
+        schedule, scratch, team, threads = self._current_workspace()
+        failed = factorise_blocks(self._frontal_structure, schedule, values, self._panels, x, scratch, team, threads)
+        done = 1.0 if failed < 0 else float(self._flops[:failed].sum()) / self.flops
         self.num_factorisations += max(_MIN_FACTORISATION, done)
-        return found
+        return failed < 0
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return H^-1 b, both (n, 3), with the last factorisation."""
         x = np.array(b, order="C")
-        solve_blocks(self._frontal_structure, self._panels, x, self._scratch.front, False)
+        schedule, scratch, team, threads = self._current_workspace()
+        solve_blocks(self._frontal_structure, schedule, self._panels, x, scratch, team, threads)
         return x
 
     def factorise_and_solve(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -108,10 +148,7 @@ class BlockCholesky:
             Solution (n, 3); None if H is not positive definite.
         """
         x = np.array(b, order="C")
-        if not self._factorise(values, x):
-            return None
-        solve_blocks(self._frontal_structure, self._panels, x, self._scratch.front, True)
-        return x
+        return x if self._factorise(values, x) else None
 
 
 def _build_frontal_structure(
@@ -132,22 +169,24 @@ def _build_frontal_structure(
     start = np.concatenate([[0], np.cumsum([len(x) for x in lists])]).astype(np.int64)
     members = np.concatenate([s.vertex_of_slot[:0], *lists]).astype(np.int64)
     within = np.full(len(members), -1)
-    stack = np.zeros(len(own), np.int64)
+    child, sibling = np.full((2, len(own)), -1)
     place = np.empty(len(pointers) - 1, np.int64)
     for k in range(len(own) - 1, -1, -1):
         above = parent[k]
         if above >= 0:
-            stack[k] = 1 - stack[above]
             list_ = members[start[above] : start[above + 1]]
             place[list_] = np.arange(len(list_))
             within[start[k] + own[k] : start[k + 1]] = place[members[start[k] + own[k] : start[k + 1]]]
+    for k, above in enumerate(parent.tolist()):
+        if above >= 0:
+            sibling[k], child[above] = child[above], k
     below = np.diff(start) - own
     heights = round_up_rows(3 * own) + round_up_rows(3 * below)
     panel = np.concatenate([[0], np.cumsum(3 * own * heights)])
     entered = _locate_blocks(
         pointers, neighbours.astype(np.int64), s.slot_of_vertex, start, members, own, heights, panel
     )
-    return FrontalStructure(start, members, own, within, parent, stack, panel, *entered)
+    return FrontalStructure(start, members, own, within, parent, child, sibling, panel, *entered)
 
 
 def _locate_blocks(
@@ -180,16 +219,3 @@ def _locate_blocks(
     row = np.where(row < own[at], 3 * row, round_up_rows(3 * own[at]) + 3 * (row - own[at]))
     entry = panel[at] + 3 * column[v[block]] * heights[at] + row
     return np.searchsorted(at, np.arange(len(own) + 1)), block, entry, np.flatnonzero(u == v)
-
-
-def _required_stack_size(fronts: FrontalStructure, sizes: NDArray[np.int64]) -> int:
-    """Return the required size of each stack for updates of the given sizes."""
-    top, most = [0, 0], 0
-    waiting: dict[int, int] = {}  # what waits for a supernode
-    for k, (above, side, size) in enumerate(zip(fronts.parent, fronts.stack_index, sizes, strict=True)):
-        most = max(most, top[side] + size)
-        top[1 - side] -= waiting.pop(k, 0)
-        if above >= 0:
-            top[side] += size
-            waiting[above] = waiting.get(above, 0) + size
-    return int(most)

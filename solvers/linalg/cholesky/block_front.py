@@ -25,6 +25,9 @@ from springbench.solvers.simd.front_tiles import (
 PANEL_DEPTH, ROW_BLOCK_HEIGHT = 192, 128
 """Columns and rows of a panel that are multiplied together: whole tiles and whole vectors, 192 KiB."""
 
+_MIN_PART_HEIGHT = 32
+"""Least height of the row blocks of parts that threads share: four vectors."""
+
 _PIVOT_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
 """Pivots below this fraction of the matrix entry are round-off."""
 
@@ -62,61 +65,112 @@ round_up_rows_inner = jit_inner(round_up_rows)
 
 
 @jit_inner
-def eliminate_front(fronts, supernode, values, panels, stride, min_pivots, triangles):
+def eliminate_front(fronts, supernode, values, to, min_pivots, triangles):
     """Factorise the panel of a supernode; return False if a pivot is not positive.
 
     Args:
         fronts: structure of the factor.
         supernode: index of the supernode.
         values: matrix blocks (b, 3, 3), for the scale of the pivots.
-        panels: panels, updated.
-        stride: entries from one panel column to the next.
+        to: front of the supernode, whose panel is updated.
         min_pivots, triangles: scratch.
     """
-    base, width = fronts.panel_start[supernode], 3 * fronts.num_columns[supernode]
-    for first in range(0, width, PANEL_DEPTH):
-        end = min(first + PANEL_DEPTH, width)
-        left = base + first * stride
-        row, stop = (
-            first,
-            min(round_up_rows_inner(end), stride),
-        )  # the triangle of these columns, and then the rows below
-        while row < stride:
-            for tile in range(first, end, TILE_COLUMNS):
-                columns, triangle = min(TILE_COLUMNS, end - tile), triangles[(tile - first) // TILE_COLUMNS]
-                above = max(row, tile // TILE_ROWS * TILE_ROWS)
-                column, strips = base + tile * stride, (stop - above) // TILE_ROWS
-                _subtract_tile(
-                    panels, left, above, tile, stride, tile - first, panels, column + above, stride, strips, columns
-                )
-                if row == first:
-                    corner = column + tile
-                    for j in range(columns):
-                        v = fronts.member_vertices[fronts.member_start[supernode] + (tile + j) // 3]
-                        min_pivots[j] = _PIVOT_ROUNDOFF * values[fronts.diagonal_block[v], j % 3, j % 3]
-                    if columns == 6:
-                        positive = factorise_tile(panels, corner, stride, min_pivots, triangle, 6)
-                    else:
-                        positive = factorise_tile(panels, corner, stride, min_pivots, triangle, 3)
-                    if not positive:
-                        return False
-                if columns == 6:
-                    solve_tile_triangle(panels, column + above, stride, triangle, strips, 6)
-                else:
-                    solve_tile_triangle(panels, column + above, stride, triangle, strips, 3)
-                if row == first:
-                    for j in range(columns):
-                        panels[column + j * stride + tile + j] = triangle[j, j]
-            row, stop = stop, min(stop + ROW_BLOCK_HEIGHT, stride)
-        _subtract_lower_product(panels, left, stride, end - first, 0, panels, base, stride, end, width)
+    for first in range(0, 3 * to.num_columns, PANEL_DEPTH):
+        if not factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, triangles):
+            return False
+        eliminate_rows_below(to, first, triangles, 0, 1)
+        subtract_panel_product(to, first, 0, 1)
     return True
 
 
 @jit_inner
-def subtract_front_update(to, columns):
-    """Subtract the product of a panel's rows below from the update."""
+def factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, triangles):
+    """Factorise the rows of a panel block, at column `first`, that contain its diagonal.
+
+    Args:
+        fronts: structure of the factor.
+        supernode: index of the supernode.
+        values: matrix blocks (b, 3, 3), for the scale of the pivots.
+        to: front of the supernode.
+        first: first column of the block.
+        min_pivots: scratch.
+        triangles: factors of the tiles, output.
+
+    Returns:
+        False if a pivot is not positive.
+    """
+    end, left = _block_end(to, first), to.panel_offset + first * to.stride
+    for tile in range(first, end, TILE_COLUMNS):
+        columns, triangle = min(TILE_COLUMNS, end - tile), triangles[(tile - first) // TILE_COLUMNS]
+        above = tile // TILE_ROWS * TILE_ROWS
+        column, strips = to.panel_offset + tile * to.stride, (_diagonal_end(to, end) - above) // TILE_ROWS
+        _subtract_tile(
+            to.panels, left, above, tile, to.stride, tile - first, to.panels, column + above, to.stride, strips, columns
+        )
+        for j in range(columns):
+            v = fronts.member_vertices[fronts.member_start[supernode] + (tile + j) // 3]
+            min_pivots[j] = _PIVOT_ROUNDOFF * values[fronts.diagonal_block[v], j % 3, j % 3]
+        if columns == 6:
+            positive = factorise_tile(to.panels, column + tile, to.stride, min_pivots, triangle, 6)
+        else:
+            positive = factorise_tile(to.panels, column + tile, to.stride, min_pivots, triangle, 3)
+        if not positive:
+            return False
+        _solve_tile(to, column + above, triangle, strips, columns)
+        for j in range(columns):
+            to.panels[column + j * to.stride + tile + j] = triangle[j, j]
+    return True
+
+
+@jit_inner
+def eliminate_rows_below(to, first, triangles, part, parts):
+    """Eliminate one of several parts of the rows below the diagonal of a panel block.
+
+    Args:
+        to: front of a supernode.
+        first: first column of the block.
+        triangles: factors of its tiles.
+        part: which part.
+        parts: number of parts.
+    """
+    end, left = _block_end(to, first), to.panel_offset + first * to.stride
+    begin = _diagonal_end(to, end)
+    height = _part_height(to.stride - begin, parts)
+    for row in range(begin + part * height, to.stride, parts * height):
+        strips = (min(row + height, to.stride) - row) // TILE_ROWS
+        for tile in range(first, end, TILE_COLUMNS):
+            columns, column = min(TILE_COLUMNS, end - tile), to.panel_offset + tile * to.stride
+            _subtract_tile(
+                to.panels, left, row, tile, to.stride, tile - first, to.panels, column + row, to.stride, strips, columns
+            )
+            _solve_tile(to, column + row, triangles[(tile - first) // TILE_COLUMNS], strips, columns)
+
+
+@jit_inner
+def subtract_panel_product(to, first, part, parts):
+    """Subtract the product of a panel block from the columns to its right, in one of several parts of the rows."""
+    end, left = _block_end(to, first), to.panel_offset + first * to.stride
+    _subtract_lower_product(
+        to.panels,
+        left,
+        to.stride,
+        end - first,
+        0,
+        to.panels,
+        to.panel_offset,
+        to.stride,
+        end,
+        3 * to.num_columns,
+        part,
+        parts,
+    )
+
+
+@jit_inner
+def subtract_front_update(to, columns, part, parts):
+    """Subtract the product of a panel's rows below from the update, in one of several parts of the rows."""
     for first in range(0, 3 * to.num_columns, PANEL_DEPTH):
-        left, depth = to.panel_offset + first * to.stride, min(PANEL_DEPTH, 3 * to.num_columns - first)
+        left, depth = to.panel_offset + first * to.stride, _block_end(to, first) - first
         _subtract_lower_product(
             to.panels,
             left,
@@ -128,17 +182,50 @@ def subtract_front_update(to, columns):
             to.update_stride,
             0,
             columns,
+            part,
+            parts,
         )
 
 
 @jit_inner
-def _subtract_lower_product(panels, left, stride, depth, head, target, to, size, first, end):
+def _block_end(to, first):
+    """Return the end of the panel block that begins at a column."""
+    return min(first + PANEL_DEPTH, 3 * to.num_columns)
+
+
+@jit_inner
+def _diagonal_end(to, end):
+    """Return the end of the rows that contain the diagonal of a panel block."""
+    return min(round_up_rows_inner(end), to.stride)
+
+
+@jit_inner
+def _part_height(rows, parts):
+    """Return the height of the row blocks into which rows are divided for several parts."""
+    if parts == 1:
+        return ROW_BLOCK_HEIGHT
+    return min(ROW_BLOCK_HEIGHT, max(_MIN_PART_HEIGHT, round_up_rows_inner(rows // (2 * parts))))
+
+
+@jit_inner
+def _solve_tile(to, at, triangle, strips, columns):
+    """Call `solve_tile_triangle` for six or three columns."""
+    if columns == 6:
+        solve_tile_triangle(to.panels, at, to.stride, triangle, strips, 6)
+    else:
+        solve_tile_triangle(to.panels, at, to.stride, triangle, strips, 3)
+
+
+@jit_inner
+def _subtract_lower_product(panels, left, stride, depth, head, target, to, size, first, end, part, parts):
     """Subtract the lower triangle of the product of panel columns with themselves from columns of a matrix.
 
     head: offset of the rows that are multiplied; first, end: range of the matrix columns.
     """
-    for row in range(first // TILE_ROWS * TILE_ROWS, size, ROW_BLOCK_HEIGHT):
-        stop = min(row + ROW_BLOCK_HEIGHT, size)
+    begin = first // TILE_ROWS * TILE_ROWS
+    height = _part_height(size - begin, parts)
+    for row in range(begin + part * height, size, parts * height):
+        stop = min(row + height, size)
         for tile in range(first, min(end, stop), TILE_COLUMNS):
             above = max(row, tile // TILE_ROWS * TILE_ROWS)
             place, strips = to + tile * size + above, (stop - above) // TILE_ROWS

@@ -1,10 +1,13 @@
-"""Multifrontal Cholesky factorisation of a matrix of 3 x 3 blocks (Duff and Reid 1983).
+"""Multifrontal Cholesky factorisation of a matrix of 3 x 3 blocks (Duff and Reid 1983), by threads.
 
-A front is the dense matrix of a supernode's columns and of the rows below. Its columns become a panel of L; the
-remainder is an update of its parent (`springbench.solvers.linalg.cholesky.block_front`). Updates are stored on two
-stacks that
-alternate between the levels of the tree. Each update is thus computed in its place, while those of its children are
-read.
+A front is the dense matrix of a supernode's columns and of the rows below, with a right-hand side as one column more.
+Its columns become a panel of L; the remainder is an update of its parent
+(`springbench.solvers.linalg.cholesky.block_front`). Threads process groups of whole subtrees, and then the supernodes
+above them one after the other, each divided into parts. Every entry is the same sum in the same order, whatever the
+groups and the parts are, so that results are bitwise independent of the number of threads.
+
+Updates within a group are stored on two stacks that alternate between the levels of the tree. Each update is thus
+computed in its place, while those of its children are read. All others have their own memory.
 
 Two ranges of rows are aligned to whole vectors: those of a panel's columns, and those below. There is no other padding.
 Entries above the diagonal are never read; the diagonal contains the inverses of L's entries.
@@ -15,13 +18,34 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
-from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_parallel, jit_kernel
 from springbench.solvers.linalg.cholesky.block_front import (
     DenseFront,
     eliminate_front,
+    eliminate_rows_below,
+    factorise_diagonal_block,
     round_up_rows_inner,
     subtract_front_update,
+    subtract_panel_product,
+)
+from springbench.solvers.linalg.cholesky.factorisation_schedule import (
+    ASSEMBLY,
+    BACKWARD,
+    ELIMINATION,
+    PRODUCT,
+    SUBTREES,
+)
+from springbench.solvers.linalg.cholesky.thread_team import (
+    complete_task,
+    finish_phases,
+    read_shared,
+    release_phase,
+    reset_team,
+    try_claim,
+    wait_for_phase,
+    write_shared,
 )
 from springbench.solvers.simd.front_tiles import (
     TILE_COLUMNS,
@@ -30,6 +54,8 @@ from springbench.solvers.simd.front_tiles import (
     backward_solve_tile,
     forward_solve_tile,
 )
+
+_NO_FAILURE = 1 << 62
 
 
 class FrontalStructure(NamedTuple):
@@ -41,7 +67,8 @@ class FrontalStructure(NamedTuple):
         num_columns: number of columns in vertices, (s,).
         parent_position: of each member below, its position among the parent's members.
         parent: (s,), -1 for a root.
-        stack_index: stack of each update, 0 or 1, (s,).
+        first_child: last child in postorder, -1 for a leaf, (s,).
+        next_sibling: previous child of the same parent in postorder, -1 for its first, (s,).
         panel_start: first entry of each panel, (s + 1,).
         block_start: first matrix block of each supernode, (s + 1,).
         block_index: matrix blocks in the order of supernodes, (b,).
@@ -54,7 +81,8 @@ class FrontalStructure(NamedTuple):
     num_columns: NDArray[np.int64]
     parent_position: NDArray[np.int64]
     parent: NDArray[np.int64]
-    stack_index: NDArray[np.int64]
+    first_child: NDArray[np.int64]
+    next_sibling: NDArray[np.int64]
     panel_start: NDArray[np.int64]
     block_start: NDArray[np.int64]
     block_index: NDArray[np.int64]
@@ -63,97 +91,271 @@ class FrontalStructure(NamedTuple):
 
 
 class FactorisationScratch(NamedTuple):
-    """Scratch memory of a factorisation with n vertices and s supernodes.
+    """Scratch memory of a factorisation by t threads.
 
     Attributes:
-        front: one vector longer than the largest front.
-        stacks: updates, (2, size).
-        pending_supernodes: supernodes on each stack, preceded by their number, (2, s + 1).
-        stack_sizes: number of entries in use on each stack, and the number of fronts eliminated, (3,).
-        min_pivots: thresholds, (TILE_COLUMNS,).
-        triangles: factors of the tiles of a panel block, (., TILE_COLUMNS, TILE_COLUMNS).
-        runs: (2, n + 1).
+        fronts: one vector longer than the largest front, (t, .).
+        updates: stacks of all threads, and shared updates.
+        failures: first supernode of each group and of the top with a pivot that is not positive, (groups + 1,).
+        min_pivots: thresholds, (t, TILE_COLUMNS).
+        triangles: factors of the tiles of a panel block, (t, ., TILE_COLUMNS, TILE_COLUMNS).
+        runs: (t, 2, .), as long as the longest list of members, and one more.
     """
 
-    front: NDArray[np.float64]
-    stacks: NDArray[np.float64]
-    pending_supernodes: NDArray[np.int64]
-    stack_sizes: NDArray[np.int64]
+    fronts: NDArray[np.float64]
+    updates: NDArray[np.float64]
+    failures: NDArray[np.int64]
     min_pivots: NDArray[np.float64]
     triangles: NDArray[np.float64]
     runs: NDArray[np.int64]
 
 
 @jit_kernel
-def factorise_blocks(fronts, values, panels, x, scratch):
+def factorise_blocks(fronts, schedule, values, panels, x, scratch, team, threads):
     """Factorise a matrix of blocks, and write L to the panels.
 
     Args:
         fronts: structure of the factor.
+        schedule: division among threads.
         values: blocks (b, 3, 3).
         panels: output.
-        x: right-hand sides (n, 3), or empty; overwritten with L^-1 x while each panel is in cache.
+        x: right-hand sides (n, 3), or empty; overwritten with the solution.
         scratch: scratch memory.
+        team: thread team.
+        threads: number of threads, None for one.
 
     Returns:
-        Whether the matrix is positive definite.
+        First supernode with a pivot that is not positive; -1 if the matrix is positive definite.
     """
-    stacks, waiting, filled = scratch.stacks, scratch.pending_supernodes, scratch.stack_sizes
-    filled[:] = 0
-    waiting[:, 0] = 0
-    for s in range(len(fronts.num_columns)):
-        _, own, below, head, stride = _front_sizes(fronts, s)
-        side = fronts.stack_index[s]
-        to = DenseFront(own, head, stride, panels, fronts.panel_start[s], stacks[side], filled[side], stride - head)
-        panels[to.panel_offset : fronts.panel_start[s + 1]] = 0.0
-        to.update_buffer[to.update_offset : to.update_offset + 3 * below * to.update_stride] = 0.0
-        _scatter_blocks(fronts, s, values, panels, stride)
-        other = 1 - side
-        while waiting[other, 0] > 0 and fronts.parent[waiting[other, waiting[other, 0]]] == s:
-            c = waiting[other, waiting[other, 0]]
-            waiting[other, 0] -= 1
-            rows = fronts.member_start[c + 1] - fronts.member_start[c] - fronts.num_columns[c]
-            filled[other] -= 3 * rows * round_up_rows_inner(3 * rows)
-            _extend_add(fronts, c, stacks[other], filled[other], to, scratch.runs)
-        if not eliminate_front(fronts, s, values, panels, stride, scratch.min_pivots, scratch.triangles):
-            return False
-        filled[2] = s + 1
+    scratch.failures[:] = _NO_FAILURE
+    reset_team(team)
+    if threads is None:
+        _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, 0, 1)
+    else:
+        _factorise_in_threads(fronts, schedule, values, panels, x, scratch, team, threads)
+    failure = _first_failure(scratch)
+    return failure if failure < _NO_FAILURE else -1
+
+
+@jit_kernel
+def solve_blocks(fronts, schedule, panels, x, scratch, team, threads):
+    """Overwrite x with H^-1 x.
+
+    Args:
+        fronts: structure of the factor.
+        schedule: division among threads.
+        panels: factor L.
+        x: right-hand sides (n, 3), overwritten.
+        scratch: scratch memory.
+        team: thread team.
+        threads: number of threads, None for one.
+    """
+    reset_team(team)
+    if threads is None:
+        _solve_in_thread(fronts, schedule, panels, x, scratch, team, 0, 1)
+    else:
+        _solve_in_threads(fronts, schedule, panels, x, scratch, team, threads)
+
+
+@jit_inner_parallel
+def _factorise_in_threads(fronts, schedule, values, panels, x, scratch, team, threads):
+    for thread in prange(threads):
+        _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, thread, threads)
+
+
+@jit_inner_parallel
+def _solve_in_threads(fronts, schedule, panels, x, scratch, team, threads):
+    for thread in prange(threads):
+        _solve_in_thread(fronts, schedule, panels, x, scratch, team, thread, threads)
+
+
+@jit_inner
+def _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, thread, threads):
+    """Process tasks of all stages that no other thread has claimed."""
+    tasks = len(team.task_sums)
+    stage = 0
+    while stage >= 0:
+        for i in range(tasks):
+            task = (thread * tasks // threads + i) % tasks
+            if try_claim(team, task, stage):
+                kind = schedule.stage_kind[stage]
+                if kind == SUBTREES:
+                    _factorise_group(fronts, schedule, task, values, panels, x, scratch, thread)
+                elif kind == BACKWARD:
+                    _solve_backward(fronts, schedule, task, panels, x, scratch, thread)
+                else:
+                    _process_part(fronts, schedule, stage, values, panels, x, scratch, thread, task, tasks)
+                if complete_task(team):
+                    if _begin_stage(fronts, schedule, stage + 1, values, panels, x, scratch, thread):
+                        release_phase(team, stage + 1)
+                    else:
+                        finish_phases(team)
+        stage = wait_for_phase(team, stage)
+
+
+@jit_inner
+def _solve_in_thread(fronts, schedule, panels, x, scratch, team, thread, threads):
+    """Process groups that no other thread has claimed, forward and then backward."""
+    tasks = len(team.task_sums)
+    phase = 0
+    while phase >= 0:
+        for i in range(tasks):
+            task = (thread * tasks // threads + i) % tasks
+            if try_claim(team, task, phase):
+                if phase == 0:
+                    _solve_forward(fronts, schedule, task, panels, x, scratch, thread)
+                else:
+                    _solve_backward(fronts, schedule, task, panels, x, scratch, thread)
+                if complete_task(team):
+                    if phase == 0:
+                        _solve_forward(fronts, schedule, tasks, panels, x, scratch, thread)
+                        _solve_backward(fronts, schedule, tasks, panels, x, scratch, thread)
+                        release_phase(team, 1)
+                    else:
+                        finish_phases(team)
+        phase = wait_for_phase(team, phase)
+
+
+@jit_inner
+def _factorise_group(fronts, schedule, group, values, panels, x, scratch, thread):
+    """Factorise the supernodes of a group."""
+    for k in range(schedule.group_start[group], schedule.group_start[group + 1]):
+        s = schedule.sequence[k]
+        if s > _first_failure(scratch):
+            return
+        to = _front_of(fronts, schedule, s, panels, scratch, thread)
+        members = fronts.member_start[s + 1] - fronts.member_start[s]
+        _assemble_columns(fronts, schedule, s, values, to, scratch, thread, 0, members)
+        if not eliminate_front(fronts, s, values, to, scratch.min_pivots[thread], scratch.triangles[thread]):
+            write_shared(scratch.failures, group, s)
+            return
         if len(x) > 0:
-            _forward_substitution(fronts, s, panels, x, scratch.front)
-        subtract_front_update(to, 3 * below)
-        if fronts.parent[s] >= 0:
-            waiting[side, 0] += 1
-            waiting[side, waiting[side, 0]] = s
-            filled[side] += 3 * below * to.update_stride
+            _forward_substitution(fronts, schedule, s, panels, x, scratch, thread)
+        subtract_front_update(to, 3 * (members - to.num_columns), 0, 1)
+
+
+@jit_inner
+def _process_part(fronts, schedule, stage, values, panels, x, scratch, thread, part, parts):
+    """Process one of several parts of a stage of the top."""
+    kind, s, first = schedule.stage_kind[stage], schedule.stage_supernode[stage], schedule.stage_column[stage]
+    to = _front_of(fronts, schedule, s, panels, scratch, thread)
+    members = fronts.member_start[s + 1] - fronts.member_start[s]
+    if kind == ASSEMBLY:
+        begin, end = part * members // parts, (part + 1) * members // parts
+        _assemble_columns(fronts, schedule, s, values, to, scratch, thread, begin, end)
+    elif kind == ELIMINATION:
+        eliminate_rows_below(to, first, scratch.triangles[0], part, parts)
+    elif kind == PRODUCT:
+        subtract_panel_product(to, first, part, parts)
+    else:
+        if part == 0 and len(x) > 0:
+            _forward_substitution(fronts, schedule, s, panels, x, scratch, thread)
+        subtract_front_update(to, 3 * (members - to.num_columns), part, parts)
+
+
+@jit_inner
+def _begin_stage(fronts, schedule, stage, values, panels, x, scratch, thread):
+    """Do what precedes a stage in one thread; return whether the stage takes place.
+
+    A supernode is processed unless one before it has failed, so that the first failure does not depend on threads.
+    """
+    if stage == len(schedule.stage_kind):
+        return False
+    kind, s = schedule.stage_kind[stage], schedule.stage_supernode[stage]
+    failure = _first_failure(scratch)
+    if kind == BACKWARD:
+        if len(x) == 0 or failure < _NO_FAILURE:
+            return False
+        _solve_backward(fronts, schedule, len(schedule.group_start) - 2, panels, x, scratch, thread)
+        return True
+    if failure < s:
+        return False
+    if kind == ELIMINATION:
+        to = _front_of(fronts, schedule, s, panels, scratch, thread)
+        first, least = schedule.stage_column[stage], scratch.min_pivots[0]
+        if not factorise_diagonal_block(fronts, s, values, to, first, least, scratch.triangles[0]):
+            write_shared(scratch.failures, len(scratch.failures) - 1, s)
+            return False
     return True
 
 
 @jit_inner
-def _scatter_blocks(fronts, supernode, values, panels, stride):
-    """Copy the matrix blocks below the diagonal to the panel of a supernode."""
-    for k in range(fronts.block_start[supernode], fronts.block_start[supernode + 1]):
-        e, at = fronts.block_index[k], fronts.entry_offset[k]
-        for j in range(3):
-            for i in range(3):
-                panels[at + j * stride + i] = values[e, j, i]
+def _first_failure(scratch):
+    """Return the first supernode that is known to have failed."""
+    failure = _NO_FAILURE
+    for k in range(len(scratch.failures)):
+        failure = min(failure, read_shared(scratch.failures, k))
+    return failure
 
 
 @jit_inner
-def _extend_add(fronts, child, source, at, to, runs):
-    """Add the update of a child, stored in `source`, to its parent's front, in runs of consecutive members."""
+def _front_of(fronts, schedule, supernode, panels, scratch, thread):
+    """Return the front of a supernode that a thread processes."""
+    _, own, _, head, stride = _front_sizes(fronts, supernode)
+    update = _locate_update(schedule, supernode, thread)
+    return DenseFront(own, head, stride, panels, fronts.panel_start[supernode], scratch.updates, update, stride - head)
+
+
+@jit_inner
+def _locate_update(schedule, supernode, thread):
+    """Return the first entry of an update."""
+    base = 0 if schedule.is_shared[supernode] else thread * schedule.thread_stack_size[0]
+    return base + schedule.update_start[supernode]
+
+
+@jit_inner
+def _assemble_columns(fronts, schedule, supernode, values, to, scratch, thread, begin, end):
+    """Assemble the columns of a front between two members: matrix blocks, and the children's updates."""
+    first, last = 3 * min(begin, to.num_columns) * to.stride, 3 * min(end, to.num_columns) * to.stride
+    first, last = to.panel_offset + first, to.panel_offset + last
+    to.panels[first:last] = 0.0
+    above, below = 3 * max(0, begin - to.num_columns), 3 * max(0, end - to.num_columns)
+    start = to.update_offset
+    to.update_buffer[start + above * to.update_stride : start + below * to.update_stride] = 0.0
+    for k in range(fronts.block_start[supernode], fronts.block_start[supernode + 1]):
+        e, at = fronts.block_index[k], fronts.entry_offset[k]
+        if first <= at < last:
+            for j in range(3):
+                for i in range(3):
+                    to.panels[at + j * to.stride + i] = values[e, j, i]
+    child = fronts.first_child[supernode]
+    while child >= 0:
+        at = _locate_update(schedule, child, thread)
+        _extend_add(fronts, child, scratch.updates, at, to, scratch.runs[thread], begin, end)
+        child = fronts.next_sibling[child]
+
+
+@jit_inner
+def _find_runs(fronts, child, num_columns, below_offset, begin, runs):
+    """List the runs of consecutive members in a child's update, from member `begin` on; return their number.
+
+    Each run begins at a row of the update, runs[0], and at a row of the parent's front, runs[1].
+    """
+    first = fronts.member_start[child] + fronts.num_columns[child]
+    rows = fronts.member_start[child + 1] - first
+    count = 0
+    for k in range(begin, rows):
+        q = fronts.parent_position[first + k]
+        if k == begin or q != fronts.parent_position[first + k - 1] + 1 or q == num_columns:
+            runs[0, count] = k
+            runs[1, count] = 3 * q if q < num_columns else below_offset + 3 * (q - num_columns)
+            count += 1
+    runs[0, count] = rows
+    return count
+
+
+@jit_inner
+def _extend_add(fronts, child, source, at, to, runs, begin, end):
+    """Add the columns of a child's update between two members of the parent to the parent's front."""
     own, first = to.num_columns, fronts.member_start[child] + fronts.num_columns[child]
     rows = fronts.member_start[child + 1] - first
     height = round_up_rows_inner(3 * rows)
-    count = 0
-    for k in range(rows):
-        q = fronts.parent_position[first + k]
-        if k == 0 or q != fronts.parent_position[first + k - 1] + 1 or q == own:
-            runs[0, count] = k
-            runs[1, count] = 3 * q if q < own else to.below_offset + 3 * (q - own)
-            count += 1
-    runs[0, count] = rows
+    b = 0
+    while b < rows and fronts.parent_position[first + b] < begin:
+        b += 1
+    count = _find_runs(fronts, child, own, to.below_offset, b, runs)
     run = 0
-    for b in range(rows):
+    while b < rows and fronts.parent_position[first + b] < end:
         if runs[0, run + 1] == b:
             run += 1
         q = fronts.parent_position[first + b]
@@ -164,6 +366,7 @@ def _extend_add(fronts, child, source, at, to, runs):
             else:
                 column = to.update_offset + (3 * (q - own) + j) * to.update_stride - to.below_offset
                 _add_runs(runs, run, count, b, source, start, to.update_buffer, column)
+        b += 1
 
 
 @jit_inner
@@ -176,11 +379,18 @@ def _add_runs(runs, run, count, b, source, start, target, column):
 
 
 @jit_inner
-def _forward_substitution(fronts, supernode, panels, x, front):
+def _forward_substitution(fronts, schedule, supernode, panels, x, scratch, thread):
     """Perform the forward substitution with the panel of a supernode; children precede parents."""
     first, own, below, head, stride = _front_sizes(fronts, supernode)
+    front, updates, runs = scratch.fronts[thread], scratch.updates, scratch.runs[thread]
     front[: stride + TILE_ROWS] = 0.0
     _gather_vertices(x, fronts.member_vertices, first, own, front, 0)
+    child = fronts.first_child[supernode]
+    while child >= 0:
+        rows = fronts.member_start[child + 1] - fronts.member_start[child] - fronts.num_columns[child]
+        at = _locate_update(schedule, child, thread) + 3 * rows * round_up_rows_inner(3 * rows)
+        _add_runs(runs, 0, _find_runs(fronts, child, own, head, 0, runs), 0, updates, at, front, 0)
+        child = fronts.next_sibling[child]
     for tile in range(0, 3 * own, TILE_COLUMNS):
         columns, corner = min(TILE_COLUMNS, 3 * own - tile), fronts.panel_start[supernode] + tile * stride + tile
         strips = (stride - tile - columns + TILE_ROWS - 1) // TILE_ROWS
@@ -189,26 +399,24 @@ def _forward_substitution(fronts, supernode, panels, x, front):
         else:
             forward_solve_tile(panels, corner, stride, front, tile, strips, 3)
     _scatter_vertices(front, 0, x, fronts.member_vertices, first, own)
-    for k in range(below):
-        for c in range(3):
-            x[fronts.member_vertices[first + own + k], c] += front[head + 3 * k + c]
+    at = _locate_update(schedule, supernode, thread) + 3 * below * (stride - head)
+    for k in range(stride - head):
+        updates[at + k] = front[head + k]
 
 
-@jit_kernel
-def solve_blocks(fronts, panels, x, front, forward_done):
-    """Overwrite x with H^-1 x.
+@jit_inner
+def _solve_forward(fronts, schedule, group, panels, x, scratch, thread):
+    """Perform the forward substitution of a group or of the top."""
+    for k in range(schedule.group_start[group], schedule.group_start[group + 1]):
+        _forward_substitution(fronts, schedule, schedule.sequence[k], panels, x, scratch, thread)
 
-    Args:
-        fronts: structure of the factor.
-        panels: factor L.
-        x: right-hand sides (n, 3), overwritten.
-        front: scratch, one vector longer than the largest front.
-        forward_done: whether `factorise_blocks` has performed the forward substitution.
-    """
-    if not forward_done:
-        for s in range(len(fronts.num_columns)):
-            _forward_substitution(fronts, s, panels, x, front)
-    for s in range(len(fronts.num_columns) - 1, -1, -1):
+
+@jit_inner
+def _solve_backward(fronts, schedule, group, panels, x, scratch, thread):
+    """Perform the backward substitution of a group or of the top."""
+    front = scratch.fronts[thread]
+    for k in range(schedule.group_start[group + 1] - 1, schedule.group_start[group] - 1, -1):
+        s = schedule.sequence[k]
         first, own, below, head, stride = _front_sizes(fronts, s)
         front[: stride + TILE_ROWS] = 0.0
         _gather_vertices(x, fronts.member_vertices, first, own, front, 0)

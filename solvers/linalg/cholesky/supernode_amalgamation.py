@@ -7,6 +7,7 @@ supernode with its parent if the solve becomes cheaper by a cost model, although
 from __future__ import annotations
 
 from heapq import heapify, heappop, heappush
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ _PANEL_COST, _ROW_COST = 30.0, 3.0
 NUM_SUBTREE_GROUPS = 4
 """Number of groups of subtrees, of about equal cost, that threads can process in parallel."""
 
-_MIN_GROUPED_COST = 3e4
+MIN_GROUPED_COST = 3e4
 """Cost of a solve below which a single group is used (a sheet of 28 x 28 vertices). One group is then faster by 1 to 7
 % on one thread, and waking a second thread consumes most of its gain: speedup 1.1 at 16 x 16, 1.3 at 20 x 20, 1.6 at
 32 x 32."""
@@ -144,8 +145,8 @@ def _find_best_merge(s, child, sibling, width, rows):
     return best, before_best
 
 
-def group_subtrees(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Assign each node of a forest to a group of whole subtrees, NUM_SUBTREE_GROUPS for the top.
+def group_subtrees(parent: NDArray[Any], cost: NDArray[np.float64], num_groups: int) -> NDArray[np.int32]:
+    """Assign each node of a forest to a group of whole subtrees, `num_groups` for the top.
 
     The heaviest subtree is split, with its root assigned to the top, until none exceeds a group's share. The lightest
     group then repeatedly gets the heaviest remaining subtree. The result depends on the tree alone, never on threads.
@@ -153,6 +154,7 @@ def group_subtrees(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDAr
     Args:
         parent: parent of each node, after its children; -1 for roots.
         cost: cost of each node.
+        num_groups: number of groups.
     """
     total = cost.copy()
     children: dict[int, list[int]] = {}
@@ -163,18 +165,16 @@ def group_subtrees(parent: NDArray[np.int32], cost: NDArray[np.float64]) -> NDAr
     roots = children.get(-1, [])
     whole = float(total[roots].sum())
     top = []
-    if whole < _MIN_GROUPED_COST:
-        return np.zeros(len(parent), np.int32)
     heap = [(-total[v], v) for v in roots]
     heapify(heap)
-    while heap and -heap[0][0] > 1.1 * whole / NUM_SUBTREE_GROUPS:
+    while heap and -heap[0][0] > 1.1 * whole / num_groups:
         v = heappop(heap)[1]
         top.append(v)
         for c in children.get(v, []):
             heappush(heap, (-total[c], c))
     group = np.full(len(parent), -1, np.int32)
-    group[top] = NUM_SUBTREE_GROUPS
-    load = np.zeros(NUM_SUBTREE_GROUPS)
+    group[top] = num_groups
+    load = np.zeros(num_groups)
     for _, v in sorted(heap):
         lightest = int(np.argmin(load))
         group[v] = lightest

@@ -16,6 +16,7 @@ from springbench.solvers.jit.kernel_compilation import cached_njit
 from springbench.solvers.linalg.cholesky.nested_dissection import nested_dissection_order
 from springbench.solvers.linalg.cholesky.supernode_amalgamation import (
     COLUMN_LANES,
+    MIN_GROUPED_COST,
     NUM_SUBTREE_GROUPS,
     amalgamate_supernodes,
     group_subtrees,
@@ -105,7 +106,8 @@ def analyse_with_order(
     tree, of_column, cost = amalgamate_supernodes(parent, count)
 
     post = _compute_postorder(tree)
-    group = group_subtrees(tree, cost)
+    groups = NUM_SUBTREE_GROUPS if cost.sum() >= MIN_GROUPED_COST else 1
+    group = group_subtrees(tree, cost, groups)
     by_number = post[np.argsort(group[post], kind="stable")]
     number = _invert_permutation(by_number)
     upper = tree[by_number]

@@ -149,3 +149,15 @@ def wait_for_phase(team, phase):
             _yield_core()
         now = _load_acquire(team.signals, _PHASE_INDEX)
     return now
+
+
+@jit_inner
+def read_shared(array, index):
+    """Return an integer that another thread may write meanwhile."""
+    return _load_acquire(array, index)
+
+
+@jit_inner
+def write_shared(array, index, value):
+    """Write an integer that other threads may read meanwhile."""
+    _store_release(array, index, value)

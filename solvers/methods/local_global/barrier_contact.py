@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.descent_method import DescentPoint, backtracking_line_search
-from springbench.solvers.iteration.idle_contact import IdleContactSolver
+from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.methods.local_global.half_space_contact import (
     ContactCorrections,
@@ -34,7 +34,7 @@ from springbench.solvers.methods.local_global.half_space_contact import (
 )
 from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
 from springbench.solvers.model.barrier_energy import PairBlocks, without_barriers
-from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, System, Unsupported
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solver, StepProblem, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
@@ -42,7 +42,7 @@ _MAX_CG_ITERATIONS = 60
 """Maximum number of conjugate gradient iterations."""
 
 
-def prepare_with_barriers(solver: Solver, system: System) -> IdleContactSolver:
+def prepare_with_barriers(solver: Solver, system: System) -> PreparedSolver:
     """Prepare a local-global method with barrier contact.
 
     Args:
@@ -62,7 +62,7 @@ def prepare_with_barriers(solver: Solver, system: System) -> IdleContactSolver:
     found = PreparedBarrierLocalGlobal(
         replace(base, system=system), idle, FixedObjective(system), ContactCorrections(base)
     )
-    return IdleContactSolver(found, idle)
+    return skip_idle_contact(found, system, lambda: idle)
 
 
 @dataclass(frozen=True, eq=False)

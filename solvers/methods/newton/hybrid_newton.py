@@ -55,7 +55,7 @@ from springbench.solvers.iteration.descent_method import (
     inner_product,
     lower_start_positions,
 )
-from springbench.solvers.iteration.idle_contact import IdleContactSolver
+from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, init_rounds
@@ -147,11 +147,12 @@ class HybridNewton:
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.description}"
         choice += objective.interpreted_energies
         found = PreparedHybrid(objective, metric, method, choice, facts)
-        if not objective.has_barriers:
-            return found
-        alone = objective.ignore_barriers()
-        method = HybridIteration(alone, metric, lbfgs, is_small)
-        return IdleContactSolver(found, replace(found, fixed_objective=alone, method=method))
+
+        def ignore_contact() -> PreparedHybrid:
+            alone = objective.ignore_barriers()
+            return replace(found, fixed_objective=alone, method=HybridIteration(alone, metric, lbfgs, is_small))
+
+        return skip_idle_contact(found, system, ignore_contact)
 
 
 class PreparedHybrid(PreparedDescent):

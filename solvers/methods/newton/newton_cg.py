@@ -13,7 +13,7 @@ contacts. An iteration converges friction, and may consist of several steps, as 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -25,6 +25,7 @@ from springbench.solvers.iteration.descent_method import (
     inner_product,
 )
 from springbench.solvers.iteration.device_interface import PrecisionOptions
+from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.preconditioners import (
     Preconditioner,
     PreconditionerName,
@@ -98,9 +99,10 @@ class NewtonCG(PrecisionOptions):
         metric = ResidualMetric(system)
         objective = FixedObjective(system)
         method = TruncatedNewtonIteration(metric, objective, self.preconditioner)
-        return PreparedDescent(
+        found = PreparedDescent(
             objective, metric, method, metric.description + objective.interpreted_energies, metric.stats
-        ).skip_idle_contact()
+        )
+        return skip_idle_contact(found, system, lambda: replace(found, fixed_objective=objective.ignore_barriers()))
 
 
 class TruncatedNewtonIteration:

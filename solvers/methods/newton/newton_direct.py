@@ -17,7 +17,7 @@ With active contacts, an iteration converges friction and may consist of several
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -30,6 +30,7 @@ from springbench.solvers.iteration.descent_method import (
     backtracking_line_search,
     inner_product,
 )
+from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.methods.newton.hessian_regularisation import (
     REGULARISATION_RULES,
@@ -97,7 +98,8 @@ class NewtonSolver:
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; residuals by {metric.description}"
         choice += objective.interpreted_energies
         method = NewtonIteration(metric, self.indefinite_strategy)
-        return PreparedDescent(objective, metric, method, choice, facts).skip_idle_contact()
+        found = PreparedDescent(objective, metric, method, choice, facts)
+        return skip_idle_contact(found, system, lambda: replace(found, fixed_objective=objective.ignore_barriers()))
 
 
 class NewtonIteration:

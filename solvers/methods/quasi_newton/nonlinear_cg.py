@@ -28,7 +28,7 @@ from springbench.solvers.iteration.descent_method import (
     backtracking_line_search,
     inner_product,
 )
-from springbench.solvers.iteration.idle_contact import IdleContactSolver
+from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.iteration.preconditioners import (
     PreconditionerBuilder,
@@ -85,11 +85,7 @@ class NonlinearCG:
         found = PreparedNonlinearCG(
             metric, objective, at, metric.description + objective.interpreted_energies, metric.stats
         )
-        return (
-            IdleContactSolver(found, replace(found, fixed_objective=objective.ignore_barriers()))
-            if objective.has_barriers
-            else found
-        )
+        return skip_idle_contact(found, system, lambda: replace(found, fixed_objective=objective.ignore_barriers()))
 
 
 @dataclass(frozen=True, eq=False)

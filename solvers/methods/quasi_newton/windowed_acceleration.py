@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
-from springbench.solvers.iteration.idle_contact import IdleContactSolver
+from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, compute_max_coordinate
 from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
@@ -75,7 +75,7 @@ def prepare_accelerated(
     base = alone.local_global
     base = replace(base, description=f"{base.description}; where pairs touch, iterations are interpreted")
     engine = _build_interpreted_engine(scheme, FixedObjective(system), base)
-    return IdleContactSolver(PreparedAccelerated(base, engine), alone)
+    return skip_idle_contact(PreparedAccelerated(base, engine), system, lambda: alone)
 
 
 def prepare_without_barriers(

@@ -33,7 +33,7 @@ from springbench.solvers.contact.half_space.vertex_contact import (
 )
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.device_interface import PrecisionOptions
-from springbench.solvers.iteration.idle_contact import IdleContactSolver
+from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
@@ -130,12 +130,10 @@ class VertexBlockDescent(PrecisionOptions):
             gauge,
             f"vertices in {made.num_colours} colours; for the residual alone {gauge.description}",
         )
-        return (
-            IdleContactSolver(
-                found, replace(found, system=without_barriers(system), residual_solver=gauge.contact_free)
-            )
-            if isinstance(gauge, IdleContactSolver)
-            else found
+        return skip_idle_contact(
+            found,
+            system,
+            lambda: replace(found, system=without_barriers(system), residual_solver=gauge.contact_free),
         )
 
 

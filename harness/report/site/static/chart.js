@@ -1,22 +1,25 @@
 // Line and point charts for all plots: by Plotly, with a custom legend, tooltip and keyboard control.
 "use strict";
 springbench.chart = (() => {
-  const { element, script, own, number, colour, glyph, keep, where } = springbench;
+  const { element, script, own, number, percent, time, colour, glyph, keep, where } = springbench;
   const tip = element("div.tip", { hidden: true, role: "tooltip" });
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
 
-  const figure = value => (typeof value === "string" ? value : number(value));
+  const figure = (value, format) => (typeof value === "string" ? value : format === "time" ? time(value) : format === "percent" ? percent(value) : number(value));
   const older = (item, k) => Boolean(Array.isArray(item.stale) ? item.stale[k] : item.stale);
 
   function told(chart, item, k) {
-    const rows = chart.hover.map(([column, words]) => {
+    const rows = chart.hover.map(([column, words, format]) => {
       const value = at(item, column, k);
-      return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, figure(value)));
+      return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, figure(value, format)));
     });
     if (older(item, k)) rows.push(element("tr", {}, element("td", {}, "code"), element("td", {}, "other than the newest rows'")));
     return [element("b", {}, item.label), item.description, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
   }
+
+  // Plotly omits a tick suffix between powers of ten; so times are formatted with seconds as the currency, such as 5ms.
+  const SECONDS = { en: { format: { currency: ["", "s"] } } };
 
   // Next to the point and inside the window, never wider than a tooltip.
   function show(x, y, content) {
@@ -31,10 +34,10 @@ springbench.chart = (() => {
   addEventListener("hashchange", hide);
 
   function trace(chart, item, x, y, panel, tail) {
-    const mark = own(chart.styles, item.label), ink = colour(mark.color), shape = item.shape ?? chart.shape, points = shape === "points";
+    const mark = item.style ?? own(chart.styles, item.label), ink = colour(mark.color), shape = item.shape ?? chart.shape, points = shape === "points";
     const ends = ["", "_low", "_high"].map(end => item[`${x.column}${end}`]), upright = ["", "_low", "_high"].map(end => item[`${y.column}${end}`]);
     // Intervals of many points would cover their line.
-    const bars = some => (some[1] && some[2] && some[0].length <= 24 ? {
+    const bars = some => (some[1] && some[2] && (points || some[0].length <= 24) ? {
       type: "data", symmetric: false, color: ink, thickness: 1.2, width: 3,
       array: some[2].map((v, k) => v - some[0][k]), arrayminus: some[1].map((v, k) => some[0][k] - v),
     } : undefined);
@@ -42,10 +45,10 @@ springbench.chart = (() => {
     const hollow = item[x.column].map((_, k) => older(item, k));
     return {
       x: item[x.column], y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
-      mode: item.joined || mark.symbol === "none" ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
+      mode: mark.symbol === "none" ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
       line: { color: ink, dash: mark.dash, width: 1.7, shape: shape === "hv" ? "hv" : undefined },
       // The number of markers per line is limited, whatever the number of its points.
-      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: item.large ? 13 : 8 * (item.scale ?? 1), maxdisplayed: points ? 0 : shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes ? 1.6 : 0)), color: ink } },
+      marker: { symbol: hollow.map(yes => mark.symbol + (yes ? "-open" : "")), color: ink, size: 8 * (item.scale ?? 1), maxdisplayed: points ? 0 : shape === "hv" ? 4 : 9, line: { width: hollow.map(yes => (yes || mark.symbol === "line-ns" ? 1.6 : 0)), color: ink } },
     };
   }
 
@@ -61,11 +64,15 @@ springbench.chart = (() => {
   function marks(chart, items, x, y, tail) {
     const shapes = [], annotations = [], frames = new Set(items.map(item => chart.frames?.[item.frame]));
     const log = (axis, v) => (axis.axis.type === "log" ? Math.log10(v) : v);
-    for (const frame of frames) {
-      for (const [low, high] of frame?.bands[y.column] || []) shapes.push({ type: "rect", layer: "below", xref: `x${tail} domain`, yref: `y${tail}`, x0: 0, x1: 1, y0: y.axis.type === "log" ? Math.max(low, high * 1e-20) : low, y1: high, line: { width: 0 }, fillcolor: css("--hair") });
-      for (const [at, words] of frame?.lines[y.column] || []) {
-        shapes.push({ type: "line", layer: "below", xref: `x${tail} domain`, yref: `y${tail}`, x0: 0, x1: 1, y0: at, y1: at, line: { width: 1, dash: "dash", color: css("--muted") } });
-        if (words) annotations.push({ text: words, xref: `x${tail} domain`, yref: `y${tail}`, x: 1, y: log(y, at), xanchor: "right", yanchor: "bottom", showarrow: false, font: { size: 12, color: css("--muted") } });
+    for (const frame of frames) for (const [name, other, axis] of [["x", "y", x], ["y", "x", y]]) {
+      const whole = { layer: "below", [`${other}ref`]: `${other}${tail} domain`, [`${name}ref`]: `${name}${tail}`, [`${other}0`]: 0, [`${other}1`]: 1 };
+      // A band from 0 has no lower end on a logarithmic axis: it begins below all data.
+      const least = high => Math.min(high, ...items.flatMap(item => item[axis.column].filter(v => v > 0))) / 2;
+      for (const [low, high] of frame?.bands[axis.column] || []) shapes.push({ ...whole, type: "rect", [`${name}0`]: axis.axis.type === "log" ? Math.max(low, least(high)) : low, [`${name}1`]: high, line: { width: 0 }, fillcolor: css("--hair") });
+      for (const [at, words] of frame?.lines[axis.column] || []) {
+        shapes.push({ ...whole, type: "line", [`${name}0`]: at, [`${name}1`]: at, line: { width: 1, dash: "dash", color: css("--muted") } });
+        const place = name === "y" ? { xanchor: "right", yanchor: "bottom" } : { xanchor: "left", yanchor: "top", textangle: -90 };
+        if (words) annotations.push({ text: words, [`${other}ref`]: `${other}${tail} domain`, [`${name}ref`]: `${name}${tail}`, [other]: 1, [name]: log(axis, at), ...place, showarrow: false, font: { size: 12, color: css("--muted") } });
       }
     }
     for (const item of y === chart.y?.[0] ? items : []) for (const [k, words] of Object.entries(item.callouts || {})) {
@@ -99,14 +106,20 @@ springbench.chart = (() => {
       annotations: [], shapes: [], font: { family: getComputedStyle(document.body).fontFamily, color: css("--ink") }, dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
     };
     const traces = [], gap = narrow ? 0.16 : 0.05, n = panels.length;
-    // Over few decades 1, 2 and 5 are labelled, over more only the powers of ten.
+    // Over few decades 1, 2 and 5 are labelled if there is space, over more only the powers of ten.
     const room = axis => (axis === y ? (narrow ? 330 : plot.clientHeight) / 42 : plot.clientWidth / (narrow ? 1 : panels.length) / 70);
     const range = axis => {
       if (axis.axis.type !== "log") return axis.axis;
       let [low, high] = [Infinity, 0];
       for (const item of items) for (const v of item[axis.column]) if (v > 0) [low, high] = [Math.min(low, v), Math.max(high, v)];
       const decades = Math.log10(high / low);
-      return { ...axis.axis, dtick: decades > 2.4 ? Math.max(1, Math.ceil(decades / room(axis))) : "D2" };
+      if (axis.axis.tickmode === "array") {
+        // A tick at each size, the largest first, if there is space for its label.
+        const sizes = [...new Set(items.flatMap(item => item[axis.column]))].filter(v => v > 0).sort((a, b) => b - a), ticks = [];
+        for (const v of sizes) if (!ticks.length || Math.log10(ticks.at(-1) / v) * room(axis) >= decades) ticks.push(v);
+        return { ...axis.axis, tickvals: ticks, ticktext: ticks.map(v => number(v)) };
+      }
+      return { ...axis.axis, dtick: 3 * decades > Math.min(7.2, room(axis)) ? Math.max(1, Math.ceil(decades / room(axis))) : "D2" };
     };
     panels.forEach((panel, k) => {
       const tail = k ? k + 1 : "", size = (1 + gap) / n - gap, low = k * (size + gap);
@@ -115,8 +128,9 @@ springbench.chart = (() => {
       layout[`yaxis${tail}`] = { ...style, ...range(y), title: { ...style.title, text: k && !narrow ? "" : y.title }, domain: up, anchor: `x${tail}`, matches: k ? "y" : undefined, showticklabels: !k || narrow };
       if (panel && n > 0) layout.annotations.push({ text: `<b>${panel}</b>`, x: across[0], y: up[1], yshift: 22, xref: "paper", yref: "paper", showarrow: false, xanchor: "left", font: { size: 13, color: css("--ink") } });
       const here = items.filter(item => (item.panel ?? "") === panel && !hidden.has(item.label)), extra = marks(chart, here, x, y, tail);
-      const label = items.find(item => (item.panel ?? "") === panel && chart.frames?.[item.frame].x_label);
-      if (label) layout[`xaxis${tail}`].title.text = chart.frames[label.frame].x_label;
+      const frame = chart.frames?.[items.find(item => (item.panel ?? "") === panel).frame];
+      if (frame?.x_label) layout[`xaxis${tail}`].title.text = frame.x_label;
+      for (const [name, axis] of [["x", x], ["y", y]]) if (frame?.place_names[axis.column]) layout[`${name}axis${tail}`].categoryarray = frame.place_names[axis.column];
       layout.shapes.push(...extra.shapes);
       layout.annotations.push(...extra.annotations);
       for (const item of here) {
@@ -125,7 +139,7 @@ springbench.chart = (() => {
       }
     });
     zoom(layout, where().query.get(zoomKey));
-    await Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true, showTips: false });
+    await Plotly.react(plot, traces, layout, { displayModeBar: false, responsive: true, showTips: false, locales: SECONDS });
     plot.removeAllListeners("plotly_hover");
     plot.removeAllListeners("plotly_unhover");
     plot.removeAllListeners("plotly_click");
@@ -139,12 +153,12 @@ springbench.chart = (() => {
     });
     plot.on("plotly_unhover", hide);
     plot.on("plotly_click", ({ points: [p] }) => { if (p.data.meta) onPoint(p.data.meta.item, p.pointNumber); });
-    keys(plot, chart, onPoint);
+    keys(plot, chart, x, y, onPoint);
   }
 
   // Left and right move along a line, up and down to the next line, Enter opens the point, plus and minus zoom, Home
   // resets the zoom.
-  function keys(plot, chart, onPoint) {
+  function keys(plot, chart, x, y, onPoint) {
     let line = -1, k = 0;
     plot.onkeydown = event => {
       const lines = plot.data.map((one, number) => [one, number]).filter(([one]) => one.meta);
@@ -164,7 +178,7 @@ springbench.chart = (() => {
         }
         const full = plot._fullData[curve], box = plot.getBoundingClientRect(), axes = [plot._fullLayout[full.xaxis.replace("x", "xaxis")], plot._fullLayout[full.yaxis.replace("y", "yaxis")]];
         show(axes[0]._offset + axes[0].d2p(one.x[k]) + box.left, axes[1]._offset + axes[1].d2p(one.y[k]) + box.top, told(chart, one.meta.item, k));
-        springbench.tell(`${one.name}: ${figure(one.x[k])}, ${figure(one.y[k])}`);
+        springbench.tell(`${one.name}: ${figure(one.x[k], x.format)}, ${figure(one.y[k], y.format)}`);
       } else return;
       event.preventDefault();
     };
@@ -189,5 +203,5 @@ springbench.chart = (() => {
     });
   }
 
-  return { draw, legend, hide };
+  return { draw, legend, hide, figure };
 })();

@@ -20,6 +20,7 @@ Object.assign(springbench, (() => {
     if (seconds < 90) return `${number(seconds)} s`;
     return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${number(seconds / 3600)} h`;
   }
+  const time = seconds => (seconds >= 1 || !seconds ? (seconds === null || seconds === undefined ? "–" : duration(seconds)) : seconds >= 1e-3 ? `${number(1e3 * seconds)} ms` : `${number(1e6 * seconds)} µs`);
   const day = text => (text || "").slice(0, 10);
   const step = dt => {
     const whole = Math.round(1 / dt);
@@ -54,6 +55,7 @@ Object.assign(springbench, (() => {
     return `M${points.join("L")}Z`;
   };
   const SHAPES = {
+    none: "M-7-1.2h14v2.4h-14Z",
     circle: "M-5.5 0a5.5 5.5 0 1 0 11 0a5.5 5.5 0 1 0 -11 0Z", square: "M-5-5h10v10h-10Z", diamond: ring(4),
     "diamond-tall": "M0-7L4 0L0 7L-4 0Z", "triangle-up": "M0-6L6 5H-6Z", "triangle-down": "M0 6L6-5H-6Z",
     "triangle-left": "M-6 0L5-6V6Z", "triangle-right": "M6 0L-5-6V6Z", pentagon: ring(5), hexagon: ring(6),
@@ -88,5 +90,5 @@ Object.assign(springbench, (() => {
     return element(`span.state.${kind}`, {}, element("span", { "aria-hidden": "true" }, `${own(SIGNS, words) || "×"} `), plain || words);
   }
 
-  return { commit, madeBy, number, count, percent, fixed, many, duration, day, step, colour, glyph, state };
+  return { commit, madeBy, number, count, percent, fixed, many, duration, time, day, step, colour, glyph, state };
 })());

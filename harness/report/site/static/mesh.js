@@ -92,8 +92,8 @@ Object.assign(springbench, (() => {
   async function solve(box, sweep, chart, item, k, close) {
     const shut = element("button.quiet.close", { type: "button", onclick: close, "aria-label": "Close" }, "×");
     box.onkeydown = event => { if (event.key === "Escape" && event.target.tagName !== "INPUT") close(); };
-    const figures = springbench.definitions(chart.hover.map(([column, words]) => [words, Array.isArray(item[column]) ? item[column][k] : item[column]])
-      .map(([words, value]) => [words, typeof value === "number" ? number(value) : value]));
+    const figures = springbench.definitions(chart.hover.map(([column, words, format]) => [words, Array.isArray(item[column]) ? item[column][k] : item[column], format])
+      .map(([words, value, format]) => [words, typeof value === "number" ? springbench.chart.figure(value, format) : value]));
     const made = item.provenance?.[k] || sweep.provenance[0] || {}, command = chart.command.replace("CONFIG", springbench.quoted(sweep.config || "CONFIG.yaml"));
     const settings = Object.entries(JSON.parse(item.parameters || "{}")).map(pair => pair.join(" ")).join(", ");
     const scrub = element("div"), file = item.recording_path && link(sweep.relative_url, item.recording_path), replay = own(sweep.replays, item.recording_path);

@@ -44,8 +44,8 @@
   springbench.views.plots = async (content, query, index) => {
     const sweeps = index.sweeps.filter(sweep => plotsOf(sweep).length);
     const box = element("div.plots"), top = element("div.choice.aside"), tabs = element("div.tabs", { role: "navigation", "aria-label": "Plots" });
-    const title = element("h1"), note = element("p.muted"), by = element("p.by"), choice = element("div.choice"), body = element("div"), point = element("section.point", { hidden: true, tabIndex: -1, "aria-label": "The chosen point" });
-    box.append(element("div.headline", {}, title, top), tabs, note, choice, body, by, point);
+    const title = element("h1"), note = element("p.muted"), by = element("p.by"), maps = element("div"), choice = element("div.choice"), body = element("div"), point = element("section.point", { hidden: true, tabIndex: -1, "aria-label": "The chosen point" });
+    box.append(element("div.headline", {}, title, top), tabs, note, maps, choice, body, by, point);
     content.append(box);
     let last = "", current = null, pointed = "";
 
@@ -61,19 +61,19 @@
         last = `${drawn}\n${sweep.slug}/${plot.id}`;
         const chart = await load(sweep, plot.id);
         title.textContent = chart.title;
-        const mixed = chart.items?.some(item => (Array.isArray(item.stale) ? item.stale.some(Boolean) : item.stale));
+        const mixed = chart.items.some(item => (Array.isArray(item.stale) ? item.stale.some(Boolean) : item.stale));
         note.textContent = [chart.note, mixed && "Hollow marks: measured by other code than the newest rows."].filter(Boolean).join(" ");
         by.textContent = `${sweep.name}: ${springbench.madeBy(sweep.provenance)}.`;
         top.hidden = sweeps.length < 2;
         top.replaceChildren(element("label.field", {}, element("span", {}, "Results"), element("select", { onchange: event => { location.hash = address("plots", { sweep: event.target.value }); } },
           ...sweeps.map(one => element("option", { value: one.slug, selected: one === sweep }, one.name)))));
         tabs.replaceChildren(...plots.map(one => element("a", { href: address("plots", { sweep: sweep.slug, plot: one.id }), "aria-current": one === plot && "page" }, one.title)));
-        if (chart.kind === "map") {
+        if (anew) maps.replaceChildren(...(chart.maps ? springbench.maps(chart, sweep) : []));
+        if (chart.items.length) await drawChart(sweep, plot, chart, next, anew);
+        else {
           choice.replaceChildren();
-          body.replaceChildren(...springbench.map(chart, sweep));
+          body.replaceChildren();
           current = null;
-        } else {
-          await drawChart(sweep, plot, chart, next, anew);
         }
       }
       await showPoint(sweep, next.get("point") || "", `${next.get("at")} ${next.get("turn")}`);
@@ -90,7 +90,7 @@
       const notes = new Set(items.flatMap(item => chart.frames?.[item.frame].notes || []));
       note.textContent = [note.textContent, ...notes].join(" ");
       const hidden = new Set((next.get("off") || "").split("~").filter(Boolean)), labels = [...new Set(items.map(item => item.label))];
-      const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper", benchmark: "Benchmark" };
+      const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper", solver: "Solver", benchmark: "Benchmark" };
       const plotBox = anew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one, plus and minus zoom, Home shows all.` }) : current.plotBox;
       const names = element("ul.legend", { "aria-label": "Solvers" }, ...springbench.chart.legend(labels, chart, items, hidden, off => change({ off: [...off].join("~") })));
       choice.replaceChildren(...chart.filters.filter(key => distinct(key).length > 1).map(key => pick(words[key] || key, key, distinct(key), chosen[key])),
@@ -133,6 +133,7 @@
   function csv(items, x, y) {
     const quote = v => (v === null || v === undefined ? "" : /[",]/.test(String(v)) ? `"${String(v).replaceAll('"', '""')}"` : v);
     const lines = items.flatMap(item => item[x.column].map((value, k) => [item.label, item.description, value, item[y.column][k]].map(quote).join(",")));
-    return [["solver", "what", x.title, y.title].map(quote).join(","), ...lines].join("\n") + "\n";
+    const named = axis => axis.title + (axis.format === "time" ? " [s]" : "");
+    return [["solver", "what", named(x), named(y)].map(quote).join(","), ...lines].join("\n") + "\n";
   }
 })();

@@ -1,0 +1,37 @@
+"""Sheets of sweeps with verified runs: their shares of correct runs, and the map of solvers x cases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from springbench.harness.errors import InputError
+from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
+from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
+from springbench.harness.report.provenance_words import describe_provenance
+from springbench.harness.report.robustness import MAP_NOTE, VerifiedRun, map_headline, read_verified_runs
+from springbench.harness.results import row_store
+
+
+def draw_hard_case_sheets(
+    results: Path, find_stale: Callable[[Path], Collection[str]]
+) -> Iterator[tuple[Path, list[VerifiedRun]]]:
+    """Draw `pictures/robustness.png` and `.svg` for each sweep with verified runs in a folder.
+
+    Args:
+        results: folder of results, or the folder of one sweep.
+        find_stale: returns the ids of those runs in a sweep's folder that other code than the current version executed.
+    Yields: each PNG file and its runs.
+    """
+    for rows in row_store.find_row_folders(results, "rows"):
+        folder = rows.parent
+        with suppress(InputError):
+            cells = read_verified_runs(folder)
+            provenance = describe_provenance([{"cpu": cell.cpu, "commit": cell.commit} for cell in cells])
+            chart = build_hard_case_chart(cells, find_stale(folder), provenance)
+            frames = [replace(frame, notes=[*frame.notes, MAP_NOTE]) for frame in chart.frames]
+            chart = replace(chart, title=map_headline(cells, folder.resolve().name), frames=frames)
+            picture, *_ = draw_chart_sheets(chart, folder / "pictures" / "robustness")
+            yield picture, cells

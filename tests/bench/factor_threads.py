@@ -1,0 +1,133 @@
+"""What a second thread saves in an iteration of Newton's method, and how that compares with MKL PARDISO.
+
+    python -m tests.bench.factor_threads [--sizes 32 64 128 256] [--rounds 9]
+
+An iteration is the gradient, the Hessian, its factorisation, the solve, and the change of the objective, on a sheet
+that is stretched by 5 %, so that the Hessian is positive definite. PARDISO, with the optional dependency `pardiso`,
+only factorises that Hessian, analysed before. Rounds of one and two threads alternate; a pause between both programs
+lets the waiting threads of either fall asleep. The table has median wall times, and medians of the rounds' ratios with
+their quartiles. It needs two idle cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from os import getloadavg
+from time import perf_counter, sleep
+
+import numba
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from scipy.sparse import bsr_array, csr_matrix, triu
+from springbench.harness.execution.machine_info import describe_machine, limit_threads
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem
+from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.step_objective import StepObjective
+
+from tests.bench.gates import sheet
+
+PAUSE = 0.3
+"""Seconds between both programs: Intel's waiting threads spin for 0.2."""
+
+
+def newton_iteration(size: int) -> tuple[Callable[[], object], StepObjective, np.ndarray]:
+    """An iteration on the sheet, its objective, and the positions [m] at which it begins."""
+    scene = sheet(size)
+    step = StepObjective(FixedObjective(scene.system), build_problem(scene, build_initial_state(scene), "previous"))
+    p = step.apply_exact_pins(1.05 * scene.mesh.rest_positions)
+
+    def iterate() -> object:
+        d = step.hessian(p).factorise_and_solve(-step.gradient(p))
+        assert d is not None, "the Hessian of a stretched sheet is positive definite"
+        return step.objective_change(p, p + d)
+
+    return iterate, step, p
+
+
+def pardiso_factorisation(step: StepObjective, p: np.ndarray, threads: int) -> Callable[[], object] | None:
+    """PARDISO's factorisation of the Hessian by a number of threads; None without pypardiso.
+
+    An analysis is for one number of threads.
+    """
+    try:
+        from pypardiso import PyPardisoSolver  # an optional dependency
+    except ImportError:
+        return None
+    matrix = step.hessian(p).assemble_clamped()
+    graph, n = matrix.graph, 3 * matrix.graph.shape[0]
+    whole = bsr_array((matrix.values, graph.indices, graph.indptr), shape=(n, n))
+    upper = csr_matrix(triu(whole.tocsr(), format="csr"))
+    solver, nothing = PyPardisoSolver(mtype=2), np.zeros((n, 1))  # symmetric positive definite
+
+    def run(phase: int) -> object:
+        solver.libmkl.MKL_Set_Num_Threads(threads)
+        solver.set_phase(phase)
+        return solver._call_pardiso(upper, nothing)
+
+    run(11)
+    return lambda: run(22)
+
+
+def _seconds(work: Callable[[], object], repeats: int) -> float:
+    begin = perf_counter()
+    for _ in range(repeats):
+        work()
+    return (perf_counter() - begin) / repeats
+
+
+def _measure(works: list[Callable[[], object]], rounds: int) -> np.ndarray:
+    """Seconds of each work, (rounds, works), in alternating order."""
+    seconds = np.empty((rounds, len(works)))
+    for work in works:
+        work()
+    repeats = max(1, int(0.02 / _seconds(works[0], 1)))
+    for k in range(rounds):
+        for i in range(len(works))[:: 1 if k % 2 == 0 else -1]:
+            seconds[k, i] = _seconds(works[i], repeats)
+    return seconds
+
+
+def _ratio(ratios: np.ndarray) -> str:
+    low, middle, high = np.quantile(ratios, (0.25, 0.5, 0.75))
+    return f"{middle:.2f} ({low:.2f} to {high:.2f})"
+
+
+def measure(size: int, rounds: int) -> list[str]:
+    """The row of a size."""
+    iterate, step, p = newton_iteration(size)
+
+    def by_threads(threads: int) -> Callable[[], object]:
+        return lambda: (numba.set_num_threads(threads), iterate())
+
+    ours = _measure([by_threads(1), by_threads(2)], rounds)
+    row = [str(size), *(f"{1e3 * s:.2f}" for s in np.median(ours, axis=0)), _ratio(ours[:, 0] / ours[:, 1])]
+    sleep(PAUSE)
+    theirs = [work for k in (1, 2) if (work := pardiso_factorisation(step, p, k))]
+    if not theirs:
+        return [*row, "-", "-", "-"]
+    seconds = _measure(theirs, rounds)
+    sleep(PAUSE)
+    medians = np.median(seconds, axis=0)
+    return [*row, *(f"{1e3 * s:.2f}" for s in medians), _ratio(seconds[:, 1] / np.median(ours[:, 1]))]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128, 256])
+    parser.add_argument("--rounds", type=int, default=9)
+    given = parser.parse_args()
+    print(f"{describe_machine().cpu}; load {getloadavg()[0]:.1f}; times in ms")
+    columns = "size", "1 thread", "2 threads", "ratio", "PARDISO, 1", "PARDISO, 2", "PARDISO / ours, 2"
+    table = Table(*columns, box=SIMPLE_HEAD)
+    with limit_threads(2):
+        for size in given.sizes:
+            table.add_row(*measure(size, given.rounds))
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    main()
