@@ -135,7 +135,7 @@ class Ipctk:
                 return found
         V, collisions = np.asfortranarray(p), self._of.NormalCollisions()
         args = (self._surface, V, self._reach, self._thickness, self._of.LBVH())
-        self._timed("pairs", lambda: collisions.build_mesh(*args))
+        self._timed("pairs", lambda: collisions.build(*args))
         value, gradient = self._timed("value and gradient", lambda: self._slopes(collisions, V))
         found = Found(p.copy(), collisions, value, gradient.reshape(-1, 3))
         self._known = [*self._known[-1:], found]

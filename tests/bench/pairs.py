@@ -111,7 +111,7 @@ def theirs(made: Folded) -> tuple[dict[str, Callable[[], object]], int]:
     )
     potential = of.BarrierPotential(reach, 1.0)
     known = of.NormalCollisions()
-    known.build_mesh(surface, V, reach, thickness, of.LBVH())
+    known.build(surface, V, reach, thickness, of.LBVH())
 
     def slopes(found: Any) -> float:
         potential.gradient(found, surface, V)
@@ -119,7 +119,7 @@ def theirs(made: Folded) -> tuple[dict[str, Callable[[], object]], int]:
 
     def anew() -> float:
         found = of.NormalCollisions()
-        found.build_mesh(surface, V, reach, thickness, of.LBVH())
+        found.build(surface, V, reach, thickness, of.LBVH())
         return slopes(found)
 
     def step() -> float:

@@ -83,6 +83,8 @@ def write_study(
         for table in ("measurements", *_TABLES)
         if (several := [tables[table] for tables in by_part if table in tables])
     }
+    if "rows" in found and _has_machine_limits(found["rows"]):
+        found["measurements"] = found.pop("rows")  # candidates of a roofline are no runs that can be repeated alone
     if not found:
         raise InputError(InputMistake("holds no rows; wanted the folder of one sweep, such as results/hard", parts[0]))
     is_timed = any(_is_timed(rows) for rows in found.values())
@@ -237,8 +239,10 @@ def _ran_alone(rows: pa.Table) -> bool:
     return "num_concurrent_runs" in rows.column_names and set(rows["num_concurrent_runs"].to_pylist()) <= {1, None}
 
 
-def _has_machine_limits(rows: pa.Table) -> bool:
-    return "solver" in rows.column_names and MACHINE_SOLVER in pc.unique(rows["solver"]).to_pylist()
+def _has_machine_limits(rows: pa.Table | None) -> bool:
+    return (
+        rows is not None and "solver" in rows.column_names and MACHINE_SOLVER in pc.unique(rows["solver"]).to_pylist()
+    )
 
 
 def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:
@@ -263,11 +267,11 @@ def _count_requested_runs(config: Path) -> int:
 
 
 def _describe_command(tables: Mapping[str, pa.Table], config: Path) -> str:
+    if _has_machine_limits(tables.get("measurements")):
+        return f"springbench roofline {config.parent.name}/{config.name}"
     if "measurements" in tables:
         return f"measurements of {config.parent.name}/{config.name}"
     command = next(name for table, name in _COMMANDS.items() if table in tables)
-    if command == "run" and _has_machine_limits(tables["rows"]):
-        command = "roofline"
     return f"springbench {command} {config.parent.name}/{config.name}"
 
 

@@ -29,7 +29,6 @@ from springbench.harness.report.accuracy.time_to_accuracy import GAP_TARGETS, fi
 from springbench.harness.report.accuracy.winner_map import build_winner_cells
 from springbench.harness.report.robustness import CORRECT, UNSUPPORTED, read_verified_runs
 from springbench.harness.report.speed.speed_figures import compute_speed_figures
-from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.published_set import (
     TABLE_FILES,
     PublishedStudy,
@@ -37,6 +36,7 @@ from springbench.harness.results.published_set import (
     list_studies,
     open_study_folder,
 )
+from springbench.harness.results.run_schema import RUN_SCHEMA
 
 
 class PublishedQueries:
@@ -166,8 +166,8 @@ def list_paper_errors(study: PublishedStudy) -> Sequence[dict[str, Any]]:
 
 def list_speedups(study: PublishedStudy) -> Sequence[dict[str, Any]]:
     """List the speedups of each candidate of a roofline study over the C++ baselines, with 95 % intervals."""
-    with open_study_folder(study) as folder:
-        figures = compute_speed_figures(parquet_rows.read_rows(row_store.list_units(folder / "rows")))
+    rows = pa.concat_tables([RUN_SCHEMA.empty_table(), study.read_table("measurements")], promote_options="default")
+    figures = compute_speed_figures(rows)
     return [
         {
             "scene": one.scene,
