@@ -8,15 +8,12 @@ from springbench.harness.cli.main import app
 from springbench.harness.experiments.archive import study_publication
 from springbench.harness.report.pages.page_files import check_pages, write_pages
 from springbench.harness.report.pages.published_queries import PublishedQueries
-from springbench.harness.results import parquet_rows
 from springbench.harness.results.published_set import read_study
-from springbench.harness.results.run_schema import RUN_SCHEMA
 from typer.testing import CliRunner
 
 from tests.bench.scripted_study import describe_moment, publish_rows
 from tests.contracts.hostile import scene
 from tests.synthetic_accuracy_rows import build_work_rows, write_accuracy_rows
-from tests.synthetic_results import write_result_rows, write_speed_results
 from tests.synthetic_run_rows import write_dummy_runs
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -91,23 +88,6 @@ def test_units_of_a_newer_part_replace_those_of_the_same_file(tmp_path: Path) ->
     units = study.read_table("accuracy").to_pylist()
     assert {(row["size"], row["error"]) for row in units if row["size"] == 10} == {(10, 0.1)}
     assert len(units) == len(rows) + len(more)
-
-
-def test_speedups_of_a_published_roofline_study_are_a_view(tmp_path: Path) -> None:
-    write_speed_results(tmp_path / "speed")
-    for path in (tmp_path / "speed" / "rows").glob("sparse-*"):
-        rows = parquet_rows.read_rows([path], RUN_SCHEMA).to_pylist()
-        write_result_rows(path, [row | {"solver": "cholmod"} for row in rows])
-    study = study_publication.write_study(
-        [tmp_path / "speed"], CONFIGS / "speed.yaml", tmp_path / "published", lambda line: None
-    )
-    assert study.metadata["command"] == "springbench roofline configs/speed.yaml"
-    queries = PublishedQueries(tmp_path / "published")
-    rows = queries.query_records("SELECT * FROM speed_speedups WHERE baseline = 'cholmod' AND solver = 'numba'")
-    assert {(row["size"], row["candidate"]) for row in rows} == {
-        (size, f"numba {linear}") for size in (8, 16, 32) for linear in ("auto", "supernodal")
-    }
-    assert {round(row["speedup"], 3) for row in rows if row["candidate"] == "numba auto"} == {round(4 / 3, 3)}
 
 
 def test_rows_of_a_script_are_a_study_with_what_made_them(tmp_path: Path) -> None:

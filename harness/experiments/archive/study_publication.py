@@ -22,19 +22,14 @@ import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write, explain_unreadable_file
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.report.speed.speed_figures import MACHINE_SOLVER
 from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
-
-_FACTOR_COLUMNS = ("flops_per_solve", "factor_bytes", "nnz_factor")
-"""Columns that only a comparison with the limits of the machine uses."""
 
 DROPPED_COLUMNS = frozenset(
     (
         *("positions_digest", "recording_digest", "recording_path", "node_id", "source_fingerprint", "sweep"),
         *("wall_seconds_check", "wall_seconds_sum", "phases_consistent", "energy_springs", "energy_inertia"),
         *("energy_force", "energy_pins", "energy_effects", "energy_gain", "energy_available", "max_strain"),
-        *("strain_p99", "nnz_system", "nnz_hessian_factor"),
-        *_FACTOR_COLUMNS,
+        *("strain_p99", "flops_per_solve", "factor_bytes", "nnz_system", "nnz_factor", "nnz_hessian_factor"),
     )
 )
 """Columns that are left out: digests of files that are not published, checks that a run has passed, and provenance.
@@ -83,8 +78,6 @@ def write_study(
         for table in ("measurements", *_TABLES)
         if (several := [tables[table] for tables in by_part if table in tables])
     }
-    if "rows" in found and _has_machine_limits(found["rows"]):
-        found["measurements"] = found.pop("rows")  # candidates of a roofline are no runs that can be repeated alone
     if not found:
         raise InputError(InputMistake("holds no rows; wanted the folder of one sweep, such as results/hard", parts[0]))
     is_timed = any(_is_timed(rows) for rows in found.values())
@@ -93,7 +86,6 @@ def write_study(
     with TemporaryDirectory(dir=published, prefix=".") as temporary:
         for table, rows in found.items():
             left_out = DROPPED_COLUMNS | (frozenset[str]() if is_timed or _ran_alone(rows) else _TIME_COLUMNS)
-            left_out -= frozenset(_FACTOR_COLUMNS if _has_machine_limits(rows) else ())
             write_published_table(Path(temporary) / published_set.TABLE_FILES[table], _drop_columns(rows, left_out))
         older = list(folder.glob("*.parquet"))
         size = sum(path.stat().st_size for path in published.rglob("*.parquet") if path not in older)
@@ -239,12 +231,6 @@ def _ran_alone(rows: pa.Table) -> bool:
     return "num_concurrent_runs" in rows.column_names and set(rows["num_concurrent_runs"].to_pylist()) <= {1, None}
 
 
-def _has_machine_limits(rows: pa.Table | None) -> bool:
-    return (
-        rows is not None and "solver" in rows.column_names and MACHINE_SOLVER in pc.unique(rows["solver"]).to_pylist()
-    )
-
-
 def _drop_columns(rows: pa.Table, names: frozenset[str]) -> pa.Table:
     """Return the table without columns of these names and without empty columns."""
     selected = [name for name in rows.column_names if name not in names and rows[name].null_count < len(rows)]
@@ -267,8 +253,6 @@ def _count_requested_runs(config: Path) -> int:
 
 
 def _describe_command(tables: Mapping[str, pa.Table], config: Path) -> str:
-    if _has_machine_limits(tables.get("measurements")):
-        return f"springbench roofline {config.parent.name}/{config.name}"
     if "measurements" in tables:
         return f"measurements of {config.parent.name}/{config.name}"
     command = next(name for table, name in _COMMANDS.items() if table in tables)

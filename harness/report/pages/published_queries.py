@@ -8,7 +8,6 @@ made when a query names them:
     <study>_times      time and iteration of each curve to each gap of GAP_TARGETS, on steps with a certified minimum
     <study>_costs      cheapest simulation of each family of methods for each error, by mesh and stiffness number
     <study>_ratios     least time of each external engine over that of the own methods, by scene and error
-    <study>_speedups   speedups and shares of the machine's limit, of a study of `springbench roofline`
     <study>_paper      own errors and those of Liu et al. 2013, by curve and iterations
 """
 
@@ -28,7 +27,6 @@ from springbench.harness.report.accuracy.liu2013_comparison import compare_with_
 from springbench.harness.report.accuracy.time_to_accuracy import GAP_TARGETS, find_time_to_accuracy, is_solvable
 from springbench.harness.report.accuracy.winner_map import build_winner_cells
 from springbench.harness.report.robustness import CORRECT, UNSUPPORTED, read_verified_runs
-from springbench.harness.report.speed.speed_figures import compute_speed_figures
 from springbench.harness.results.published_set import (
     TABLE_FILES,
     PublishedStudy,
@@ -36,7 +34,6 @@ from springbench.harness.results.published_set import (
     list_studies,
     open_study_folder,
 )
-from springbench.harness.results.run_schema import RUN_SCHEMA
 
 
 class PublishedQueries:
@@ -164,44 +161,12 @@ def list_paper_errors(study: PublishedStudy) -> Sequence[dict[str, Any]]:
         return [one._asdict() for one in compare_with_paper(read_accuracy(folder))]
 
 
-def list_speedups(study: PublishedStudy) -> Sequence[dict[str, Any]]:
-    """List the speedups of each candidate of a roofline study over the C++ baselines, with 95 % intervals."""
-    rows = pa.concat_tables([RUN_SCHEMA.empty_table(), study.read_table("measurements")], promote_options="default")
-    figures = compute_speed_figures(rows)
-    return [
-        {
-            "scene": one.scene,
-            "size": one.size,
-            "vertices": one.vertices,
-            "candidate": one.label,
-            "solver": one.solver,
-            "threads": one.threads,
-            "baseline": baseline,
-            "speedup": speedup.estimate,
-            "low": speedup.low,
-            "high": speedup.high,
-            "binding_limit": one.binding_limit,
-            "limit_share": one.roofline_fraction,
-            "warm_milliseconds": one.warm,
-        }
-        for one in figures
-        for baseline, speedup in (
-            ("eigen", one.speedup),
-            ("eigen, cheap temporaries", one.speedup_over_cheap),
-            ("cholmod", one.speedup_over_cholmod),
-            ("cholespy, one solve", one.solve_speedup_over_cholespy),
-        )
-        if speedup
-    ]
-
-
 COMPUTED_VIEWS: dict[str, Callable[[PublishedStudy], Sequence[dict[str, Any]]]] = {
     "outcomes": list_outcomes,
     "times": list_times,
     "costs": list_costs,
     "ratios": list_engine_ratios,
     "paper": list_paper_errors,
-    "speedups": list_speedups,
 }
 """Functions that compute the rows of views, by the ends of their names."""
 
