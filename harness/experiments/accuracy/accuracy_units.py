@@ -158,7 +158,11 @@ class CurveUnit:
     spec: CurveSpec
     results: AccuracyResults
     snapshot_row: Mapping[str, Any]
-    cost_estimate: RunCost = UNIT_COST
+
+    @property
+    def cost_estimate(self) -> RunCost:
+        """Cost of one unit; the solvers of a step take times of one magnitude."""
+        return RunCost(self.spec.build_problem_stem())
 
     @property
     def title(self) -> str:
@@ -220,7 +224,13 @@ class WorkPrecisionUnit:
 
     spec: WorkSpec
     results: AccuracyResults
-    cost_estimate: RunCost = UNIT_COST
+
+    @property
+    def cost_estimate(self) -> RunCost:
+        """Estimated cost: vertices times steps times iterations."""
+        case = self.spec.case
+        steps = self.spec.t_end / case.scene.time_step * self.spec.measurement.rounds
+        return RunCost(self.spec.solver.name, (case.size or 32) ** 2 * steps * self.spec.options["max_iterations"])
 
     @property
     def title(self) -> str:

@@ -31,7 +31,7 @@ from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy.error_times import list_curve_times, list_simulation_times
 from springbench.harness.report.robustness import classify_run
 from springbench.harness.results import parquet_rows, row_store
-from springbench.harness.results.published_set import RUN_KEYS, PublishedStudy, open_study_folder
+from springbench.harness.results.published_set import QUICK_SHARE, RUN_KEYS, PublishedStudy, open_study_folder
 from springbench.harness.results.study_comparison import (
     AgreementLevel,
     RunAgreement,
@@ -44,10 +44,6 @@ from springbench.harness.results.study_comparison import (
 )
 from springbench.harness.results.time_ratios import list_step_times
 from springbench.solvers.registry import OPTIONAL_SOLVERS
-
-QUICK_SHARE = 0.1
-"""Share of the runs that `--quick` repeats."""
-
 
 RowPair = tuple[RunRows, RunRows]
 """Rows of a published run and of the repeated one."""
