@@ -29,11 +29,13 @@ from springbench.harness.execution.timing_lock import (
 from springbench.harness.execution.worker_process import ProgressCallback
 from springbench.harness.experiments.failure_columns import build_energy_growth_columns, build_failure_columns
 from springbench.harness.experiments.machine_calibration import calibrate_machine
-from springbench.harness.experiments.provenance import build_run_columns, build_specification_columns, convert_tolerance
-from springbench.harness.experiments.source_fingerprint import (
+from springbench.harness.experiments.provenance import (
     ERROR_CONTROL_TARGET,
+    build_run_columns,
+    build_specification_columns,
     collect_source_parts,
     compute_source_fingerprint,
+    convert_tolerance,
     load_solver_class,
 )
 from springbench.harness.experiments.sweep_plan import RunFiles
