@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from time import thread_time
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,9 @@ from springbench.harness.reference.perturbation_growth import PerturbationGrowth
 from springbench.harness.reference.reference_trajectory import ProgressFunction, ReferenceTrajectory, integrate_motion
 from springbench.harness.reference.self_converged_trajectory import (
     CONTACT_MARGIN,
+    MAX_SECONDS,
+    SHORTEST_REFINEMENT,
+    TRIAL_SHARE,
     NotConverged,
     SelfConvergedTrajectory,
     compute_self_converged,
@@ -163,6 +167,7 @@ class ReferenceStore:
         error: float,
         report_progress: ProgressFunction | None = None,
         growth_end: float | None = None,
+        contact_error: float | None = None,
     ) -> ReferenceTrajectory:
         """Load or compute a reference trajectory at given times.
 
@@ -176,6 +181,8 @@ class ReferenceStore:
           error: smallest relative error to be measured.
           report_progress: called with the progress of an integration.
           growth_end: time [s] up to which the growth of a perturbation is estimated; the last time by default.
+          contact_error: relative error for which a motion with contact is refined if none is stored; `error` by
+            default.
 
         Raises:
           InputError: the scene cannot be built.
@@ -184,7 +191,7 @@ class ReferenceStore:
         """
         name = _build_motion_name(spec, size, times)
         if has_contact(build_exact_scene(spec, size).system):
-            found = self.load_self_converged(spec, size, times, error=error)
+            found = self.load_self_converged(spec, size, times, error=error, refined_error=contact_error)
             found.require_accuracy(error)
             return found
         seen = self.load_growth(spec, size, growth_end or times[-1])
@@ -223,7 +230,14 @@ class ReferenceStore:
         return found
 
     def load_self_converged(
-        self, spec: SceneSpec, size: int, times: Sequence[float], *, error: float
+        self,
+        spec: SceneSpec,
+        size: int,
+        times: Sequence[float],
+        *,
+        error: float,
+        refined_error: float | None = None,
+        seconds: float | None = None,
     ) -> SelfConvergedTrajectory:
         """Load the self-converged trajectory of a scene with contact, or compute it; it may be less accurate.
 
@@ -234,6 +248,8 @@ class ReferenceStore:
           size: size of the scene.
           times: ascending times [s].
           error: smallest relative error to be measured, if that takes no longer than a limit.
+          refined_error: the same where no motion for `error` is stored; `error` by default.
+          seconds: that limit, processor time [s]; MAX_SECONDS by default.
 
         Raises:
           InputError: the scene cannot be built.
@@ -246,9 +262,12 @@ class ReferenceStore:
         if known and float(stored.pop("error")) <= error:
             scalars = {key: stored.pop(key).item() for key in ("step", "last_change")}
             return SelfConvergedTrajectory(**stored, **scalars)
-        found = compute_self_converged(
-            lambda h, name: build_exact_scene(spec.with_time_step(h), size, name), spec.time_step, times, error
-        )
+        error = refined_error or error
+
+        def build_refined(h: float, integrator: str) -> Scene:
+            return build_exact_scene(spec.with_time_step(h), size, integrator, show_warnings=False)
+
+        found = compute_self_converged(build_refined, spec.time_step, times, error, seconds or MAX_SECONDS)
         for k in range(len(times)):  # each time alone too: it may become the horizon of another request
             part, name = found.select_times(slice(k, k + 1)), _build_motion_name(spec, size, times[k : k + 1])
             _save_self_converged(self.folder / f"converged-{name}.npz", part, witness, error)
@@ -261,7 +280,7 @@ class ReferenceStore:
     ) -> tuple[SelfConvergedTrajectory, str]:
         """Load the motion of a scene with contact at the longest time at which an error can be measured.
 
-        Eighths of t_end are tried, then those of a quarter of it, and so on.
+        Eighths of t_end are tried, then those of a quarter of it, and so on, within MAX_SECONDS altogether.
 
         Args:
           spec: specification of the scene.
@@ -275,12 +294,15 @@ class ReferenceStore:
           InputError: the scene cannot be built.
           NotConverged: there is no such time.
         """
-        last, reason = max(1, round(t_end / spec.time_step)), ""
+        last, reason, left = max(1, round(t_end / spec.time_step)), "", MAX_SECONDS
         step = t_end / last
         while True:
+            began = thread_time()
             ends = sorted({max(1, round(last * part / _NUM_HORIZONS)) for part in range(1, _NUM_HORIZONS + 1)})
             try:
-                found = self.load_self_converged(spec, size, [step * end for end in ends], error=error)
+                found = self.load_self_converged(
+                    spec, size, [step * end for end in ends], error=error, seconds=TRIAL_SHARE * left
+                )
                 known = found.find_last_known_time(CONTACT_MARGIN * error)
                 if known is None:
                     found.require_accuracy(error)
@@ -288,8 +310,8 @@ class ReferenceStore:
                     reason = found.describe_uncertainty(known + 1) if known + 1 < len(ends) else reason
                     return found.select_times(slice(known, known + 1)), reason
             except NotConverged as refused:
-                reason = str(refused)
-                if last == 1:
+                reason, left = str(refused), left - (thread_time() - began)
+                if last == 1 or left < SHORTEST_REFINEMENT:
                     raise
             last = max(1, last // 4)
 

@@ -33,7 +33,11 @@ LIMIT_INTEGRATORS = ("implicit-euler", "bdf2")
 """Integrators that support contact."""
 MAX_SECONDS = 60.0
 """Limit on the processor time [s] for a reference."""
-MAX_RELATIVE_ERROR = 0.01
+SHORTEST_REFINEMENT = 0.5
+"""Processor time [s] below which no motion is refined."""
+TRIAL_SHARE = 0.6
+"""Share of the remaining time that a motion is given, before one of a quarter of its length is tried."""
+MAX_RELATIVE_ERROR = 0.05
 """Relative error for which a reference is always accurate enough, if MAX_SECONDS suffice."""
 CONTACT_MARGIN = 0.3
 """Largest bound on the error of a reference, relative to an error that is measured by it; the bound is stated."""

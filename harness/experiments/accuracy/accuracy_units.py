@@ -31,6 +31,8 @@ from springbench.solvers.plugins.plugin_discovery import identify_plugins
 
 ResultRow = dict[str, Any]
 
+CONTACT_STUDY_ERROR = 0.01
+"""Smallest relative error that a study with contact is to measure, if its reference is known well enough in time."""
 EXTRA_WALL_SECONDS = 3600.0
 """Wall time in addition to the solver's limit, for compiling, scoring and finding minima [s]."""
 WALL_TIME_FACTOR = 4.0
@@ -338,7 +340,9 @@ def load_reference_trajectory(spec: WorkSpec, reference_store: ReferenceStore) -
         reference_store: store of the reference solutions.
     """
     try:
-        return reference_store.load_trajectory(spec.case.scene, spec.case.size, [spec.t_end], error=1.0)
+        return reference_store.load_trajectory(
+            spec.case.scene, spec.case.size, [spec.t_end], error=1.0, contact_error=CONTACT_STUDY_ERROR
+        )
     except InputError:
         raise
     except Exception as error:
