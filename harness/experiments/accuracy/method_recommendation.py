@@ -360,9 +360,10 @@ def recommend_method(
     )
     store = open_reference_store(results)
     candidates = StudyCandidates.from_goal(goal, engine)
-    study, reference_error = isolated(
+    planned: tuple[AccuracyPlan, float] = isolated(
         partial(_plan_study, path, scene, size, goal, candidates, t_end, time_limit, store)
     )
+    study, reference_error = planned
     if goal.max_error and reference_error:
         goal = replace(goal, max_error=goal.max_error - reference_error)
         print_message(
