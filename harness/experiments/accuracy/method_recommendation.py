@@ -435,7 +435,8 @@ def _plan_study(
     """
     max_error = goal.reference_error
     print_message("estimating how far ahead the motion can be predicted")
-    if mistakes := find_scene_mistakes(scene, [size]):
+    study = None if t_end is None else _build_valid_study(path, scene, size, candidates, t_end, time_limit)
+    if study is None and (mistakes := find_scene_mistakes(scene, [size])):
         raise InputError(mistakes)
     touches = has_contact(build_exact_scene(scene, size).system)
     if touches:
@@ -443,12 +444,19 @@ def _plan_study(
         t_end = _find_contact_t_end(scene, size, max_error, t_end, reference_store, print_message)
     elif t_end is None:
         t_end = find_default_t_end(path, scene, size, max_error, reference_store, print_message)
-    try:
-        study = build_study(path, scene, size, candidates, t_end, time_limit)
-    except InputError as refused:  # the studies are ours; what is wrong came with an option
-        raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
+    study = study or _build_valid_study(path, scene, size, candidates, t_end, time_limit)
     trajectory = _compute_reference(scene, size, max_error, t_end, reference_store, print_message)
     return study, trajectory.get_error_bound(-1) if touches else 0.0
+
+
+def _build_valid_study(
+    path: Path, scene: SceneSpec, size: int, candidates: StudyCandidates, t_end: float, time_limit: float
+) -> AccuracyPlan:
+    """Build the study; its mistakes are those of options. Raises InputError."""
+    try:
+        return build_study(path, scene, size, candidates, t_end, time_limit)
+    except InputError as refused:  # the studies are ours; what is wrong came with an option
+        raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
 
 
 def _find_contact_t_end(
