@@ -34,8 +34,11 @@ import psutil
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.experiments import dask_cluster
-from springbench.harness.experiments.provenance import build_run_columns
-from springbench.harness.experiments.source_fingerprint import collect_source_parts, compute_source_fingerprint
+from springbench.harness.experiments.provenance import (
+    build_run_columns,
+    collect_source_parts,
+    compute_source_fingerprint,
+)
 from springbench.harness.experiments.sweep_runner import run_sweep
 from springbench.harness.results import parquet_rows
 

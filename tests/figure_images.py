@@ -18,6 +18,7 @@ from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.figures.panel_selection import select_entries
 
 from tests import synthetic_results as made
+from tests.synthetic_device_rows import write_device_results
 
 EXPECTED_FOLDER = Path(__file__).parent / "looks"
 PART_PIXELS, MIN_SIMILARITY = 24, 0.9
@@ -42,6 +43,7 @@ FIGURE_SOURCES: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "speed": ("step", made.write_speed_results),
     "history": ("", made.write_benchmark_history),
     "engines": ("", made.write_engine_results),
+    "devices": ("0.001", write_device_results),
 }
 
 

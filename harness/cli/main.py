@@ -248,13 +248,12 @@ def report(
     The maps show the verified runs. Runs on a device also get a picture of the time that the device saves.
     """
     from springbench.harness.experiments.stale_results import find_stale_runs_in_folder
-    from springbench.harness.report.device_speedup_plot import draw_device_speedups
     from springbench.harness.report.robustness import build_score_table
     from springbench.harness.report.site import update_page
-    from springbench.harness.report.sweep_sheets import draw_hard_case_sheets
+    from springbench.harness.report.sweep_sheets import draw_device_sheets, draw_hard_case_sheets
 
     show_activity("reading the rows")
-    for picture, words in draw_device_speedups(results):
+    for picture, words in draw_device_sheets(results):
         for line in words:
             _say(line)
         if picture:

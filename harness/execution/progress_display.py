@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from statistics import median
+from functools import cache
 from time import monotonic
 from typing import Any, NamedTuple, Protocol
 
@@ -112,10 +112,11 @@ def create_display(console: Console) -> ProgressDisplay:
 class RemainingTime:
     """Estimate of the remaining time from the runs that have ended.
 
-        seconds = a + b amount,   a = least seconds of a run,   b = (seconds - a) / amount of the kind's latest run,
+        seconds = a + b amount,   a = least seconds of a run,   b = sum(seconds - a) / sum(amount) of finished runs,
 
-    where a is the overhead of any run. A kind without a finished run has the median b of the others. Compilation and
-    waiting are excluded from the seconds. For concurrent runs the sum is divided by the concurrency observed so far.
+    where a is the overhead of any run. The finished runs are those of the same kind and amount; without any, of the
+    same kind, whose largest ones weigh most; else all. Compilation and waiting are excluded from the seconds. For
+    concurrent runs the sum is divided by the concurrency observed so far.
     """
 
     def __init__(self, efforts: Sequence[RunCost] = (), at_once: int = 1) -> None:
@@ -126,7 +127,7 @@ class RemainingTime:
         self._ended = 0
         self.finished_amount = 0.0
         self._began, self._seconds, self._least = monotonic(), 0.0, math.inf
-        self._latest: dict[str, tuple[float, float]] = {}
+        self._finished: dict[str, list[tuple[float, float]]] = {}
 
     def remove_run(self, cost: RunCost) -> None:
         """Remove a run that another command has taken over."""
@@ -139,7 +140,7 @@ class RemainingTime:
             self._left[cost.kind].remove(cost.amount)
         self._ended, self.finished_amount = self._ended + 1, self.finished_amount + cost.amount
         self._seconds, self._least = self._seconds + seconds, min(self._least, seconds)
-        self._latest[cost.kind] = cost.amount, seconds
+        self._finished.setdefault(cost.kind, []).append((cost.amount, seconds))
 
     def estimate_seconds(self, running: Sequence[_RunState] = ()) -> float | None:
         """Estimate the seconds until all runs have ended.
@@ -150,13 +151,15 @@ class RemainingTime:
         """
         known = max(self._ended / max(1, self._runs), self.finished_amount / (self.total_amount or 1.0))
         kinds = {kind for kind, amounts in self._left.items() if amounts}
-        if not self._latest or known < (_MIN_KNOWN_SHARE if kinds <= set(self._latest) else 0.5):
+        if not self._finished or known < (_MIN_KNOWN_SHARE if kinds <= set(self._finished) else 0.5):
             return None
-        rates = {kind: (seconds - self._least) / (amount or 1.0) for kind, (amount, seconds) in self._latest.items()}
-        usual = median(rates.values())
+        everything = [run for runs in self._finished.values() for run in runs]
 
+        @cache
         def estimate(effort: RunCost) -> float:
-            return self._least + effort.amount * rates.get(effort.kind, usual)
+            runs = self._finished.get(effort.kind, everything)
+            same = [run for run in runs if run[0] == effort.amount]
+            return self._least + effort.amount * self._compute_rate(same or runs)
 
         seconds = sum(estimate(RunCost(kind, amount)) for kind, amounts in self._left.items() for amount in amounts)
         for run in running:
@@ -169,6 +172,10 @@ class RemainingTime:
             seconds += left - whole
         at_once = min(self._at_once, max(1.0, self._seconds / max(1e-9, monotonic() - self._began)))
         return max(0.0, seconds) / at_once
+
+    def _compute_rate(self, runs: Sequence[tuple[float, float]]) -> float:
+        """Compute the seconds of an amount of 1, from the amounts and seconds of runs."""
+        return sum(seconds - self._least for _, seconds in runs) / (sum(amount for amount, _ in runs) or 1.0)
 
 
 @dataclass

@@ -10,7 +10,7 @@ from springbench.harness.atomic_files import WriteError
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.execution.error_location import format_error, locate_error
-from springbench.harness.experiments.source_fingerprint import load_solver_class
+from springbench.harness.experiments.provenance import load_solver_class
 from springbench.harness.simulation.energy_balance import EnergyGrowth
 from springbench.harness.simulation.timing_pass import DivergenceError, StepError
 from springbench.solvers.contact.obstacle_advancement import NoClearance

@@ -1,4 +1,4 @@
-"""Execute one run: build its objects, run all passes, write the files.
+"""Execute one run: specification, scene and solver, timed rounds, observed run with its recording, rows.
 
 The timed passes come first and record nothing. Recording, energies and pictures come from an instrumentation pass. Its
 final positions must be bitwise identical to the timed ones. The rows are written last: where they exist, the run is
@@ -7,10 +7,10 @@ complete.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Generator, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,11 +29,13 @@ from springbench.harness.execution.timing_lock import (
 from springbench.harness.execution.worker_process import ProgressCallback
 from springbench.harness.experiments.failure_columns import build_energy_growth_columns, build_failure_columns
 from springbench.harness.experiments.machine_calibration import calibrate_machine
-from springbench.harness.experiments.provenance import build_run_columns, build_specification_columns, convert_tolerance
-from springbench.harness.experiments.source_fingerprint import (
+from springbench.harness.experiments.provenance import (
     ERROR_CONTROL_TARGET,
+    build_run_columns,
+    build_specification_columns,
     collect_source_parts,
     compute_source_fingerprint,
+    convert_tolerance,
     load_solver_class,
 )
 from springbench.harness.experiments.sweep_plan import RunFiles
@@ -41,6 +43,7 @@ from springbench.harness.recording.recorder_interface import (
     FrameSamples,
     RecordedFrame,
     RecordingInfo,
+    RunRecorder,
     list_obstacles,
 )
 from springbench.harness.recording.strain_shading import compute_strain_range
@@ -75,6 +78,81 @@ if TYPE_CHECKING:
     from springbench.harness.recording.rerun_recorder import RerunRecorder
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RunJob:
+    """A run to execute, its files, and who is notified of its progress.
+
+    Attributes:
+        run: specification of the run.
+        files: paths of its files.
+        tick: called with the name of the pass after each step.
+        positions_path: where to store the positions after every step; None for not at all.
+    """
+
+    run: RunSpec
+    files: RunFiles
+    tick: ProgressCallback
+    positions_path: Path | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunSetup:
+    """Scene of a run, its solver, and the settings of its steps."""
+
+    scene: Scene
+    build_solver: Callable[[], Solver]
+    settings: SteppingSettings
+
+    @classmethod
+    def from_run(cls, run: RunSpec) -> RunSetup:
+        """Build the scene of a run and load its solver; raises the errors of user code unchanged."""
+        scene = build_scene(run.scene, run.size, run.integrator)
+        stop = build_stop_rule(run.max_iterations, run.rtol)
+        settings = SteppingSettings(stop, run.initial_guess, run.frames, run.rounds)
+        return cls(scene, partial(load_solver_class(run), **run.solver.parameters), settings)
+
+    @property
+    def is_minimiser(self) -> bool:
+        """Whether the solver's iterates converge to a minimum."""
+        return is_minimiser(self.build_solver())
+
+    def observe_first_frames(self, count: int, recorder: RunRecorder | None = None) -> None:
+        """Simulate the first frames again, with a new solver, and record them; raises StepError."""
+        observe_run(
+            self.scene,
+            prepare(self.scene, self.build_solver()),
+            replace(self.settings, frames=count),
+            recorder=recorder,
+            convergence_frames=(),
+            positions_out=None,
+            verify_step=None,
+            tick=lambda name: None,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimedRounds:
+    """Times of a run.
+
+    Attributes:
+        measured: the measurement.
+        rows: its rows; None without timed passes, whose times the observed run then adds.
+        columns: columns of the device and of the timing lock.
+    """
+
+    measured: RunMeasurement
+    rows: list[dict[str, Any]] | None
+    columns: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedRun:
+    """What the instrumentation pass has found: columns of each frame, and columns of the run's status."""
+
+    columns_by_frame: dict[int, dict[str, Any]]
+    status_columns: dict[str, str]
+
+
 def execute_run(
     run: RunSpec,
     files: RunFiles,
@@ -100,27 +178,19 @@ def execute_run(
     """
     shared: dict[str, Any] = {"num_concurrent_runs": num_concurrent_runs, **calibrate_machine(tick)}
     threads = machine_info.choose_threads(run.threads)
-    with machine_info.limit_threads(threads.count), TimingSession(tick, exclusive=run.timing == "exclusive") as turn:
-        with turn.lock_for_preparation():
+    with machine_info.limit_threads(threads.count), TimingSession(tick, exclusive=run.timing == "exclusive") as session:
+        with session.lock_for_preparation():
             shared |= build_run_columns(run) | {
                 "source_fingerprint": compute_source_fingerprint(collect_source_parts(run))
             }
         try:
             run = run.replace_options(scene=run.scene.load_plugins())
-            found = _run_passes(run, files, tick, positions, turn)
+            found = _run_passes(RunJob(run, files, tick, positions), session)
         except Exception as error:  # a solver may raise any exception; the row states it, and the sweep continues
             if isinstance(error, InputError) and not run.find_plugins():
                 raise
-            turn.finish_timing()
-            own = _list_solver_files(run)
-            found = [_find_first_diverged_frame(run, build_failure_columns(error, own), own)]
-            for earlier in (
-                files.recording_path,
-                files.picture_path,
-            ):  # of a time when it did not fail; they would hide this
-                earlier.unlink(missing_ok=True)
-            if run.record and "frame" in found[0]:
-                _record_before_failure(run, files, found[0])
+            session.finish_timing()
+            found = [_build_failure_row(RunJob(run, files, tick, positions), error)]
         if threads.reason:
             for row in found:
                 row["solver_description"] = "; ".join(filter(None, [row.get("solver_description"), threads.reason]))
@@ -132,36 +202,46 @@ def execute_run(
     return result
 
 
-def _run_passes(
-    run: RunSpec, files: RunFiles, tick: ProgressCallback, positions: Path | None, timing_session: TimingSession
-) -> list[dict[str, Any]]:
+def _run_passes(job: RunJob, session: TimingSession) -> list[dict[str, Any]]:
     """Run all passes and return the rows.
 
     The timing session is checked for disturbances at the end.
     """
-    if run.error_target is not None:
-        return _run_error_controlled(run, run.error_target, files, tick, positions, timing_session)
-    with timing_session.lock_for_preparation():
-        scene = build_scene(run.scene, run.size, run.integrator)
-    counts = {"vertices": len(scene.mesh.rest_positions), "springs": len(scene.all_springs.edges)}
-    settings = _build_settings(run)
-    with _hold_timing_lock(run, tick) as how:
-        if run.timing == "none":
-            measured, rows = prepare_untimed(scene, _build_solver(run)), None
+    if job.run.error_target is not None:
+        return _run_error_controlled(job, job.run.error_target, session)
+    with session.lock_for_preparation():
+        setup = RunSetup.from_run(job.run)
+    timed = _time_rounds(job, setup)
+    session.finish_timing()
+    observed = _observe_run(job, setup, timed.measured)
+    return _build_rows(job.run, setup, timed, observed)
+
+
+def _time_rounds(job: RunJob, setup: RunSetup) -> TimedRounds:
+    """Prepare the solver and time the rounds, under the timing lock of the run."""
+    with _hold_timing_lock(job.run, job.tick) as lock_columns:
+        if job.run.timing == "none":
+            measured, rows = prepare_untimed(setup.scene, setup.build_solver()), None
         else:
-            measured, rows = measure_rows(scene, _build_solver(run), settings, tick)
-        where = device_columns(measured.prepared)
-    timing_session.finish_timing()
-    by_frame, stands = _run_instrumentation_pass(run, files, scene, measured, settings, tick, positions)
-    rows = rows or build_timing_rows(measured)
-    require_finite(by_frame, is_minimiser=is_minimiser(_build_solver(run)), has_rtol=isinstance(run.rtol, float))
-    facts: dict[str, Any] = {name: int(value) for name, value in measured.prepared.stats.items()}
-    facts |= {
-        "solver_description": measured.prepared.description,
-        "modulus_exponent": _find_modulus_exponent(run, scene),
+            measured, rows = measure_rows(setup.scene, setup.build_solver(), setup.settings, job.tick)
+        return TimedRounds(measured, rows, device_columns(measured.prepared) | lock_columns)
+
+
+def _build_rows(run: RunSpec, setup: RunSetup, timed: TimedRounds, observed: ObservedRun) -> list[dict[str, Any]]:
+    """Build the rows of a finished run; raises StepError for a column that is not finite."""
+    prepared, by_frame = timed.measured.prepared, observed.columns_by_frame
+    rows = timed.rows or build_timing_rows(timed.measured)
+    require_finite(by_frame, is_minimiser=setup.is_minimiser, has_rtol=isinstance(run.rtol, float))
+    shared: dict[str, Any] = {
+        "vertices": len(setup.scene.mesh.rest_positions),
+        "springs": len(setup.scene.all_springs.edges),
+        **{name: int(value) for name, value in prepared.stats.items()},
+        "solver_description": prepared.description,
+        "modulus_exponent": _find_modulus_exponent(run, setup.scene),
+        **timed.columns,
+        **observed.status_columns,
     }
-    facts |= where | stands | how
-    return [counts | facts | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in rows]
+    return [shared | row | (by_frame[row["frame"]] if row["phase"] == "step" else {}) for row in rows]
 
 
 def _find_modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
@@ -191,28 +271,20 @@ def _build_formula_check_columns(scene: Scene, frames: int) -> dict[str, str]:
     return {"status": "wrong-gradient", "formula_check": check, "reason": f"{reason}; mend `add_gradient` or `value`"}
 
 
-def _run_error_controlled(
-    run: RunSpec,
-    max_error: float,
-    files: RunFiles,
-    tick: ProgressCallback,
-    positions: Path | None,
-    timing_session: TimingSession,
-) -> list[dict[str, Any]]:
+def _run_error_controlled(job: RunJob, max_error: float, session: TimingSession) -> list[dict[str, Any]]:
     """Return the rows of an error-controlled run, whose integrator and step size are chosen first."""
-    with _hold_timing_lock(run, tick) as how:
-        found = load_target(ERROR_CONTROL_TARGET)(run, max_error, tick)
+    run = job.run
+    with _hold_timing_lock(run, job.tick) as lock_columns:
+        found = load_target(ERROR_CONTROL_TARGET)(run, max_error, job.tick)
     rows, seen, last = found.rows(), found.positions, dict[str, Any]()
-    timing_session.finish_timing()
-    if positions:
-        save_positions(positions, seen[1:])
+    session.finish_timing()
+    if job.positions_path:
+        save_positions(job.positions_path, seen[1:])
     if run.record:
         from springbench.harness.recording.recording_check import require_recorded_frames
 
         chosen = {name: rows[0][name] for name in ("status", "integrator", "error_estimated")}
-        recorder = _open_recorder(
-            run, files, found.scene, chosen | {"milliseconds_per_step": found.ms_per_step}, seen[-1]
-        )
+        recorder = _open_recorder(job, found.scene, chosen | {"milliseconds_per_step": found.ms_per_step}, seen[-1])
         try:
             for k, p in enumerate(seen):
                 recorder.record_frame(RecordedFrame(k, found.scene.compute_time(k), p, {}, float("nan"), 0))
@@ -223,10 +295,10 @@ def _run_error_controlled(
         due = {k: found.scene.compute_time(k) for k in chosen}
         last = {
             "recording_digest": require_recorded_frames(
-                files.recording_path, recorder.info, due, {k: seen[k] for k in chosen}
+                job.files.recording_path, recorder.info, due, {k: seen[k] for k in chosen}
             )
         }
-    return [how | row | (last if row["frame"] == run.frames else {}) for row in rows]
+    return [lock_columns | row | (last if row["frame"] == run.frames else {}) for row in rows]
 
 
 @contextmanager
@@ -240,62 +312,66 @@ def _hold_timing_lock(run: RunSpec, tick: ProgressCallback) -> Generator[dict[st
             yield {"pinned_cores": " ".join(map(str, cores))}
 
 
-def _run_instrumentation_pass(
-    run: RunSpec,
-    files: RunFiles,
-    scene: Scene,
-    measured: RunMeasurement,
-    settings: SteppingSettings,
-    tick: ProgressCallback,
-    positions: Path | None,
-) -> tuple[dict[int, dict[str, Any]], dict[str, str]]:
-    """Repeat the simulation and observe energies, convergence, positions and the recording.
-
-    Returns: the columns of each frame, and the status columns of the run.
-    """
-    stored = np.empty((run.frames, len(scene.mesh.rest_positions), 3)) if positions else None
+def _observe_run(job: RunJob, setup: RunSetup, measured: RunMeasurement) -> ObservedRun:
+    """Repeat the simulation and observe energies, convergence, positions and the recording."""
+    run, scene = job.run, setup.scene
+    stored = np.empty((run.frames, len(scene.mesh.rest_positions), 3)) if job.positions_path else None
     samples = FrameSamples(run.frames)
+    middle_frames = {1, (run.frames + 1) // 2, run.frames}
     with ExitStack() as cleanup:
         recorder = None
         if run.record:
             assert measured.final_positions is not None  # a sweep with `timing: none` and `record` is rejected
             seconds = [t.seconds for t in measured.timings if t.phase == "step"]
             facts = {"status": "ok", "milliseconds_per_step": compute_ms_per_step(seconds)}
-            recorder = _open_recorder(run, files, scene, facts, measured.final_positions)
+            recorder = _open_recorder(job, scene, facts, measured.final_positions)
             cleanup.callback(recorder.abandon_recording)
-        graded = AuditedSolver(measured.prepared, _build_solver(run), {1, (run.frames + 1) // 2, run.frames})
+        graded = AuditedSolver(measured.prepared, setup.build_solver(), middle_frames)
         found = observe_run(
             scene,
             graded,
-            settings,
+            setup.settings,
             recorder=recorder,
-            convergence_frames={1, (run.frames + 1) // 2, run.frames}
-            if run.convergence_frames is None
-            else run.convergence_frames,
+            convergence_frames=middle_frames if run.convergence_frames is None else run.convergence_frames,
             positions_out=stored,
             sample_frame=samples.add_frame if recorder else None,
-            verify_step=_build_verifier(run, scene),
-            tick=tick,
+            verify_step=_build_verifier(run, setup),
+            tick=job.tick,
             clock=measured.clock,
         )
         if measured.final_positions is not None and found[run.frames]["positions_digest"] != hash_positions(
             measured.final_positions
         ):
             raise RunFailed("the recorded pass ended at other positions than the timed pass")
-        stands = _build_status_columns(run, scene, found)
+        status_columns = _build_status_columns(run, scene, found)
         if recorder and measured.final_positions is not None:
             from springbench.harness.recording.recording_check import require_recorded_frames
 
-            ended = {name: stands[name] for name in ("status", "reason")} if stands["status"] != "ok" else None
-            recorder.finish_recording(compute_milliseconds(measured, run.frames), ended)
+            is_ok = status_columns["status"] == "ok"
+            outcome = None if is_ok else {name: status_columns[name] for name in ("status", "reason")}
+            recorder.finish_recording(compute_milliseconds(measured, run.frames), outcome)
             due = {frame: scene.compute_time(frame) for frame in samples.frames}
             motion = samples.positions | {run.frames: measured.final_positions}
             found[run.frames]["recording_digest"] = require_recorded_frames(
-                files.recording_path, recorder.info, due, motion
+                job.files.recording_path, recorder.info, due, motion
             )
-    if positions and stored is not None:
-        save_positions(positions, stored)
-    return {frame: graded.found.get(frame, {}) | columns for frame, columns in found.items()}, stands
+    if job.positions_path and stored is not None:
+        save_positions(job.positions_path, stored)
+    return ObservedRun({frame: graded.found.get(frame, {}) | row for frame, row in found.items()}, status_columns)
+
+
+def _build_failure_row(job: RunJob, error: Exception) -> dict[str, Any]:
+    """Return the row of a failed run, and record the frames before the failed one."""
+    own = _list_solver_files(job.run)
+    row = _find_first_diverged_frame(job.run, build_failure_columns(error, own), own)
+    for earlier in (
+        job.files.recording_path,
+        job.files.picture_path,
+    ):  # of a time when it did not fail; they would hide this
+        earlier.unlink(missing_ok=True)
+    if job.run.record and "frame" in row:
+        _record_before_failure(job, row)
+    return row
 
 
 def _find_first_diverged_frame(
@@ -307,19 +383,8 @@ def _find_first_diverged_frame(
     """
     if failure_row["status"] != "diverged" or "frame" not in failure_row:
         return failure_row
-    settings = replace(_build_settings(run), frames=failure_row["frame"] - 1)
     try:
-        scene = build_scene(run.scene, run.size, run.integrator)
-        observe_run(
-            scene,
-            prepare(scene, _build_solver(run)),
-            settings,
-            recorder=None,
-            convergence_frames=(),
-            positions_out=None,
-            verify_step=None,
-            tick=lambda name: None,
-        )
+        RunSetup.from_run(run).observe_first_frames(failure_row["frame"] - 1)
     except StepError as earlier:
         return build_failure_columns(earlier, solver_files)
     except Exception:  # what went wrong is known already
@@ -327,28 +392,17 @@ def _find_first_diverged_frame(
     return failure_row
 
 
-def _record_before_failure(run: RunSpec, files: RunFiles, failure_row: dict[str, Any]) -> None:
+def _record_before_failure(job: RunJob, failure_row: dict[str, Any]) -> None:
     """Record the frames before the failed one and mark the recording.
 
     Nothing is recorded if they fail too.
     """
     facts = {"status": failure_row["status"], "reason": failure_row["reason"], "failed_frame": failure_row["frame"]}
-    settings = replace(_build_settings(run), frames=failure_row["frame"] - 1)
     with ExitStack() as cleanup, suppress(Exception):  # the first error is already reported
-        scene = build_scene(run.scene, run.size, run.integrator)
-        prepared = prepare(scene, _build_solver(run))
-        recorder = _open_recorder(run, files, scene, facts)
+        setup = RunSetup.from_run(job.run)
+        recorder = _open_recorder(job, setup.scene, facts)
         cleanup.callback(recorder.abandon_recording)
-        observe_run(
-            scene,
-            prepared,
-            settings,
-            recorder=recorder,
-            convergence_frames=(),
-            positions_out=None,
-            verify_step=None,
-            tick=lambda name: None,
-        )
+        setup.observe_first_frames(failure_row["frame"] - 1, recorder)
         recorder.finish_recording({})
 
 
@@ -360,14 +414,6 @@ def _list_solver_files(run: RunSpec) -> frozenset[Path]:
         return frozenset()
 
 
-def _build_settings(run: RunSpec) -> SteppingSettings:
-    return SteppingSettings(build_stop_rule(run.max_iterations, run.rtol), run.initial_guess, run.frames, run.rounds)
-
-
-def _build_solver(run: RunSpec) -> Solver:
-    return load_solver_class(run)(**run.solver.parameters)
-
-
 @dataclass(frozen=True, slots=True)
 class _MotionKey:
     """Cache key: a run's scene and the other settings that determine its motion."""
@@ -376,11 +422,11 @@ class _MotionKey:
     run: RunSpec = field(compare=False)
 
 
-def _build_verifier(run: RunSpec, scene: Scene) -> StepVerifier | None:
+def _build_verifier(run: RunSpec, setup: RunSetup) -> StepVerifier | None:
     if not run.verify:
         return None
     key = (run.scene.scene_digest, run.size, run.integrator, run.initial_guess, run.frames)
-    return StepVerifier(scene, _compute_reference(_MotionKey(key, run)), is_minimiser=is_minimiser(_build_solver(run)))
+    return StepVerifier(setup.scene, _compute_reference(_MotionKey(key, run)), is_minimiser=setup.is_minimiser)
 
 
 @lru_cache(maxsize=1)
@@ -399,9 +445,7 @@ def _compute_reference(motion: _MotionKey) -> NDArray[np.float64] | None:
         return None
 
 
-def _open_recorder(
-    run: RunSpec, files: RunFiles, scene: Scene, outcome: Mapping[str, Any], *final_positions: Positions
-) -> RerunRecorder:
+def _open_recorder(job: RunJob, scene: Scene, outcome: Mapping[str, Any], *final_positions: Positions) -> RerunRecorder:
     """Open the recording of a run.
 
     `outcome` is how the run ended, stored among the recording's properties. `final_positions` set the colour scale.
@@ -410,7 +454,8 @@ def _open_recorder(
         RerunRecorder,  # with Rerun, which a light installation lacks
     )
 
-    files.recording_path.parent.mkdir(parents=True, exist_ok=True)
+    run, recording_path = job.run, job.files.recording_path
+    recording_path.parent.mkdir(parents=True, exist_ok=True)
     here = machine_info.describe_machine()
     properties = {
         "sweep": run.sweep,
@@ -431,7 +476,7 @@ def _open_recorder(
     }
     size = f" {run.size}" if run.size else ""
     return RerunRecorder(
-        files.recording_path,
+        recording_path,
         RecordingInfo(
             title=f"{run.scene_name}{size} - {run.solver.name}",
             run_id=run.compute_run_id(here.machine_id),

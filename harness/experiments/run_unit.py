@@ -11,8 +11,11 @@ from springbench.harness.atomic_files import find_partial_files
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
 from springbench.harness.execution.progress_display import RunCost
-from springbench.harness.experiments.provenance import build_run_columns
-from springbench.harness.experiments.source_fingerprint import collect_source_parts, compute_source_fingerprint
+from springbench.harness.experiments.provenance import (
+    build_run_columns,
+    collect_source_parts,
+    compute_source_fingerprint,
+)
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.quantities import compute_ms_per_step

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.execution import machine_info
 from springbench.harness.experiments.completion_status import COMPLETED, NOT_STARTED, CompletionStatus
-from springbench.harness.experiments.source_fingerprint import collect_source_parts, compute_source_fingerprint
+from springbench.harness.experiments.provenance import collect_source_parts, compute_source_fingerprint
 from springbench.harness.recording.recording_integrity import scan_messages
 from springbench.harness.results import row_store
 

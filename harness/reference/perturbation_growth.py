@@ -19,7 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.reference.equations_of_motion import OdeField, OdeState, build_ode_scene
 from springbench.harness.reference.reference_trajectory import CHECK_PERTURBATION as ROUND_OFF
-from springbench.harness.reference.reference_trajectory import REFERENCE_MARGIN, UnpredictableMotion
+from springbench.harness.reference.reference_trajectory import (
+    REFERENCE_MARGIN,
+    ReferenceTrajectory,
+    UnpredictableMotion,
+)
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
@@ -64,6 +68,13 @@ class PerturbationGrowth:
     displacement: NDArray[np.float64]
     growth_factor: NDArray[np.float64]
     scale: float
+
+    @classmethod
+    def from_reference(cls, reference: ReferenceTrajectory) -> PerturbationGrowth:
+        """Return the uncertainty of a reference in place of the growth, where no perturbation can be integrated."""
+        coordinates = 3 * max(1, len(reference.free_vertices))
+        scale = float(reference.displacement[-1]) / coordinates**0.5
+        return cls(reference.times, reference.displacement, reference.disagreement, scale)
 
     @property
     def min_error(self) -> float:

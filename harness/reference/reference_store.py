@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from time import thread_time
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,11 @@ from springbench.harness.reference.equations_of_motion import OdeField, build_od
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth, estimate_growth
 from springbench.harness.reference.reference_trajectory import ProgressFunction, ReferenceTrajectory, integrate_motion
 from springbench.harness.reference.self_converged_trajectory import (
+    CONTACT_MARGIN,
+    MAX_SECONDS,
+    SHORTEST_REFINEMENT,
+    TRIAL_SHARE,
+    NotConverged,
     SelfConvergedTrajectory,
     compute_self_converged,
     has_contact,
@@ -56,6 +62,8 @@ _CERTIFICATE_FIELDS = tuple(f.name for f in fields(MinimumCertificate) if f.name
 _TRAJECTORY_FIELDS = tuple(f.name for f in fields(ReferenceTrajectory) if f.name != "growth")
 """Stored fields of a trajectory; the growth of perturbations has its own file."""
 _SELF_CONVERGED_FIELDS = tuple(f.name for f in fields(SelfConvergedTrajectory))
+_NUM_HORIZONS = 8
+"""Number of times, evenly spaced, among which the longest at which an error can be measured is found."""
 _GROWTH_FIELDS = tuple(f.name for f in fields(PerturbationGrowth))
 
 
@@ -159,6 +167,7 @@ class ReferenceStore:
         error: float,
         report_progress: ProgressFunction | None = None,
         growth_end: float | None = None,
+        contact_error: float | None = None,
     ) -> ReferenceTrajectory:
         """Load or compute a reference trajectory at given times.
 
@@ -172,6 +181,8 @@ class ReferenceStore:
           error: smallest relative error to be measured.
           report_progress: called with the progress of an integration.
           growth_end: time [s] up to which the growth of a perturbation is estimated; the last time by default.
+          contact_error: relative error for which a motion with contact is refined if none is stored; `error` by
+            default.
 
         Raises:
           InputError: the scene cannot be built.
@@ -180,7 +191,7 @@ class ReferenceStore:
         """
         name = _build_motion_name(spec, size, times)
         if has_contact(build_exact_scene(spec, size).system):
-            found = self.load_self_converged(spec, size, times, error=error)
+            found = self.load_self_converged(spec, size, times, error=error, refined_error=contact_error)
             found.require_accuracy(error)
             return found
         seen = self.load_growth(spec, size, growth_end or times[-1])
@@ -219,7 +230,14 @@ class ReferenceStore:
         return found
 
     def load_self_converged(
-        self, spec: SceneSpec, size: int, times: Sequence[float], *, error: float
+        self,
+        spec: SceneSpec,
+        size: int,
+        times: Sequence[float],
+        *,
+        error: float,
+        refined_error: float | None = None,
+        seconds: float | None = None,
     ) -> SelfConvergedTrajectory:
         """Load the self-converged trajectory of a scene with contact, or compute it; it may be less accurate.
 
@@ -230,6 +248,8 @@ class ReferenceStore:
           size: size of the scene.
           times: ascending times [s].
           error: smallest relative error to be measured, if that takes no longer than a limit.
+          refined_error: the same where no motion for `error` is stored; `error` by default.
+          seconds: that limit, processor time [s]; MAX_SECONDS by default.
 
         Raises:
           InputError: the scene cannot be built.
@@ -241,13 +261,75 @@ class ReferenceStore:
         known = bool(stored) and is_equal_to_roundoff(stored.pop("fingerprint"), witness)
         if known and float(stored.pop("error")) <= error:
             scalars = {key: stored.pop(key).item() for key in ("step", "last_change")}
-            found = SelfConvergedTrajectory(**stored, **scalars)
-        else:
-            found = compute_self_converged(
-                lambda h, name: build_exact_scene(spec.with_time_step(h), size, name), spec.time_step, times, error
+            return SelfConvergedTrajectory(**stored, **scalars)
+        error = refined_error or error
+
+        def build_refined(h: float, integrator: str) -> Scene:
+            return build_exact_scene(spec.with_time_step(h), size, integrator, show_warnings=False)
+
+        found = compute_self_converged(build_refined, spec.time_step, times, error, seconds or MAX_SECONDS)
+        for k in range(len(times)):  # each time alone too: it may become the horizon of another request
+            part, name = found.select_times(slice(k, k + 1)), _build_motion_name(spec, size, times[k : k + 1])
+            _save_self_converged(self.folder / f"converged-{name}.npz", part, witness, error)
+        if len(times) > 1:
+            _save_self_converged(path, found, witness, error)
+        return found
+
+    def load_contact_horizon(
+        self, spec: SceneSpec, size: int, t_end: float, *, error: float
+    ) -> tuple[SelfConvergedTrajectory, str]:
+        """Load the motion of a scene with contact at the longest time at which an error can be measured.
+
+        Eighths of t_end are tried, then those of a quarter of it, and so on, within MAX_SECONDS altogether.
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          t_end: longest time [s].
+          error: relative error to be measured.
+
+        Returns: the motion at that time, and why the time is not longer; empty at t_end.
+
+        Raises:
+          InputError: the scene cannot be built.
+          NotConverged: there is no such time.
+        """
+        last, reason, left = max(1, round(t_end / spec.time_step)), "", MAX_SECONDS
+        step = t_end / last
+        while True:
+            began = thread_time()
+            ends = sorted({max(1, round(last * part / _NUM_HORIZONS)) for part in range(1, _NUM_HORIZONS + 1)})
+            try:
+                found = self.load_self_converged(
+                    spec, size, [step * end for end in ends], error=error, seconds=TRIAL_SHARE * left
+                )
+                known = found.find_last_known_time(CONTACT_MARGIN * error)
+                if known is None:
+                    found.require_accuracy(error)
+                else:
+                    reason = found.describe_uncertainty(known + 1) if known + 1 < len(ends) else reason
+                    return found.select_times(slice(known, known + 1)), reason
+            except NotConverged as refused:
+                reason, left = str(refused), left - (thread_time() - began)
+                if last == 1 or left < SHORTEST_REFINEMENT:
+                    raise
+            last = max(1, last // 4)
+
+    def require_contact_horizon(
+        self, spec: SceneSpec, size: int, t_end: float, *, error: float
+    ) -> SelfConvergedTrajectory:
+        """Load the motion of a scene with contact at t_end [s], by which a relative error can be measured.
+
+        Raises:
+          InputError: the scene cannot be built.
+          NotConverged: the error cannot be measured then; the message states until when it can.
+        """
+        found, reason = self.load_contact_horizon(spec, size, t_end, error=error)
+        if reason:
+            raise NotConverged(
+                f"with contact an error of {error:g} can be measured up to {found.times[-1]:.4g} s only, for {reason}; "
+                f"ask for a --t-end of {found.times[-1]:.4g} or less, or a larger --error"
             )
-            arrays = {name: np.asarray(getattr(found, name)) for name in _SELF_CONVERGED_FIELDS}
-            _write_arrays(path, arrays | {"fingerprint": witness, "error": np.asarray(error)})
         return found
 
     def _load_known_snapshots(self, request: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
@@ -285,6 +367,11 @@ def _build_motion_name(spec: SceneSpec, size: int, times: Sequence[float]) -> st
     It consists of the scene without its step size, its size, and the times.
     """
     return f"{spec.with_time_step(1.0).scene_digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
+
+
+def _save_self_converged(path: Path, found: SelfConvergedTrajectory, witness: Positions, error: float) -> None:
+    arrays = {name: np.asarray(getattr(found, name)) for name in _SELF_CONVERGED_FIELDS}
+    _write_arrays(path, arrays | {"fingerprint": witness, "error": np.asarray(error)})
 
 
 def _build_minima(arrays: Arrays) -> KnownMinima:

@@ -147,16 +147,6 @@ def find_break_even(device_pairs: Sequence[DevicePair]) -> DevicePair | None:
     return first
 
 
-def summarise_table(table: pa.Table, config: str) -> list[str]:
-    """Summarise the device runs of a sweep's rows in sentences.
-
-    Args:
-        table: rows of the sweep.
-        config: path of the sweep's config; "" if it no longer exists.
-    """
-    return summarise_runs(read_device_runs(table), config)
-
-
 def summarise_runs(all_runs: Sequence[DeviceRun], config: str) -> list[str]:
     """Summarise runs in sentences; empty if no run of the sweep requested a device.
 

@@ -1,4 +1,4 @@
-"""Sheets of sweeps with verified runs: their shares of correct runs, and the map of solvers x cases."""
+"""Sheets of sweeps: of verified runs, and of runs on a device."""
 
 from __future__ import annotations
 
@@ -8,11 +8,36 @@ from dataclasses import replace
 from pathlib import Path
 
 from springbench.harness.errors import InputError
+from springbench.harness.report.charts.device_chart import build_device_chart
 from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
+from springbench.harness.report.device_speedup import read_device_runs, summarise_runs
 from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.provenance_words import describe_provenance
 from springbench.harness.report.robustness import MAP_NOTE, VerifiedRun, map_headline, read_verified_runs
-from springbench.harness.results import row_store
+from springbench.harness.report.site.row_provenance import find_config
+from springbench.harness.results import parquet_rows, row_store
+
+
+def draw_device_sheets(results: Path) -> Iterator[tuple[Path | None, list[str]]]:
+    """Draw `pictures/devices.png` and `.svg` for each sweep that requested a device.
+
+    Args:
+        results: folder of results, or the folder of one sweep.
+    Yields: the PNG file, or None if no run on a device reached its residual; and sentences on the sweep's rows.
+    """
+    for rows in row_store.find_row_folders(results, "rows"):
+        folder = rows.parent
+        try:
+            found = read_device_runs(
+                parquet_rows.read_rows(row_store.list_units(rows), on_invalid=lambda mistake: None)
+            )
+        except InputError:
+            continue  # the page reports damaged rows
+        if sentences := summarise_runs(found, find_config(folder)):
+            stem = folder / "pictures" / "devices"
+            for suffix in (".png", ".svg"):
+                stem.with_suffix(suffix).unlink(missing_ok=True)  # rows that are gone may have drawn it
+            yield next(iter(draw_chart_sheets(build_device_chart(found), stem)), None), sentences
 
 
 def draw_hard_case_sheets(

@@ -57,6 +57,10 @@ RUN_KEYS = (
 """Columns that identify a run on any machine and in any results folder."""
 
 
+QUICK_SHARE = 0.1
+"""Share of the runs that `springbench reproduce --quick` repeats."""
+
+
 @dataclass(frozen=True, slots=True)
 class PublishedStudy:
     """One study of the published set.

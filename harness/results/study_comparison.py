@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.published_set import RUN_KEYS
-from springbench.harness.results.time_ratios import MethodTimes, compute_time_ratios
+from springbench.harness.results.time_ratios import MAX_PREEMPTED_SHARE, MethodTimes, compute_time_ratios
 
 ITERATION_TOLERANCE, ITERATION_SLACK = 0.1, 3
 """Relative and absolute difference of a step's iterations: where the descent left is round-off, single ones change."""
@@ -188,13 +188,15 @@ def compare_time_ratios(published: Sequence[MethodTimes], repeated: Sequence[Met
     """Compare the ratios of times of the methods that both sides have, to the same reference method.
 
     A ratio is close within the accepted interval of the published one. Outside it is undecided if the load of a machine
-    delayed one of its times, or if its own interval reaches into the accepted one.
+    delayed one of its times or more than MAX_PREEMPTED_SHARE of all, or if its own interval reaches into the accepted
+    one: a busy machine also slows what it does not interrupt.
     """
     common = {(one.task, one.method) for one in published} & {(one.task, one.method) for one in repeated}
     before, after = (
         {(one.task, one.method, one.reference): one for one in compute_time_ratios(side)}
         for side in ([one for one in times if (one.task, one.method) in common] for times in (published, repeated))
     )
+    delayed = sum(one.is_preempted for one in repeated)
     found: list[RunAgreement] = []
     for key, new in after.items():
         if old := before.get(key):
@@ -205,6 +207,9 @@ def compare_time_ratios(published: Sequence[MethodTimes], repeated: Sequence[Met
                 level = AgreementLevel.CLOSE
             elif old.is_preempted or new.is_preempted:
                 level, why = AgreementLevel.UNDECIDED, f"{why}; other processes interrupted it"
+            elif delayed > MAX_PREEMPTED_SHARE * len(repeated):
+                why += f"; other processes interrupted {delayed} of {len(repeated)} times"
+                level = AgreementLevel.UNDECIDED
             elif new.low <= high and new.high >= low:
                 level, why = AgreementLevel.UNDECIDED, f"{why}, [{new.low:.3g}, {new.high:.3g}] over its rounds"
             found.append(RunAgreement(new.title, level, why))

@@ -72,7 +72,7 @@ class MethodTimeRatio(NamedTuple):
 
 
 MAX_PREEMPTED_SHARE = 0.1
-"""Largest share of interrupted steps of a run whose times count; the median of the others is right with more."""
+"""Largest share of interrupted steps of a run, or of interrupted times of a study, on a machine that is not busy."""
 
 
 def list_step_times(rows: Iterable[Mapping[str, Any]]) -> list[MethodTimes]:

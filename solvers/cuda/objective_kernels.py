@@ -17,8 +17,10 @@ import numpy as np
 from springbench.solvers.cuda import device_sums
 from springbench.solvers.cuda.cuda_target import cuda
 from springbench.solvers.cuda.function_sharing import share_with_device
-from springbench.solvers.kernels import spring_hessian
-from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
+from springbench.solvers.kernels import spring_law
+
+_unit_direction = share_with_device(spring_law.unit_direction)
+_spring_energy_change = share_with_device(spring_law.spring_energy_change)
 
 
 @cuda.jit(device=True)
@@ -27,10 +29,10 @@ def edge_direction_and_tension(edges, e, v0, v1, v2):
 
     The direction points away from the entry's own end; v is the vector from the other end.
     """
-    length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
     k, rest = edges.entry_stiffness[e], edges.entry_rest_length[e]
-    if rest == rest and length > ZERO_LENGTH:
-        return v0 / length, v1 / length, v2 / length, k * (length - rest), length
+    if rest == rest:
+        n0, n1, n2, length = _unit_direction(v0, v1, v2, edges.edge_direction, edges.edge_indices[e])
+        return n0, n1, n2, k * (length - rest), length
     named, sign = edges.edge_indices[e], 1.0
     if named < 0:
         named, sign = ~named, -1.0
@@ -39,8 +41,7 @@ def edge_direction_and_tension(edges, e, v0, v1, v2):
         sign * edges.edge_direction[named, 1],
         sign * edges.edge_direction[named, 2],
     )
-    if rest == rest:
-        return n0, n1, n2, -k * rest, 0.0
+    length = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
     return n0, n1, n2, k * (n0 * v0 + n1 * v1 + n2 * v2 - edges.dashpot_offset[named]), length
 
 
@@ -85,16 +86,7 @@ def sum_objective_change(edges, step_data, p, q, sum_slot, partials):
     while e < edges.ends.shape[0]:
         i, j, k, rest = edges.ends[e, 0], edges.ends[e, 1], edges.edge_stiffness[e], edges.edge_rest_length[e]
         if rest == rest:
-            before, after, change = 0.0, 0.0, 0.0
-            for c in range(3):
-                v = p[i, c] - p[j, c]
-                s = (q[i, c] - p[i, c]) - (q[j, c] - p[j, c])
-                before += v * v
-                after += (v + s) * (v + s)
-                change += s * (2.0 * v + s)
-            both = math.sqrt(before) + math.sqrt(after)
-            if both > ZERO_LENGTH:
-                total += k * (change / both) * (0.5 * both - rest)
+            total += _spring_energy_change(k, rest, i, j, p, q)
         else:
             closing, closer = -edges.dashpot_offset[e], 0.0
             for c in range(3):
@@ -116,7 +108,7 @@ class HessianKernels(NamedTuple):
 def build_hessian_kernels(real: type[np.float32] | type[np.float64]) -> HessianKernels:
     """Build the kernels that compute in `real`."""
 
-    transverse_stiffness = share_with_device(spring_hessian.transverse_stiffness)
+    transverse_stiffness = share_with_device(spring_law.transverse_stiffness)
 
     @cuda.jit
     def linearise(edges, free, p, linear):

@@ -9,7 +9,6 @@ on the SWEEP operator"):
 
 from __future__ import annotations
 
-import math
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -17,13 +16,13 @@ import numpy as np
 from springbench.solvers.cuda import device_sums
 from springbench.solvers.cuda.cuda_target import cuda
 from springbench.solvers.cuda.function_sharing import share_with_device
-from springbench.solvers.kernels import spring_hessian
+from springbench.solvers.kernels import spring_law
 from springbench.solvers.model.energies import element_energies
-from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 
 RealType = type[np.float32] | type[np.float64]
 
-_transverse_stiffness = share_with_device(spring_hessian.transverse_stiffness)
+_unit_direction = share_with_device(spring_law.unit_direction)
+_transverse_stiffness = share_with_device(spring_law.transverse_stiffness)
 _axial_hessian = share_with_device(element_energies.axial_hessian)
 
 
@@ -42,14 +41,12 @@ def write_edge_blocks(edges, p, stiff):
     while e < edges.ends.shape[0]:
         i, j, k, rest = edges.ends[e, 0], edges.ends[e, 1], edges.edge_stiffness[e], edges.edge_rest_length[e]
         v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
-        length, lateral = math.sqrt(v0 * v0 + v1 * v1 + v2 * v2), 0.0
-        if rest == rest and length > ZERO_LENGTH:  # a dashpot's length at rest is nan, and its direction is its axis
-            n0, n1, n2 = v0 / length, v1 / length, v2 / length
-        else:
-            n0, n1, n2 = edges.edge_direction[e, 0], edges.edge_direction[e, 1], edges.edge_direction[e, 2]
-            length = 0.0
         if rest == rest:
+            n0, n1, n2, length = _unit_direction(v0, v1, v2, edges.edge_direction, e)
             lateral = _transverse_stiffness(k, rest, k * (length - rest), length)
+        else:  # a dashpot's length at rest is nan, and its direction is its axis
+            n0, n1, n2 = edges.edge_direction[e, 0], edges.edge_direction[e, 1], edges.edge_direction[e, 2]
+            lateral = 0.0
         if rest > 0.0:  # edges of quadratic forms have no rest length, and may have a negative stiffness
             lateral = max(0.0, lateral)
         xx, xy, xz, yy, yz, zz = _axial_hessian(k, lateral, n0, n1, n2)

@@ -63,10 +63,12 @@ class SolverState(ABC):
     Attributes:
         positions: the iterate (n, 3) [m], which the next iteration may overwrite.
         velocity: velocity at the end of the step (n, 3) [m/s], for a method that computes its own.
+        start_residual: residual at the initial guess [J^(1/2)], if the method computes it at the start.
     """
 
     positions: Positions
     velocity: Positions | None = None
+    start_residual: float | None = None
 
     @property
     def warm_start(self) -> NDArray[np.float64] | None:
@@ -160,7 +162,8 @@ class IterativeSolver(ABC):
                 stop.atol,
             )
             if stop.rtol is not None:
-                yardstick = self.residual_at(problem, problem.current_positions)
+                known = run.start_residual if problem.initial_guess is problem.current_positions else None
+                yardstick = self.residual_at(problem, problem.current_positions) if known is None else known
                 limit, close = max(limit, stop.rtol * yardstick), stop.rtol <= _MINIMUM_CHECK_RTOL
             limits = LoopLimits(stop.max_iterations, limit, near, iteration_loop.RESIDUAL_EACH)
         count, residual, ended = self._iterate_to_roundoff(run, problem, limits, stop.roundoff_floor)
@@ -208,8 +211,9 @@ class IterativeSolver(ABC):
             return None
         if not self._saddle_checks or self._saddle_checks[0].system is not system:
             from springbench.solvers.iteration.saddle_check import SaddleCheck  # for those who need it
+            from springbench.solvers.objective.fixed_objective import FixedObjective
 
-            self._saddle_checks[:] = [SaddleCheck(system)]
+            self._saddle_checks[:] = [SaddleCheck(FixedObjective(system))]
         return self._saddle_checks[0].find_lower_point(problem, p, num_iterations)
 
     @cached_property
@@ -256,7 +260,10 @@ class IterativeSolver(ABC):
         """
         if self.residual_iterate == "none":
             return float("nan")
-        return self.init_state(problem, p).run_iterations(iteration_limit(int(self.residual_iterate == "previous")))[1]
+        run = self.init_state(problem, p)
+        if run.start_residual is not None:
+            return run.start_residual
+        return run.run_iterations(iteration_limit(int(self.residual_iterate == "previous")))[1]
 
     def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:
         """Build a function that returns `residual_at` for many positions of one step."""

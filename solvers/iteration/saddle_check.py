@@ -22,7 +22,7 @@ from springbench.solvers.kernels import curvature_search
 from springbench.solvers.kernels.curvature_search import EXHAUSTED_RATIO, CurvatureScratch
 from springbench.solvers.kernels.line_search_conditions import is_armijo_step
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
-from springbench.solvers.model.step_problem import Positions, StepProblem, System
+from springbench.solvers.model.step_problem import Positions, StepProblem
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import VALUE_ROUNDOFF, Hessian, StepObjective
 
@@ -39,9 +39,9 @@ _MAX_HALVINGS = 40
 class SaddleCheck:
     """The check of the end points of solves, for one system."""
 
-    def __init__(self, system: System) -> None:
-        self.system = system
-        self._fixed_objective = FixedObjective(system)
+    def __init__(self, fixed_objective: FixedObjective) -> None:
+        self.system = system = fixed_objective.system
+        self._fixed_objective = fixed_objective
         self._anchor_stiffness = compute_anchor_stiffness(system)
         self._linear_terms = np.empty((len(self._fixed_objective.springs.stiffness), 4))
         self._negative_stiffness = np.empty(system.num_vertices)
@@ -87,7 +87,7 @@ class SaddleCheck:
         else:
             terms, linear = whole.objective_terms, self._linear_terms
             arguments = terms, linear, whole.quadratic_form, None, None
-            is_bounded = curvature_search.bound_by_springs(terms, p, anchor_stiffness, linear, negative)
+            is_bounded = self.is_bounded_by_springs(p)
         if is_bounded:
             return None
         scratch = self._scratch
@@ -98,6 +98,15 @@ class SaddleCheck:
             found = curvature_search.search_compiled(arguments, anchor_stiffness, max_products, scratch)
         size = float(np.abs(scratch.direction).max(initial=0.0))
         return (scratch.direction / size, found / size**2) if found < 0.0 else None
+
+    def is_bounded_by_springs(self, p: Positions) -> bool:
+        """Return whether the bound over springs rules out negative curvature at p (n, 3) [m]."""
+        terms, form = self._fixed_objective.objective_terms, self._fixed_objective
+        if form.element_energy_indices or form.other_energy_indices:
+            return False
+        return curvature_search.bound_by_springs(
+            terms, p, self._anchor_stiffness, self._linear_terms, self._negative_stiffness
+        )
 
     @cached_property
     def _scratch(self) -> CurvatureScratch:

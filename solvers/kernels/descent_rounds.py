@@ -133,12 +133,9 @@ def build_compiled_rounds(
 
 def init_rounds(newton_cost: float) -> Any:
     """Return the state of rounds at their start, (1,); the cost of a Newton step is in groups."""
-    rounds = np.zeros(1, ROUND_STATE_DTYPE)
-    now = rounds[0]
-    now["group_end"], now["gain"], now["initial_residual"], now["newton_cost"] = (
-        GROUP_ITERATIONS,
-        np.inf,
-        -1.0,
-        newton_cost,
-    )
+    rounds = _INITIAL_ROUNDS.copy()
+    rounds["newton_cost"] = newton_cost
     return rounds
+
+
+_INITIAL_ROUNDS = np.array([(0, GROUP_ITERATIONS, 0, -1.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0)], ROUND_STATE_DTYPE)

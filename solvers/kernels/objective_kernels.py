@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
-from springbench.solvers.model.energies.spring_energy import ZERO_LENGTH, Springs
+from springbench.solvers.kernels.spring_law import spring_energy_change, unit_direction
+from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.rounding_bound import EPS
 from springbench.solvers.model.step_problem import Positions, StepProblem, System
 
@@ -70,11 +71,7 @@ class StepData(NamedTuple):
 def spring_direction(terms, e, p):
     """Return the unit direction of spring e and its length [m]; at zero length that of the rest shape."""
     i, j = terms.edges[e, 0], terms.edges[e, 1]
-    v0, v1, v2 = p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2]
-    length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-    if length <= ZERO_LENGTH:
-        return terms.rest_direction[e, 0], terms.rest_direction[e, 1], terms.rest_direction[e, 2], 0.0
-    return v0 / length, v1 / length, v2 / length, length
+    return unit_direction(p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2], terms.rest_direction, e)
 
 
 @jit_kernel
@@ -156,15 +153,5 @@ def objective_change(terms, step_data, p, q):
             total += terms.pin_weight[k] * (q[v, c] - p[v, c]) * (middle - step_data.pin_targets[k, c])
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
-        before = after = change = 0.0
-        for c in range(3):
-            v = p[i, c] - p[j, c]
-            s = (q[i, c] - p[i, c]) - (q[j, c] - p[j, c])
-            before += v * v
-            after += (v + s) * (v + s)
-            change += s * (2.0 * v + s)
-        before, after = np.sqrt(before), np.sqrt(after)
-        if before + after > ZERO_LENGTH:
-            both = before + after
-            total += terms.stiffness[e] * (change / both) * (0.5 * both - terms.rest_length[e])
+        total += spring_energy_change(terms.stiffness[e], terms.rest_length[e], i, j, p, q)
     return total

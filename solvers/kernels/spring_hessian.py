@@ -18,6 +18,7 @@ from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.objective_kernels import spring_direction
 from springbench.solvers.kernels.quadratic_form_kernels import add_product
 from springbench.solvers.kernels.quadratic_form_kernels import add_to_diagonal as hold_block
+from springbench.solvers.kernels.spring_law import transverse_stiffness
 from springbench.solvers.model.energies.element_energies import add_products, axial_hessian
 from springbench.solvers.model.step_problem import System
 
@@ -107,16 +108,6 @@ def linearise_tensions(terms, p, d, out):
         n0, n1, n2, length = spring_direction(terms, e, p)
         stretch = n0 * (d[i, 0] - d[j, 0]) + n1 * (d[i, 1] - d[j, 1]) + n2 * (d[i, 2] - d[j, 2])
         out[e] = terms.stiffness[e] * (length - terms.rest_length[e] + stretch)
-
-
-@jit_inner
-def transverse_stiffness(stiffness, rest_length, tension, length):
-    """Return a spring's transverse stiffness [N/m], at most k; 0 for zero length and positive rest length."""
-    if rest_length == 0.0:
-        return stiffness
-    if length <= 0.0:
-        return 0.0
-    return min(tension / length, stiffness)
 
 
 @jit_inner

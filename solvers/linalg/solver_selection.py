@@ -202,15 +202,15 @@ def select_solver(
 
 
 def estimate_supernodal_cost(s: SymbolicFactor, precision: Precision = "float64") -> CostEstimate:
-    """Estimate the cost of a supernodal factor: its panels, and fronts and updates during factorisation."""
+    """Estimate the cost of a supernodal factor: its panels, and those of L and updates during factorisation."""
     squares, entered = count_stored_entries(s)
     half = 2 if precision == "float16" else 4
     panels = 8 * (squares + entered)
     factor_bytes = panels if precision == "float64" else 4 * squares + half * entered
-    fronts, flops = _count_factorisation_work(s.parent, s.first_slot, s.row_start, s.postorder)
+    entries, flops = _count_factorisation_work(s.parent, s.first_slot, s.row_start, s.postorder)
     memory = (
         panels
-        + max(8 * fronts, _ROUNDED_COPY_MEMORY[precision] * panels)
+        + max(8 * entries, _ROUNDED_COPY_MEMORY[precision] * panels)
         + _SYMBOLIC_BYTES_PER_VERTEX * len(s.slot_of_vertex)
     )
     words = (
@@ -250,18 +250,18 @@ def _raise_out_of_memory(memory_limit: float, needs: dict[str, CostEstimate]) ->
 
 @cached_njit()
 def _count_factorisation_work(parent, first, row_start, sequence):
-    """Return the peak number of entries in fronts and pending updates, and the flops, of the factorisation."""
+    """Return the peak number of entries in panels of L and updates, and the flops, of the factorisation."""
     nodes = len(parent)
     waiting = np.zeros(nodes + 1, np.int64)  # of each supernode's children; the last is the roots'
-    most, now, largest, flops = 0, 0, 0, 0.0
+    most, now, panels, flops = 0, 0, 0, 0.0
     for s in sequence:
-        own, below = first[s + 1] - first[s], (row_start[s + 1] - row_start[s] + 3) // 4 * 4
-        largest = max(largest, own + below)
+        own, below = first[s + 1] - first[s], (row_start[s + 1] - row_start[s] + 7) // 8 * 8
+        panels += own * (own + below)
         now += below**2 - waiting[s]
         most = max(most, now + waiting[s])
         waiting[parent[s]] += below**2
         flops += own * (own**2 / 3.0 + own * below + 1.0 * below**2)
-    return largest**2 + most, flops
+    return panels + most, flops
 
 
 _SOLVER_BUILDERS: dict[str, Callable[[csr_array, Precision, SymbolicFactor | None], LinearSolver]] = {

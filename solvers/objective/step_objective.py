@@ -43,7 +43,6 @@ class StepObjective:
         element_energies: energies with an element-wise form, except those without elements in this step.
         other_energies: energies without an element-wise form.
         barrier_energies: barrier energies among these, which limit the step size.
-        step_matrix: the matrix of the Hessians.
     """
 
     def __init__(self, fixed_objective: FixedObjective, problem: StepProblem) -> None:
@@ -51,7 +50,6 @@ class StepObjective:
         if len(problem.system.energies) != len(fixed_objective.system.energies):
             raise ValueError("the objective was made for a system of other energies than the step's")
         self.fixed_objective, self.problem = fixed_objective, problem
-        self.step_data = objective_kernels.StepData.from_problem(problem)
         self.element_energies: list[ElementEnergy] = []
         self.other_energies: list[Energy] = []
         self.barrier_energies: list[BarrierEnergy] = []
@@ -71,9 +69,18 @@ class StepObjective:
             self.other_energies = [begun[k] for k in fixed_objective.other_energy_indices]
             self.barrier_energies = [energy for energy in self.other_energies if is_barrier_energy(energy)]
         self._constant_cache: tuple[BlockMatrix, FloatArray] | None = None
-        self.step_matrix = StepMatrix(fixed_objective, self.barrier_energies)
         pins = problem.system.pins
         self._exact_pins, self._exact_targets = pins.vertices[pins.exact_mask], problem.pin_targets[pins.exact_mask]
+
+    @cached_property
+    def step_data(self) -> objective_kernels.StepData:
+        """The step's inertial target, force and targets of penalty pins, for the kernels."""
+        return objective_kernels.StepData.from_problem(self.problem)
+
+    @cached_property
+    def step_matrix(self) -> StepMatrix:
+        """The matrix of the Hessians."""
+        return StepMatrix(self.fixed_objective, self.barrier_energies)
 
     @property
     def has_contact_elements(self) -> bool:

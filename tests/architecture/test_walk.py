@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from types import FrameType
 from typing import Any, NamedTuple
 
 import pytest
 from springbench.harness.cli.main import app
+from springbench.harness.config.sweep_config import RunSpec, SolverSpec
+from springbench.harness.scenes.scene_spec import SceneSpec
 from typer.testing import CliRunner
 
 ROWS = (
@@ -75,12 +80,36 @@ class Call(NamedTuple):
     by: str
     of: str
     name: str
+    is_handover: bool
 
 
 def row(module: str) -> int:
     _, package, name, *_ = [*module.split("."), ""]
     wanted = package if package == "solvers" else name
     return next(index for index, names in enumerate(ROWS) if wanted in names.split())
+
+
+def carries_specification(value: object, depth: int = 3) -> bool:
+    """Return whether a value is the specification of a run or a part of it, or holds one."""
+    if isinstance(value, (RunSpec, SceneSpec, SolverSpec)):
+        return True
+    if not depth or isinstance(value, str):
+        return False
+    if isinstance(value, Mapping):
+        return any(carries_specification(one, depth - 1) for one in value.values())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return any(carries_specification(one, depth - 1) for one in value)
+    if is_dataclass(value):
+        return any(carries_specification(getattr(value, one.name, None), depth - 1) for one in fields(value))
+    return False
+
+
+def is_handover(frame: FrameType) -> bool:
+    """Return whether the arguments of a call carry the specification; a value that reads itself goes nowhere."""
+    code = frame.f_code
+    count = code.co_argcount + code.co_kwonlyargcount + bool(code.co_flags & 4) + bool(code.co_flags & 8)
+    names = code.co_varnames[:count]
+    return any(carries_specification(frame.f_locals[name]) for name in names if name != "self")
 
 
 def ours(frame: FrameType | None) -> FrameType | None:
@@ -109,7 +138,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
             return
         above = ours(frame.f_back)
         if above and (by := above.f_globals["__name__"]) != (of := frame.f_globals["__name__"]):
-            calls.append(Call(by, of, frame.f_code.co_name))
+            sys.setprofile(None)
+            calls.append(Call(by, of, frame.f_code.co_name, is_handover(frame)))
+            sys.setprofile(trace)
 
     run()
     sys.setprofile(trace)
@@ -154,3 +185,14 @@ def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
     modules = {call.of for call in before}
     assert len(modules) <= 106, "106 when this was counted last"
     assert len(before) <= 1605, "1,602 when this was counted last, friction and the balances of energy among them"
+
+
+def test_the_specification_of_a_run_comes_through_few_files_and_seldom_back_up(walk: list[Call]):
+    """From the config to the rows: which modules hand it to each other, one stay for each that it comes to."""
+    handovers = [call for call in walk if call.is_handover and "springbench.harness.report" not in call.by + call.of]
+    stays = [handovers[0].by]
+    for module in (module for call in handovers for module in (call.by, call.of)):
+        stays += [module] if module != stays[-1] else []
+    climbs = [(below, above) for below, above in pairwise(stays) if row(above) < row(below)]
+    assert len(stays) <= 40
+    assert len(climbs) <= 8

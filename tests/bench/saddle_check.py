@@ -27,6 +27,7 @@ from springbench.harness.simulation.time_loop import SimulationStep, prepare, si
 from springbench.solvers.iteration.saddle_check import SaddleCheck
 from springbench.solvers.kernels.curvature_search import CurvatureScratch
 from springbench.solvers.model.step_problem import StopRule
+from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.registry import SOLVERS, load_target
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
@@ -43,7 +44,7 @@ def measure_shares(name: str, solver: str, frames: int, stop: StopRule) -> list[
     scene, _, size = name.partition(":")
     spec = load_scene(SCENES / f"{scene}.yaml")
     made = build_scene(spec, int(size or spec.default_size or 0))
-    prepared, check = prepare(made, load_target(SOLVERS[solver])()), SaddleCheck(made.system)
+    prepared, check = prepare(made, load_target(SOLVERS[solver])()), SaddleCheck(FixedObjective(made.system))
     shares, iterations, seconds, bounded, saddles = [], [], [], 0, 0
 
     def measure(step: SimulationStep) -> tuple[float, float]:
@@ -59,7 +60,9 @@ def measure_shares(name: str, solver: str, frames: int, stop: StopRule) -> list[
         iterations.append(step.num_iterations)
         saddles += step.solution.termination_reason == "saddle"
         with patch.object(CurvatureScratch, "from_size", side_effect=SearchStarted), suppress(SearchStarted):
-            SaddleCheck(made.system).find_lower_point(step.problem, step.solution.positions, step.num_iterations)
+            SaddleCheck(FixedObjective(made.system)).find_lower_point(
+                step.problem, step.solution.positions, step.num_iterations
+            )
             bounded += 1
     middle, most = np.median(shares[1:]), max(shares[1:])
     return [

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pytest
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError
-from springbench.harness.experiments.source_fingerprint import collect_source_parts, compute_source_fingerprint
+from springbench.harness.experiments.provenance import collect_source_parts, compute_source_fingerprint
 from springbench.harness.report.sweep_pictures import PictureJob, group_by_scene
 from springbench.solvers.plugins.plugin_discovery import InvalidPluginName
 from springbench.solvers.registry import SOLVER_TABLE

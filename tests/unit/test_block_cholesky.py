@@ -6,7 +6,7 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array, diags_array
+from scipy.sparse import bsr_array, coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 from springbench.harness.execution.machine_info import limit_threads
 from springbench.solvers.linalg.cholesky import block_cholesky
@@ -128,10 +128,11 @@ def always_by_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def by_threads(A: bsr_array, values: NDArray[np.float64]) -> list[tuple[NDArray[np.float64] | None, float, bytes]]:
     """The solution, the counted factorisations and another solve, for each number of threads."""
-    b, found = np.random.default_rng(3).normal(size=(len(A.indptr) - 1, 3)), []
+    size = values.shape[1]
+    b, found = np.random.default_rng(3).normal(size=(len(A.indptr) - 1, size)), []
     for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):  # type: ignore[attr-defined]
         with limit_threads(threads):
-            factor = BlockCholesky(graph_of(A))
+            factor = BlockCholesky(graph_of(A), block_size=size)
             x = factor.factorise_and_solve(values, b)
             again = b if x is None else factor.solve(b)
         found.append((x, factor.num_factorisations, again.tobytes()))
@@ -140,11 +141,25 @@ def by_threads(A: bsr_array, values: NDArray[np.float64]) -> list[tuple[NDArray[
 
 @pytest.mark.usefixtures("always_by_threads")
 @matrices
-def test_the_bits_do_not_depend_on_threads(A):
-    (first, *_), *others = by_threads(A, entries(A))
+@pytest.mark.parametrize("size", [1, 3])
+def test_the_bits_do_not_depend_on_threads(A, size):
+    values = entries(A)[:, :size, :size].copy()
+    (first, *_), *others = by_threads(A, values)
+    assert first is not None
     for x, _, again in others:
         assert x is not None
         assert first.tobytes() == x.tobytes() == again
+
+
+@matrices
+def test_numbers_are_blocks_of_one(A):
+    """The first entry of each block makes a matrix that is diagonally dominant too."""
+    values, n = entries(A)[:, :1, :1].copy(), len(A.indptr) - 1
+    b = np.random.default_rng(4).normal(size=(n, 1))
+    found = BlockCholesky(graph_of(A), block_size=1).factorise_and_solve(values, b)
+    wanted = np.asarray(spsolve(csc_array(csr_array((values.ravel(), A.indices, A.indptr), shape=(n, n))), b.ravel()))
+    assert found is not None
+    np.testing.assert_allclose(found.ravel(), wanted, rtol=0, atol=ROUND_OFF * np.abs(wanted).max())
 
 
 @pytest.mark.usefixtures("always_by_threads")

@@ -37,6 +37,11 @@ from springbench.harness.report.charts.figure_panels import (
     merge_cell_maps,
 )
 from springbench.harness.report.charts.published_curves import PUBLISHED_LABEL
+from springbench.harness.report.charts.recommendation_chart import (
+    CandidatePoint,
+    RecommendationLimits,
+    build_recommendation_chart,
+)
 from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.figures.figure_layout import compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
@@ -194,6 +199,33 @@ def test_a_marked_value_of_x_is_an_upright_line() -> None:
     assert [30.0, 30.0] in [np.asarray(line.get_xdata()).tolist() for line in ax.lines]
     assert ax.get_xlim()[1] > 30.0
     assert serialise_chart(replace(chart, frames=[frame]))["frames"][0]["lines"] == {"n": [[30.0, "m"]]}
+
+
+@pytest.mark.parametrize(
+    ("limits", "best", "marked"),
+    [
+        (RecommendationLimits(0.05), "fine", {"error": [(0.05, "requested: 5 %")], "seconds": []}),
+        (RecommendationLimits(None, 0.3), "finer", {"error": [], "seconds": [(0.3, "budget: 300 ms")]}),
+    ],
+    ids=["error", "budget"],
+)
+def test_the_cheapest_or_the_most_accurate_candidate_is_recommended(
+    limits: RecommendationLimits, best: str, marked: dict
+) -> None:
+    points = [
+        CandidatePoint("newton", 50.0, 0.01, "unstable"),
+        CandidatePoint("newton", 0.1, 0.1, "coarse"),
+        CandidatePoint("hybrid", 0.02, 0.2, "fine"),
+        CandidatePoint("newton", 0.01, 0.3, "finer"),
+    ]
+    (frame,) = build_recommendation_chart("Ways", ["a fact"], points, limits).frames
+    words = {series.columns["candidate"][k]: text for series in frame.series for k, text in series.callouts.items()}
+    assert words[best] == "recommended"
+    assert "unstable" not in words
+    assert frame.lines == marked
+    assert frame.notes[0] == "a fact; 1 unstable setting not shown."
+    assert frame.notes[1].startswith(f"Recommended: {best}: an error of")
+    assert ("1.5 times as long" in " ".join(frame.notes)) == (limits.error is not None)
 
 
 def build_small_chart(sizes: tuple[float, ...]) -> ChartDescription:

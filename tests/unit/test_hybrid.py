@@ -172,8 +172,8 @@ def test_a_failed_factorisation_counts_by_the_operations_before_it_fails():
     prepared = HybridNewton().prepare(stiff(1.0).system)
     assert isinstance(prepared, PreparedHybrid)
     graph = prepared.hybrid_iteration.factor
-    n = graph._frontal_structure.diagonal_block  # pyright: ignore[reportPrivateUsage]
-    blocks = np.zeros((graph._frontal_structure.block_index.max() + 1, 3, 3))  # pyright: ignore[reportPrivateUsage]
+    n = graph.fronts.diagonal_block
+    blocks = np.zeros((graph.fronts.block_index.max() + 1, 3, 3))
     assert not graph.factorise(blocks)
     least = graph.num_factorisations
     assert 0.0 < least < 1.0

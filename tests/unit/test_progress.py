@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import random
 from collections.abc import Callable
 
 import pytest
@@ -16,6 +17,8 @@ from springbench.harness.execution.progress_display import (
     RunCost,
 )
 from springbench.harness.execution.progress_events import COMPILING, POLL, report_activity
+
+from tests.bench.progress import is_estimate_wrong
 
 
 @pytest.fixture
@@ -44,9 +47,7 @@ SWEEP = [
 
 
 @pytest.mark.parametrize("kind", [ProgressLines, ProgressBars])
-def test_the_time_left_follows_from_the_latest_run_of_each_kind(
-    kind: Callable[..., ProgressDisplay], clock: list[float]
-):
+def test_the_time_left_follows_from_the_runs_of_each_kind(kind: Callable[..., ProgressDisplay], clock: list[float]):
     def does(display: ProgressDisplay) -> None:
         display.start_sweep(SWEEP)
         for effort, seconds in zip(SWEEP, (3.0, 5.0, 9.0, 35.0), strict=False):
@@ -58,9 +59,23 @@ def test_the_time_left_follows_from_the_latest_run_of_each_kind(
 
     lines = capture_progress(kind, does)
     # 3 s come with any run. After the second one: fast 0 s and slow 0.2 s for each of the amount, so 3, 3 + 8 and 3 s.
-    # After the third one: fast 6 s for 40, so 3 + 8 s and 3 + 15 s. After the fourth one 3 + 15 s.
-    for seconds in (17, 29, 18):
+    # After the third one: fast 0 + 6 s for 10 + 40, so 3 + 8 s and 3 + 12 s. After the fourth one 3 + 12 s.
+    for seconds in (17, 26, 15):
         assert f"about {seconds} s left" in lines
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_time_left_is_right_within_a_factor_of_two_from_half_way_on(clock: list[float], seed: int):
+    """Runs of some solvers whose times vary by a factor of 1,000, as those of hard cases do."""
+    chance = random.Random(seed)
+    costs = [RunCost(f"solver {chance.randrange(10)}", chance.choice((9.0, 36.0, 1024.0))) for _ in range(300)]
+    seconds = [0.01 * 1000.0 ** chance.random() for _ in costs]
+    pace = RemainingTime(costs)
+    for k, cost in enumerate(costs):
+        clock[0] += seconds[k]
+        pace.record_run(cost, seconds[k])
+        if is_estimate_wrong(pace.estimate_seconds() or 0.0, clock[0], sum(seconds)):
+            pytest.fail(f"after {k} runs {clock[0]:.0f} of {sum(seconds):.0f} s, estimated {pace.estimate_seconds()}")
 
 
 def test_a_run_that_is_done_elsewhere_is_left_out(clock: list[float]):

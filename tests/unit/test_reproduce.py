@@ -13,7 +13,11 @@ from springbench.harness.cli.commands.published import report_agreement
 from springbench.harness.cli.main import app
 from springbench.harness.experiments.archive import archive_verification
 from springbench.harness.experiments.archive.study_publication import write_published_table, write_study_file
-from springbench.harness.experiments.archive.study_reproduction import draw_sample, omit_missing_software
+from springbench.harness.experiments.archive.study_reproduction import (
+    draw_from_groups,
+    draw_sample,
+    omit_missing_software,
+)
 from springbench.harness.report.published_comparison import compare_with_published
 from springbench.harness.results.published_set import read_study
 from springbench.harness.results.study_comparison import (
@@ -189,6 +193,15 @@ def test_a_tenth_is_drawn_by_its_seed() -> None:
     assert len(draw_sample(items, 1)) == 10
     assert draw_sample(items, 1) == draw_sample(items, 1)
     assert draw_sample(items, 1) != draw_sample(items, 2)
+
+
+def test_a_tenth_is_drawn_from_few_groups() -> None:
+    items = list(range(95))
+    drawn = draw_from_groups(items, lambda item: item % 12, 1)
+    assert len(drawn) == len(set(drawn)) == 10
+    assert len({item % 12 for item in drawn}) == 2, "a group has 7 or 8 items"
+    assert drawn == draw_from_groups(items, lambda item: item % 12, 1) != draw_from_groups(items, lambda k: k % 12, 2)
+    assert draw_from_groups(items, lambda item: item % 12, None) == items
 
 
 ROW: dict[str, Any] = {

@@ -99,7 +99,10 @@ def test_the_bound_of_a_single_spring_is_its_buckling_load(factor: float, bounde
 
 def check_search(problem: StepProblem, p: Positions) -> bool:
     """Search with as many products as there are unknowns; return whether there is something to find."""
-    found, least = SaddleCheck(problem.system).find_negative_curvature(problem, p, p.size), eigenvalues(problem, p)[0]
+    found, least = (
+        SaddleCheck(FixedObjective(problem.system)).find_negative_curvature(problem, p, p.size),
+        eigenvalues(problem, p)[0],
+    )
     if least < -1e-6:  # conjugate gradients resolve no less in as many products as there are unknowns
         assert found is not None
     if found is None:

@@ -29,7 +29,8 @@ from springbench.harness.experiments.setting_convergence import (
 from springbench.harness.reference import self_converged_trajectory
 from springbench.harness.reference.equations_of_motion import NotIntegrable
 from springbench.harness.reference.reference_store import ReferenceStore
-from springbench.harness.report.convergence_map import draw_convergence_map
+from springbench.harness.report.charts.setting_chart import build_setting_chart
+from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.results.setting_verdict import (
     ConvergenceStudy,
     SettingAssessment,
@@ -302,24 +303,30 @@ def test_a_setting_that_is_not_supported_ends_the_study(scene: Path):
         study(scene)
 
 
-def test_a_map_marks_the_given_setting_and_the_iso_error_lines(tmp_path: Path):
+def test_a_map_marks_the_given_setting_and_the_cheapest_ones() -> None:
     full = {(s, i): 0.3 / (s * i) for s in (1, 2, 4) for i in (2, 4, 8)}
     failed = replace(synthetic(full).results[0], error=inf, reason="diverged in frame 1")
     drawn = replace(synthetic(full), results=(failed, *synthetic(full).results[1:]))
-    paths = draw_convergence_map(tmp_path / "map", drawn, "Is 2 x 4 converged?", ["facts"])
-    text = paths[1].read_text()
-    assert all(path.is_file() for path in paths)
-    assert "given" in text
-    assert "an error of 5" in text
-    assert "diverged in" in text
+    (shown,) = build_setting_chart(drawn, "Is 2 x 4 converged?", ["facts"]).maps
+    assert (shown.row_names, shown.column_names) == (["2", "4", "8"], ["1", "2", "4"])
+    cells = {(cell.column, cell.row): cell for cell in shown.cells}
+    assert {place for place, cell in cells.items() if cell.is_framed} == {("2", "4")}
+    assert cells["2", "4"].value_text.startswith("3.8 %")
+    assert cells["2", "4"].value_text.endswith("\ngiven")
+    assert [place for place, cell in cells.items() if cell.value_text.endswith("cheapest to 5 %")] == [("1", "8")]
+    assert cells["2", "4"].outcome == "2 to 5 %"
+    assert cells["1", "2"].value_text.startswith("diverged in")
+    assert cells["1", "2"].outcome == "no error"
+    assert shown.notes[0] == "facts."
 
 
-def test_a_map_of_a_single_row_has_colours(tmp_path: Path):
+def test_a_map_of_a_single_row_fills_its_sheet(tmp_path: Path) -> None:
     """MuJoCo has substeps and no iterations."""
     drawn = synthetic({(s, 0): 0.3 / s for s in (1, 2, 4)}, given=[StepSetting(2, 0)])
-    image = plt.imread(draw_convergence_map(tmp_path / "map", drawn, "Is 2 converged?", [])[0])[..., :3]
+    path, _ = draw_chart_sheets(build_setting_chart(drawn, "Is 2 converged?", ["facts"]), tmp_path / "map")
+    image = plt.imread(path)[..., :3]
     coloured = np.ptp(image, axis=2) > 0.1
-    assert coloured.mean() > 0.03
+    assert coloured.mean() > 0.1
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from springbench.harness.cli.main import app
 from springbench.harness.config import solver_parameters
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.experiments import run_pipeline as run_module
-from springbench.harness.experiments.source_fingerprint import (
+from springbench.harness.experiments.provenance import (
     collect_source_parts,
     compute_source_fingerprint,
     list_source_files,

@@ -94,6 +94,15 @@ def test_a_wrong_ratio_of_interrupted_rounds_is_undecided(tmp_path: Path) -> Non
     assert "other processes interrupted it" in next(o for o in found if o.level is AgreementLevel.UNDECIDED).explanation
 
 
+@pytest.mark.parametrize(("others", "level"), [(True, AgreementLevel.UNDECIDED), (False, AgreementLevel.DIFFERENT)])
+def test_a_wrong_ratio_is_undecided_where_many_others_were_interrupted(
+    tmp_path: Path, others: bool, level: AgreementLevel
+) -> None:
+    rows = [row | {"preempted": others and row.get("solver") == "newton"} for row in build_study({"lbfgs": 9.0})]
+    found = compare_studies(tmp_path, iter(rows))
+    assert {one.level for one in found if "lbfgs over" in one.title} == {level}
+
+
 def test_rounds_that_reach_into_the_interval_leave_a_ratio_undecided(tmp_path: Path) -> None:
     slow = list(build_study({"lbfgs": 9.0}))
     rows = [

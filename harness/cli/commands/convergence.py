@@ -158,7 +158,8 @@ def _study_setting(
         study_convergence,
     )
     from springbench.harness.reference.equations_of_motion import NotIntegrable
-    from springbench.harness.report.convergence_map import draw_convergence_map
+    from springbench.harness.report.charts.setting_chart import build_setting_chart
+    from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 
     spec = spec.load_plugins()
     if mistakes := find_scene_mistakes(spec, [size]):
@@ -190,7 +191,7 @@ def _study_setting(
     title = f"{verb} {', '.join(map(str, given))} converged? {name} {size or ''}".rstrip() + f", {solver.name}"
     frames = f"{simulator.num_frames} frames of {spec.time_step:.6g} s"
     facts = [frames, simulator.integrator, f"errors against {study.reference}"]
-    picture, *_ = draw_convergence_map(folder / "pictures" / stem, study, title, facts)
+    picture, *_ = draw_chart_sheets(build_setting_chart(study, title, facts), folder / "pictures" / stem)
     print_message(f"the map is {picture}, its numbers are in {folder / f'{stem}.csv'}")
     best = study.find_cheapest(options["error"])
     for setting in given if best is None or best.setting in given else [*given, best.setting]:

@@ -20,7 +20,11 @@ from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.execution.worker_process import TaskLimits
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
-from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, format_method_name
+from springbench.harness.experiments.error_control.candidate_methods import (
+    ErrorTarget,
+    format_method_name,
+    list_contact_methods,
+)
 from springbench.harness.experiments.error_control.method_search import (
     SearchResult,
     Trial,
@@ -39,6 +43,7 @@ from springbench.harness.experiments.run_pipeline import save_positions
 from springbench.harness.recording.recorder_interface import RecordedFrame, RecordingInfo
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth
+from springbench.harness.reference.self_converged_trajectory import describe_self_convergence
 from springbench.harness.report.sweep_summary import describe_losses
 from springbench.harness.results import parquet_rows
 from springbench.harness.results.folder_ownership import claim_folder
@@ -127,12 +132,15 @@ def _execute_error_control(
     print_message: PrintMessage,
 ) -> bool:
     print_message("estimating how far ahead the motion can be predicted")
-    error_target = ErrorTarget.from_scene(scene, size, t_end, print_message)
+    error_target = ErrorTarget.from_scene(scene, size, t_end, print_message, supports_contact=True)
     folder = claim_folder(results / config.stem, config)
     with machine_info.limit_threads(1):
-        seen = compute_predictability_horizon(error_target, error, print_message)
         before = read_stored_trials(folder / "accuracy", error_target)
-        answer = _search_method(error_target, error, seen, [] if rerun else before, print_message)
+        if error_target.has_contact:
+            answer = _search_contact_method(error_target, error, results, print_message)
+        else:
+            seen = compute_predictability_horizon(error_target, error, print_message)
+            answer = _search_method(error_target, error, seen, [] if rerun else before, print_message)
     path, best = answer.best_trial.trajectory, answer.best_trial
     print_message(f"asked {error:g}, estimated {best.error_estimated:.1g}, {path.cpu_seconds:.3g} s of processor time")
     factors = f", {path.num_factorisations} factorisations" if path.num_factorisations else ""
@@ -151,6 +159,9 @@ def _execute_error_control(
     measured = _verify_error(error_target, error, path.positions[-1], results, print_message) if verify else None
     label = f"{config.stem}-{error_target.size}-asked-{error:g}-{error_target.t_end:g}"
     row = _build_row(config.stem, error_target, error, answer, status) | {"error": measured}
+    if error_target.has_contact:
+        bound = answer.reference_trial.error_estimated
+        row |= {"reference_kind": "self-converged", "reference_error": bound}
     row |= {name: value for name, value in energies.columns.items() if name in _ENERGY_COLUMNS}
     if RECORDINGS.is_installed():
         recording = _record_motion(
@@ -206,6 +217,21 @@ def _search_method(
     except RunFailed as failed:
         print_message(f"{failed}; so all ways are tried")
         return search_cheapest_method(error_target, error, growth, print_message)
+
+
+def _search_contact_method(
+    error_target: ErrorTarget, error: float, results: Path, print_message: PrintMessage
+) -> SearchResult:
+    """Search the cheapest method for a scene with contact, by the self-converged reference. Raises RunFailed."""
+    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
+
+    print_message(describe_self_convergence(error_target.scene.path.stem))
+    reference = open_reference_store(results).require_contact_horizon(
+        error_target.scene, error_target.size, error_target.t_end, error=error
+    )
+    print_message(f"the reference itself errs by up to {reference.get_error_bound(-1):.1e}, which counts")
+    growth = PerturbationGrowth.from_reference(reference)
+    return search_cheapest_method(error_target, error, growth, print_message, list_contact_methods(), reference)
 
 
 def _verify_error(

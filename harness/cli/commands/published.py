@@ -82,8 +82,6 @@ def reproduce(
     """
     from secrets import randbelow
 
-    from springbench.harness.experiments.archive.study_reproduction import QUICK_SHARE
-
     if seed is not None and not quick and study != ENTRIES:
         raise InputError(InputMistake("draws the runs of --quick; give both", key="--seed"))
     if study == ENTRIES:
@@ -91,7 +89,9 @@ def reproduce(
     found = published_set.list_studies(published) if study == ALL_STUDIES else ()
     studies = [one for one in found if one.is_repeatable] or [published_set.find_study(published, study)]
     chance = (randbelow(10**6) if seed is None else seed) if quick else None
-    durations = [(QUICK_SHARE if quick else 1.0) * (one.metadata["duration_seconds"] or 0.0) for one in studies]
+    durations = [
+        (published_set.QUICK_SHARE if quick else 1.0) * (one.metadata["duration_seconds"] or 0.0) for one in studies
+    ]
     if len(studies) > 1:
         print_message(f"{len(studies)} studies, which took {_format_duration(sum(durations))} when they were published")
     codes = [_reproduce_one(one, took, results, chance, workers) for one, took in zip(studies, durations, strict=True)]
@@ -102,15 +102,15 @@ def _reproduce_one(
     study: published_set.PublishedStudy, duration: float, results: Path, seed: int | None, workers: int | None
 ) -> int:
     """Repeat one study, print what agrees, and return the exit code."""
-    from springbench.harness.execution.progress_display import create_display
-    from springbench.harness.experiments.archive.study_reproduction import reproduce_study
-
     if changed := published_set.find_changed_tables(study):
         raise InputError(InputMistake("differs from its checksum in study.json; restore it", changed[0]))
     machine, count = study.metadata["machines"][0], study.metadata["runs"]
     drawn = f"{count} runs" if seed is None else f"a tenth of {count} runs, drawn by --seed {seed}"
     took = f"{_format_duration(duration)} on {machine.get('cpu')}, {machine.get('cores')} cores"
     print_message(f"{study.study_name}: {drawn}; when it was published this took {took}")
+    from springbench.harness.execution.progress_display import create_display
+    from springbench.harness.experiments.archive.study_reproduction import reproduce_study
+
     display = create_display(get_error_console())
     found = reproduce_study(study, results / study.study_name, display, print_message, seed=seed, num_workers=workers)
     return report_agreement(study.study_name, found.runs, found.ratios)

@@ -47,7 +47,12 @@ def recommend(
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.accuracy.method_recommendation import RecommendationGoal
     from springbench.harness.experiments.accuracy.method_recommendation import recommend_method as find
-    from springbench.harness.report.accuracy.recommendation_plot import CandidatePoint, draw_recommendation
+    from springbench.harness.report.charts.recommendation_chart import (
+        CandidatePoint,
+        RecommendationLimits,
+        build_recommendation_chart,
+    )
+    from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 
     if (error is None) == (budget is None):
         raise InputError("recommend: give one of --error and --budget")
@@ -95,7 +100,8 @@ def recommend(
     name = f"ways-{scene.stem}-{found.best_method.work_spec.case.size}-{requested}-{t_end:g}".replace(".", "_")
     facts = [f"{t_end:g} s simulated", "time stepping and solver together"]
     facts += [] if integrated else [f"by a {found.checked_method.reference_kind} reference"]
-    picture, *_ = draw_recommendation(folder / name, title, facts, points, error, found.cost_limit)
+    chart = build_recommendation_chart(title, facts, points, RecommendationLimits(error, found.cost_limit))
+    picture, *_ = draw_chart_sheets(chart, folder / name)
     print_message(f"the runners-up are in {picture}")
     if command := found.best_method.format_command(scene):
         print_message(f"to run it:\n  {command}")

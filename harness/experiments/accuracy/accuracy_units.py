@@ -31,6 +31,8 @@ from springbench.solvers.plugins.plugin_discovery import identify_plugins
 
 ResultRow = dict[str, Any]
 
+CONTACT_STUDY_ERROR = 0.01
+"""Smallest relative error that a study with contact is to measure, if its reference is known well enough in time."""
 EXTRA_WALL_SECONDS = 3600.0
 """Wall time in addition to the solver's limit, for compiling, scoring and finding minima [s]."""
 WALL_TIME_FACTOR = 4.0
@@ -158,7 +160,11 @@ class CurveUnit:
     spec: CurveSpec
     results: AccuracyResults
     snapshot_row: Mapping[str, Any]
-    cost_estimate: RunCost = UNIT_COST
+
+    @property
+    def cost_estimate(self) -> RunCost:
+        """Cost of one unit; the solvers of a step take times of one magnitude."""
+        return RunCost(self.spec.build_problem_stem())
 
     @property
     def title(self) -> str:
@@ -220,7 +226,13 @@ class WorkPrecisionUnit:
 
     spec: WorkSpec
     results: AccuracyResults
-    cost_estimate: RunCost = UNIT_COST
+
+    @property
+    def cost_estimate(self) -> RunCost:
+        """Estimated cost: vertices times steps times iterations."""
+        case = self.spec.case
+        steps = self.spec.t_end / case.scene.time_step * self.spec.measurement.rounds
+        return RunCost(self.spec.solver.name, (case.size or 32) ** 2 * steps * self.spec.options["max_iterations"])
 
     @property
     def title(self) -> str:
@@ -328,7 +340,9 @@ def load_reference_trajectory(spec: WorkSpec, reference_store: ReferenceStore) -
         reference_store: store of the reference solutions.
     """
     try:
-        return reference_store.load_trajectory(spec.case.scene, spec.case.size, [spec.t_end], error=1.0)
+        return reference_store.load_trajectory(
+            spec.case.scene, spec.case.size, [spec.t_end], error=1.0, contact_error=CONTACT_STUDY_ERROR
+        )
     except InputError:
         raise
     except Exception as error:

@@ -1,19 +1,21 @@
 """Repeat a published study on this machine (`springbench reproduce`).
 
 All of its runs, or a tenth that is drawn at random, are executed in a folder of their own, without recordings and
-pictures. Of frozen steps a tenth is drawn, each with all of its solvers, so that times to an error have ratios. Steps
-of studies that publish no times are not timed. Runs that are complete there are not executed again.
+pictures. The tenth of an accuracy study is drawn from few frozen steps and motions: their references take most of the
+time, and times to an error have ratios within them. Steps of studies that publish no times are not timed. Runs that are
+complete there are not executed again.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from springbench.harness.config.accuracy_config import CurveSpec
 from springbench.harness.config.accuracy_loader import load_accuracy
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.config.sweep_config import RunSpec
@@ -31,7 +33,7 @@ from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy.error_times import list_curve_times, list_simulation_times
 from springbench.harness.report.robustness import classify_run
 from springbench.harness.results import parquet_rows, row_store
-from springbench.harness.results.published_set import RUN_KEYS, PublishedStudy, open_study_folder
+from springbench.harness.results.published_set import QUICK_SHARE, RUN_KEYS, PublishedStudy, open_study_folder
 from springbench.harness.results.study_comparison import (
     AgreementLevel,
     RunAgreement,
@@ -44,10 +46,6 @@ from springbench.harness.results.study_comparison import (
 )
 from springbench.harness.results.time_ratios import list_step_times
 from springbench.solvers.registry import OPTIONAL_SOLVERS
-
-QUICK_SHARE = 0.1
-"""Share of the runs that `--quick` repeats."""
-
 
 RowPair = tuple[RunRows, RunRows]
 """Rows of a published run and of the repeated one."""
@@ -102,6 +100,21 @@ def draw_sample(items: Sequence[Any], seed: int | None) -> list[Any]:
     count = max(1, math.ceil(QUICK_SHARE * len(items)))
     chosen = sorted(random.Random(seed).sample(range(len(items)), count))
     return [items[k] for k in chosen]
+
+
+def draw_from_groups(items: Sequence[Any], get_group: Callable[[Any], Hashable], seed: int | None) -> list[Any]:
+    """Draw a tenth of the items, at least one, from as few groups as have so many; all of them without a seed."""
+    if seed is None or not items:
+        return list(items)
+    chance = random.Random(seed)
+    groups: dict[Hashable, list[int]] = {}
+    for k, item in enumerate(items):
+        groups.setdefault(get_group(item), []).append(k)
+    count = math.ceil(QUICK_SHARE * len(items))
+    chosen: list[int] = []
+    for members in chance.sample(list(groups.values()), len(groups)):
+        chosen += chance.sample(members, min(len(members), count - len(chosen)))
+    return [items[k] for k in sorted(chosen)]
 
 
 def classify_outcome(run: RunRows) -> str:
@@ -201,9 +214,9 @@ def _reproduce_accuracy(
 ) -> StudyRepetition:
     """Repeat an accuracy study: convergence of curves, errors of simulations, and ratios of their times."""
     plan = load_accuracy(study.config_path)
-    steps = set(draw_sample(list(dict.fromkeys(spec.build_problem_stem() for spec in plan.curves)), seed))
-    curves = tuple(spec for spec in plan.curves if spec.build_problem_stem() in steps)
-    plan = replace(plan, curves=curves, work=tuple(draw_sample(plan.work, seed)))
+    curves = draw_from_groups(plan.curves, CurveSpec.build_problem_stem, seed)
+    work = draw_from_groups(plan.work, lambda spec: (spec.case.scene_name, spec.case.size, spec.t_end), seed)
+    plan = replace(plan, curves=tuple(curves), work=tuple(work))
     files = run_accuracy_study(plan, folder, display, print_message, rerun_stale=True)
     rows = parquet_rows.read_rows(files, ACCURACY_SCHEMA).to_pylist()
     table = study.read_table("accuracy").to_pylist()

@@ -11,7 +11,7 @@ from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.execution.progress_display import ThrottledMessages
 from springbench.harness.experiments.error_control.step_doubling import estimate_by_step_doubling
-from springbench.harness.reference.self_converged_trajectory import has_contact
+from springbench.harness.reference.self_converged_trajectory import LIMIT_INTEGRATORS, has_contact
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
@@ -52,7 +52,13 @@ class ErrorTarget:
 
     @classmethod
     def from_scene(
-        cls, scene: SceneSpec, size: int | None, t_end: float | None, print_message: Callable[[str], None] | None = None
+        cls,
+        scene: SceneSpec,
+        size: int | None,
+        t_end: float | None,
+        print_message: Callable[[str], None] | None = None,
+        *,
+        supports_contact: bool = False,
     ) -> ErrorTarget:
         """Return the target for a scene.
 
@@ -63,10 +69,11 @@ class ErrorTarget:
             size: size of the mesh; the scene's default if None.
             t_end: simulated time [s]; that of the scene if None.
             print_message: prints a remark.
+            supports_contact: whether errors are measured by a self-converged reference where there is contact.
 
         Raises:
             InputError: the size or the time step does not fit the scene.
-            RunFailed: the scene has contact.
+            RunFailed: the scene has contact, which is not supported.
         """
         scene.require_fixed_time_step()
         t_end = t_end or scene.frames * scene.time_step
@@ -75,8 +82,7 @@ class ErrorTarget:
         if mistakes := find_scene_mistakes(scene, [size]):
             raise InputError(mistakes)
         target = cls(scene, size, t_end, frames)
-        system = target.build_scene(target.frame_seconds, "implicit-euler").system
-        if has_contact(system):
+        if target.has_contact and not supports_contact:
             if print_message:
                 print_message(
                     "no error can be promised with contact; halving steps for "
@@ -91,6 +97,11 @@ class ErrorTarget:
     def build_scene(self, time_step: float, integrator: str) -> Scene:
         """Build the scene with a time step [s] and an integrator by name."""
         return build_exact_scene(self.scene.with_time_step(time_step), self.size, integrator, show_warnings=False)
+
+    @property
+    def has_contact(self) -> bool:
+        """Whether the scene has contact."""
+        return has_contact(self.build_scene(self.frame_seconds, "implicit-euler").system)
 
     @property
     def frame_seconds(self) -> float:
@@ -140,6 +151,15 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
     }
     found = [(integrator, SolverSpec(name, {})) for name, several in tried.items() for integrator in several]
     return sorted(found, key=lambda pair: pair[0] != "substepping")
+
+
+def list_contact_methods() -> list[tuple[str, SolverSpec]]:
+    """Return the integrators that support contact, combined with the first minimising solver of each family."""
+    solvers = {name: load_target(target) for name, target in SOLVERS.items()}
+    first = [
+        name for name, one in solvers.items() if is_minimiser(one) and find_solver_info(one, name).is_family_default
+    ]
+    return [(integrator, SolverSpec(name, {})) for name in first for integrator in LIMIT_INTEGRATORS]
 
 
 def list_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:

@@ -34,7 +34,7 @@ from springbench.harness.experiments.error_control.candidate_methods import (
     prepare_candidate_methods,
 )
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth, estimate_growth
-from springbench.harness.reference.reference_trajectory import compute_position_error
+from springbench.harness.reference.reference_trajectory import ReferenceTrajectory, compute_position_error
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import (
     StepObserver,
@@ -49,6 +49,9 @@ from springbench.harness.simulation.energy_balance import (
     StepDissipation,
     compute_frame_balances,
 )
+from springbench.harness.simulation.fixed_stepping import FixedImplicitStepper
+from springbench.harness.simulation.time_loop import build_initial_state
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import Positions
 
@@ -205,6 +208,7 @@ def search_cheapest_method(
     growth: PerturbationGrowth,
     print_message: Callable[[str], None],
     candidates: Sequence[tuple[str, SolverSpec]] = (),
+    reference: ReferenceTrajectory | None = None,
 ) -> SearchResult:
     """Find the cheapest method whose relative error at t_end is at most `max_error`.
 
@@ -214,11 +218,12 @@ def search_cheapest_method(
         growth: growth of perturbations (`compute_predictability_horizon`).
         print_message: prints a remark.
         candidates: integrators and solvers to try; the default candidates if empty.
+        reference: motion at t_end that errors are measured by; a trial with a much smaller error if omitted.
 
     Raises:
         RunFailed: no method reaches the error.
     """
-    return _MethodSearch(error_target, max_error, growth, print_message).find_cheapest(candidates)
+    return _MethodSearch(error_target, max_error, growth, print_message, reference).find_cheapest(candidates)
 
 
 _MethodSetting = tuple[Method, float]
@@ -226,8 +231,14 @@ _MethodSetting = tuple[Method, float]
 
 class _MethodSearch:
     def __init__(
-        self, error_target: ErrorTarget, error: float, growth: PerturbationGrowth, print_message: Callable[[str], None]
+        self,
+        error_target: ErrorTarget,
+        error: float,
+        growth: PerturbationGrowth,
+        print_message: Callable[[str], None],
+        reference: ReferenceTrajectory | None,
     ) -> None:
+        self._reference = reference
         self._error_target, self._max_error, self._growth, self._print_message = (
             error_target,
             error,
@@ -243,7 +254,9 @@ class _MethodSearch:
         known = prepare_candidate_methods(self._error_target, self._print_message, candidates)
         began = perf_counter()
         raced = self._run_first_trials(known, tolerance)
-        closer = self._find_reference_trial(raced)
+        closer = (
+            self._find_reference_trial(raced) if self._reference is None else self._adopt_reference(self._reference)
+        )
         graded = sorted((self._estimate_error_and_order(one, closer) for one in raced), key=self._predict_cost)
         for one in graded:
             self._print_message(
@@ -309,6 +322,18 @@ class _MethodSearch:
             self._print_message(f"  {method}: given up after {given:.3g} s, for it is slower than others")
         return found
 
+    def _adopt_reference(self, reference: ReferenceTrajectory) -> Trial:
+        """Return a given motion as the reference trial."""
+        scene = self._error_target.build_scene(self._error_target.frame_seconds, "implicit-euler")
+        start = build_initial_state(scene).motion
+        positions, velocities = (
+            np.array([start.positions, reference.positions[-1]]),
+            np.array([start.velocity, reference.velocities[-1]]),
+        )
+        path = Trajectory(positions, velocities, 1, 0, 0, 0, (0.0, 0.0), 0.0, (0.0,), 0.0)
+        stepper = FixedImplicitStepper(lambda h: scene, NewtonSolver(), self._error_target.t_end, 1)
+        return Trial(Method("bdf2", "newton", stepper), 1.0, path, reference.get_error_bound(-1), 1.0)
+
     def _find_reference_trial(self, trials: list[Trial]) -> Trial:
         """Run the reference trial: a motion whose error is much smaller than the target error.
 
@@ -359,6 +384,9 @@ class _MethodSearch:
         p, q = trial.trajectory.positions, reference_trial.trajectory.positions
         moved = self._compute_distance(q[-1], q[0])
         least = (reference_trial.step_atol or 0.0) / self._growth.scale
+        if self._reference is not None:  # its own error is bounded
+            least = self._compute_distance(p[-1], q[-1]) / moved + reference_trial.error_estimated
+            return replace(trial, error_estimated=least if least < inf else inf)
         estimated = max(ESTIMATE_SAFETY * self._compute_distance(p[-1], q[-1]) / moved, least) if moved else inf
         return replace(trial, error_estimated=estimated if estimated < inf else inf)
 

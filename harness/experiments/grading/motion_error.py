@@ -26,7 +26,9 @@ from springbench.harness.reference.certified_minimum import UNLIMITED_STOP_RULE
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import ReferenceTrajectory, UnpredictableMotion
 from springbench.harness.reference.self_converged_trajectory import (
+    SHORTEST_REFINEMENT,
     SOLVED_STOP_RULE,
+    TRIAL_SHARE,
     SelfConvergedTrajectory,
     compute_self_converged,
     has_contact,
@@ -42,10 +44,6 @@ SMALLEST_ERROR = 1e-3
 """Smallest relative error that is measured; a motion that is less predictable is measured for a shorter time."""
 LARGEST_REFERENCE_ERROR = 0.1
 """Largest relative error of a reference with contact at a time at which errors are measured."""
-_SHORTEST_REFINEMENT = 0.5
-"""Processor time [s] below which no motion with contact is refined."""
-_TRIAL_SHARE = 0.6
-"""Share of the remaining time that a motion with contact is given, before one of a quarter of its length is tried."""
 
 
 class ErrorShares(NamedTuple):
@@ -105,7 +103,7 @@ class MotionReference:
                         trajectory.measure_error(k, p),
                         trajectory.measure_error(k, exact),
                         away,
-                        float(max(trajectory.disagreement[k], trajectory.growth[k])),
+                        trajectory.get_error_bound(k),
                         trajectory.reference_kind,
                     )
                 )
@@ -132,12 +130,12 @@ class MotionReference:
     def _converge_trajectory(self, num_steps: int) -> tuple[tuple[int, ...], ReferenceTrajectory | None, str]:
         """Halve the steps of a motion with contact, up to a step or to the last one at which it is known."""
         last, left, reason = num_steps, self._seconds, "--budget allows no time for it"
-        while last >= 1 and left >= _SHORTEST_REFINEMENT:
+        while last >= 1 and left >= SHORTEST_REFINEMENT:
             steps, times = self._choose_steps(last)
             began = thread_time()
             try:
                 found = compute_self_converged(
-                    self._build_refined, times[0] / steps[0], times, SMALLEST_ERROR, _TRIAL_SHARE * left
+                    self._build_refined, times[0] / steps[0], times, SMALLEST_ERROR, TRIAL_SHARE * left
                 )
             except (RunFailed, Unsupported) as error:
                 reason = str(error)

@@ -193,7 +193,7 @@ def _lay_down(series: CurveSeries, row: int) -> CurveSeries:
     """Turn the point of a series into one in a row of its own."""
     return CurveSeries(
         series.label, series.style, series.y, np.full(len(series.y), float(row)), series.lower, series.upper,
-        is_horizontal=True, stale=series.stale, is_connected=False, setting=series.setting,
+        is_horizontal=True, stale=series.stale, is_connected=False, setting=series.setting, callouts=series.callouts,
     )  # fmt: skip
 
 

@@ -22,6 +22,8 @@ _MAX_LABELS, _MAX_WIDTH_SHARE = 9, 0.3
 """Maximum number of labels of a frame, and maximum share of the width for them."""
 _CALLOUT_RADIUS = 5.0
 """Distance of a callout from its point [points]; the ring is a little smaller."""
+_RING_DISTANCE = 1.6
+"""Distance of a callout relative to that of a label without a ring."""
 _LABEL_DISTANCE = 7.0
 """Distance from the frame to the labels [points]."""
 
@@ -55,7 +57,7 @@ def add_direct_labels(axes: Sequence[Axes], panels: Sequence[FigurePanel], optio
     if named:
         _label_points(axes[0], panel.series, options)
         return True
-    if not fits or not known or panel.bands or len(known) > _MAX_LABELS:
+    if not fits or not known or panel.bands or panel.x_bands or len(known) > _MAX_LABELS:
         return False
     _EndLabels(axes[0], known, options)
     return True
@@ -153,6 +155,7 @@ def _label_points(ax: Axes, series: Sequence[CurveSeries], options: FigureOption
 
 def _add_callouts(ax: Axes, series: Sequence[CurveSeries], options: FigureOptions) -> None:
     """Draw a ring and words at each point that has a callout."""
+    offsets = [(_RING_DISTANCE * dx, _RING_DISTANCE * dy, ha) for dx, dy, ha in _LABEL_OFFSETS]
     for one in series:
         for k, words in one.callouts.items():
             x, y = float(one.x[k]), float(one.y[k])
@@ -162,7 +165,7 @@ def _add_callouts(ax: Axes, series: Sequence[CurveSeries], options: FigureOption
                 words, (x, y), (_CALLOUT_RADIUS, 0), textcoords="offset points", va="center",
                 fontsize=options.small_font_size, color=TEXT_COLOUR, annotation_clip=False,
             )  # fmt: skip
-            setattr(name, "settle", lambda name=name: _place_label(ax, name, _LABEL_OFFSETS))  # noqa: B010 as above
+            setattr(name, "settle", lambda name=name: _place_label(ax, name, offsets))  # noqa: B010 as above
 
 
 _LABEL_OFFSETS: tuple[tuple[float, float, Any], ...] = tuple(

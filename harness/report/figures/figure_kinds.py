@@ -16,8 +16,10 @@ from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.charts.ablation_charts import build_effect_chart, build_overhead_chart
 from springbench.harness.report.charts.chart_description import ChartDescription, select_panels
 from springbench.harness.report.charts.chart_table import build_compared_chart
+from springbench.harness.report.charts.device_chart import build_device_chart
 from springbench.harness.report.charts.figure_panels import CellMap, FigurePanel, MeshPicture, merge_cell_maps
 from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
+from springbench.harness.report.device_speedup import read_device_runs
 from springbench.harness.report.figures import benchmark_panels, timing_panels
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
 from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
@@ -107,6 +109,10 @@ def _build_overhead_chart(folder: Path) -> ChartDescription:
     return build_overhead_chart([row for rows in read_ablations(folder, "overhead").values() for row in rows])
 
 
+def _build_device_chart(folder: Path) -> ChartDescription:
+    return build_device_chart(read_device_runs(timing_panels.read_sweep_rows(folder)))
+
+
 def _list_hard_case_panels(folder: Path, find_stale: timing_panels.StaleFinder) -> list[PanelEntry]:
     table = timing_panels.read_sweep_rows(folder)
     provenance = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
@@ -164,6 +170,11 @@ FIGURE_KINDS: dict[str, FigureKind] = {
         "rows of `springbench roofline CONFIG`",
         _without_stale(timing_panels.speed_panels),
         (("step",), ("global",)),
+    ),
+    "devices": FigureKind(
+        "What a device saves",
+        f"{_SWEEP_ROWS} on a device, to a residual",
+        _list_chart_panels(_build_device_chart),
     ),
     "run": FigureKind(
         "The mesh at the end",

@@ -16,7 +16,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.transforms import ScaledTranslation
-from springbench.harness.report.accuracy.plot_sheet import marker_scale as enlarged
 from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot, CurveSeries, FloatArray, MeshPicture
 from springbench.harness.report.figures.axis_scales import frame_size_points, set_axis_scales
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
@@ -24,6 +23,10 @@ from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEX
 
 _LINE_WIDTH, _MARKER_SIZE, _MAX_MARKERS = 1.1, 3.6, 12
 """Width of curves and size of markers [points]; curves of at most this many points get a marker at each."""
+_MARKER_SCALES: dict[Any, float] = {"*": 1.8, "P": 1.35, "X": 1.35, "p": 1.2, "h": 1.15, "d": 1.2}
+"""Factors that make all markers appear equally large."""
+_MAX_LEVEL_LETTERS = 3
+"""Number of letters up to which the names of a map's columns are not rotated."""
 _DOT_INSET = 2.2
 """Distance from a cell's corner to the dot in it [points]."""
 RASTER_DPI = 300
@@ -113,7 +116,7 @@ def marker_style(style: SeriesStyle, marker_scale: float = 1.0, *, is_stale: boo
     """
     face = "white" if is_stale else style.color
     edge, width = (style.color, 0.9) if is_stale else ("white", 0.35)
-    size = marker_scale * _MARKER_SIZE * enlarged(style)
+    size = marker_scale * _MARKER_SIZE * _MARKER_SCALES.get(style.marker, 1.0)
     return {
         "marker": style.marker,
         "color": style.color,
@@ -169,7 +172,8 @@ def draw_cell_map(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
         if cell.is_stale and mixed:
             ax.plot(x + 0.04, y + 0.06, "o", mfc="white", mec=TEXT_COLOUR, ms=2.6, mew=0.7, zorder=4, transform=corner)
     ax.set_yticks(np.arange(len(rows)) + 0.5, rows, fontsize=options.small_font_size)
-    ax.set_xticks(np.arange(len(columns)) + 0.5, columns, fontsize=options.small_font_size, rotation=90)
+    angle = 90 if max(map(len, columns)) > _MAX_LEVEL_LETTERS else 0
+    ax.set_xticks(np.arange(len(columns)) + 0.5, columns, fontsize=options.small_font_size, rotation=angle)
     ax.tick_params(length=0, pad=2, labeltop=True, labelbottom=False, labelcolor=TEXT_COLOUR)
     ax.xaxis.set_label_position("top")
     ax.set_xlabel(panel.column_label, loc="left", fontsize=options.small_font_size, labelpad=2)

@@ -21,9 +21,10 @@ from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.report.ablation_summary import select_kind, summarise_ablation
 from springbench.harness.report.charts.ablation_charts import build_effect_chart, build_overhead_chart
+from springbench.harness.report.charts.device_chart import build_device_chart
 from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
 from springbench.harness.report.charts.speed_chart import build_speed_chart
-from springbench.harness.report.device_speedup import summarise_table as of_devices
+from springbench.harness.report.device_speedup import read_device_runs, summarise_runs
 from springbench.harness.report.robustness import has_verification, map_headline, read_verified_runs
 from springbench.harness.report.site import (
     frame_scripts,
@@ -136,9 +137,12 @@ def _build_run_section(
     table = run_table.read_run_rows(folder, _report_skipped(print_message))
     found = run_table.build_run_table(folder, table)
     scripts: dict[str, Any] = {}
-    findings = [
-        {"text": words} for words in of_devices(table, row_provenance.find_config(folder.path))
-    ] + describe_runs(found)
+    device_runs = read_device_runs(table)
+    words = summarise_runs(device_runs, row_provenance.find_config(folder.path))
+    findings = [{"text": sentence} for sentence in words] + describe_runs(found)
+    devices = build_device_chart(device_runs)
+    if devices.frames:
+        scripts["devices"] = serialise_chart(devices)
     if has_machine_limits(table):
         candidates = compute_speed_figures(table)
         citations = dict(zip(*(table[name].to_pylist() for name in ("solver", "citation")), strict=True))

@@ -21,7 +21,7 @@ from springbench.solvers.contact.potentials.friction_law import (
     smoothed_length,
 )
 from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner
-from springbench.solvers.kernels.spring_local_step import ZERO_LENGTH_SQUARED
+from springbench.solvers.kernels.spring_law import unit_direction
 from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
 
 _MAX_ACTIVE_SET_PASSES = 4
@@ -103,18 +103,8 @@ def _spring_gradient_and_block(bundles, b, lane, p, x, anchor_stiffness, load):
         if k == 0.0:
             continue
         v0, v1, v2 = x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]
-        squared = v0 * v0 + v1 * v1 + v2 * v2
-        if squared <= ZERO_LENGTH_SQUARED:
-            length, name = 0.0, bundles.spring_index[e]
-            sign = -1.0 if name < 0 else 1.0
-            name = ~name if name < 0 else name
-            n0, n1, n2 = bundles.rest_direction[name]
-            n0, n1, n2 = sign * n0, sign * n1, sign * n2
-            lateral = 0.0 if pull > 0.0 else k
-        else:
-            length = np.sqrt(squared)
-            n0, n1, n2 = v0 / length, v1 / length, v2 / length
-            lateral = max(k - pull / length, min(k, 0.0))
+        n0, n1, n2, length = unit_direction(v0, v1, v2, bundles.rest_direction, bundles.spring_index[e])
+        lateral = max(k - pull / length, min(k, 0.0)) if length > 0.0 else 0.0 if pull > 0.0 else k
         tension, axial = k * length - pull, k - lateral
         g0, g1, g2 = g0 + tension * n0, g1 + tension * n1, g2 + tension * n2
         a00, a01, a02 = a00 + axial * n0 * n0 + lateral, a01 + axial * n0 * n1, a02 + axial * n0 * n2

@@ -37,6 +37,7 @@ class DenseFront(NamedTuple):
 
     Attributes:
         num_columns: number of columns in vertices.
+        width: columns of the panel, in whole tiles.
         below_offset: offset of the rows below in a panel column.
         stride: entries from one panel column to the next.
         panels: memory of the panels.
@@ -47,6 +48,7 @@ class DenseFront(NamedTuple):
     """
 
     num_columns: int
+    width: int
     below_offset: int
     stride: int
     panels: NDArray[np.float64]
@@ -61,26 +63,36 @@ def round_up_rows(rows: Any) -> Any:
     return (rows + TILE_ROWS - 1) // TILE_ROWS * TILE_ROWS
 
 
+def round_up_columns(columns: Any) -> Any:
+    """Return the number of columns, rounded up to tiles of three and six."""
+    return (columns + 2) // 3 * 3
+
+
 round_up_rows_inner = jit_inner(round_up_rows)
+round_up_columns_inner = jit_inner(round_up_columns)
 
 
 @jit_inner
 def eliminate_front(fronts, supernode, values, to, min_pivots, triangles):
-    """Factorise the panel of a supernode; return False if a pivot is not positive.
+    """Factorise the panel of a supernode.
 
     Args:
         fronts: structure of the factor.
         supernode: index of the supernode.
-        values: matrix blocks (b, 3, 3), for the scale of the pivots.
+        values: matrix blocks (b, d, d), for the scale of the pivots.
         to: front of the supernode, whose panel is updated.
         min_pivots, triangles: scratch.
+
+    Returns:
+        First vertex with a pivot that is not positive, or -1.
     """
-    for first in range(0, 3 * to.num_columns, PANEL_DEPTH):
-        if not factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, triangles):
-            return False
+    for first in range(0, to.width, PANEL_DEPTH):
+        failed = factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, triangles)
+        if failed >= 0:
+            return failed
         eliminate_rows_below(to, first, triangles, 0, 1)
         subtract_panel_product(to, first, 0, 1)
-    return True
+    return -1
 
 
 @jit_inner
@@ -90,15 +102,16 @@ def factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, t
     Args:
         fronts: structure of the factor.
         supernode: index of the supernode.
-        values: matrix blocks (b, 3, 3), for the scale of the pivots.
+        values: matrix blocks (b, d, d), for the scale of the pivots.
         to: front of the supernode.
         first: first column of the block.
         min_pivots: scratch.
         triangles: factors of the tiles, output.
 
     Returns:
-        False if a pivot is not positive.
+        First vertex with a pivot that is not positive, or -1.
     """
+    start, size = fronts.member_start[supernode], fronts.block_size
     end, left = _block_end(to, first), to.panel_offset + first * to.stride
     for tile in range(first, end, TILE_COLUMNS):
         columns, triangle = min(TILE_COLUMNS, end - tile), triangles[(tile - first) // TILE_COLUMNS]
@@ -108,18 +121,31 @@ def factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, t
             to.panels, left, above, tile, to.stride, tile - first, to.panels, column + above, to.stride, strips, columns
         )
         for j in range(columns):
-            v = fronts.member_vertices[fronts.member_start[supernode] + (tile + j) // 3]
-            min_pivots[j] = _PIVOT_ROUNDOFF * values[fronts.diagonal_block[v], j % 3, j % 3]
+            min_pivots[j] = 0.0  # columns that complete a tile are those of the identity
+            if tile + j < size * to.num_columns:
+                v = fronts.member_vertices[start + (tile + j) // size]
+                c = (tile + j) % size
+                min_pivots[j] = max(0.0, _PIVOT_ROUNDOFF * values[fronts.diagonal_block[v], c, c])
         if columns == 6:
             positive = factorise_tile(to.panels, column + tile, to.stride, min_pivots, triangle, 6)
         else:
             positive = factorise_tile(to.panels, column + tile, to.stride, min_pivots, triangle, 3)
         if not positive:
-            return False
+            j = _failed_column(triangle, min_pivots, columns)
+            return fronts.member_vertices[start + (tile + j) // size]
         _solve_tile(to, column + above, triangle, strips, columns)
         for j in range(columns):
             to.panels[column + j * to.stride + tile + j] = triangle[j, j]
-    return True
+    return -1
+
+
+@jit_inner
+def _failed_column(triangle, min_pivots, columns):
+    """Return the first column of a tile with a pivot, the inverse square on the diagonal, that is too small."""
+    for j in range(columns):
+        if not min_pivots[j] * triangle[j, j] * triangle[j, j] < 1.0:
+            return j
+    return columns - 1
 
 
 @jit_inner
@@ -160,7 +186,7 @@ def subtract_panel_product(to, first, part, parts):
         to.panel_offset,
         to.stride,
         end,
-        3 * to.num_columns,
+        to.width,
         part,
         parts,
     )
@@ -168,8 +194,8 @@ def subtract_panel_product(to, first, part, parts):
 
 @jit_inner
 def subtract_front_update(to, columns, part, parts):
-    """Subtract the product of a panel's rows below from the update, in one of several parts of the rows."""
-    for first in range(0, 3 * to.num_columns, PANEL_DEPTH):
+    """Subtract the product of a panel's rows below from columns of the update, in one of several parts of the rows."""
+    for first in range(0, to.width, PANEL_DEPTH):
         left, depth = to.panel_offset + first * to.stride, _block_end(to, first) - first
         _subtract_lower_product(
             to.panels,
@@ -190,7 +216,7 @@ def subtract_front_update(to, columns, part, parts):
 @jit_inner
 def _block_end(to, first):
     """Return the end of the panel block that begins at a column."""
-    return min(first + PANEL_DEPTH, 3 * to.num_columns)
+    return min(first + PANEL_DEPTH, to.width)
 
 
 @jit_inner

@@ -1,4 +1,4 @@
-"""Multifrontal Cholesky factorisation of a matrix of 3 x 3 blocks (Duff and Reid 1983), by threads.
+"""Multifrontal Cholesky factorisation of a matrix of d x d blocks (Duff and Reid 1983), by threads.
 
 A front is the dense matrix of a supernode's columns and of the rows below, with a right-hand side as one column more.
 Its columns become a panel of L; the remainder is an update of its parent
@@ -9,7 +9,8 @@ groups and the parts are, so that results are bitwise independent of the number 
 Updates within a group are stored on two stacks that alternate between the levels of the tree. Each update is thus
 computed in its place, while those of its children are read. All others have their own memory.
 
-Two ranges of rows are aligned to whole vectors: those of a panel's columns, and those below. There is no other padding.
+Two ranges of rows are aligned to whole vectors: those of a panel's columns, and those below. The columns of either are
+padded to tiles of three and six, a panel's with those of the identity. There is no other padding.
 Entries above the diagonal are never read; the diagonal contains the inverses of L's entries.
 """
 
@@ -26,6 +27,7 @@ from springbench.solvers.linalg.cholesky.block_front import (
     eliminate_front,
     eliminate_rows_below,
     factorise_diagonal_block,
+    round_up_columns_inner,
     round_up_rows_inner,
     subtract_front_update,
     subtract_panel_product,
@@ -58,38 +60,6 @@ from springbench.solvers.simd.front_tiles import (
 _NO_FAILURE = 1 << 62
 
 
-class FrontalStructure(NamedTuple):
-    """Structure of a factor with n vertices and s supernodes in postorder.
-
-    Attributes:
-        member_start: first member of each supernode, (s + 1,).
-        member_vertices: vertices of each supernode's columns, followed by those of the rows below.
-        num_columns: number of columns in vertices, (s,).
-        parent_position: of each member below, its position among the parent's members.
-        parent: (s,), -1 for a root.
-        first_child: last child in postorder, -1 for a leaf, (s,).
-        next_sibling: previous child of the same parent in postorder, -1 for its first, (s,).
-        panel_start: first entry of each panel, (s + 1,).
-        block_start: first matrix block of each supernode, (s + 1,).
-        block_index: matrix blocks in the order of supernodes, (b,).
-        entry_offset: target of each of them in the panels, (b,).
-        diagonal_block: diagonal block of each vertex, (n,).
-    """
-
-    member_start: NDArray[np.int64]
-    member_vertices: NDArray[np.int64]
-    num_columns: NDArray[np.int64]
-    parent_position: NDArray[np.int64]
-    parent: NDArray[np.int64]
-    first_child: NDArray[np.int64]
-    next_sibling: NDArray[np.int64]
-    panel_start: NDArray[np.int64]
-    block_start: NDArray[np.int64]
-    block_index: NDArray[np.int64]
-    entry_offset: NDArray[np.int64]
-    diagonal_block: NDArray[np.int64]
-
-
 class FactorisationScratch(NamedTuple):
     """Scratch memory of a factorisation by t threads.
 
@@ -97,6 +67,7 @@ class FactorisationScratch(NamedTuple):
         fronts: one vector longer than the largest front, (t, .).
         updates: stacks of all threads, and shared updates.
         failures: first supernode of each group and of the top with a pivot that is not positive, (groups + 1,).
+        failed_vertices: the vertex of this pivot, (groups + 1,).
         min_pivots: thresholds, (t, TILE_COLUMNS).
         triangles: factors of the tiles of a panel block, (t, ., TILE_COLUMNS, TILE_COLUMNS).
         runs: (t, 2, .), as long as the longest list of members, and one more.
@@ -105,6 +76,7 @@ class FactorisationScratch(NamedTuple):
     fronts: NDArray[np.float64]
     updates: NDArray[np.float64]
     failures: NDArray[np.int64]
+    failed_vertices: NDArray[np.int64]
     min_pivots: NDArray[np.float64]
     triangles: NDArray[np.float64]
     runs: NDArray[np.int64]
@@ -117,9 +89,9 @@ def factorise_blocks(fronts, schedule, values, panels, x, scratch, team, threads
     Args:
         fronts: structure of the factor.
         schedule: division among threads.
-        values: blocks (b, 3, 3).
+        values: blocks (b, d, d).
         panels: output.
-        x: right-hand sides (n, 3), or empty; overwritten with the solution.
+        x: right-hand sides (n, d), or empty; overwritten with the solution.
         scratch: scratch memory.
         team: thread team.
         threads: number of threads, None for one.
@@ -145,7 +117,7 @@ def solve_blocks(fronts, schedule, panels, x, scratch, team, threads):
         fronts: structure of the factor.
         schedule: division among threads.
         panels: factor L.
-        x: right-hand sides (n, 3), overwritten.
+        x: right-hand sides (n, d), overwritten.
         scratch: scratch memory.
         team: thread team.
         threads: number of threads, None for one.
@@ -226,12 +198,14 @@ def _factorise_group(fronts, schedule, group, values, panels, x, scratch, thread
         to = _front_of(fronts, schedule, s, panels, scratch, thread)
         members = fronts.member_start[s + 1] - fronts.member_start[s]
         _assemble_columns(fronts, schedule, s, values, to, scratch, thread, 0, members)
-        if not eliminate_front(fronts, s, values, to, scratch.min_pivots[thread], scratch.triangles[thread]):
+        failed = eliminate_front(fronts, s, values, to, scratch.min_pivots[thread], scratch.triangles[thread])
+        if failed >= 0:
+            scratch.failed_vertices[group] = failed
             write_shared(scratch.failures, group, s)
             return
         if len(x) > 0:
             _forward_substitution(fronts, schedule, s, panels, x, scratch, thread)
-        subtract_front_update(to, 3 * (members - to.num_columns), 0, 1)
+        subtract_front_update(to, _update_width(fronts, s), 0, 1)
 
 
 @jit_inner
@@ -250,7 +224,7 @@ def _process_part(fronts, schedule, stage, values, panels, x, scratch, thread, p
     else:
         if part == 0 and len(x) > 0:
             _forward_substitution(fronts, schedule, s, panels, x, scratch, thread)
-        subtract_front_update(to, 3 * (members - to.num_columns), part, parts)
+        subtract_front_update(to, _update_width(fronts, s), part, parts)
 
 
 @jit_inner
@@ -273,7 +247,9 @@ def _begin_stage(fronts, schedule, stage, values, panels, x, scratch, thread):
     if kind == ELIMINATION:
         to = _front_of(fronts, schedule, s, panels, scratch, thread)
         first, least = schedule.stage_column[stage], scratch.min_pivots[0]
-        if not factorise_diagonal_block(fronts, s, values, to, first, least, scratch.triangles[0]):
+        failed = factorise_diagonal_block(fronts, s, values, to, first, least, scratch.triangles[0])
+        if failed >= 0:
+            scratch.failed_vertices[len(scratch.failures) - 1] = failed
             write_shared(scratch.failures, len(scratch.failures) - 1, s)
             return False
     return True
@@ -293,7 +269,10 @@ def _front_of(fronts, schedule, supernode, panels, scratch, thread):
     """Return the front of a supernode that a thread processes."""
     _, own, _, head, stride = _front_sizes(fronts, supernode)
     update = _locate_update(schedule, supernode, thread)
-    return DenseFront(own, head, stride, panels, fronts.panel_start[supernode], scratch.updates, update, stride - head)
+    width = round_up_columns_inner(fronts.block_size * own)
+    return DenseFront(
+        own, width, head, stride, panels, fronts.panel_start[supernode], scratch.updates, update, stride - head
+    )
 
 
 @jit_inner
@@ -306,18 +285,22 @@ def _locate_update(schedule, supernode, thread):
 @jit_inner
 def _assemble_columns(fronts, schedule, supernode, values, to, scratch, thread, begin, end):
     """Assemble the columns of a front between two members: matrix blocks, and the children's updates."""
-    first, last = 3 * min(begin, to.num_columns) * to.stride, 3 * min(end, to.num_columns) * to.stride
-    first, last = to.panel_offset + first, to.panel_offset + last
+    size = fronts.block_size
+    first = to.panel_offset + (size * begin if begin < to.num_columns else to.width) * to.stride
+    last = to.panel_offset + (size * end if end < to.num_columns else to.width) * to.stride
     to.panels[first:last] = 0.0
-    above, below = 3 * max(0, begin - to.num_columns), 3 * max(0, end - to.num_columns)
+    above, below = size * max(0, begin - to.num_columns), size * max(0, end - to.num_columns)
     start = to.update_offset
     to.update_buffer[start + above * to.update_stride : start + below * to.update_stride] = 0.0
     for k in range(fronts.block_start[supernode], fronts.block_start[supernode + 1]):
         e, at = fronts.block_index[k], fronts.entry_offset[k]
         if first <= at < last:
-            for j in range(3):
-                for i in range(3):
-                    to.panels[at + j * to.stride + i] = values[e, j, i]
+            for j in range(size):
+                for i in range(size):
+                    to.panels[at + j * to.stride + i] += values[e, j, i]
+    if begin < to.num_columns <= end:
+        for j in range(size * to.num_columns, to.width):
+            to.panels[to.panel_offset + j * to.stride + j] = 1.0
     child = fronts.first_child[supernode]
     while child >= 0:
         at = _locate_update(schedule, child, thread)
@@ -331,14 +314,14 @@ def _find_runs(fronts, child, num_columns, below_offset, begin, runs):
 
     Each run begins at a row of the update, runs[0], and at a row of the parent's front, runs[1].
     """
-    first = fronts.member_start[child] + fronts.num_columns[child]
+    first, size = fronts.member_start[child] + fronts.num_columns[child], fronts.block_size
     rows = fronts.member_start[child + 1] - first
     count = 0
     for k in range(begin, rows):
         q = fronts.parent_position[first + k]
         if k == begin or q != fronts.parent_position[first + k - 1] + 1 or q == num_columns:
             runs[0, count] = k
-            runs[1, count] = 3 * q if q < num_columns else below_offset + 3 * (q - num_columns)
+            runs[1, count] = size * q if q < num_columns else below_offset + size * (q - num_columns)
             count += 1
     runs[0, count] = rows
     return count
@@ -348,8 +331,9 @@ def _find_runs(fronts, child, num_columns, below_offset, begin, runs):
 def _extend_add(fronts, child, source, at, to, runs, begin, end):
     """Add the columns of a child's update between two members of the parent to the parent's front."""
     own, first = to.num_columns, fronts.member_start[child] + fronts.num_columns[child]
+    size = fronts.block_size
     rows = fronts.member_start[child + 1] - first
-    height = round_up_rows_inner(3 * rows)
+    height = round_up_rows_inner(size * rows)
     b = 0
     while b < rows and fronts.parent_position[first + b] < begin:
         b += 1
@@ -359,47 +343,50 @@ def _extend_add(fronts, child, source, at, to, runs, begin, end):
         if runs[0, run + 1] == b:
             run += 1
         q = fronts.parent_position[first + b]
-        for j in range(3):
-            start = at + (3 * b + j) * height
+        for j in range(size):
+            start = at + (size * b + j) * height
             if q < own:
-                _add_runs(runs, run, count, b, source, start, to.panels, to.panel_offset + (3 * q + j) * to.stride)
+                column = to.panel_offset + (size * q + j) * to.stride
+                _add_runs(runs, run, count, b, size, source, start, to.panels, column)
             else:
-                column = to.update_offset + (3 * (q - own) + j) * to.update_stride - to.below_offset
-                _add_runs(runs, run, count, b, source, start, to.update_buffer, column)
+                column = to.update_offset + (size * (q - own) + j) * to.update_stride - to.below_offset
+                _add_runs(runs, run, count, b, size, source, start, to.update_buffer, column)
         b += 1
 
 
 @jit_inner
-def _add_runs(runs, run, count, b, source, start, target, column):
+def _add_runs(runs, run, count, b, size, source, start, target, column):
     """Add the rows of a column, from member b on."""
     for k in range(run, count):
         a = max(b, runs[0, k])
-        to = column + runs[1, k] + 3 * (a - runs[0, k])
-        add_vector(source, start + 3 * a, target, to, 3 * (runs[0, k + 1] - a))
+        to = column + runs[1, k] + size * (a - runs[0, k])
+        add_vector(source, start + size * a, target, to, size * (runs[0, k + 1] - a))
 
 
 @jit_inner
 def _forward_substitution(fronts, schedule, supernode, panels, x, scratch, thread):
     """Perform the forward substitution with the panel of a supernode; children precede parents."""
-    first, own, below, head, stride = _front_sizes(fronts, supernode)
+    first, own, _, head, stride = _front_sizes(fronts, supernode)
     front, updates, runs = scratch.fronts[thread], scratch.updates, scratch.runs[thread]
+    size = fronts.block_size
     front[: stride + TILE_ROWS] = 0.0
-    _gather_vertices(x, fronts.member_vertices, first, own, front, 0)
+    _gather_vertices(x, fronts.member_vertices, first, own, front, 0, size)
     child = fronts.first_child[supernode]
     while child >= 0:
         rows = fronts.member_start[child + 1] - fronts.member_start[child] - fronts.num_columns[child]
-        at = _locate_update(schedule, child, thread) + 3 * rows * round_up_rows_inner(3 * rows)
-        _add_runs(runs, 0, _find_runs(fronts, child, own, head, 0, runs), 0, updates, at, front, 0)
+        at = _locate_update(schedule, child, thread) + _update_width(fronts, child) * round_up_rows_inner(size * rows)
+        _add_runs(runs, 0, _find_runs(fronts, child, own, head, 0, runs), 0, size, updates, at, front, 0)
         child = fronts.next_sibling[child]
-    for tile in range(0, 3 * own, TILE_COLUMNS):
-        columns, corner = min(TILE_COLUMNS, 3 * own - tile), fronts.panel_start[supernode] + tile * stride + tile
+    width = round_up_columns_inner(size * own)
+    for tile in range(0, width, TILE_COLUMNS):
+        columns, corner = min(TILE_COLUMNS, width - tile), fronts.panel_start[supernode] + tile * stride + tile
         strips = (stride - tile - columns + TILE_ROWS - 1) // TILE_ROWS
         if columns == 6:
             forward_solve_tile(panels, corner, stride, front, tile, strips, 6)
         else:
             forward_solve_tile(panels, corner, stride, front, tile, strips, 3)
-    _scatter_vertices(front, 0, x, fronts.member_vertices, first, own)
-    at = _locate_update(schedule, supernode, thread) + 3 * below * (stride - head)
+    _scatter_vertices(front, 0, x, fronts.member_vertices, first, own, size)
+    at = _locate_update(schedule, supernode, thread) + _update_width(fronts, supernode) * (stride - head)
     for k in range(stride - head):
         updates[at + k] = front[head + k]
 
@@ -414,40 +401,51 @@ def _solve_forward(fronts, schedule, group, panels, x, scratch, thread):
 @jit_inner
 def _solve_backward(fronts, schedule, group, panels, x, scratch, thread):
     """Perform the backward substitution of a group or of the top."""
-    front = scratch.fronts[thread]
+    front, size = scratch.fronts[thread], fronts.block_size
     for k in range(schedule.group_start[group + 1] - 1, schedule.group_start[group] - 1, -1):
         s = schedule.sequence[k]
         first, own, below, head, stride = _front_sizes(fronts, s)
         front[: stride + TILE_ROWS] = 0.0
-        _gather_vertices(x, fronts.member_vertices, first, own, front, 0)
-        _gather_vertices(x, fronts.member_vertices, first + own, below, front, head)
-        for tile in range((3 * own - 1) // TILE_COLUMNS * TILE_COLUMNS, -1, -TILE_COLUMNS):
-            columns, corner = min(TILE_COLUMNS, 3 * own - tile), fronts.panel_start[s] + tile * stride + tile
+        _gather_vertices(x, fronts.member_vertices, first, own, front, 0, size)
+        _gather_vertices(x, fronts.member_vertices, first + own, below, front, head, size)
+        width = round_up_columns_inner(size * own)
+        for tile in range((width - 1) // TILE_COLUMNS * TILE_COLUMNS, -1, -TILE_COLUMNS):
+            columns, corner = min(TILE_COLUMNS, width - tile), fronts.panel_start[s] + tile * stride + tile
             strips = (stride - tile - columns + TILE_ROWS - 1) // TILE_ROWS
             if columns == 6:
                 backward_solve_tile(panels, corner, stride, front, tile, strips, 6)
             else:
                 backward_solve_tile(panels, corner, stride, front, tile, strips, 3)
-        _scatter_vertices(front, 0, x, fronts.member_vertices, first, own)
+        _scatter_vertices(front, 0, x, fronts.member_vertices, first, own, size)
 
 
 @jit_inner
 def _front_sizes(fronts, supernode):
     """Return first member, columns and rows below in vertices, and begin and end of those rows in the panel."""
-    first, own = fronts.member_start[supernode], fronts.num_columns[supernode]
-    below, head = fronts.member_start[supernode + 1] - first - own, round_up_rows_inner(3 * own)
-    return first, own, below, head, head + round_up_rows_inner(3 * below)
+    first, own, size = fronts.member_start[supernode], fronts.num_columns[supernode], fronts.block_size
+    below, head = (
+        fronts.member_start[supernode + 1] - first - own,
+        round_up_rows_inner(round_up_columns_inner(size * own)),
+    )
+    return first, own, below, head, head + round_up_rows_inner(size * below)
 
 
 @jit_inner
-def _gather_vertices(x, members, first, count, front, at):
-    for k in range(count):
-        for c in range(3):
-            front[at + 3 * k + c] = x[members[first + k], c]
+def _update_width(fronts, supernode):
+    """Return the number of columns of an update without its right-hand side."""
+    members = fronts.member_start[supernode + 1] - fronts.member_start[supernode]
+    return round_up_columns_inner(fronts.block_size * (members - fronts.num_columns[supernode]))
 
 
 @jit_inner
-def _scatter_vertices(front, at, x, members, first, count):
+def _gather_vertices(x, members, first, count, front, at, size):
     for k in range(count):
-        for c in range(3):
-            x[members[first + k], c] = front[at + 3 * k + c]
+        for c in range(size):
+            front[at + size * k + c] = x[members[first + k], c]
+
+
+@jit_inner
+def _scatter_vertices(front, at, x, members, first, count, size):
+    for k in range(count):
+        for c in range(size):
+            x[members[first + k], c] = front[at + size * k + c]

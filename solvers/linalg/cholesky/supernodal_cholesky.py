@@ -18,12 +18,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from springbench.solvers.linalg.cholesky.numeric_factorisation import (
-    FactorPanels,
-    SparseRows,
-    factorise_supernodes,
-    preserve_column_sums,
-)
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
+from springbench.solvers.linalg.cholesky.inverse_panels import preserve_column_sums, write_inverse_panels
 from springbench.solvers.linalg.cholesky.supernode_amalgamation import COLUMN_LANES, MAX_PANEL_WIDTH
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import SymbolicFactor, analyse_graph
 from springbench.solvers.linalg.cholesky.thread_team import ThreadTeam
@@ -179,14 +175,18 @@ class SupernodalCholesky:
         neighbours = np.asarray(Q.indices, np.int32)
         s = symbolic_factor or analyse_graph(pointers, neighbours)
         layout = PanelLayout.from_symbolic(s)
-        squares, panels = allocate_aligned(layout.num_inverse_entries), allocate_aligned(layout.num_panel_entries)
-        into = FactorPanels(layout.first_chunk, layout.chunks, squares, panels)
-        v = factorise_supernodes(SparseRows(pointers, neighbours, Q.data), s, into)
-        if v >= 0:
+        cholesky = BlockCholesky(Q, block_size=1, symbolic_factor=s)
+        if not cholesky.factorise(np.asarray(Q.data, np.float64).reshape(-1, 1, 1)):
             raise NotPositiveDefinite(
-                f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "
-                "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
+                "Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex "
+                f"{cholesky.failed_vertex}: nothing determines its position, or stiffnesses, masses and pin weights "
+                "lie too far apart or are negative"
             )
+        squares, panels = allocate_aligned(layout.num_inverse_entries), allocate_aligned(layout.num_panel_entries)
+        write_inverse_panels(
+            cholesky.fronts, cholesky.panels, s.postorder, layout.first_chunk, layout.chunks, squares, panels
+        )
+        del cholesky  # before the panels are copied
         self.nonzeros: int | None = s.nonzeros
         work = allocate_aligned(4 * layout.num_work_rows, np.float64 if precision == "float64" else np.float32)
         if precision == "float16":

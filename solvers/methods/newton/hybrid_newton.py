@@ -42,6 +42,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar, cast
 
 import numpy as np
@@ -57,6 +58,7 @@ from springbench.solvers.iteration.descent_method import (
 )
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import SolverState
+from springbench.solvers.iteration.saddle_check import SaddleCheck
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.kernels.descent_rounds import GROUP_ITERATIONS, REASON_SWITCH, init_rounds
 from springbench.solvers.kernels.iteration_loop import (
@@ -163,6 +165,11 @@ class PreparedHybrid(PreparedDescent):
         """The method."""
         return cast(HybridIteration, self.method)
 
+    @cached_property
+    def saddle_check(self) -> SaddleCheck:
+        """The check for saddles, whose bound makes factorisations unnecessary."""
+        return SaddleCheck(self.fixed_objective)
+
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
         return _HybridState(self, StepObjective(self.fixed_objective, problem), initial_guess)
@@ -204,9 +211,13 @@ class _HybridState(SolverState):
     """The state of a solve, which does many rounds of L-BFGS at once."""
 
     def __init__(self, prepared: PreparedHybrid, step: StepObjective, guess: Positions) -> None:
-        self._metric, self._step, self._control = prepared.metric, step, SolveControl()
+        self._prepared, self._metric, self._step, self._control = prepared, prepared.metric, step, SolveControl()
         self.positions = step.apply_exact_pins(guess)
-        self._points = prepared.hybrid_iteration.iterate_from(step, self.positions, self._control)
+        method, first = prepared.hybrid_iteration, None
+        if method.exact_lbfgs:
+            first = method.start_lbfgs(step, self.positions)
+            self.start_residual = first.start_residual
+        self._points = method.iterate_from(step, self.positions, self._control, first)
         self._point: DescentPoint | None = None
 
     def step_state(self) -> bool:
@@ -244,7 +255,11 @@ class _HybridState(SolverState):
 
     def can_terminate(self) -> bool:
         control = self._control
-        control.must_escape = not (control.is_minimum or is_positive_definite(self._step, self.positions))
+        control.must_escape = not (
+            control.is_minimum
+            or self._prepared.saddle_check.is_bounded_by_springs(self.positions)
+            or is_positive_definite(self._step, self.positions)
+        )
         return not control.must_escape
 
     @property
@@ -324,12 +339,19 @@ class HybridIteration:
         """Yield the points after `start`."""
         return self.iterate_from(step, start.positions, SolveControl())
 
-    def iterate_from(self, step: StepObjective, p: Positions, control: SolveControl) -> Iterator[DescentPoint]:
-        """Yield the points after the positions p, (n, 3) [m]; restarts after an escape from a saddle."""
-        p, point = lower_start_positions(step, p), None
+    def iterate_from(
+        self, step: StepObjective, p: Positions, control: SolveControl, first: AcceleratedState | None = None
+    ) -> Iterator[DescentPoint]:
+        """Yield the points after the positions p, (n, 3) [m]; restarts after an escape from a saddle.
+
+        `first` is L-BFGS started at p, if it is.
+        """
+        lower, point = lower_start_positions(step, p), None
+        p, first = lower, first if lower is p else None
         while point is None or not point.is_stalled:
             if not (step.has_contact_elements or has_active_barrier(step, p)):
-                for following in _Approach(self, step, p, control).iterate_points():
+                run, first = first or self.start_lbfgs(step, p), None
+                for following in _Approach(self, step, p, run, control).iterate_points():
                     if not _is_collision_free(step, p, following.positions):
                         break
                     p, point = following.positions, following
@@ -369,9 +391,17 @@ class HybridIteration:
 class _Approach:
     """The choice between the methods in one solve, without active contacts."""
 
-    def __init__(self, method: HybridIteration, step: StepObjective, start: Positions, control: SolveControl) -> None:
+    def __init__(
+        self,
+        method: HybridIteration,
+        step: StepObjective,
+        start: Positions,
+        run: AcceleratedState,
+        control: SolveControl,
+    ) -> None:
+        """Start at positions (n, 3) [m], with L-BFGS started there."""
         self._method, self._step, self._start, self._control = method, step, start, control
-        self._run: AcceleratedState | None = method.start_lbfgs(step, start)
+        self._run: AcceleratedState | None = run
         self._point, self._rounds = DescentPoint(start, start), init_rounds(method.newton_cost)
         self._rule, self._steepest = _MeasuredRule(method.inertia_diagonal), 0.0
         self._predicting: PredictedTensionNewton | None = None

@@ -58,7 +58,10 @@ class AcceleratedStep(NamedTuple):
 
 @jit_kernel
 def start_solve(step: AcceleratedStep, edges, window: AccelerationWindow, target, force, pin_targets, guess):
-    """Start the solve of a step; edges: strain limits and dashpots, or None."""
+    """Start the solve of a step and return the residual [J^(1/2)] at the guess.
+
+    `edges` are strain limits and dashpots, or None.
+    """
     write_right_hand_side(step.vertex_rows, target, force, pin_targets, step.right_hand_side)
     write_positions(step.vertex_rows, guess, pin_targets, window.trial_position)
     step.objective_values[0] = _evaluate_trial(step, edges, window)
@@ -69,6 +72,7 @@ def start_solve(step: AcceleratedStep, edges, window: AccelerationWindow, target
     _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
     init_window(window, step.solution_rows)
     window.window_state[0].objective_decrease = 0.0
+    return _residual((step, edges, window))
 
 
 @jit_inner

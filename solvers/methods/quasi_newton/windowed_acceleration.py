@@ -231,7 +231,7 @@ class _CompiledAccelerationState(AcceleratedState):
         ]
         step.objective_values[2] = parts.negative_energy(guess)
         self.positions = np.empty_like(guess)
-        accelerated_step.start_solve(*self._state, *given)
+        self.start_residual = accelerated_step.start_solve(*self._state, *given)
         step.objective_values[1] += parts.edge_energy_scale(guess)
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
