@@ -27,7 +27,7 @@ from springbench.solvers.objective.hessian_pattern import BlockMatrix
 
 @runtime_checkable
 class RankUpdateEnergy(Energy, Protocol):
-    """An energy whose Hessian is sparse plus a product of a few columns."""
+    """An energy whose Hessian is sparse plus a rank update: a product of a few columns."""
 
     def sparse_hessian(self, p: Positions) -> csr_array:
         """Return the Hessian minus V V' [N/m], shape (3n, 3n)."""
