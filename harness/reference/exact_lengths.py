@@ -28,14 +28,13 @@ from springbench.harness.reference.reference_evaluator import (
     StationarityReading,
     assemble_stiffness,
 )
-from springbench.solvers.model.constraints import LengthConstraints
 from springbench.solvers.model.energies.augmented_lagrangian import (
     build_augmented_system,
     compute_penalty_stiffness,
     concatenate_constraints,
 )
 from springbench.solvers.model.energies.edge_energy import unit_directions
-from springbench.solvers.model.step_problem import Positions, StepProblem, System
+from springbench.solvers.model.step_problem import LengthConstraints, Positions, StepProblem, System
 from springbench.solvers.model.system_matrix_assembly import signed_incidence_matrix_sparse
 
 COMPLIANCE, NUM_REFINEMENTS = 1e-10, 4

@@ -25,10 +25,10 @@ from scipy.sparse import bsr_array, csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 from springbench.harness.reference.reference_evaluator import factorise_symmetric_lu
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
-from springbench.solvers.model.rank_update import RankUpdateEnergy
 from springbench.solvers.model.rounding_bound import EPS
 from springbench.solvers.model.step_problem import Positions, StepProblem
 from springbench.solvers.model.system_matrix_assembly import diagonal_matrix
+from springbench.solvers.objective.woodbury import RankUpdateEnergy
 
 LARGE_SIZE = 30_000
 """Number of unknowns from which on SuperLU would need gigabytes, so that the block Cholesky factor replaces it. The
@@ -50,7 +50,7 @@ class SplitHessian(NamedTuple):
     Attributes:
       sparse: S (3 f, 3 f).
       columns: V (3 f, r), with r = 0 where all energies have sparse Hessians (see
-      `springbench.solvers.model.rank_update`).
+      `springbench.solvers.objective.woodbury`).
     """
 
     sparse: csr_array

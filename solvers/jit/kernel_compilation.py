@@ -12,11 +12,8 @@ from typing import Any
 
 from numba import njit  # noqa: TID251
 from numba.core.typing.templates import signature
-from springbench.solvers.jit.compiler_savings import pause_garbage_collection, reduce_compiler_work
 from springbench.solvers.jit.inline_linking import LinkedCompiler
 from springbench.solvers.jit.kernel_cache import KernelCache
-
-reduce_compiler_work()
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -29,8 +26,7 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
         def compile_once(args: Any, return_type: Any) -> Any:
             sig = args if return_type is None else signature(return_type, *args)
-            with pause_garbage_collection():
-                return kernel_cache.compile_once(sig, dispatcher.targetctx, lambda: compile_code(args, return_type))
+            return kernel_cache.compile_once(sig, dispatcher.targetctx, lambda: compile_code(args, return_type))
 
         dispatcher._compiler.compile = compile_once
         return dispatcher

@@ -20,12 +20,41 @@ from typing import ClassVar, Literal, Protocol, TypeGuard, runtime_checkable
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from springbench.solvers.model.constraints import DirichletPins, LengthConstraints
 
 Positions = NDArray[np.float64]
 """Positions [m], shape (n, 3), float64, C-contiguous."""
 ResidualIterate = Literal["returned", "previous", "none"]
 """The iterate that a residual belongs to: the returned one, or its predecessor; "none" if there is no residual."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DirichletPins:
+    """Dirichlet conditions: `vertices` (q,), sorted and unique; `weight` (q,) [N/m], infinite for an exact pin."""
+
+    vertices: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    weight: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def exact_mask(self) -> NDArray[np.bool_]:
+        """Mask of the pins that are eliminated instead of penalised, shape (q,)."""
+        return np.isinf(self.weight)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LengthConstraints:
+    """Length constraints that hold exactly, from springs and strain limits of infinite stiffness.
+
+    Attributes:
+        edges: (m, 2).
+        min_length, max_length: bounds of the lengths (m,) [m], 0 <= low <= high, 0 < high; equal for an inextensible
+            spring.
+        rest_direction: (m, 3), unit directions of edges of zero length.
+    """
+
+    edges: NDArray[np.int64]
+    min_length: NDArray[np.float64]
+    max_length: NDArray[np.float64]
+    rest_direction: NDArray[np.float64]
 
 
 class PluginContractError(Exception):

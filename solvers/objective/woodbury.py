@@ -1,5 +1,9 @@
 """Factorisation of H = S + V V' for a sparse S and a few columns V (Woodbury 1950; Sherman and Morrison 1950).
 
+It serves energies that couple all their vertices by a few scalars c, as gas does by its volume:
+
+    E = S(p) + phi(c(p)),   Hess E = sparse + V V'
+
     H^-1 = S^-1 - W C^-1 W',   W = S^-1 V,   C = I + V'W
 
 S may be indefinite although H is not, as that of gas is without the stiffness of its volume. By Sylvester's law of
@@ -10,16 +14,29 @@ minus that of C. So if S has no Cholesky factor, a factorisation with negative p
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 from scipy.sparse import bsr_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
-from springbench.solvers.model.rank_update import RankUpdateEnergy
 from springbench.solvers.model.step_problem import Energy, Positions
 from springbench.solvers.objective.hessian_pattern import BlockMatrix
+
+
+@runtime_checkable
+class RankUpdateEnergy(Energy, Protocol):
+    """An energy whose Hessian is sparse plus a rank update: a product of a few columns."""
+
+    def sparse_hessian(self, p: Positions) -> csr_array:
+        """Return the Hessian minus V V' [N/m], shape (3n, 3n)."""
+        ...
+
+    def low_rank_columns(self, p: Positions) -> Positions:
+        """Return V [(N/m)^(1/2)], one column for each scalar, shape (n, 3, r)."""
+        ...
+
 
 LinearSolve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """The product with S^-1, (f, 3)."""

@@ -37,9 +37,9 @@ from springbench.solvers.contact.collision_mesh import CollisionMesh
 from springbench.solvers.contact.contact_potential import SelfContact
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric, backtracking_line_search
 from springbench.solvers.model.barrier_energy import without_barriers
-from springbench.solvers.model.constraints import DirichletPins
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import (
+    DirichletPins,
     Energy,
     Positions,
     StepProblem,

@@ -14,8 +14,7 @@ from springbench.solvers.cuda.cuda_target import cuda
 from springbench.solvers.iteration.preconditioners import PreconditionerName
 from springbench.solvers.linalg import additive_schwarz
 from springbench.solvers.methods.newton.newton_cg import NewtonCG
-from springbench.solvers.model.constraints import DirichletPins
-from springbench.solvers.model.step_problem import StepProblem, StopRule, Unsupported
+from springbench.solvers.model.step_problem import DirichletPins, StepProblem, StopRule, Unsupported
 
 from tests.cuda.near import same_iterates
 from tests.effect_scenes import (

@@ -27,10 +27,9 @@ from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.methods.vertex_block.avbd import AugmentedVertexBlockDescent as Avbd
 from springbench.solvers.methods.vertex_block.avbd import PreparedAugmentedVertexBlockDescent
 from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
-from springbench.solvers.model.constraints import LengthConstraints
 from springbench.solvers.model.energies import spring_energy
 from springbench.solvers.model.energies.augmented_lagrangian import concatenate_constraints, length_errors
-from springbench.solvers.model.step_problem import Solution, StepProblem, StopRule, Unsupported
+from springbench.solvers.model.step_problem import LengthConstraints, Solution, StepProblem, StopRule, Unsupported
 
 from tests.oracles.verify_scene import verify_terms
 from tests.scene_builders import build_first_problem, build_test_scene

@@ -4,8 +4,13 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from matplotlib.patches import Rectangle
 from springbench.harness.cli.main import app
 from springbench.harness.experiments.archive import study_publication
+from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot
+from springbench.harness.report.figures.figure_layout import compose_figure
+from springbench.harness.report.figures.figure_options import FigureOptions
+from springbench.harness.report.pages.page_charts import ChartPoint, PageChartOptions, build_page_panel
 from springbench.harness.report.pages.page_files import check_pages, write_pages
 from springbench.harness.report.pages.published_queries import PublishedQueries
 from springbench.harness.results.published_set import read_study
@@ -171,3 +176,28 @@ def test_a_mistake_in_a_template_is_named(checkout: Path, template: str, message
     assert result.exit_code == 2
     assert "runs.md.j2" in result.output
     assert message in " ".join(result.output.split())
+
+
+def test_bars_begin_at_no_difference_and_state_their_values() -> None:
+    points = [ChartPoint("fast", 0.0, 0.5), ChartPoint("slow", 0.0, 4.0, 3.0, 6.0), ChartPoint("none", 0.0, None)]
+    options = PageChartOptions(x_label="ratio", x_scale="log", highlights=["slow"], limit=(2.0, "twice"))
+    ax = compose_figure([build_page_panel("ratios", "bars", points, options)], "", FigureOptions()).axes[0]
+    fast, slow = (patch for patch in ax.patches if isinstance(patch, Rectangle))
+    assert (fast.get_x(), fast.get_width()) == (1.0, -0.5), "a ratio of 1 is no bar"
+    assert slow.get_width() == 3.0
+    assert fast.get_facecolor() != slow.get_facecolor()
+    assert [text.get_text() for text in ax.texts] == ["twice", "0.5", "4"]
+
+
+def test_lines_that_a_chart_is_not_about_are_grey_and_share_a_label() -> None:
+    points = [ChartPoint(name, x, x + k) for k, name in enumerate("abc") for x in (1.0, 2.0)]
+    panel = build_page_panel("curves", "lines", points, PageChartOptions(highlights=["b"]))
+    assert isinstance(panel, CurvePlot)
+    assert [(one.label, one.setting) for one in panel.series] == [("others", "a"), ("others", "c"), ("b", "b")]
+
+
+def test_a_heat_map_states_shares_in_percent() -> None:
+    points = [ChartPoint("newton", "contact", 0.834), ChartPoint("xpbd", "contact", None)]
+    panel = build_page_panel("shares", "heatmap", points, PageChartOptions())
+    assert isinstance(panel, CellMap)
+    assert [(cell.value_text, cell.outcome) for cell in panel.cells] == [("83", "80 % and more"), ("", "none")]

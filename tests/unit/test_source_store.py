@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 
 import pytest
-from springbench.solvers.jit import source_store
-from springbench.solvers.jit.source_store import SourceFacts, read_facts, store_facts
+from springbench.solvers.jit import source_digest
+from springbench.solvers.jit.source_digest import SourceFacts, read_facts, store_facts
 
 
 def test_facts_are_read_back_for_the_state_of_the_sources_that_they_were_read_from(
@@ -21,7 +21,7 @@ def test_facts_are_read_back_for_the_state_of_the_sources_that_they_were_read_fr
     facts = {paths[0]: SourceFacts("00", [paths[1]]), paths[1]: SourceFacts("ff", [])}
     store_facts(states, facts)
     assert read_facts(states) == {}  # two edits within one tick of the file system's clock look alike
-    monkeypatch.setattr(source_store, "_SETTLING_NS", -(10**11))
+    monkeypatch.setattr(source_digest, "_SETTLING_NS", -(10**11))
     store_facts(states, facts)
     assert read_facts(states) == facts
     (stored,) = (tmp_path / "cache").rglob("*.json")

@@ -220,6 +220,10 @@ class CurveUnit:
         ]
 
 
+_ITERATIONS_TO_TOLERANCE = 10
+"""Iterations by which the cost of a step to a tolerance is estimated, whatever their limit."""
+
+
 @dataclass(frozen=True, slots=True)
 class WorkPrecisionUnit:
     """Unit that measures one simulation of a scene up to a horizon."""
@@ -230,9 +234,10 @@ class WorkPrecisionUnit:
     @property
     def cost_estimate(self) -> RunCost:
         """Estimated cost: vertices times steps times iterations."""
-        case = self.spec.case
+        case, options = self.spec.case, self.spec.options
         steps = self.spec.t_end / case.scene.time_step * self.spec.measurement.rounds
-        return RunCost(self.spec.solver.name, (case.size or 32) ** 2 * steps * self.spec.options["max_iterations"])
+        iterations = options["max_iterations"] if options["rtol"] is None else _ITERATIONS_TO_TOLERANCE
+        return RunCost(self.spec.solver.name, (case.size or 32) ** 2 * steps * iterations)
 
     @property
     def title(self) -> str:

@@ -51,6 +51,9 @@ RowPair = tuple[RunRows, RunRows]
 """Rows of a published run and of the repeated one."""
 
 
+_UNPUBLISHED = "requests none of the published runs; publish the study again"
+
+
 class StudyRepetition(NamedTuple):
     """What a repetition found.
 
@@ -139,9 +142,7 @@ def _reproduce_sweep(
     published = group_runs(published_rows)
     runs = _select_published_runs(load_config(study.config_path).list_runs(), published)
     if not runs:
-        raise InputError(
-            InputMistake("requests none of the published runs; publish the study again", study.config_path)
-        )
+        raise InputError(InputMistake(_UNPUBLISHED, study.config_path))
     chosen = dict(draw_sample(list(runs.items()), seed))
     timing = {} if study.is_timed else {"timing": "none"}
     specs = [run.replace_options(record=False, pictures=False, **timing) for run in chosen.values()]
@@ -214,12 +215,16 @@ def _reproduce_accuracy(
 ) -> StudyRepetition:
     """Repeat an accuracy study: convergence of curves, errors of simulations, and ratios of their times."""
     plan = load_accuracy(study.config_path)
-    curves = draw_from_groups(plan.curves, CurveSpec.build_problem_stem, seed)
-    work = draw_from_groups(plan.work, lambda spec: (spec.case.scene_name, spec.case.size, spec.t_end), seed)
+    table = study.read_table("accuracy").to_pylist()
+    units = {row[row_store.FILE_COLUMN] for row in table}
+    curves, work = ([one for one in specs if one.build_file_stem() in units] for specs in (plan.curves, plan.work))
+    if not curves and not work:
+        raise InputError(InputMistake(_UNPUBLISHED, study.config_path))
+    curves = draw_from_groups(curves, CurveSpec.build_problem_stem, seed)
+    work = draw_from_groups(work, lambda spec: (spec.case.scene_name, spec.case.size, spec.t_end), seed)
     plan = replace(plan, curves=tuple(curves), work=tuple(work))
     files = run_accuracy_study(plan, folder, display, print_message, rerun_stale=True)
     rows = parquet_rows.read_rows(files, ACCURACY_SCHEMA).to_pylist()
-    table = study.read_table("accuracy").to_pylist()
     before, after = group_curves(table), group_curves(rows)
     pairs = [(before[key], curve) for key, curve in after.items() if key in before]
     found = [compare_repeated_curve(old, new) for old, new in omit_missing_software(pairs, print_message)]

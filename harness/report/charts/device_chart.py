@@ -54,7 +54,7 @@ def _build_frame(panel: ScenePanel, compared: Sequence[DevicePair]) -> ChartFram
         series=[_build_series(side, found) for side, runs in sides.items() if (found := [run for run in runs if run])],
         lines={"vertices": [MarkedValue(first.vertices, "")]} if first else {},
         notes=[
-            "Rings: the fastest solver of a side, where it changes.",
+            "Names: the fastest solver of a side, where it changes.",
             *([f"{scene}: a device pays from the dashed line on."] if first else []),
         ],
     )

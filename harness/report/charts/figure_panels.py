@@ -43,6 +43,8 @@ class CurveSeries:
         stale: which points (k,) other code measured; they are drawn hollow.
         is_stepped: whether the curve is constant between points.
         is_connected: whether a line connects the points.
+        is_bar: whether horizontal bars with their values are drawn to the points, from 0, or from 1 on a logarithmic
+            axis.
         labels_points: whether `label` is drawn at each point.
         setting: distinguishes curves of the same label in the data.
         marker_scale: marker size relative to other curves.
@@ -60,6 +62,7 @@ class CurveSeries:
     stale: NDArray[np.bool_] | None = None
     is_stepped: bool = False
     is_connected: bool = True
+    is_bar: bool = False
     labels_points: bool = False
     setting: str = ""
     marker_scale: float = 1.0

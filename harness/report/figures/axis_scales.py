@@ -65,6 +65,11 @@ def set_axis_scales(ax: Axes, panel: CurvePlot, panels: Sequence[CurvePlot]) -> 
     ax.tick_params(length=2.5, width=0.5, pad=2)
 
 
+def bar_base(scale: AxisScale) -> float:
+    """Return where bars along an axis begin."""
+    return 1.0 if scale.division == "log" else 0.0  # a ratio of 1, from which both directions are equally long
+
+
 def _data_extent(panel: CurvePlot) -> tuple[FloatArray, FloatArray]:
     """Return all finite x and y values, including interval ends and marked lines."""
     found: tuple[list[FloatArray], list[FloatArray]] = ([], [])
@@ -72,6 +77,8 @@ def _data_extent(panel: CurvePlot) -> tuple[FloatArray, FloatArray]:
         ends = [end for end in (series.lower, series.upper) if end is not None]
         found[0].extend([series.x, *(ends if series.is_horizontal else [])])
         found[1].extend([series.y, *([] if series.is_horizontal else ends)])
+    if any(series.is_bar for series in panel.series):
+        found[0].append(np.array([bar_base(panel.x)]))
     for values, marked in zip(found, (panel.x_lines, panel.lines), strict=True):
         values.append(np.array([line.value for line in marked], float))
     x, y = (np.concatenate([np.zeros(0), *values]) for values in found)

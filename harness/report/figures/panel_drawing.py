@@ -16,8 +16,15 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.transforms import ScaledTranslation
-from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot, CurveSeries, FloatArray, MeshPicture
-from springbench.harness.report.figures.axis_scales import frame_size_points, set_axis_scales
+from springbench.harness.report.charts.figure_panels import (
+    AxisScale,
+    CellMap,
+    CurvePlot,
+    CurveSeries,
+    FloatArray,
+    MeshPicture,
+)
+from springbench.harness.report.figures.axis_scales import bar_base, frame_size_points, set_axis_scales
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
 from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEXT_COLOUR, SeriesStyle
 
@@ -52,6 +59,9 @@ def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions, panels: 
     if panel.x.division == "linear" and ax.get_xlim()[0] < 0.0 < ax.get_xlim()[1]:
         ax.axvline(0.0, color=MUTED_COLOUR, linewidth=0.5, zorder=1)
     for series in panel.series:
+        if series.is_bar:
+            _draw_bars(ax, series, panel.x, options)
+            continue
         _draw_curve(ax, series, options)
         if series.has_cross:
             _draw_cross(ax, series, options)
@@ -61,7 +71,7 @@ def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions, panels: 
 
 
 def _draw_marked_values(ax: Axes, panel: CurvePlot, options: FigureOptions) -> None:
-    """Draw dashed lines at marked values, with their labels at the right and at the top."""
+    """Draw dashed lines at marked values, with their labels at the right and at the top; above rows of names."""
     line: Any = {"color": MUTED_COLOUR, "linewidth": 0.6, "linestyle": (0, (4, 2.5)), "zorder": 1}
     words: Any = {"textcoords": "offset points", "fontsize": options.small_font_size, "color": MUTED_COLOUR}
     for marked in panel.lines:
@@ -69,9 +79,13 @@ def _draw_marked_values(ax: Axes, panel: CurvePlot, options: FigureOptions) -> N
         at: Any = {"xy": (1.0, marked.value), "xycoords": ("axes fraction", "data")}
         ax.annotate(marked.label, **at, xytext=(-1, 2), ha="right", **words)
     for marked in panel.x_lines:
-        ax.axvline(marked.value, **line)
+        ax.axvline(marked.value, **line | {"zorder": 2.5})
         at = {"xy": (marked.value, 1.0), "xycoords": ("data", "axes fraction")}
-        ax.annotate(marked.label, **at, xytext=(2, -1), va="top", rotation=90, **words)
+        if panel.y.division == "names":
+            at |= {"xytext": (0, 1), "va": "bottom", "ha": "center", "annotation_clip": False}
+        else:
+            at |= {"xytext": (2, -1), "va": "top", "rotation": 90}
+        ax.annotate(marked.label, **at, **words)
 
 
 def _draw_curve(ax: Axes, series: CurveSeries, options: FigureOptions) -> None:
@@ -96,6 +110,22 @@ def _draw_curve(ax: Axes, series: CurveSeries, options: FigureOptions) -> None:
                 marks.set_markevery((0.1, 0.3))  # a step is no measurement: marks but tell the curves apart
             elif many:
                 marks.set_markevery(0.14)
+
+
+def _draw_bars(ax: Axes, series: CurveSeries, scale: AxisScale, options: FigureOptions) -> None:
+    """Draw horizontal bars with their intervals and values."""
+    base, color = bar_base(scale), series.style.color
+    ax.barh(series.y, series.x - base, left=base, height=0.72, color=color, linewidth=0, zorder=2)
+    ends = series.x
+    if series.lower is not None and series.upper is not None:
+        ax.hlines(series.y, series.lower, series.upper, color=TEXT_COLOUR, linewidth=1.0, zorder=3)
+        ends = np.fmax(ends, series.upper)
+    for x, y, value in zip(ends, series.y, series.x, strict=True):
+        words = f"{100 * value:.0f} %" if scale.tick_format == "percent" else f"{value:.3g}"
+        ax.annotate(
+            words, (x, y), (3, 0), textcoords="offset points", va="center", fontsize=options.small_font_size,
+            annotation_clip=False,
+        )  # fmt: skip
 
 
 def _draw_cross(ax: Axes, series: CurveSeries, options: FigureOptions) -> None:

@@ -9,7 +9,7 @@ A template is a Jinja2 file next to its page: `hard-cases.md.j2` makes `hard-cas
     table(sql)         its rows as a table of Markdown, with the columns' names as heading
     bars, lines, heatmap(name, title, sql, alt, ...)
                        a link to a picture, drawn from the columns series, x, y, low and high; `order` selects
-                       and orders the series, the other options are those of `PageChart`
+                       and orders the series, the other options are those of `PageChartOptions`
     figure(name, title, kind, study, alt, panels)
                        a link to a picture of a kind that `springbench figure` draws
     provenance(study)  command, machine, load, date and commit of a study, in one line
@@ -29,16 +29,18 @@ from typing import Any
 
 import jinja2
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.report.charts.figure_panels import FigurePanel
+from springbench.harness.report.charts.figure_panels import CurvePlot, FigurePanel
 from springbench.harness.report.figures.figure_kinds import find_figure_kind
 from springbench.harness.report.figures.figure_layout import compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.figures.panel_selection import select_entries
-from springbench.harness.report.pages.page_charts import ChartForm, ChartPoint, PageChart, draw_chart
+from springbench.harness.report.pages.page_charts import ChartForm, ChartPoint, PageChartOptions, build_page_panel
 from springbench.harness.report.pages.published_queries import PublishedQueries
 from springbench.harness.results.published_set import open_study_folder
 
 TEMPLATE_SUFFIX = ".md.j2"
+_CHART_WIDTH = 132.0
+"""Width of a chart [mm]: at 85 mm its type is 6 points high."""
 PICTURE_FOLDER = "pictures"
 """Folder of a page's pictures, next to the page."""
 
@@ -94,8 +96,8 @@ class _PageFields:
             points = sorted((p for p in points if p.series in order), key=lambda p: order.index(p.series))
         if not points:
             raise InputError(f"the picture {name} has no points; its query has no rows")
-        chart = PageChart(title, form, points, **options)
-        return self._add_picture(name, alt, chart.compute_digest(), lambda: draw_chart(chart))
+        panel = build_page_panel(name, form, points, PageChartOptions(**options))
+        return self._add_panels(name, alt, title, [panel], _CHART_WIDTH)
 
     def add_figure(
         self, name: str, title: str, kind: str, study: str, alt: str, panels: str = "", width: float = 170.0
@@ -105,10 +107,7 @@ class _PageFields:
             entries = found.list_panels(folder, lambda table: set())
             selectors = [tuple(one.split(":")) for one in panels.split(",") if one] or found.default_panels
             drawn = found.prepare_panels(select_entries(entries, selectors))
-        options = FigureOptions(width_mm=width, formats=("png",), font_size=9.0)
-        return self._add_picture(
-            name, alt, _digest_panels(drawn, title, width), lambda: _draw_panels(drawn, title, options)
-        )
+        return self._add_panels(name, alt, title, drawn, width)
 
     def describe_study(self, study: str) -> str:
         about = self.queries.studies[study].metadata
@@ -124,11 +123,13 @@ class _PageFields:
         load = f", load {' to '.join(dict.fromkeys(loads))}" if loads else ""
         return f"Data: `{about['command']}`, {count} runs, {where}{load}, {date}, commit {commits}."
 
-    def _add_picture(self, name: str, alt: str, digest: str, draw_png: Callable[[], bytes]) -> str:
+    def _add_panels(self, name: str, alt: str, title: str, panels: Sequence[FigurePanel], width: float) -> str:
         path = self.page.parent / PICTURE_FOLDER / f"{name}.png"
         if any(picture.path == path for picture in self.pictures):
             raise InputError(f"the picture {name} is there twice; give each a name of its own")
-        self.pictures.append(PagePicture(path, digest, draw_png))
+        options = FigureOptions(width_mm=width, formats=("png",), font_size=9.0)
+        digest = _digest_panels(panels, title, width)
+        self.pictures.append(PagePicture(path, digest, lambda: _draw_panels(panels, title, options)))
         return f"![{alt}]({PICTURE_FOLDER}/{name}.png)"
 
 
@@ -205,7 +206,12 @@ def _format_count(value: int) -> str:
 def _digest_panels(panels: Sequence[FigurePanel], title: str, width: float) -> str:
     rows = list(chain.from_iterable(panel.csv_rows() for panel in panels))
     words = [(panel.subject, panel.title, *panel.notes) for panel in panels]
-    return sha256(json.dumps([title, width, words, rows], default=str).encode()).hexdigest()
+    plots = [panel for panel in panels if isinstance(panel, CurvePlot)]
+    marks = [
+        (plot.x, plot.y, plot.lines, plot.x_lines, [(one.style, one.is_bar) for one in plot.series]) for plot in plots
+    ]
+    shown = [title, width, words, rows, *([marks] if marks else [])]
+    return sha256(json.dumps(shown, default=str).encode()).hexdigest()
 
 
 def _draw_panels(panels: Sequence[FigurePanel], title: str, options: FigureOptions) -> bytes:

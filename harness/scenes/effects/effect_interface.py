@@ -15,10 +15,9 @@ from springbench.harness.errors import InputError
 from springbench.harness.scenes.key_frames import KeyFrameMotion
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.solvers.model import integrators
-from springbench.solvers.model.constraints import LengthConstraints
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.integrators import has_split_filters
-from springbench.solvers.model.step_problem import Energy, Positions
+from springbench.solvers.model.step_problem import Energy, LengthConstraints, Positions
 
 if TYPE_CHECKING:  # for those who have any
     from springbench.harness.scenes.edge_triangle_intersections import IntersectionCheck

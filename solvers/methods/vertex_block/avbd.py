@@ -45,7 +45,6 @@ from springbench.solvers.methods.vertex_block import avbd_dual_step as kernels
 from springbench.solvers.methods.vertex_block.lagrange_multipliers import LagrangeMultipliers
 from springbench.solvers.methods.vertex_block.vbd import PreparedVertexBlockDescent, SweepState, VertexBlockDescent
 from springbench.solvers.model.barrier_energy import is_barrier_energy
-from springbench.solvers.model.constraints import LengthConstraints
 from springbench.solvers.model.energies.augmented_lagrangian import (
     AugmentedLagrangian,
     build_augmented_system,
@@ -54,7 +53,14 @@ from springbench.solvers.model.energies.augmented_lagrangian import (
     length_errors,
 )
 from springbench.solvers.model.energies.spring_energy import Springs
-from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
+from springbench.solvers.model.step_problem import (
+    LengthConstraints,
+    Positions,
+    PreparedSolver,
+    StepProblem,
+    System,
+    Unsupported,
+)
 
 if TYPE_CHECKING:
     from springbench.solvers.methods.local_global.half_space_contact import ContactFreeSolver

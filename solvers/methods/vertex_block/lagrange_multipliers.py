@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import block_array, coo_array, csc_array, csr_array, diags_array, kron
 from scipy.sparse.linalg import splu
-from springbench.solvers.model.constraints import LengthConstraints
 from springbench.solvers.model.energies.edge_energy import unit_directions
-from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
+from springbench.solvers.model.step_problem import LengthConstraints, Positions, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
 _COMPLIANCE = 1e-10

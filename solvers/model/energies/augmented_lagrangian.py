@@ -20,12 +20,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner
-from springbench.solvers.model.constraints import LengthConstraints
 from springbench.solvers.model.energies import strain_limit_energy
 from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 from springbench.solvers.model.energies.element_energies import ElementLaw, axial_hessian
 from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
-from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepStart, System
+from springbench.solvers.model.step_problem import LengthConstraints, Positions, ProjectiveEnergy, StepStart, System
 from springbench.solvers.model.system_matrix_assembly import stiffness_shares
 
 _LIMIT_FUNCTIONS = StrainLimits.element_law.element_functions
