@@ -62,6 +62,8 @@ _CERTIFICATE_FIELDS = tuple(f.name for f in fields(MinimumCertificate) if f.name
 _TRAJECTORY_FIELDS = tuple(f.name for f in fields(ReferenceTrajectory) if f.name != "growth")
 """Stored fields of a trajectory; the growth of perturbations has its own file."""
 _SELF_CONVERGED_FIELDS = tuple(f.name for f in fields(SelfConvergedTrajectory))
+_NUM_FINGERPRINT_STEPS = 100
+"""Number of steps of a motion with contact, of which the first is its fingerprint."""
 _NUM_HORIZONS = 8
 """Number of times, evenly spaced, among which the longest at which an error can be measured is found."""
 _GROWTH_FIELDS = tuple(f.name for f in fields(PerturbationGrowth))
@@ -241,7 +243,7 @@ class ReferenceStore:
     ) -> SelfConvergedTrajectory:
         """Load the self-converged trajectory of a scene with contact, or compute it; it may be less accurate.
 
-        Its fingerprint is its first step.
+        Its fingerprint is a first step, the same for every time step of the scene.
 
         Args:
           spec: specification of the scene.
@@ -256,7 +258,7 @@ class ReferenceStore:
           NotConverged: not even two step sizes could be compared.
         """
         path = self.folder / f"converged-{_build_motion_name(spec, size, times)}.npz"
-        witness = next(iter(run_reference(build_exact_scene(spec, size), self.solver, 1, [1])[0].values())).positions
+        witness = self._compute_contact_fingerprint(spec, size, times[-1])
         stored = _read_arrays(path, [*_SELF_CONVERGED_FIELDS, "fingerprint", "error"])
         known = bool(stored) and is_equal_to_roundoff(stored.pop("fingerprint"), witness)
         if known and float(stored.pop("error")) <= error:
@@ -268,12 +270,13 @@ class ReferenceStore:
             return build_exact_scene(spec.with_time_step(h), size, integrator, show_warnings=False)
 
         found = compute_self_converged(build_refined, spec.time_step, times, error, seconds or MAX_SECONDS)
-        for k in range(len(times)):  # each time alone too: it may become the horizon of another request
-            part, name = found.select_times(slice(k, k + 1)), _build_motion_name(spec, size, times[k : k + 1])
-            _save_self_converged(self.folder / f"converged-{name}.npz", part, witness, error)
-        if len(times) > 1:
-            _save_self_converged(path, found, witness, error)
+        _save_self_converged(path, found, witness, error)
         return found
+
+    def _compute_contact_fingerprint(self, spec: SceneSpec, size: int, t_end: float) -> Positions:
+        """Compute the positions (n, 3) [m] after a short step, the same for every time step of the scene."""
+        short = build_exact_scene(spec.with_time_step(t_end / _NUM_FINGERPRINT_STEPS), size, show_warnings=False)
+        return next(iter(run_reference(short, self.solver, 1, [1])[0].values())).positions
 
     def load_contact_horizon(
         self, spec: SceneSpec, size: int, t_end: float, *, error: float
@@ -308,12 +311,22 @@ class ReferenceStore:
                     found.require_accuracy(error)
                 else:
                     reason = found.describe_uncertainty(known + 1) if known + 1 < len(ends) else reason
-                    return found.select_times(slice(known, known + 1)), reason
+                    return self._save_horizon(spec, size, found.select_times(slice(known, known + 1)), error), reason
             except NotConverged as refused:
                 reason, left = str(refused), left - (thread_time() - began)
                 if last == 1 or left < SHORTEST_REFINEMENT:
                     raise
             last = max(1, last // 4)
+
+    def _save_horizon(
+        self, spec: SceneSpec, size: int, found: SelfConvergedTrajectory, error: float
+    ) -> SelfConvergedTrajectory:
+        """Store the motion at its only time, at which other requests will ask for it."""
+        path = self.folder / f"converged-{_build_motion_name(spec, size, found.times.tolist())}.npz"
+        if not path.exists():
+            witness = self._compute_contact_fingerprint(spec, size, float(found.times[-1]))
+            _save_self_converged(path, found, witness, error)
+        return found
 
     def require_contact_horizon(
         self, spec: SceneSpec, size: int, t_end: float, *, error: float

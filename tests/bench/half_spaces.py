@@ -1,6 +1,6 @@
 """Can barriers alone serve as contact? Half spaces and barriers for the same floor.
 
-    python -m tests.bench.half_spaces [--size 24] [--block 4] [--frames 40] [--rounds 2] [--solvers hybrid newton vbd]
+    python -m tests.bench.half_spaces [--size 24] [--block 4] [--frames 40] [--rounds 2] [--solvers hybrid newton]
 
 Scenes have the effect `contact` (vertices against half spaces), then `surface-contact` (barriers), with the same plane
 and minimum distance, and are simulated to a relative residual of 1e-6. Thin barriers act within a tenth of the minimum
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--block", type=int, default=4, help="vertices a side of the block")
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--solvers", nargs="+", default=["hybrid", "newton", "vbd"])
+    parser.add_argument("--solvers", nargs="+", default=["hybrid", "newton"])
     options = parser.parse_args()
     table = Table("solver", "measured", *FLOORS, box=SIMPLE_HEAD)
     table.title = f"the same floor as half spaces and as barriers; {describe_machine().cpu}"

@@ -58,9 +58,9 @@ PAGE = (
     ),
     Mutation(
         "figure-of-times-scaled",
-        "harness/report/figures/timing_panels.py",
-        "values = [1e-3 * np.array(",
-        "values = [1e-2 * np.array(",
+        "harness/report/charts/timing_chart.py",
+        "else 1e-3 * value for value in milliseconds",
+        "else 1e-2 * value for value in milliseconds",
         (_STATED,),
     ),
     Mutation(

@@ -17,6 +17,7 @@ from springbench.harness.experiments.ablation.ablation_unit import run_ablation
 from springbench.harness.experiments.ablation.interleaved_variants import VariantRun, compute_cost
 from springbench.harness.experiments.ablation.scene_variants import SceneVariant, build_variants
 from springbench.harness.report.ablation_summary import describe_effect, read_ablation, summarise_ablation
+from springbench.harness.report.plot_style import PAGE_WIDTH
 from springbench.harness.results.folder_ownership import claim_folder
 from springbench.harness.results.run_schema import RUN_COLUMNS as RUN_COLUMNS
 from typer.testing import CliRunner
@@ -221,7 +222,7 @@ def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: 
     (picture,) = tmp_path.glob("cloth/pictures/*.png")
     assert len(read_ablation(rows)) >= 1 + 5 + 2
     assert {row["solver"] for row in read_ablation(rows)} == {DEFAULT_ABLATION_SOLVER}
-    assert Image.open(picture).size == (1600, 900)
+    assert Image.open(picture).width == PAGE_WIDTH
 
 
 def test_a_sweep_is_refused(tmp_path: Path):

@@ -36,18 +36,20 @@ from springbench.harness.report.charts.figure_panels import (
     describe_stale_cells,
     merge_cell_maps,
 )
-from springbench.harness.report.charts.published_curves import PUBLISHED_LABEL
+from springbench.harness.report.charts.published_curves import PUBLISHED_LABEL, add_published_curves
 from springbench.harness.report.charts.recommendation_chart import (
     CandidatePoint,
     RecommendationLimits,
     build_recommendation_chart,
 )
+from springbench.harness.report.charts.timing_chart import build_timing_chart
 from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.figures.figure_layout import compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.plot_style import PAGE_WIDTH, TEXT_COLOUR, SeriesStyle, assign_solver_styles
 from springbench.harness.report.site.chart_json import serialise_chart
-from springbench.harness.results import row_store
+from springbench.harness.report.timing_table import read_run_times
+from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.published_set import STUDY_FILE, TABLE_FILES
 
 from tests import synthetic_accuracy_rows as made
@@ -332,3 +334,29 @@ def test_published_curves_are_grey_behind_those_of_the_same_step_and_solver(tmp_
 def test_the_same_chart_gives_the_same_vectors(tmp_path: Path) -> None:
     once, again = (draw_chart_sheets(build_small_chart((1.0, 2.0)), tmp_path / name)[1] for name in ("once", "again"))
     assert once.read_bytes() == again.read_bytes()
+
+
+def test_published_times_are_in_the_row_of_their_solver(tmp_path: Path) -> None:
+    folder = synthetic_results.write_sweep_results(tmp_path, sizes=(8,))
+    runs = read_run_times(parquet_rows.read_rows(row_store.list_units(folder / "rows")))
+    slower = build_timing_chart([run._replace(step=10.0 * (run.step or 0.0)) for run in runs], machine_words="theirs")
+    chart = add_published_curves(build_timing_chart(runs), [slower])
+    plot = next(plot for plot in select_curve_plots(chart) if plot.name == ("step",))
+    places = {series.setting or series.label: float(series.y[0]) for series in plot.series}
+    assert [series.label for series in plot.series[:2]] == [PUBLISHED_LABEL, plot.y.place_names[0]]
+    assert len(plot.y.place_names) == len(plot.series) / 2 == len(places)
+    assert plot.series[0].style.marker == "o", "a single point has a marker"
+    assert plot.series[0].x == pytest.approx(10.0 * plot.series[1].x)
+    page = serialise_chart(chart)
+    grey = next(item for item in page["items"] if item["label"] == PUBLISHED_LABEL)
+    assert grey["provenance"] == [{"commit": None, "cpu": "theirs"}]
+    other = build_timing_chart([run._replace(parameters_json='{"omega": 2}') for run in runs])
+    compared = add_published_curves(build_timing_chart(runs), [other])
+    assert all(series.label != PUBLISHED_LABEL for frame in compared.frames for series in frame.series)
+
+
+def test_times_on_the_page_have_units_and_sizes_their_numbers() -> None:
+    page = serialise_chart(build_small_chart((10.0, 20.0)))
+    assert page["y"][0]["axis"] == {"type": "log", "tickformat": "$~s"}, "the page's currency is the second"
+    assert page["y"][0]["format"] == "time"
+    assert page["x"][0]["axis"]["tickmode"] == "array"

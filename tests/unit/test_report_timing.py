@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 from rich.console import Console
-from springbench.harness.report import page_layout, timing_plot
-from springbench.harness.report.line_end_labels import LABEL_SPACING, spread_heights
-from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH, assign_solver_styles
+from springbench.harness.report import timing_plot
+from springbench.harness.report.charts.timing_chart import build_timing_chart
+from springbench.harness.report.plot_style import PAGE_WIDTH, assign_solver_styles
 from springbench.harness.report.sweep_pictures import PictureJob, draw_sweep_pictures
 from springbench.harness.report.sweep_summary import build_closing_lines, summarise_sweep
 from springbench.harness.report.timing_plot import draw_timing_plot
@@ -114,23 +113,6 @@ def learned_from(message: list[dict[str, Any]]) -> list[str]:
     return lines.replace("\n  ", " ").splitlines()
 
 
-@pytest.fixture
-def sheets(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The pages that a test draws."""
-    drawn: list[Figure] = []
-
-    def save(sheet: Figure, path: Path, **more: Any) -> None:
-        drawn.append(sheet)
-        page_layout.save_page(sheet, path, **more)
-
-    monkeypatch.setattr(timing_plot, "save_page", save)
-    return drawn
-
-
-def written(sheet: Figure) -> list[str]:
-    return [text.get_text() for text in [*sheet.texts, *(t for ax in sheet.axes for t in ax.texts)]]
-
-
 def test_a_run_is_summed_up_in_milliseconds() -> None:
     (run,) = read_run_times(rows(sizes=(10,), solvers=("sparse",)))
     # The step takes 1e-6 s * 100 = 0.1 ms; round-off of a few products.
@@ -166,53 +148,50 @@ def test_labels_name_only_the_settings_in_which_a_solvers_runs_differ() -> None:
         pytest.param(rows(), id="three solvers"),
         pytest.param(rows(sizes=(8,), solvers=("sparse",)), id="one run"),
         pytest.param(rows(scenes=("a-scene-with-a-long-name-" * 4, "b", "c", "d", "e")), id="five scenes"),
+    ],
+)
+def test_every_table_gives_a_plot_of_the_page_s_width(table: pa.Table, tmp_path: Path) -> None:
+    paths = draw_timing_plot(table, tmp_path / "time.png", "A title that is too long for the page " * 5)
+    with Image.open(tmp_path / "time.png") as image:
+        assert image.width == PAGE_WIDTH
+        assert np.asarray(image.convert("L")).std() > 3, "an empty page has no variance"
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["time.png", "time.svg"], "no partial file is left"
+    assert sorted(paths) == sorted(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
         pytest.param(rows(sizes=(2,), solvers=("dense",), failed=[(2, "dense")]), id="nothing succeeded"),
         pytest.param(RUN_SCHEMA.empty_table(), id="no rows"),
     ],
 )
-def test_every_table_gives_a_plot_of_the_page_s_width(table: pa.Table, tmp_path: Path) -> None:
-    draw_timing_plot(table, tmp_path / "time.png", "A title that is too long for the page " * 5)
-    with Image.open(tmp_path / "time.png") as image:
-        assert image.width == PAGE_WIDTH
-        assert 200 < image.height <= PAGE_HEIGHT
-        assert np.asarray(image.convert("L")).std() > 3, "an empty page has no variance"
-    assert [file.name for file in tmp_path.iterdir()] == ["time.png"], "no partial file is left"
+def test_without_a_time_there_is_no_plot_and_an_old_one_goes(table: pa.Table, tmp_path: Path) -> None:
+    (tmp_path / "time.png").write_bytes(b"of earlier rows")
+    assert draw_timing_plot(table, tmp_path / "time.png", "Nothing") == []
+    assert not list(tmp_path.iterdir())
 
 
-def test_each_solver_is_a_line_named_with_its_fitted_power(sheets: list[Figure], tmp_path: Path) -> None:
-    draw_timing_plot(rows(), tmp_path / "time.png", "Scaling")
-    said = written(sheets[0])
-    for solver, power in POWERS.items():
-        assert f"{solver}  $n^{{{power:.1f}}}$" in said
-    step = sheets[0].axes[0]
-    heights = {tuple(np.round(np.asarray(line.get_ydata(), float), 6)) for line in step.lines}
-    assert (0.064, 0.256, 1.024) in heights, "the medians of sparse, in milliseconds"
-
-
-def test_failed_runs_are_crosses_at_the_upper_edge_and_words(sheets: list[Figure], tmp_path: Path) -> None:
-    draw_timing_plot(rows(failed=[(16, "dense"), (32, "dense")]), tmp_path / "time.png", "Scaling")
-    step = sheets[0].axes[0]
-    crosses = [line for line in step.lines if line.get_marker() == "x"]
-    assert [list(map(float, np.asarray(line.get_xdata()))) for line in crosses] == [[256.0], [1024.0]]
-    assert all(float(np.asarray(line.get_ydata())[0]) > 0.9 for line in crosses), "in shares of the panel's height"
-    assert {line.get_color() for line in crosses} == {assign_solver_styles(POWERS)["dense"].color}
-    said = written(sheets[0])
-    assert said.count("diverged") == 2
-    assert f"dense on cloth, size 32 diverged: {EXPLOSION}" in said
-
-
-def test_preparing_has_its_own_panel_cold_and_warm(sheets: list[Figure], tmp_path: Path) -> None:
-    draw_timing_plot(rows(solvers=("sparse",)), tmp_path / "time.png", "Scaling")
-    cold, warm = (np.asarray(line.get_ydata(), float) for line in sheets[0].axes[1].lines)
+def test_each_solver_is_a_curve_in_seconds_and_its_fitted_power_is_stated() -> None:
+    (frame,) = build_timing_chart(read_run_times(rows())).frames
+    assert "Fitted powers of the vertices, cloth: sparse n^1.0, dense n^2.0, xpbd n^1.5." in frame.notes
+    curves = {series.label: series.columns for series in frame.series}
+    assert curves["sparse"]["vertices"] == [64, 256, 1024]
+    assert curves["sparse"]["step"] == pytest.approx([6.4e-5, 2.56e-4, 1.024e-3])
+    cold, warm = (np.array(curves["sparse"][name]) for name in ("cold", "warm"))
     assert cold == pytest.approx(8 / 3 * warm)
+    (frame,) = build_timing_chart(read_run_times(rows(sizes=(8, 16)))).frames
+    assert not any("powers" in note for note in frame.notes), "two sizes give none"
 
 
-@pytest.mark.parametrize("wanted", [[10.0, 11.0, 12.0], [10.0, 60.0, 99.0], [90.0, 95.0, 99.0]])
-def test_direct_labels_do_not_overlap_and_stay_on_the_panel(wanted: list[float]) -> None:
-    at = spread_heights(wanted, 6.0, 100.0)
-    assert (np.diff(at) >= LABEL_SPACING).all()
-    assert min(at) >= 6.0
-    assert max(at) <= 100.0
+def test_a_curve_whose_larger_sizes_failed_ends_in_a_cross_and_words_say_why() -> None:
+    (frame,) = build_timing_chart(read_run_times(rows(failed=[(16, "dense"), (32, "dense"), (8, "xpbd")]))).frames
+    assert {series.label: series.status for series in frame.series} == {
+        "sparse": "ok",
+        "xpbd": "ok",
+        "dense": "diverged",
+    }
+    assert f"× Failed on cloth (diverged, {EXPLOSION}): xpbd 8, dense 16, dense 32." in frame.notes
 
 
 def test_solvers_have_marks_of_their_own_that_stay_the_same() -> None:

@@ -51,7 +51,11 @@ from springbench.harness.experiments.accuracy.work_precision import build_work_r
 from springbench.harness.experiments.best_first_search import SearchSummary
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import ReferenceTrajectory
-from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
+from springbench.harness.reference.self_converged_trajectory import (
+    LIMIT_INTEGRATORS,
+    describe_self_convergence,
+    has_contact,
+)
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.folder_ownership import claim_folder
@@ -417,6 +421,17 @@ class StudyCandidates:
         names = dict.fromkeys(name for entry in grid for name in entry["solver"])
         return cls([{"name": name} for name in names], grid, refinements)
 
+    def restrict_to_contact(self) -> StudyCandidates:
+        """Return the minimising solvers with integrators that support contact; all candidates if there are none."""
+        grid = list[dict[str, Any]]()
+        for entry in self.grid:
+            names = [name for name in entry["solver"] if is_minimiser(_load_solver(name))]
+            integrators = [one for one in entry.get("integrator", ["implicit-euler"]) if one in LIMIT_INTEGRATORS]
+            grid += [{**entry, "solver": names, "integrator": integrators}] if names and integrators else []
+        known = {name for entry in grid for name in entry["solver"]}
+        solvers = [one for one in self.solvers if one["name"] in known]
+        return StudyCandidates(solvers, grid, self.refinements) if solvers else self
+
 
 def _plan_study(
     path: Path,
@@ -435,16 +450,18 @@ def _plan_study(
     """
     max_error = goal.reference_error
     print_message("estimating how far ahead the motion can be predicted")
-    study = None if t_end is None else _build_valid_study(path, scene, size, candidates, t_end, time_limit)
-    if study is None and (mistakes := find_scene_mistakes(scene, [size])):
+    if t_end is not None:
+        _build_valid_study(path, scene, size, candidates, t_end, time_limit)
+    elif mistakes := find_scene_mistakes(scene, [size]):
         raise InputError(mistakes)
     touches = has_contact(build_exact_scene(scene, size).system)
     if touches:
         print_message(describe_self_convergence(scene.path.stem))
+        candidates = candidates.restrict_to_contact()
         t_end = _find_contact_t_end(scene, size, max_error, t_end, reference_store, print_message)
     elif t_end is None:
         t_end = find_default_t_end(path, scene, size, max_error, reference_store, print_message)
-    study = study or _build_valid_study(path, scene, size, candidates, t_end, time_limit)
+    study = _build_valid_study(path, scene, size, candidates, t_end, time_limit)
     trajectory = _compute_reference(scene, size, max_error, t_end, reference_store, print_message)
     return study, trajectory.get_error_bound(-1) if touches else 0.0
 

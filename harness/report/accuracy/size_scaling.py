@@ -5,7 +5,7 @@ Power laws are fitted to these times.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -59,12 +59,17 @@ def fit_scalings(
         if len(times) > 1:
             lost = [n for n, t in times.items() if t == np.inf]
             hollow = [any(map(is_stale_curve, sizes[n])) for n in reached]
-            exponent = _fit_exponent(reached)
+            exponent = fit_size_exponent(reached)
             found.append(SizeScaling(scene, guess, label, [*reached], [*reached.values()], exponent, lost, hollow))
     return found
 
 
-def _fit_exponent(times: dict[int, float]) -> float:
+def fit_size_exponent(times: Mapping[int, float]) -> float:
+    """Fit the exponent of a power law; nan for too few sizes.
+
+    Args:
+        times: time by number of vertices.
+    """
     if len(times) < _MIN_FIT_SIZES:
         return np.nan
     return float(np.polyfit(np.log([*times]), np.log([*times.values()]), 1)[0])

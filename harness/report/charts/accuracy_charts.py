@@ -158,6 +158,7 @@ def _build_convergence_series(
         stale=is_by_other_code(curve, newest_fingerprint),
         status=curve.status,
         callouts=callouts,
+        identity=(curve.label, curve.parameters),
         links={"parameters": curve.parameters, **link_source(curve)},
     )
 
@@ -248,6 +249,7 @@ def _build_time_series(
                 columns,
                 description=f"{own[0].problem.mesh_label}, {many} step{'s' if many > 1 else ''}",
                 stale=any(is_by_other_code(curve, newest_fingerprint) for curve in own),
+                identity=(label, own[0].parameters),
                 links={"parameters": own[0].parameters},
             )
 
@@ -349,6 +351,7 @@ def _build_step_size_series(
             setting=stop,
             marker_scale=1.0 + 0.25 * tolerances.index(tolerance) if tolerance in tolerances else 0.75,
             callouts={k: "the default" for k, one in enumerate(members) if one is default},
+            identity=(_label_work(members[0]), stop, members[0].parameters),
             links={"parameters": members[0].parameters},
         )
 

@@ -57,6 +57,8 @@ class ChartSeries:
         status: "ok", or how the measurement ended; then a cross marks its end.
         is_stepped, is_connected, labels_points, marker_scale, setting: see `CurveSeries`.
         callouts: words at points, by index; drawn where the first quantity of y is shown.
+        identity: solver and settings, by which the same measurement is found in other results.
+        behind: label of the series that it is drawn behind; empty if there is none.
         links: what the page offers for a point, such as a recording.
     """
 
@@ -72,6 +74,8 @@ class ChartSeries:
     marker_scale: float = 1.0
     setting: str = ""
     callouts: Mapping[int, str] = field(default_factory=dict[int, str])
+    identity: tuple[str, ...] = ()
+    behind: str = ""
     links: Mapping[str, Any] = field(default_factory=dict[str, Any])
 
 
@@ -152,22 +156,30 @@ def select_curve_plots(
     for frame in chart.frames if frames is None else frames:
         for up in chart.y if y is None else y:
             for across in chart.x:
-                series = [made for one in frame.series if (made := _build_curve(one, across, up, up is chart.y[0]))]
-                if series:
-                    yield _build_plot(chart, frame, across, up, series)
+                curves = [
+                    (one.behind or one.label, made)
+                    for one in frame.series
+                    if (made := _build_curve(one, across, up, up is chart.y[0]))
+                ]
+                if curves:
+                    yield _build_plot(chart, frame, across, up, curves)
 
 
 def _build_plot(
-    chart: ChartDescription, frame: ChartFrame, across: ChartAxis, up: ChartAxis, series: list[CurveSeries]
+    chart: ChartDescription, frame: ChartFrame, across: ChartAxis, up: ChartAxis, curves: list[tuple[str, CurveSeries]]
 ) -> CurvePlot:
+    """Build a plot of curves and the labels that they are compared by."""
+    series = [curve for _, curve in curves]
     names = [frame.place_names.get(axis.column, axis.scale.place_names) for axis in (across, up)]
     scales = (
         across.scale._replace(label=frame.x_label or across.scale.label, place_names=names[0]),
         up.scale._replace(place_names=names[1]),
     )
     if across.scale.division == "sizes" and len({float(x) for one in series for x in one.x}) == 1:
-        scales = up.scale, AxisScale("", "names", place_names=tuple(one.label for one in _sort_by_value(series)))
-        series = [_lay_down(one, k) for k, one in enumerate(_sort_by_value(series))]
+        least = {label: float(curve.y[0]) for label, curve in curves}  # of one's own, which are last
+        labels = sorted(least, key=lambda label: least[label])
+        scales = up.scale, AxisScale("", "names", place_names=tuple(labels))
+        series = [_lay_down(one, k) for k, row in enumerate(labels) for label, one in curves if label == row]
     return CurvePlot(
         group=frame.group,
         name=(*frame.name, *filter(None, (up.name, across.name))),
@@ -183,10 +195,6 @@ def _build_plot(
         notes=frame.notes,
         machine_words=chart.machine_words,
     )
-
-
-def _sort_by_value(series: Sequence[CurveSeries]) -> list[CurveSeries]:
-    return sorted(series, key=lambda one: float(one.y[0]))
 
 
 def _lay_down(series: CurveSeries, row: int) -> CurveSeries:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from springbench.harness.report.charts.chart_description import ChartDescription, ChartFrame, select_curve_plots
@@ -18,11 +19,13 @@ SHEET_OPTIONS = FigureOptions(
 
 _MAX_WHOLE_FRAMES = 4
 """Maximum number of frames of a sheet that shows all quantities of each."""
+_MAX_NOTES = 12
+"""Maximum number of notes at the foot of a sheet."""
 _MAX_LONE_COLUMNS = 4
 """Maximum number of plots of a single frame in one row."""
 
 
-def draw_chart_sheets(chart: ChartDescription, stem: Path) -> list[Path]:
+def draw_chart_sheets(chart: ChartDescription, stem: Path, sources: str = "") -> list[Path]:
     """Draw the sheets of a chart as PNG and SVG, and return the files.
 
     Its maps are on its own sheet, one below the other.
@@ -30,6 +33,7 @@ def draw_chart_sheets(chart: ChartDescription, stem: Path) -> list[Path]:
     Args:
         chart: the chart.
         stem: path of the chart's own sheet without suffix; a folder for the other sheets.
+        sources: digest of the data, stored in the PNG (`springbench.harness.report.picture_sources`).
     """
     paths: list[Path] = []
     maps = merge_cell_maps(chart.maps)
@@ -41,10 +45,21 @@ def draw_chart_sheets(chart: ChartDescription, stem: Path) -> list[Path]:
         if maps and not sheet:
             columns = 1 if plots else None
         if panels:
-            figure = compose_figure(panels, chart.title, SHEET_OPTIONS, columns)
+            figure = compose_figure(_shorten_notes(panels), chart.title, SHEET_OPTIONS, columns)
             target = stem / sheet if sheet else stem
-            paths += write_images(figure, target, chart.title, chart.machine_words, SHEET_OPTIONS, PAGE_DPI)
+            paths += write_images(figure, target, chart.title, chart.machine_words, SHEET_OPTIONS, PAGE_DPI, sources)
     return paths
+
+
+def _shorten_notes(panels: Sequence[FigurePanel]) -> list[FigurePanel]:
+    """Leave at most _MAX_NOTES different notes, the last of which states how many there are more."""
+    notes = list(dict.fromkeys(note for panel in panels for note in panel.notes))
+    if len(notes) <= _MAX_NOTES:
+        return [*panels]
+    shown = {*notes[: _MAX_NOTES - 1]}
+    rest = f"{len(notes) - len(shown)} more notes are on the results page."
+    shortened = [replace(panel, notes=[note for note in panel.notes if note in shown]) for panel in panels]
+    return [*shortened[:-1], replace(shortened[-1], notes=[*shortened[-1].notes, rest])]
 
 
 def _arrange_plots(chart: ChartDescription, frames: Sequence[ChartFrame]) -> tuple[list[CurvePlot], int | None]:

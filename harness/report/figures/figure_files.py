@@ -21,6 +21,7 @@ from springbench.harness.report.figures import script_templates
 from springbench.harness.report.figures.figure_layout import FIGURE_RC, MILLIMETRES_PER_INCH
 from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.figures.panel_drawing import RASTER_DPI
+from springbench.harness.report.picture_sources import SOURCES_KEY
 
 
 def write_figure(
@@ -54,7 +55,13 @@ def write_figure(
 
 
 def write_images(
-    figure: Figure, stem: Path, title: str, about: str, options: FigureOptions, dpi: int = RASTER_DPI
+    figure: Figure,
+    stem: Path,
+    title: str,
+    about: str,
+    options: FigureOptions,
+    dpi: int = RASTER_DPI,
+    sources: str = "",
 ) -> list[Path]:
     """Write a figure in the formats of its options, and return the files.
 
@@ -64,6 +71,7 @@ def write_images(
         title, about: metadata of the files.
         options: options of the figure.
         dpi: resolution of images [dots per inch].
+        sources: digest of the data, stored in PNG files.
     Raises:
         WriteError: if a file cannot be written.
     """
@@ -72,11 +80,11 @@ def write_images(
     for kind in options.formats:
         paths.append(stem.with_name(f"{stem.name}.{kind}"))
         with matplotlib.rc_context(FIGURE_RC), atomic_write(paths[-1]) as partial:
-            figure.savefig(partial, format=kind, dpi=dpi, metadata=_build_metadata(kind, title, about))
+            figure.savefig(partial, format=kind, dpi=dpi, metadata=_build_metadata(kind, title, about, sources))
     return paths
 
 
-def _build_metadata(kind: str, title: str, about: str) -> dict[str, Any]:
+def _build_metadata(kind: str, title: str, about: str, sources: str) -> dict[str, Any]:
     """Build the metadata of a file, without a date.
 
     Equal data thus gives equal files.
@@ -85,7 +93,7 @@ def _build_metadata(kind: str, title: str, about: str) -> dict[str, Any]:
         return {"Title": title, "Subject": about, "Creator": "springbench", "CreationDate": None}
     if kind == "svg":
         return {"Title": title, "Description": about, "Creator": "springbench", "Date": None}
-    return {"Title": title, "Description": about, "Software": "springbench"}
+    return {"Title": title, "Description": about, "Software": "springbench", SOURCES_KEY: sources}
 
 
 def _write_csv(path: Path, rows: Sequence[CsvRow], about: Sequence[str]) -> None:

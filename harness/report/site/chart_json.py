@@ -76,7 +76,9 @@ def _plotly_axis(scale: AxisScale) -> dict[str, Any]:
     ticks = _TIME_TICKS if scale.tick_format == "time" else {}
     if scale.division != "linear":
         return {"type": "log", **ticks, **({"tickmode": "array"} if scale.division == "sizes" else {})}
-    return {"tickformat": ".0%", "rangemode": "tozero"} if scale.tick_format == "percent" else {**ticks}
+    if scale.tick_format in ("percent", "strain"):
+        return {"tickformat": ".3~%", "rangemode": "tozero"}
+    return {**ticks}
 
 
 def _describe_frame(frame: ChartFrame) -> dict[str, Any]:

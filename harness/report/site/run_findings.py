@@ -6,9 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from springbench.harness.report import equal_accuracy
-from springbench.harness.report.timing_table import RunTimes
-
-RunRecord = dict[str, Any]
+from springbench.harness.report.site.run_table import RunRecord, restore_run_times
 
 
 def describe_runs(run_records: Sequence[RunRecord]) -> list[dict[str, Any]]:
@@ -16,14 +14,10 @@ def describe_runs(run_records: Sequence[RunRecord]) -> list[dict[str, Any]]:
     names = {run["run_id"]: run["label"] for run in run_records}
     sentences = [
         {"text": words, "runs": runs}
-        for compared in equal_accuracy.compare_runs(map(_to_run_times, run_records))
+        for compared in equal_accuracy.compare_runs(map(restore_run_times, run_records))
         for words, runs in equal_accuracy.describe_comparison(compared, names)
     ]
     return sentences + list(_describe_unconverged(run_records))
-
-
-def _to_run_times(run: RunRecord) -> RunTimes:
-    return RunTimes(*(run["global" if name == "global_" else name] for name in RunTimes._fields))
 
 
 def _describe_unconverged(run_records: Sequence[RunRecord]) -> Iterator[dict[str, Any]]:

@@ -17,7 +17,7 @@ from springbench.harness.report.site.plotly_styles import plotly_style
 from springbench.harness.report.site.sweep_folders import SweepFolder
 from springbench.harness.report.speed.speed_figures import MACHINE_SOLVER
 from springbench.harness.report.table_queries import query_records
-from springbench.harness.report.timing_table import label_runs, read_run_times
+from springbench.harness.report.timing_table import RunTimes, label_runs, read_run_times
 from springbench.harness.results import parquet_rows, row_store
 from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 
@@ -89,6 +89,11 @@ def build_run_table(folder: SweepFolder, table: pa.Table) -> list[RunRecord]:
     for run, how in zip(found, _classify_staleness(found), strict=True):
         run["staleness"] = how
     return found
+
+
+def restore_run_times(record: RunRecord) -> RunTimes:
+    """Return the times in the record of a run."""
+    return RunTimes(*(record["global" if name == "global_" else name] for name in RunTimes._fields))
 
 
 def build_run_script(

@@ -24,6 +24,7 @@ from springbench.harness.report.charts.ablation_charts import build_effect_chart
 from springbench.harness.report.charts.device_chart import build_device_chart
 from springbench.harness.report.charts.hard_case_chart import build_hard_case_chart
 from springbench.harness.report.charts.speed_chart import build_speed_chart
+from springbench.harness.report.charts.timing_chart import build_compared_timing_chart, build_run_accuracy_chart
 from springbench.harness.report.device_speedup import read_device_runs, summarise_runs
 from springbench.harness.report.robustness import has_verification, map_headline, read_verified_runs
 from springbench.harness.report.site import (
@@ -137,6 +138,14 @@ def _build_run_section(
     table = run_table.read_run_rows(folder, _report_skipped(print_message))
     found = run_table.build_run_table(folder, table)
     scripts: dict[str, Any] = {}
+    citations = dict(zip(*(table[name].to_pylist() for name in ("solver", "citation")), strict=True))
+    stale_ids = {run["run_id"] for run in found if run["staleness"] == "stale"}
+    timed_runs = [run_table.restore_run_times(record) for record in found]
+    times = build_compared_timing_chart(timed_runs, stale_ids, citations=citations)
+    accuracies = build_run_accuracy_chart(timed_runs, stale_ids, citations=citations)
+    scripts |= {
+        name: serialise_chart(chart) for name, chart in (("size", times), ("accuracy", accuracies)) if chart.frames
+    }
     device_runs = read_device_runs(table)
     words = summarise_runs(device_runs, row_provenance.find_config(folder.path))
     findings = [{"text": sentence} for sentence in words] + describe_runs(found)
@@ -145,14 +154,12 @@ def _build_run_section(
         scripts["devices"] = serialise_chart(devices)
     if has_machine_limits(table):
         candidates = compute_speed_figures(table)
-        citations = dict(zip(*(table[name].to_pylist() for name in ("solver", "citation")), strict=True))
         newest = row_provenance.find_newest_fingerprint(table)
         scripts["speed"] = serialise_chart(build_speed_chart(candidates, newest, citations))
         findings = [{"text": words} for words in describe_speed(candidates)]
     outcomes: dict[str, Any] = {}
     if has_verification(table):
         cells = read_verified_runs(folder.path)
-        stale_ids = {run["run_id"] for run in found if run["staleness"] == "stale"}
         scripts["hard"] = serialise_chart(build_hard_case_chart(cells, stale_ids))
         outcomes = {cell.run_id: {"label": cell.outcome.label, "reason": cell.reason} for cell in cells}
         findings = [{"text": f"{map_headline(cells, folder.name)}.", "plot": "hard"}, *findings[-1:]]

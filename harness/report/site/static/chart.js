@@ -6,7 +6,7 @@ springbench.chart = (() => {
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
 
-  const figure = (value, format) => (typeof value === "string" ? value : format === "time" ? time(value) : format === "percent" ? percent(value) : number(value));
+  const figure = (value, format) => (typeof value === "string" ? value : format === "time" ? time(value) : format === "percent" || format === "strain" ? percent(value) : number(value));
   const older = (item, k) => Boolean(Array.isArray(item.stale) ? item.stale[k] : item.stale);
 
   function told(chart, item, k) {
@@ -34,7 +34,7 @@ springbench.chart = (() => {
   addEventListener("hashchange", hide);
 
   function trace(chart, item, x, y, panel, tail) {
-    const mark = item.style ?? own(chart.styles, item.label), ink = colour(mark.color), shape = item.shape ?? chart.shape, points = shape === "points";
+    const mark = item.style ?? own(chart.styles, item.label), ink = colour(mark.color), shape = item.shape, points = shape === "points";
     const ends = ["", "_low", "_high"].map(end => item[`${x.column}${end}`]), upright = ["", "_low", "_high"].map(end => item[`${y.column}${end}`]);
     // Intervals of many points would cover their line.
     const bars = some => (some[1] && some[2] && (points || some[0].length <= 24) ? {
@@ -119,7 +119,7 @@ springbench.chart = (() => {
         for (const v of sizes) if (!ticks.length || Math.log10(ticks.at(-1) / v) * room(axis) >= decades) ticks.push(v);
         return { ...axis.axis, tickvals: ticks, ticktext: ticks.map(v => number(v)) };
       }
-      return { ...axis.axis, dtick: 3 * decades > Math.min(7.2, room(axis)) ? Math.max(1, Math.ceil(decades / room(axis))) : "D2" };
+      return { ...axis.axis, dtick: decades < 0.7 ? undefined : 3 * decades > Math.min(7.2, room(axis)) ? Math.max(1, Math.ceil(decades / room(axis))) : "D2" };
     };
     panels.forEach((panel, k) => {
       const tail = k ? k + 1 : "", size = (1 + gap) / n - gap, low = k * (size + gap);
@@ -135,7 +135,7 @@ springbench.chart = (() => {
       layout.annotations.push(...extra.annotations);
       for (const item of here) {
         traces.push(trace(chart, item, x, y, panel, tail));
-        if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour(own(chart.styles, item.label).color)));
+        if (item.status && item.status !== "ok") traces.push(...failed(item, x, y, tail, colour((item.style ?? own(chart.styles, item.label)).color)));
       }
     });
     zoom(layout, where().query.get(zoomKey));

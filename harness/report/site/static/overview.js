@@ -77,7 +77,6 @@
     const links = [];
     if (sweep.runs) links.push(element("a.button", { href: address("runs", { sweep: sweep.slug }) }, `All ${many(sweep.runs, "run")}`));
     links.push(...sweep.plots.slice(0, 6).map(plot => element("a.button", { href: address("plots", { sweep: sweep.slug, plot: plot.id }) }, plot.title)));
-    if (sweep.runs && !sweep.plots.length) links.push(element("a.button", { href: address("plots", { sweep: sweep.slug }) }, "Plots"));
     return element("section.sweep", { "aria-labelledby": id },
       element("div.head", {},
         element("div", {}, element("h2", { id }, sweep.name), element("p.muted", {}, facts(sweep)), element("p.states", {}, ...outcome(sweep))),

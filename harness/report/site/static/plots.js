@@ -1,48 +1,9 @@
 // All plots, one at a time, with the selection of axes in the URL; a point links to its run.
 "use strict";
 (() => {
-  const { element, data, own, change, address, where, save } = springbench;
-  const LOG = { type: "log" }, PLAIN = {};
-  const axis = (column, title, how = LOG) => ({ column, title, axis: how });
-
-  // A chart of a sweep's runs themselves.
-  const OF_RUNS = {
-    size: {
-      title: "Time by size", note: "The median over frames and rounds, with its quartiles, at each size; point at a mark to read its run.",
-      x: [axis("vertices", "vertices"), axis("size", "mesh size")], y: [axis("step", "ms a step"), axis("least", "ms, the least step"), axis("warm", "ms to prepare, warm"), axis("local", "ms, a local step"), axis("global", "ms, a global step"), axis("num_iterations", "iterations a step", PLAIN), axis("max_strain", "largest strain, %", PLAIN)],
-    },
-    accuracy: {
-      title: "Time and accuracy", shape: "points", note: "What a step takes against how far its last iterate is from a minimum: to the lower left is better.",
-      x: [axis("step", "ms a step"), axis("least", "ms, the least step")], y: [axis("residual", "last residual, J^½"), axis("max_strain", "largest strain, %", PLAIN)],
-    },
-  };
-
-  async function ofRuns(sweep, id) {
-    const rows = (await springbench.rows(sweep.slug)).filter(row => row.step !== null), table = await data(`${sweep.slug}/runs`);
-    const groups = new Map();
-    for (const row of rows) {
-      const name = `${row.scene}\n${row.label}`;
-      groups.set(name, [...(groups.get(name) || []), row]);
-    }
-    const items = [...groups.values()].map(some => {
-      some.sort((a, b) => a.vertices - b.vertices);
-      const column = name => some.map(row => row[name]);
-      return {
-        label: some[0].label, description: some[0].scene, scene: some[0].scene, panel: some[0].scene, runs: column("key"), vertices: column("vertices"), size: column("size"), step: column("step"),
-        step_low: column("lower"), step_high: column("upper"), least: column("least"), warm: column("warm"), local: column("local"), global: column("global"),
-        num_iterations: column("num_iterations"), residual: column("residual"), max_strain: some.map(row => row.max_strain === null ? null : 100 * row.max_strain),
-        stale: some.map(row => row.staleness === "stale"),
-      };
-    });
-    const hover = [["vertices", "vertices"], ["step", "ms a step"], ["least", "least ms"], ["num_iterations", "iterations"], ["residual", "last residual"], ["max_strain", "largest strain, %"]];
-    return { ...OF_RUNS[id], filters: ["scene"], hover, items, styles: table.styles, citations: Object.fromEntries(items.map(item => [item.label, own(table.citations, item.label.split(",")[0])])) };
-  }
-
-  const plotsOf = sweep => [...(sweep.runs ? Object.entries(OF_RUNS).map(([id, { title }]) => ({ id, title })) : []), ...sweep.plots];
-  const load = (sweep, id) => (own(OF_RUNS, id) ? ofRuns(sweep, id) : data(`${sweep.slug}/${id}`));
-
+  const { element, data, change, address, where, save } = springbench;
   springbench.views.plots = async (content, query, index) => {
-    const sweeps = index.sweeps.filter(sweep => plotsOf(sweep).length);
+    const sweeps = index.sweeps.filter(sweep => sweep.plots.length);
     const box = element("div.plots"), top = element("div.choice.aside"), tabs = element("div.tabs", { role: "navigation", "aria-label": "Plots" });
     const title = element("h1"), note = element("p.muted"), by = element("p.by"), maps = element("div"), choice = element("div.choice"), body = element("div"), point = element("section.point", { hidden: true, tabIndex: -1, "aria-label": "The chosen point" });
     box.append(element("div.headline", {}, title, top), tabs, note, maps, choice, body, by, point);
@@ -53,13 +14,13 @@
       element("select", { "aria-label": words, onchange: event => change({ [key]: event.target.value, point: "", at: "", turn: "", zoom: "" }) }, ...names.map(name => element("option", { value: name, selected: name === value }, named(name)))));
 
     async function update(next) {
-      const sweep = sweeps.find(one => one.slug === next.get("sweep")) || sweeps[0], plots = plotsOf(sweep);
+      const sweep = sweeps.find(one => one.slug === next.get("sweep")) || sweeps[0], plots = sweep.plots;
       const plot = plots.find(one => one.id === next.get("plot")) || plots.find(one => one.id === "convergence") || plots[0];
       const drawn = [...next].filter(([key]) => !["point", "at", "turn"].includes(key)).join("&") + sweep.slug + plot.id;
       const anew = last.split("\n")[1] !== `${sweep.slug}/${plot.id}`;
       if (drawn !== last.split("\n")[0]) {
         last = `${drawn}\n${sweep.slug}/${plot.id}`;
-        const chart = await load(sweep, plot.id);
+        const chart = await data(`${sweep.slug}/${plot.id}`);
         title.textContent = chart.title;
         const mixed = chart.items.some(item => (Array.isArray(item.stale) ? item.stale.some(Boolean) : item.stale));
         note.textContent = [chart.note, mixed && "Hollow marks: measured by other code than the newest rows."].filter(Boolean).join(" ");
@@ -117,7 +78,7 @@
       point.hidden = !item;
       if (!item) return;
       const close = () => { change({ point: "", at: "", turn: "" }); current.plotBox.focus(); };
-      if (item.runs) await springbench.detail(point, item.runs[k], { close });
+      if (item.runs) await springbench.detail(point, `${sweep.slug}/${item.runs[k]}`, { close });
       else await springbench.solve(point, sweep, current.chart, item, k, close);
       if (!another) return;
       point.scrollIntoView({ block: "nearest" });

@@ -53,7 +53,7 @@
   document.querySelector(".skip").addEventListener("click", event => { event.preventDefault(); content.focus(); });
   data("index").then(index => {
     document.getElementById("title").textContent = index.title;
-    const some = names.filter(([id]) => id === "overview" || index.sweeps.some(s => (id === "runs" ? s.runs : s.runs || s.plots.length)));
+    const some = names.filter(([id]) => id === "overview" || index.sweeps.some(s => (id === "runs" ? s.runs : s.plots.length)));
     document.getElementById("views").append(...some.map(([id, words]) => element("a", { href: `#${id}` }, words)));
     theme();
     addEventListener("hashchange", guarded);
