@@ -15,6 +15,7 @@ import argparse
 from collections.abc import Callable
 from os import getloadavg
 from time import perf_counter, sleep
+from typing import Any
 
 import numba
 import numpy as np
@@ -53,14 +54,15 @@ def pardiso_factorisation(step: StepObjective, p: np.ndarray, threads: int) -> C
     An analysis is for one number of threads.
     """
     try:
-        from pypardiso import PyPardisoSolver  # an optional dependency
+        from pypardiso import PyPardisoSolver  # pyright: ignore[reportMissingImports]  (an optional dependency)
     except ImportError:
         return None
     matrix = step.hessian(p).assemble_clamped()
     graph, n = matrix.graph, 3 * matrix.graph.shape[0]
     whole = bsr_array((matrix.values, graph.indices, graph.indptr), shape=(n, n))
     upper = csr_matrix(triu(whole.tocsr(), format="csr"))
-    solver, nothing = PyPardisoSolver(mtype=2), np.zeros((n, 1))  # symmetric positive definite
+    solver: Any = PyPardisoSolver(mtype=2)  # symmetric positive definite
+    nothing = np.zeros((n, 1))
 
     def run(phase: int) -> object:
         solver.libmkl.MKL_Set_Num_Threads(threads)
