@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from springbench.harness.config.config_loader import load_config
+from springbench.harness.config.config_loader import load_config, load_scene
 from springbench.harness.experiments.run_pipeline import execute_run
 from springbench.harness.experiments.sweep_plan import RunFiles
+from springbench.harness.reference.residual_audit import AuditedSolver
 from springbench.harness.report.sweep_summary import SOLVED_RESIDUAL, summarise_sweep
 from springbench.harness.report.timing_table import read_run_times as runs_of
 from springbench.harness.results.run_schema import RUN_SCHEMA
+from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation import timing_pass
+from springbench.harness.simulation.solver_contract import DelegatingSolver
+from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.step_problem import Solution, StepProblem, StopRule
 
 from tests.plugin_solvers import SWEEP_OPTIONS, PluginSweep, write_plugin_solver
+
+CONFIGS = Path(__file__).parents[2] / "configs"
 
 
 def rows_of(made: PluginSweep, folder: Path) -> list[dict[str, Any]]:
@@ -168,6 +177,22 @@ frames: 3
 effects: [{kind: springs}]
 """
 """Four cables and two struts in self-stress: the start is an equilibrium."""
+
+
+class ClaimsNothingLeft(DelegatingSolver):
+    """A prepared solver that reports a residual of zero."""
+
+    def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        return replace(self._prepared.solve(problem, stop), residual=0.0)
+
+
+def test_a_claim_is_not_compared_where_the_gradient_is_round_off():
+    """At 3e12 N m round-off leaves a thousandth of the initial residual, which evaluations of it disagree about."""
+    scene = build_scene(load_scene(CONFIGS / "hard" / "effects-bending-1e12.yaml"), 6)
+    audited = AuditedSolver(ClaimsNothingLeft(prepare(scene, NewtonSolver())), NewtonSolver(), {1})
+    step = next(simulate_scene(scene, audited, StopRule(300, 1e-6), initial_guess="previous", frames=1))
+    assert step.solution.termination_reason == "roundoff"
+    assert audited.found[1]["stationarity_audit"] > 1e-4
 
 
 @pytest.mark.parametrize(
