@@ -58,7 +58,7 @@ SCENES = find_scenes("scenes")
 VERIFIED = find_scenes("hard", "hard-long", "exact")
 """Scenes of the published sweeps with `verify: true`."""
 OTHERS = find_scenes("hessians", "winners")
-CONTACT = find_scenes("growth", "hard-touch", "touch")
+CONTACT = find_scenes("contact-accuracy", "growth", "hard-touch", "touch")
 
 
 def coarse_size(spec: SceneSpec) -> int:

@@ -143,7 +143,7 @@ def test_a_hessians_factor_that_does_not_fit_is_refused(solver: Solver, monkeypa
 
 def test_what_no_linear_solver_holds_is_refused_with_what_each_needs():
     with pytest.raises(
-        Unsupported, match=r"does not fit in 100 KiB of memory: supernodal needs [\d.]+ KiB .* cg needs"
+        Unsupported, match=r"does not fit in 100 KiB of memory: supernodal needs [\d.]+ MiB .* cg needs"
     ):
         build_linear_solver(grid_matrix(40, 40), memory_limit=100.0 * 2**10)
 
