@@ -225,7 +225,7 @@ def _build_mesh(spec: SceneSpec, size: int) -> Mesh:
 def _build_contribution(spec: SceneSpec, i: int, mesh: Mesh, mass: NDArray[np.float64]) -> EffectContribution:
     effect, (plugin, _) = spec.effects[i], spec.plugins.get(f"effects[{i}]", (None, None))
     try:
-        given = mesh, mass, spec.time_step
+        given = mesh, mass, spec.find_effect_time_step(effect)
         bound = (
             effect.build_contribution(*given)
             if plugin is None

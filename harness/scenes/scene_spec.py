@@ -152,6 +152,8 @@ class SceneSpec(SceneFields):
     """Effects on the mesh; only listed effects are simulated."""
     initial_guess: InitialGuess = "previous"
     """Initial guess of a step unless a sweep sets it; see `choose_initial_guess`."""
+    barrier_time_step: float | None = None
+    """Time step [s] of the file where the scene has another one: default barrier stiffnesses are derived from it."""
     path: Path
     """Source file of the scene, for messages."""
     plugins: SkipValidation[Mapping[str, tuple[PluginName, Mapping[str, Any]]]] = Field(default_factory=dict)
@@ -186,11 +188,22 @@ class SceneSpec(SceneFields):
         return SceneSpec.model_construct(None, **values | {"mesh": made[0], "effects": tuple(made[1:])})
 
     def with_time_step(self, time_step: float) -> SceneSpec:
-        """Return the scene with another time step [s], the same for all steps."""
+        """Return the scene with another time step [s], the same for all steps.
+
+        Barriers retain their default stiffness. If it grew with 1/dt^2, shorter steps would never resolve an impact.
+        """
         if time_step == self.time_step:
             return self
         values: dict[str, Any] = {key: getattr(self, key) for key in SceneSpec.model_fields}
-        return SceneSpec.model_construct(None, **values | {"time_step": time_step, "alternate_time_step": None})
+        values |= {"time_step": time_step, "alternate_time_step": None}
+        if any(map(_has_default_barrier, self.effects)):
+            declared = self.barrier_time_step or self.time_step
+            values["barrier_time_step"] = None if time_step == declared else declared
+        return SceneSpec.model_construct(None, **values)
+
+    def find_effect_time_step(self, effect: SceneEffect) -> float:
+        """Return the time step [s] from which an effect derives its parameters."""
+        return self.barrier_time_step if self.barrier_time_step and _has_default_barrier(effect) else self.time_step
 
     def require_fixed_time_step(self) -> None:
         """Raise InputError if the steps differ in length."""
@@ -215,7 +228,13 @@ class SceneSpec(SceneFields):
             content["mass_per_area"] = self.mass_per_area
         if self.alternate_time_step is not None:
             content["alternate_time_step"] = self.alternate_time_step
+        if self.barrier_time_step is not None:
+            content["barrier_time_step"] = self.barrier_time_step
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _has_default_barrier(effect: SceneEffect) -> bool:
+    return getattr(effect, "barrier_stiffness", 0.0) is None
 
 
 def _load_part(part: Any, at: str) -> Any:
