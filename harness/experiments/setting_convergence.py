@@ -32,7 +32,11 @@ from springbench.harness.experiments.accuracy.method_recommendation import find_
 from springbench.harness.reference.equations_of_motion import NotIntegrable
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import REFERENCE_MARGIN, ReferenceTrajectory
-from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
+from springbench.harness.reference.self_converged_trajectory import (
+    CONTACT_MARGIN,
+    describe_self_convergence,
+    has_contact,
+)
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.results.setting_verdict import (
     ERROR_LEVELS,
@@ -68,9 +72,6 @@ DEFAULT_ITERATIONS = 50
 
 NUM_SAMPLES = 8
 """Number of times at which motions are compared."""
-
-CONTACT_MARGIN = 0.3
-"""Largest uncertainty of a self-converged motion, relative to an error that is claimed; the verdict states it."""
 
 MATERIAL_EFFECTS = (SpringsEffect, BendingEffect, StrainLimitsEffect)
 """Effects that belong to the material, which hangs with them."""
@@ -487,7 +488,7 @@ def _find_reference(
             )
         print_message(f"the motion is known well enough up to {until:g} s, to which the comparison is limited")
         simulator.shorten_motion(num_known)
-    return SampledReference.from_trajectory(scene, trajectory.select_times(num_known))
+    return SampledReference.from_trajectory(scene, trajectory.select_times(slice(num_known)))
 
 
 def _compare_with_finest(

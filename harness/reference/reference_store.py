@@ -30,6 +30,8 @@ from springbench.harness.reference.equations_of_motion import OdeField, build_od
 from springbench.harness.reference.perturbation_growth import PerturbationGrowth, estimate_growth
 from springbench.harness.reference.reference_trajectory import ProgressFunction, ReferenceTrajectory, integrate_motion
 from springbench.harness.reference.self_converged_trajectory import (
+    CONTACT_MARGIN,
+    NotConverged,
     SelfConvergedTrajectory,
     compute_self_converged,
     has_contact,
@@ -56,6 +58,8 @@ _CERTIFICATE_FIELDS = tuple(f.name for f in fields(MinimumCertificate) if f.name
 _TRAJECTORY_FIELDS = tuple(f.name for f in fields(ReferenceTrajectory) if f.name != "growth")
 """Stored fields of a trajectory; the growth of perturbations has its own file."""
 _SELF_CONVERGED_FIELDS = tuple(f.name for f in fields(SelfConvergedTrajectory))
+_NUM_HORIZONS = 8
+"""Number of times, evenly spaced, among which the longest at which an error can be measured is found."""
 _GROWTH_FIELDS = tuple(f.name for f in fields(PerturbationGrowth))
 
 
@@ -241,14 +245,53 @@ class ReferenceStore:
         known = bool(stored) and is_equal_to_roundoff(stored.pop("fingerprint"), witness)
         if known and float(stored.pop("error")) <= error:
             scalars = {key: stored.pop(key).item() for key in ("step", "last_change")}
-            found = SelfConvergedTrajectory(**stored, **scalars)
-        else:
-            found = compute_self_converged(
-                lambda h, name: build_exact_scene(spec.with_time_step(h), size, name), spec.time_step, times, error
-            )
-            arrays = {name: np.asarray(getattr(found, name)) for name in _SELF_CONVERGED_FIELDS}
-            _write_arrays(path, arrays | {"fingerprint": witness, "error": np.asarray(error)})
+            return SelfConvergedTrajectory(**stored, **scalars)
+        found = compute_self_converged(
+            lambda h, name: build_exact_scene(spec.with_time_step(h), size, name), spec.time_step, times, error
+        )
+        for k in range(len(times)):  # each time alone too: it may become the horizon of another request
+            part, name = found.select_times(slice(k, k + 1)), _build_motion_name(spec, size, times[k : k + 1])
+            _save_self_converged(self.folder / f"converged-{name}.npz", part, witness, error)
+        if len(times) > 1:
+            _save_self_converged(path, found, witness, error)
         return found
+
+    def load_contact_horizon(
+        self, spec: SceneSpec, size: int, t_end: float, *, error: float
+    ) -> tuple[SelfConvergedTrajectory, str]:
+        """Load the motion of a scene with contact at the longest time at which an error can be measured.
+
+        Eighths of t_end are tried, then those of a quarter of it, and so on.
+
+        Args:
+          spec: specification of the scene.
+          size: size of the scene.
+          t_end: longest time [s].
+          error: relative error to be measured.
+
+        Returns: the motion at that time, and why the time is not longer; empty at t_end.
+
+        Raises:
+          InputError: the scene cannot be built.
+          NotConverged: there is no such time.
+        """
+        last, reason = max(1, round(t_end / spec.time_step)), ""
+        step = t_end / last
+        while True:
+            ends = sorted({max(1, round(last * part / _NUM_HORIZONS)) for part in range(1, _NUM_HORIZONS + 1)})
+            try:
+                found = self.load_self_converged(spec, size, [step * end for end in ends], error=error)
+                known = found.find_last_known_time(CONTACT_MARGIN * error)
+                if known is None:
+                    found.require_accuracy(error)
+                else:
+                    reason = found.describe_uncertainty(known + 1) if known + 1 < len(ends) else reason
+                    return found.select_times(slice(known, known + 1)), reason
+            except NotConverged as refused:
+                reason = str(refused)
+                if last == 1:
+                    raise
+            last = max(1, last // 4)
 
     def _load_known_snapshots(self, request: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
         """Load those of the snapshots that are on disk and match the present scene."""
@@ -285,6 +328,11 @@ def _build_motion_name(spec: SceneSpec, size: int, times: Sequence[float]) -> st
     It consists of the scene without its step size, its size, and the times.
     """
     return f"{spec.with_time_step(1.0).scene_digest[:12]}-{size}-{'-'.join(f'{t:.9g}' for t in times)}"
+
+
+def _save_self_converged(path: Path, found: SelfConvergedTrajectory, witness: Positions, error: float) -> None:
+    arrays = {name: np.asarray(getattr(found, name)) for name in _SELF_CONVERGED_FIELDS}
+    _write_arrays(path, arrays | {"fingerprint": witness, "error": np.asarray(error)})
 
 
 def _build_minima(arrays: Arrays) -> KnownMinima:

@@ -70,6 +70,10 @@ class ReferenceTrajectory:
         """The kind of the reference."""
         return "integrated"
 
+    def get_error_bound(self, k: int) -> float:
+        """Return the bound on the reference's own error at times[k], relative to the displacement."""
+        return float(max(self.disagreement[k], self.growth[k]))
+
     def measure_error(self, k: int, p: Positions) -> float:
         """Measure the error of p (n, 3) [m] at times[k], relative to the displacement."""
         return compute_position_error(p, self.positions[k], self.free_vertices) / float(self.displacement[k])

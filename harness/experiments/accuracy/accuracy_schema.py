@@ -96,6 +96,9 @@ ACCURACY_COLUMNS = (
     ColumnSpec(
         "reference_kind", _TEXT, "", "kind of that reference: integrated, or self-converged where there is contact"
     ),
+    ColumnSpec(
+        "reference_error", _REAL, "", "bound on the error of that reference itself, relative to the displacement"
+    ),
     ColumnSpec("end_error_rms_m", _REAL, "m", "root mean square distance of a vertex from the reference at `t_end`"),
     ColumnSpec("num_iterations", _INT, "", "iterations of all steps together"),
     *select_run_columns("solver_description"),

@@ -87,6 +87,7 @@ def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: C
         tick()
     away = (p - trajectory.positions[-1])[scene.system.free_vertices]
     row["error"], row["reference_kind"] = trajectory.measure_error(-1, p), trajectory.reference_kind
+    row["reference_error"] = trajectory.get_error_bound(-1)
     row["end_error_rms_m"] = float(np.sqrt(np.einsum("ij,ij->i", away, away).mean()))
     row |= {"seconds": seconds, "seconds_per_simulated_second": float(np.median(seconds)) / spec.t_end}
     try:

@@ -105,7 +105,7 @@ class MotionReference:
                         trajectory.measure_error(k, p),
                         trajectory.measure_error(k, exact),
                         away,
-                        float(max(trajectory.disagreement[k], trajectory.growth[k])),
+                        trajectory.get_error_bound(k),
                         trajectory.reference_kind,
                     )
                 )

@@ -51,8 +51,8 @@ class SelfContactEffect(ConfigModel):
     dhat: PositiveFloat | None = None
     """Distance [m] beyond `min_distance` at which the barrier activates; equal to `min_distance` by default."""
     barrier_stiffness: PositiveFloat | None = None
-    """Barrier stiffness k [N/m] at each vertex; by default a tenth of the resistance of inertia and springs in a step of
-    the scene's file. Other time steps retain it."""
+    """Barrier stiffness k [N/m] at each vertex; by default a tenth of the resistance of inertia and springs at the
+    time step of the scene's file; other time steps retain it."""
     friction: NonNegativeFloat = 0.0
     """Coulomb's friction coefficient mu, both static and kinetic."""
     eps_v: PositiveFloat = 1e-3
