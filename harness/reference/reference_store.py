@@ -293,6 +293,23 @@ class ReferenceStore:
                     raise
             last = max(1, last // 4)
 
+    def require_contact_horizon(
+        self, spec: SceneSpec, size: int, t_end: float, *, error: float
+    ) -> SelfConvergedTrajectory:
+        """Load the motion of a scene with contact at t_end [s], by which a relative error can be measured.
+
+        Raises:
+          InputError: the scene cannot be built.
+          NotConverged: the error cannot be measured then; the message states until when it can.
+        """
+        found, reason = self.load_contact_horizon(spec, size, t_end, error=error)
+        if reason:
+            raise NotConverged(
+                f"with contact an error of {error:g} can be measured up to {found.times[-1]:.4g} s only, for {reason}; "
+                f"ask for a --t-end of {found.times[-1]:.4g} or less, or a larger --error"
+            )
+        return found
+
     def _load_known_snapshots(self, request: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
         """Load those of the snapshots that are on disk and match the present scene."""
         stored = [_read_arrays(self._snapshot_path(request, frame), SNAPSHOT_ARRAYS) for frame in frames]

@@ -47,7 +47,9 @@ SceneBuilder = Callable[[float, str], Scene]
 
 
 class NotConverged(UnpredictableMotion):
-    """The motion has no limit that is known accurately enough."""
+    """The motion has no limit that is known as accurately as the user asked for."""
+
+    exit_code = 2
 
 
 def has_contact(system: System) -> bool:

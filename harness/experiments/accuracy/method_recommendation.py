@@ -50,6 +50,7 @@ from springbench.harness.experiments.accuracy.setting_grid import (
 from springbench.harness.experiments.accuracy.work_precision import build_work_rows
 from springbench.harness.experiments.best_first_search import SearchSummary
 from springbench.harness.reference.reference_store import ReferenceStore
+from springbench.harness.reference.reference_trajectory import ReferenceTrajectory
 from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.results import parquet_rows, row_store
@@ -359,7 +360,14 @@ def recommend_method(
     )
     store = open_reference_store(results)
     candidates = StudyCandidates.from_goal(goal, engine)
-    study: AccuracyPlan = isolated(partial(_plan_study, path, scene, size, goal, candidates, t_end, time_limit, store))
+    study, reference_error = isolated(
+        partial(_plan_study, path, scene, size, goal, candidates, t_end, time_limit, store)
+    )
+    if goal.max_error and reference_error:
+        goal = replace(goal, max_error=goal.max_error - reference_error)
+        print_message(
+            f"the reference itself errs by up to {reference_error:.1e}: against it, {goal.max_error:.3g} is allowed"
+        )
     t_end, frame = study.work[0].t_end, scene.time_step
 
     def read_methods() -> tuple[list[MeasuredMethod], list[dict[str, Any]]]:
@@ -419,18 +427,46 @@ def _plan_study(
     time_limit: float,
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
-) -> AccuracyPlan:
-    """Return the study that may be measured, and compute its reference. Raises InputError, RunFailed."""
+) -> tuple[AccuracyPlan, float]:
+    """Compute the reference of a study, and return the study and the bound on the error of a self-converged reference.
+
+    The bound is 0 without contact. Raises InputError, RunFailed.
+    """
     max_error = goal.reference_error
     print_message("estimating how far ahead the motion can be predicted")
-    if t_end is None:
+    if mistakes := find_scene_mistakes(scene, [size]):
+        raise InputError(mistakes)
+    touches = has_contact(build_exact_scene(scene, size).system)
+    if touches:
+        print_message(describe_self_convergence(scene.path.stem))
+        t_end = _find_contact_t_end(scene, size, max_error, t_end, reference_store, print_message)
+    elif t_end is None:
         t_end = find_default_t_end(path, scene, size, max_error, reference_store, print_message)
     try:
         study = build_study(path, scene, size, candidates, t_end, time_limit)
     except InputError as refused:  # the studies are ours; what is wrong came with an option
         raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
-    _compute_reference(scene, size, max_error, t_end, reference_store, print_message)
-    return study
+    trajectory = _compute_reference(scene, size, max_error, t_end, reference_store, print_message)
+    return study, trajectory.get_error_bound(-1) if touches else 0.0
+
+
+def _find_contact_t_end(
+    scene: SceneSpec,
+    size: int,
+    max_error: float,
+    t_end: float | None,
+    reference_store: ReferenceStore,
+    print_message: Callable[[str], None],
+) -> float:
+    """Return the given end time [s], or the horizon up to that of the scene. Raises NotConverged."""
+    if t_end is not None:
+        reference_store.require_contact_horizon(scene, size, t_end, error=max_error)
+        return t_end
+    longest = min(DEFAULT_T_END, scene.frames * scene.time_step)
+    motion, reason = reference_store.load_contact_horizon(scene, size, longest, error=max_error)
+    if reason:
+        print_message(f"an error of {max_error:g} can be measured up to {motion.times[-1]:.4g} s, for {reason}")
+    return float(motion.times[-1])
 
 
 def find_default_t_end(
@@ -467,10 +503,8 @@ def _compute_reference(
     t_end: float,
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
-) -> None:
-    """Compute the reference, or report without delay why there is none. Raises RunFailed."""
-    if has_contact(build_exact_scene(scene, size).system):
-        print_message(describe_self_convergence(scene.path.stem))
+) -> ReferenceTrajectory:
+    """Return the reference, or report without delay why there is none. Raises RunFailed."""
     print_message(f"the reference first, the motion up to {t_end:g} s, which is made once")
     last = [monotonic()]
 
@@ -479,7 +513,7 @@ def _compute_reference(
             last[0] = monotonic()
             print_message(f"  motion {motion} of 2, at {time:.3g} of {t_end:g} s")
 
-    reference_store.load_trajectory(scene, size, [t_end], error=max_error, report_progress=told)
+    return reference_store.load_trajectory(scene, size, [t_end], error=max_error, report_progress=told)
 
 
 def _measure_study(
