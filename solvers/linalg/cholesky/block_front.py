@@ -28,6 +28,9 @@ PANEL_DEPTH, ROW_BLOCK_HEIGHT = 192, 128
 _MIN_PART_HEIGHT = 32
 """Least height of the row blocks of parts that threads share: four vectors."""
 
+ZERO, ONE = np.int64(0), np.int64(1)
+"""Numbers 0 and 1 as arguments: kernels are compiled once more for the literals."""
+
 _PIVOT_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
 """Pivots below this fraction of the matrix entry are round-off."""
 
@@ -90,8 +93,8 @@ def eliminate_front(fronts, supernode, values, to, min_pivots, triangles):
         failed = factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, triangles)
         if failed >= 0:
             return failed
-        eliminate_rows_below(to, first, triangles, 0, 1)
-        subtract_panel_product(to, first, 0, 1)
+        eliminate_rows_below(to, first, triangles, ZERO, ONE)
+        subtract_panel_product(to, first, ZERO, ONE)
     return -1
 
 
@@ -181,7 +184,7 @@ def subtract_panel_product(to, first, part, parts):
         left,
         to.stride,
         end - first,
-        0,
+        ZERO,
         to.panels,
         to.panel_offset,
         to.stride,
@@ -206,7 +209,7 @@ def subtract_front_update(to, columns, part, parts):
             to.update_buffer,
             to.update_offset,
             to.update_stride,
-            0,
+            ZERO,
             columns,
             part,
             parts,

@@ -23,6 +23,8 @@ from numba import prange
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_parallel, jit_kernel
 from springbench.solvers.linalg.cholesky.block_front import (
+    ONE,
+    ZERO,
     DenseFront,
     eliminate_front,
     eliminate_rows_below,
@@ -102,7 +104,7 @@ def factorise_blocks(fronts, schedule, values, panels, x, scratch, team, threads
     scratch.failures[:] = _NO_FAILURE
     reset_team(team)
     if threads is None:
-        _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, 0, 1)
+        _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, ZERO, ONE)
     else:
         _factorise_in_threads(fronts, schedule, values, panels, x, scratch, team, threads)
     failure = _first_failure(scratch)
@@ -124,7 +126,7 @@ def solve_blocks(fronts, schedule, panels, x, scratch, team, threads):
     """
     reset_team(team)
     if threads is None:
-        _solve_in_thread(fronts, schedule, panels, x, scratch, team, 0, 1)
+        _solve_in_thread(fronts, schedule, panels, x, scratch, team, ZERO, ONE)
     else:
         _solve_in_threads(fronts, schedule, panels, x, scratch, team, threads)
 
@@ -145,7 +147,7 @@ def _solve_in_threads(fronts, schedule, panels, x, scratch, team, threads):
 def _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, thread, threads):
     """Process tasks of all stages that no other thread has claimed."""
     tasks = len(team.task_sums)
-    stage = 0
+    stage = ZERO
     while stage >= 0:
         for i in range(tasks):
             task = (thread * tasks // threads + i) % tasks
@@ -169,7 +171,7 @@ def _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, thr
 def _solve_in_thread(fronts, schedule, panels, x, scratch, team, thread, threads):
     """Process groups that no other thread has claimed, forward and then backward."""
     tasks = len(team.task_sums)
-    phase = 0
+    phase = ZERO
     while phase >= 0:
         for i in range(tasks):
             task = (thread * tasks // threads + i) % tasks
@@ -197,7 +199,7 @@ def _factorise_group(fronts, schedule, group, values, panels, x, scratch, thread
             return
         to = _front_of(fronts, schedule, s, panels, scratch, thread)
         members = fronts.member_start[s + 1] - fronts.member_start[s]
-        _assemble_columns(fronts, schedule, s, values, to, scratch, thread, 0, members)
+        _assemble_columns(fronts, schedule, s, values, to, scratch, thread, ZERO, members)
         failed = eliminate_front(fronts, s, values, to, scratch.min_pivots[thread], scratch.triangles[thread])
         if failed >= 0:
             scratch.failed_vertices[group] = failed
@@ -205,7 +207,7 @@ def _factorise_group(fronts, schedule, group, values, panels, x, scratch, thread
             return
         if len(x) > 0:
             _forward_substitution(fronts, schedule, s, panels, x, scratch, thread)
-        subtract_front_update(to, _update_width(fronts, s), 0, 1)
+        subtract_front_update(to, _update_width(fronts, s), ZERO, ONE)
 
 
 @jit_inner
@@ -370,12 +372,12 @@ def _forward_substitution(fronts, schedule, supernode, panels, x, scratch, threa
     front, updates, runs = scratch.fronts[thread], scratch.updates, scratch.runs[thread]
     size = fronts.block_size
     front[: stride + TILE_ROWS] = 0.0
-    _gather_vertices(x, fronts.member_vertices, first, own, front, 0, size)
+    _gather_vertices(x, fronts.member_vertices, first, own, front, ZERO, size)
     child = fronts.first_child[supernode]
     while child >= 0:
         rows = fronts.member_start[child + 1] - fronts.member_start[child] - fronts.num_columns[child]
         at = _locate_update(schedule, child, thread) + _update_width(fronts, child) * round_up_rows_inner(size * rows)
-        _add_runs(runs, 0, _find_runs(fronts, child, own, head, 0, runs), 0, size, updates, at, front, 0)
+        _add_runs(runs, ZERO, _find_runs(fronts, child, own, head, ZERO, runs), ZERO, size, updates, at, front, 0)
         child = fronts.next_sibling[child]
     width = round_up_columns_inner(size * own)
     for tile in range(0, width, TILE_COLUMNS):
@@ -406,7 +408,7 @@ def _solve_backward(fronts, schedule, group, panels, x, scratch, thread):
         s = schedule.sequence[k]
         first, own, below, head, stride = _front_sizes(fronts, s)
         front[: stride + TILE_ROWS] = 0.0
-        _gather_vertices(x, fronts.member_vertices, first, own, front, 0, size)
+        _gather_vertices(x, fronts.member_vertices, first, own, front, ZERO, size)
         _gather_vertices(x, fronts.member_vertices, first + own, below, front, head, size)
         width = round_up_columns_inner(size * own)
         for tile in range((width - 1) // TILE_COLUMNS * TILE_COLUMNS, -1, -TILE_COLUMNS):
