@@ -22,6 +22,7 @@ from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.results import parquet_rows
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.solvers.contact.contact_potential import ObstacleContact
+from springbench.solvers.contact.obstacle_mesh import ObstacleCollisionMesh
 from typer.testing import CliRunner
 
 from tests.progress_displays import SilentDisplay
@@ -52,8 +53,9 @@ def drop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def find_barrier_stiffness(spec: SceneSpec) -> float:
     energies = build_exact_scene(spec, 3, "bdf2").system.energies
-    (contact,) = (one for one in energies if isinstance(one, ObstacleContact))
-    return float(np.max(contact.collision_mesh.stiffness))
+    (mesh,) = (one.collision_mesh for one in energies if isinstance(one, ObstacleContact))
+    assert isinstance(mesh, ObstacleCollisionMesh)
+    return float(np.max(mesh.stiffness))
 
 
 def test_a_barrier_retains_its_default_stiffness_at_other_time_steps(drop: Path) -> None:

@@ -49,7 +49,7 @@ def interrupt(process: subprocess.Popen[str], seconds: float) -> None:
         assert seconds > 0.5
 
 
-@pytest.mark.parametrize("seconds", [0.3, 0.6])
+@pytest.mark.parametrize("seconds", [0.1, 0.6])
 def test_ctrl_c_while_modules_are_imported(seconds: float):
     interrupt(start("schema"), seconds)
 

@@ -7,7 +7,7 @@ Sizes are in points of the printed figure.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from springbench.harness.report.charts.figure_panels import (
     CurveSeries,
     FloatArray,
     MeshPicture,
+    ShadedBand,
 )
 from springbench.harness.report.figures.axis_scales import bar_base, frame_size_points, set_axis_scales
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
@@ -50,7 +51,11 @@ def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions, panels: 
         panels: all panels of the figure.
     """
     set_axis_scales(ax, panel, panels)
-    for bands, limits, shade in ((panel.bands, ax.get_ylim(), ax.axhspan), (panel.x_bands, ax.get_xlim(), ax.axvspan)):
+    directions: list[tuple[Sequence[ShadedBand], tuple[float, float], Callable[..., object]]] = [
+        (panel.bands, ax.get_ylim(), ax.axhspan),
+        (panel.x_bands, ax.get_xlim(), ax.axvspan),
+    ]
+    for bands, limits, shade in directions:
         for band in bands:
             low, high = max(band.low, limits[0]), min(band.high, limits[1])
             if low < high:
