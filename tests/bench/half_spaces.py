@@ -1,6 +1,7 @@
 """Can barriers alone serve as contact? Half spaces and barriers for the same floor.
 
     python -m tests.bench.half_spaces [--size 24] [--block 4] [--frames 40] [--rounds 2] [--solvers hybrid newton]
+        [--publish results/published/half-spaces]
 
 Scenes have the effect `contact` (vertices against half spaces), then `surface-contact` (barriers), with the same plane
 and minimum distance, and are simulated to a relative residual of 1e-6. Thin barriers act within a tenth of the minimum
@@ -36,6 +37,8 @@ from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.model.step_problem import Positions, StopRule
 from springbench.solvers.registry import SOLVERS, load_target
+
+from tests.bench.scripted_study import describe_moment, publish_rows
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 FLOORS: dict[str, tuple[Any, float | None]] = {
@@ -93,36 +96,45 @@ def simulate_interleaved(
     return [Motion(*it) for it in zip(seconds, ends, limited.tolist(), lowest.tolist(), strict=True)]
 
 
-def measure_idle(size: int, solver: str, frames: int, rounds: int) -> list[str]:
-    """Return the ratios of a step with each floor far below to one without a floor."""
+def measure_idle(size: int, solver: str, frames: int, rounds: int) -> list[dict[str, Any]]:
+    """Measure the ratio of a step with each floor far below to one without a floor."""
     spec = load_scene(CONFIGS / "scenes" / "hanging-cloth.yaml")
     more: list[tuple[SceneEffect, ...]] = [(), *((build_floor(kind, -5.0),) for kind in FLOORS)]
     motions = simulate_interleaved(
         [spec.model_copy(update={"effects": (*spec.effects, *one)}) for one in more], size, solver, frames, rounds
     )
     without, *others = (float(motion.step_seconds[NUM_WARMUP_STEPS:].sum()) for motion in motions)
-    return [f"{one / without:.3f}" for one in others]
+    return [{"idle_ratio": one / without} for one in others]
 
 
-def measure_resting(size: int, solver: str, frames: int, rounds: int) -> tuple[list[str], list[str]]:
-    """Return the time of a step at rest [ms], and the error of the resting height [mm], for each floor."""
+def measure_resting(size: int, solver: str, frames: int, rounds: int) -> list[dict[str, Any]]:
+    """Measure the time of a step at rest [ms], and the error of the resting height [mm], for each floor."""
     spec = load_scene(CONFIGS / "scenes" / "block-drop.yaml")
     start = float(build_scene(spec, size, log_warnings=False).mesh.rest_positions[:, 1].min())
     floor = start - 0.05 - MIN_DISTANCE
     motions = simulate_interleaved(_replace_contact(spec, floor), size, solver, frames, rounds)
-    times = [1e3 * float(np.median(motion.step_seconds[-frames // 3 :])) for motion in motions]
-    heights = [1e3 * (_mean_lowest(motion.positions, size) - floor - MIN_DISTANCE) for motion in motions]
-    return [f"{one:.2f}" for one in times], [f"{one:+.3f}" for one in heights]
+    return [
+        {
+            "step_milliseconds": 1e3 * float(np.median(motion.step_seconds[-frames // 3 :])),
+            "height_error_mm": 1e3 * (_mean_lowest(motion.positions, size) - floor - MIN_DISTANCE),
+        }
+        for motion in motions
+    ]
 
 
-def measure_hard_case(name: str, solver: str) -> list[str]:
-    """Return for each floor the steps at the iteration limit and the deepest vertex [mm] of a hard case."""
+def measure_hard_case(name: str, solver: str) -> list[dict[str, Any]]:
+    """Count for each floor the steps at the iteration limit of a hard case, and measure its deepest vertex [mm]."""
     spec = load_scene(CONFIGS / "hard-touch" / f"{name}.yaml")
     last: Any = spec.effects[-1]
     floor = float(last.obstacles[0].point[1])
     motions = simulate_interleaved(_replace_contact(spec, floor, last.min_distance), None, solver, spec.frames, 1)
-    deepest = [max(0.0, 1e3 * (floor + last.min_distance - motion.lowest_height)) for motion in motions]
-    return [f"{motion.num_limited_steps}; {one:.3g}" for motion, one in zip(motions, deepest, strict=True)]
+    return [
+        {
+            "num_limited_steps": motion.num_limited_steps,
+            "depth_mm": max(0.0, 1e3 * (floor + last.min_distance - motion.lowest_height)),
+        }
+        for motion in motions
+    ]
 
 
 def _replace_contact(spec: SceneSpec, floor: float, min_distance: float = MIN_DISTANCE) -> list[SceneSpec]:
@@ -136,6 +148,37 @@ def _mean_lowest(p: Positions, size: int) -> float:
     return float(np.sort(p[:, 1])[: size * size].mean())
 
 
+def measure_solver(solver: str, size: int, block_size: int, frames: int, rounds: int) -> list[dict[str, Any]]:
+    """Measure all with one solver: a row for each scene and floor."""
+    measured = {
+        "hanging-cloth": measure_idle(size, solver, 16, rounds),
+        "block-drop": measure_resting(block_size, solver, frames, rounds),
+        **{name: measure_hard_case(name, solver) for name in HARD_CASES},
+    }
+    return [
+        {"solver": solver, "scene": scene, "floor": kind, **row}
+        for scene, found in measured.items()
+        for kind, row in zip(FLOORS, found, strict=True)
+    ]
+
+
+def tabulate(rows: Sequence[dict[str, Any]]) -> Table:
+    """Build the table of all rows, with a column for each floor."""
+    table = Table("solver", "measured", *FLOORS, box=SIMPLE_HEAD)
+    table.title = f"the same floor as half spaces and as barriers; {describe_machine().cpu}"
+    lines = {
+        ("hanging-cloth", "nothing near, ratio"): "{idle_ratio:.3f}",
+        ("block-drop", "resting, ms a step"): "{step_milliseconds:.2f}",
+        ("block-drop", "resting height, mm"): "{height_error_mm:+.3f}",
+        **{(name, f"{name}: limited steps; depth, mm"): "{num_limited_steps}; {depth_mm:.3g}" for name in HARD_CASES},
+    }
+    for solver in dict.fromkeys(row["solver"] for row in rows):
+        for (scene, words), form in lines.items():
+            found = [row for row in rows if (row["solver"], row["scene"]) == (solver, scene)]
+            table.add_row(solver, words, *(form.format_map(row) for row in found))
+    return table
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -144,18 +187,15 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--solvers", nargs="+", default=["hybrid", "newton"])
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    table = Table("solver", "measured", *FLOORS, box=SIMPLE_HEAD)
-    table.title = f"the same floor as half spaces and as barriers; {describe_machine().cpu}"
+    begin, rows = describe_moment(), list[dict[str, Any]]()
     with limit_threads(1):
         for solver in options.solvers:
-            table.add_row(solver, "nothing near, ratio", *measure_idle(options.size, solver, 16, options.rounds))
-            times, heights = measure_resting(options.block, solver, options.frames, options.rounds)
-            table.add_row(solver, "resting, ms a step", *times)
-            table.add_row(solver, "resting height, mm", *heights)
-            for name in HARD_CASES:
-                table.add_row(solver, f"{name}: limited steps; depth, mm", *measure_hard_case(name, solver))
-    Console(width=120).print(table)
+            rows += measure_solver(solver, options.size, options.block, options.frames, options.rounds)
+    Console(width=120).print(tabulate(rows))
+    config = CONFIGS / "scenes" / "block-drop.yaml"
+    publish_rows(options.publish, config, "python -m tests.bench.half_spaces", rows, begin)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""What code written for vector registers buys beside plain Numba: `python -m tests.bench.vectors` prints a table.
+"""What code written for vector registers buys beside plain Numba.
+
+    python -m tests.bench.vectors [FILE ...] [--publish results/published/vectors]
 
 A kernel is compiled twice, as it is and with plain functions (`tests.bench.plain`) in the place of the vectors that it
 calls. Both must find the same, and are then timed in turns, A B B A or B A A B by a coin, by this thread's CPU time;
@@ -7,12 +9,13 @@ the interval is the gates' (see README.md). What buys less than 15 % has no plac
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from math import ceil
 from os import getloadavg
+from pathlib import Path
 from time import thread_time
 from types import FunctionType, ModuleType
 from typing import Any
@@ -44,9 +47,12 @@ from springbench.solvers.model.step_problem import Positions
 from tests.bench import plain
 from tests.bench.gates import STOP, prepare, sheet
 from tests.bench.pairs import folded
+from tests.bench.scripted_study import describe_moment, publish_rows
 from tests.bench.solves import system_matrix
 
 SIZE, TURNS = 64, 40
+SHEET_FILE = Path(__file__).with_name("gates.py")
+"""File that states the measured sheet."""
 ROUND_OFF = 1e-5
 """Of the largest entry: the same sums in another order, in float32 or among pins of 1e10 N/m in float64."""
 
@@ -301,13 +307,22 @@ def _seconds(kernel: Any, case: Case, repeats: int) -> float:
 
 def main() -> None:
     """Measure the files that are named, or all, and print a table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("files", nargs="*", default=list(CASES), metavar="FILE")
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    options = parser.parse_args()
+    begin, rows = describe_moment(), list[dict[str, Any]]()
     print(f"{describe_machine().cpu}, one thread, {SIZE} x {SIZE} vertices; load {getloadavg()[0]:.1f}\n")
     print("| file | what | plain Numba takes | between |\n|---|---|---|---|")
     with limit_threads(1):
-        for file in sys.argv[1:] or CASES:
+        for file in options.files:
             for case in CASES[file]():
                 median, low, high = ratio(case)
                 print(f"| `{file}` | {case.what} | {median:.2f} times as long | {low:.2f} and {high:.2f} |", flush=True)
+                rows.append(
+                    {"file": file, "kernel": case.what, "size": SIZE, "ratio": median, "low": low, "high": high}
+                )
+    publish_rows(options.publish, SHEET_FILE, "python -m tests.bench.vectors", rows, begin)
 
 
 if __name__ == "__main__":
