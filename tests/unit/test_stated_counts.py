@@ -43,8 +43,7 @@ def test_the_page_of_configs_counts_the_solvers_of_the_hard_cases():
 
 @pytest.mark.long
 @pytest.mark.skipif(Path(sys.prefix) != ROOT / ".venv", reason="another environment may hold anything")
-def test_the_first_page_states_the_size_of_the_environment():
-    """An environment with `dev` has its stated size, and 15 % are for other versions of libraries."""
+def test_the_environment_with_dev_fits_in_the_size_that_the_first_page_states():
     (stated,) = re.findall(r"with `dev` ([0-9.]+) GB", (ROOT / "README.md").read_text())
     taken = sum(path.lstat().st_blocks * 512 for path in Path(sys.prefix).rglob("*"))
-    assert taken / 2**30 == pytest.approx(float(stated), rel=0.15)
+    assert taken / 2**30 <= float(stated)
