@@ -322,7 +322,8 @@ def main() -> None:
                 rows.append(
                     {"file": file, "kernel": case.what, "size": SIZE, "ratio": median, "low": low, "high": high}
                 )
-    publish_rows(options.publish, SHEET_FILE, "python -m tests.bench.vectors", rows, begin)
+    command = " ".join(["python -m tests.bench.vectors", *(options.files if options.files != list(CASES) else ())])
+    publish_rows(options.publish, SHEET_FILE, command, rows, begin)
 
 
 if __name__ == "__main__":
