@@ -161,10 +161,12 @@ def draw_gallery_sheet(tiles: Sequence[SceneTile], path: Path, title: str, facts
     with matplotlib.rc_context(PAGE_RC), OffscreenRenderer(width, height, mesh_lines=_PIXELS_PER_VERTEX) as studio:
         sheet = _Sheet()
         sheet.add_paragraph(wrap_to_width(title, whole, _TITLE_SIZE, weight="bold"), size=_TITLE_SIZE, weight="bold")
+        sheet.y += _BAND_GAP // 2
         for k in range(0, len(tiles), columns):
-            below = sheet.y + height
-            for column, tile in enumerate(tiles[k : k + columns]):
-                left = _MARGIN + column * (width + _TILE_GAP)
+            below, row = sheet.y + height, tiles[k : k + columns]
+            indent = _MARGIN + (columns - len(row)) * (width + _TILE_GAP) // 2
+            for column, tile in enumerate(row):
+                left = indent + column * (width + _TILE_GAP)
                 sheet.add_image(_render_tile(studio, tile, width / height), left, sheet.y)
                 below = max(below, _add_caption(sheet, tile, left, sheet.y + height, width))
             sheet.y = below + _BAND_GAP

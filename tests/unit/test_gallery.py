@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 from springbench.harness.cli.main import app
 from springbench.harness.execution import machine_info
 from springbench.harness.report import gallery_sheet, opengl_probe
@@ -82,7 +83,10 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 def find_overlaps(page: Figure) -> list[tuple[str, str]]:
     """Pairs of texts and images that overlap, and what is outside the page."""
     boxes = {f"{k}: {text.get_text()}": text.get_window_extent() for k, text in enumerate(page.texts)}
-    boxes |= {f"image {k}": image.get_window_extent() for k, image in enumerate(page.images)}
+    boxes |= {
+        f"image {k}": Bbox.from_extents(*np.take(image.get_extent(), (0, 2, 1, 3)))
+        for k, image in enumerate(page.images)
+    }
     pairs = [(one, other) for one, other in combinations(boxes, 2) if boxes[one].overlaps(boxes[other])]
     whole = page.bbox
     return pairs + [
