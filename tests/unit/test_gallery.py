@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -82,11 +83,11 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
 
 def find_overlaps(page: Figure) -> list[tuple[str, str]]:
     """Pairs of texts and images that overlap, and what is outside the page."""
-    boxes = {f"{k}: {text.get_text()}": text.get_window_extent() for k, text in enumerate(page.texts)}
-    boxes |= {
-        f"image {k}": Bbox.from_extents(*np.take(image.get_extent(), (0, 2, 1, 3)))
-        for k, image in enumerate(page.images)
-    }
+    images: list[Any] = page.images
+    boxes: dict[str, Any] = {f"{k}: {text.get_text()}": text.get_window_extent() for k, text in enumerate(page.texts)}
+    for k, image in enumerate(images):
+        left, right, bottom, top = image.get_extent()
+        boxes[f"image {k}"] = Bbox.from_extents(left, bottom, right, top)
     pairs = [(one, other) for one, other in combinations(boxes, 2) if boxes[one].overlaps(boxes[other])]
     whole = page.bbox
     return pairs + [
