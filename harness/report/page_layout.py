@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Polygon
 from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
@@ -63,6 +64,36 @@ def draw_text(
         **text_options: further keywords of `Figure.text`.
     """
     page.text(x / PAGE_WIDTH, 1 - y / PAGE_HEIGHT, words, size=size, color=color, **text_options)
+
+
+def measure_text(words: str, size: float, *, weight: str = "normal") -> float:
+    """Return the width of a line of text [pixels], in the font family of the present `matplotlib.rc_context`."""
+    font = FontProperties(size=size, weight=weight)
+    return float(RendererAgg(1, 1, PAGE_DPI).get_text_width_height_descent(words, font, ismath=False)[0])
+
+
+def wrap_to_width(words: str, width: float, size: float, *, weight: str = "normal", separator: str = " ") -> list[str]:
+    """Wrap text into lines that are at most `width` wide.
+
+    Args:
+        words: text.
+        width: largest width of a line [pixels].
+        size: font size [points].
+        weight: weight of the font.
+        separator: where lines break; it is left out there. Parts wider than a line also break between letters.
+    """
+    lines = [""]
+    for part in words.split(separator):
+        longer = f"{lines[-1]}{separator}{part}" if lines[-1] else part
+        if measure_text(longer, size, weight=weight) <= width:
+            lines[-1] = longer
+            continue
+        lines += [""] if lines[-1] else []
+        for letter in part:
+            if lines[-1] and measure_text(lines[-1] + letter, size, weight=weight) > width:
+                lines.append("")
+            lines[-1] += letter
+    return lines
 
 
 def draw_provenance(page: Figure, replays: Iterable[RecordingReplay], y: float) -> None:

@@ -127,10 +127,10 @@ PICTURES = (
         (_RECORDINGS,),
     ),
     Mutation(
-        "caption-cut-at-its-notes",
+        "names-past-their-tile",
         "harness/report/gallery_sheet.py",
-        'shown = [*effects[:count], *(["…"] if count < len(effects) else []), *notes]',
-        "shown = [*effects, *notes]",
-        (f"{_DRAWN}::test_every_picture_of_a_surface_says_that_nothing_keeps_it_apart",),
+        "in wrap_to_width(words, width, _TEXT_SIZE):",
+        "in [words]:",
+        ("tests/unit/test_gallery.py::test_a_sheet_of_any_names_is_read_where_it_is_a_column_wide",),
     ),
 )

@@ -23,6 +23,7 @@ def gallery(
         list[Path], describe_config("SCENES...", "Scenes (YAML) in the order of the sheet, or names of shipped ones.")
     ],
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write (.png).")] = Path("scenes.png"),
+    title: Annotated[str, typer.Option(help="Title of the sheet.")] = "Scenes coloured by strain",
 ) -> None:
     """Draw a sheet of scenes, each at its default size and last frame."""
     from springbench.harness.report.gallery_sheet import draw_gallery_sheet
@@ -32,16 +33,8 @@ def gallery(
     for path in scenes:
         tiles.append(_build_tile(path))
         print_message(f"[{len(tiles)}/{len(scenes)}] {tiles[-1].name}")
-    draw_gallery_sheet(
-        tiles, output, [f"at the last frame, by {_SOLVER} to {_TOLERANCE}", *_format_strain_range(tiles)]
-    )
+    draw_gallery_sheet(tiles, output, title, [f"at the last frame, by {_SOLVER} to {_TOLERANCE}"])
     print_message(f"the sheet is {output}")
-
-
-def _format_strain_range(tiles: list[Any]) -> list[str]:
-    """Return the legend of the strain colours if all tiles share one range."""
-    ranges = {tile.replay.strain_range for tile in tiles}
-    return [f"strain: blue −{100 * ranges.pop():g} % or more, orange as much stretched"] if len(ranges) == 1 else []
 
 
 def _build_tile(path: Path) -> Any:
@@ -99,12 +92,10 @@ def _simulate_tile(run: RunSpec, tick: ProgressCallback) -> Any:
         },
         origin=origin,
     )
-    kinds = dict.fromkeys(effect.kind for effect in run.scene.effects)
     camera = run.scene.camera
     return SceneTile(
         replay=replay,
         mass=scene.system.mass,
         name=run.scene_name.replace("-", " "),
-        effect_words=", ".join(kinds).replace("-", " "),
         angles=(camera.azimuth, camera.elevation) if camera else None,
     )
