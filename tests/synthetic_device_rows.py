@@ -1,4 +1,4 @@
-"""Rows of runs on a device and on the processor of one computer: rows that nobody measured."""
+"""Rows of runs on a device and on the processor of one computer: made up, not measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results of every kind for figures of known looks: rows that nobody measured."""
+"""Results of every kind for figures of known looks: made up, not measured."""
 
 from __future__ import annotations
 

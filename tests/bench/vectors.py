@@ -1,10 +1,10 @@
-"""What code written for vector registers buys beside plain Numba.
+"""Speedup of vector code compared with plain Numba.
 
     python -m tests.bench.vectors [FILE ...] [--publish results/published/vectors]
 
 A kernel is compiled twice, as it is and with plain functions (`tests.bench.plain`) in the place of the vectors that it
 calls. Both must find the same, and are then timed in turns, A B B A or B A A B by a coin, by this thread's CPU time;
-the interval is the gates' (see README.md). What buys less than 15 % has no place in `solvers/simd`.
+the interval is the gates' (see README.md). What saves less than 15 % has no place in `solvers/simd`.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ class Home:
         ).to_pylist()
         return [row for row in table if row["kind"] == kind and all(row[key] == v for key, v in values.items())]
 
-    def told(self) -> list[str]:
+    def list_untimed_rows(self) -> list[str]:
         """All rows, less their times; as text, because what is not a number equals nothing."""
         table = parquet_rows.read_rows(sorted((self.folder / "accuracy").glob("*.parquet")), ACCURACY_SCHEMA)
         return list(map(repr, table.drop_columns(list(TIMES)).to_pylist()))
@@ -163,7 +163,7 @@ def test_a_config_that_was_stopped_goes_on_where_it_was(home: Home, tmp_path: Pa
     assert len(there) == after
     assert stopped.run() == UNITS - after
     assert there.items() <= stopped.written().items()
-    assert stopped.told() == home.told()
+    assert stopped.list_untimed_rows() == home.list_untimed_rows()
 
 
 def test_a_changed_request_replaces_the_earlier_one(tmp_path: Path) -> None:

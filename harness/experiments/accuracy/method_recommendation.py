@@ -534,12 +534,12 @@ def _compute_reference(
     print_message(f"the reference first, the motion up to {t_end:g} s, which is made once")
     last = [monotonic()]
 
-    def told(motion: int, time: float) -> None:
+    def report_progress(motion: int, time: float) -> None:
         if monotonic() - last[0] > _MESSAGE_INTERVAL:
             last[0] = monotonic()
             print_message(f"  motion {motion} of 2, at {time:.3g} of {t_end:g} s")
 
-    return reference_store.load_trajectory(scene, size, [t_end], error=max_error, report_progress=told)
+    return reference_store.load_trajectory(scene, size, [t_end], error=max_error, report_progress=report_progress)
 
 
 def _measure_study(

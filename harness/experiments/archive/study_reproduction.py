@@ -106,7 +106,7 @@ def draw_sample(items: Sequence[Any], seed: int | None) -> list[Any]:
 
 
 def draw_from_groups(items: Sequence[Any], get_group: Callable[[Any], Hashable], seed: int | None) -> list[Any]:
-    """Draw a tenth of the items, at least one, from as few groups as have so many; all of them without a seed."""
+    """Draw a tenth of the items, at least one, from as few groups as suffice; all of them without a seed."""
     if seed is None or not items:
         return list(items)
     chance = random.Random(seed)

@@ -9,7 +9,7 @@ springbench.chart = (() => {
   const figure = (value, format) => (typeof value === "string" ? value : format === "time" ? time(value) : format === "percent" || format === "strain" ? percent(value) : number(value));
   const older = (item, k) => Boolean(Array.isArray(item.stale) ? item.stale[k] : item.stale);
 
-  function told(chart, item, k) {
+  function describePoint(chart, item, k) {
     const rows = chart.hover.map(([column, words, format]) => {
       const value = at(item, column, k);
       return value === null || value === undefined ? null : element("tr", {}, element("td", {}, words), element("td", {}, figure(value, format)));
@@ -149,7 +149,7 @@ springbench.chart = (() => {
       if (!p.data.meta) return;
       const box = plot.getBoundingClientRect();
       const [left, top] = [p.xaxis._offset + p.xaxis.d2p(p.x) + box.left, p.yaxis._offset + p.yaxis.d2p(p.y) + box.top];
-      show(left, top, told(chart, p.data.meta.item, p.pointNumber));
+      show(left, top, describePoint(chart, p.data.meta.item, p.pointNumber));
     });
     plot.on("plotly_unhover", hide);
     plot.on("plotly_click", ({ points: [p] }) => { if (p.data.meta) onPoint(p.data.meta.item, p.pointNumber); });
@@ -177,7 +177,7 @@ springbench.chart = (() => {
           if (one.x[k] !== null && one.y[k] !== null) break;
         }
         const full = plot._fullData[curve], box = plot.getBoundingClientRect(), axes = [plot._fullLayout[full.xaxis.replace("x", "xaxis")], plot._fullLayout[full.yaxis.replace("y", "yaxis")]];
-        show(axes[0]._offset + axes[0].d2p(one.x[k]) + box.left, axes[1]._offset + axes[1].d2p(one.y[k]) + box.top, told(chart, one.meta.item, k));
+        show(axes[0]._offset + axes[0].d2p(one.x[k]) + box.left, axes[1]._offset + axes[1].d2p(one.y[k]) + box.top, describePoint(chart, one.meta.item, k));
         springbench.tell(`${one.name}: ${figure(one.x[k], x.format)}, ${figure(one.y[k], y.format)}`);
       } else return;
       event.preventDefault();

@@ -59,8 +59,8 @@ Object.assign(springbench, (() => {
       size: row.size || null, solver: row.solver, ...(chosen ? { "error-target": row.error_requested } : stated), "time-step": row.time_step && (Math.abs(Math.round(1 / row.time_step) * row.time_step - 1) < 1e-12 ? `1/${Math.round(1 / row.time_step)}` : row.time_step), threads: row.threads,
       frames: row.frames, rounds: row.rounds,
     };
-    const told = Object.entries(options).filter(([, value]) => value !== null && value !== undefined);
-    return [`springbench run ${quoted(scene)}`, ...told.map(([name, value]) => `--${name} ${quoted(String(value))}`)].join(" ");
+    const given = Object.entries(options).filter(([, value]) => value !== null && value !== undefined);
+    return [`springbench run ${quoted(scene)}`, ...given.map(([name, value]) => `--${name} ${quoted(String(value))}`)].join(" ");
   }
 
   // Return the path of a results file as commands refer to it.

@@ -30,10 +30,10 @@ Object.assign(springbench, (() => {
   // List the code versions and machines of figures: each pair once, the newest first.
   const commit = text => (text || "unknown").slice(0, 10) + (/dirty/.test(text) ? "-dirty" : "");
   function madeBy(some, most = 2) {
-    const told = [...new Set(some.map(one => `${one.cpu || "unknown processor"}${one.machine_id ? ` (machine ${one.machine_id.slice(0, 6)})` : ""}, code ${commit(one.commit)}`))];
+    const origins = [...new Set(some.map(one => `${one.cpu || "unknown processor"}${one.machine_id ? ` (machine ${one.machine_id.slice(0, 6)})` : ""}, code ${commit(one.commit)}`))];
     const machines = new Set(some.map(one => one.machine_id || one.cpu)).size;
     const compare = machines > 1 ? ` · ${machines} machines: compare times within one, ratios of such times across them` : "";
-    return `made on ${told.slice(0, most).join("; on ")}${told.length > most ? `; and by ${told.length - most} more` : ""}${compare}`;
+    return `made on ${origins.slice(0, most).join("; on ")}${origins.length > most ? `; and by ${origins.length - most} more` : ""}${compare}`;
   }
 
   // Adjust a solver's colour for contrast with the page: lighter on dark, darker on light if it is pale.

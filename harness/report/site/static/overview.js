@@ -4,21 +4,21 @@
   const { element, put, link, address, commit, many, count, duration, day, state } = springbench;
 
   function facts(sweep) {
-    const told = [];
-    if (sweep.runs) told.push(many(sweep.runs, "run"));
-    if (sweep.curves) told.push(many(sweep.curves, "solve"));
-    if (sweep.work_points) told.push(many(sweep.work_points, "simulation"));
-    if (sweep.ablations) told.push(many(sweep.ablations, "verdict"));
-    if (sweep.gates) told.push(many(sweep.gates, "gate"));
-    if (sweep.sizes?.length) told.push(`size${sweep.sizes.length > 1 ? `s ${sweep.sizes[0]} to ${sweep.sizes.at(-1)}` : ` ${sweep.sizes[0]}`}`);
-    if (sweep.total_seconds) told.push(`${duration(sweep.total_seconds)} timed`);
-    return told.join(" · ");
+    const parts = [];
+    if (sweep.runs) parts.push(many(sweep.runs, "run"));
+    if (sweep.curves) parts.push(many(sweep.curves, "solve"));
+    if (sweep.work_points) parts.push(many(sweep.work_points, "simulation"));
+    if (sweep.ablations) parts.push(many(sweep.ablations, "verdict"));
+    if (sweep.gates) parts.push(many(sweep.gates, "gate"));
+    if (sweep.sizes?.length) parts.push(`size${sweep.sizes.length > 1 ? `s ${sweep.sizes[0]} to ${sweep.sizes.at(-1)}` : ` ${sweep.sizes[0]}`}`);
+    if (sweep.total_seconds) parts.push(`${duration(sweep.total_seconds)} timed`);
+    return parts.join(" · ");
   }
 
   function outcome(sweep) {
-    const told = Object.entries(sweep.statuses || {}).map(([status, n]) => state(status, `${count(n)} ${status}`));
-    if (sweep.num_stale_runs) told.push(element("span.state.mild", {}, element("span", { "aria-hidden": "true" }, "↻ "), `${count(sweep.num_stale_runs)} by other code`));
-    return told;
+    const parts = Object.entries(sweep.statuses || {}).map(([status, n]) => state(status, `${count(n)} ${status}`));
+    if (sweep.num_stale_runs) parts.push(element("span.state.mild", {}, element("span", { "aria-hidden": "true" }, "↻ "), `${count(sweep.num_stale_runs)} by other code`));
+    return parts;
   }
 
   function made(sweep) {
