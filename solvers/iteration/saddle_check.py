@@ -42,6 +42,7 @@ class SaddleCheck:
     def __init__(self, fixed_objective: FixedObjective) -> None:
         self.system = system = fixed_objective.system
         self._fixed_objective = fixed_objective
+        self._has_springs_alone = not (fixed_objective.element_energy_indices or fixed_objective.other_energy_indices)
         self._anchor_stiffness = compute_anchor_stiffness(system)
         self._linear_terms = np.empty((len(self._fixed_objective.springs.stiffness), 4))
         self._negative_stiffness = np.empty(system.num_vertices)
@@ -76,7 +77,10 @@ class SaddleCheck:
         """
         whole, hessian, is_compiled = self._fixed_objective, None, True
         anchor_stiffness, negative = self._anchor_stiffness, self._negative_stiffness
-        if whole.element_energy_indices or whole.other_energy_indices:
+        if self._has_springs_alone:
+            arguments = whole.objective_terms, self._linear_terms, whole.quadratic_form, None, None
+            is_bounded = self.is_bounded_by_springs(p)
+        else:
             step = StepObjective(whole, problem)
             hessian = step.hessian(p)
             terms, linear, _, joined, curvature = arguments = hessian.kernel_arguments
@@ -84,10 +88,6 @@ class SaddleCheck:
             is_bounded = is_compiled and curvature_search.bound_by_elements(
                 terms, linear, joined, curvature, anchor_stiffness, negative
             )
-        else:
-            terms, linear = whole.objective_terms, self._linear_terms
-            arguments = terms, linear, whole.quadratic_form, None, None
-            is_bounded = self.is_bounded_by_springs(p)
         if is_bounded:
             return None
         scratch = self._scratch
@@ -101,10 +101,8 @@ class SaddleCheck:
 
     def is_bounded_by_springs(self, p: Positions) -> bool:
         """Return whether the bound over springs rules out negative curvature at p (n, 3) [m]."""
-        terms, form = self._fixed_objective.objective_terms, self._fixed_objective
-        if form.element_energy_indices or form.other_energy_indices:
-            return False
-        return curvature_search.bound_by_springs(
+        terms = self._fixed_objective.objective_terms
+        return self._has_springs_alone and curvature_search.bound_by_springs(
             terms, p, self._anchor_stiffness, self._linear_terms, self._negative_stiffness
         )
 
