@@ -34,10 +34,8 @@ def draw_device_sheets(results: Path) -> Iterator[tuple[Path | None, list[str]]]
         except InputError:
             continue  # the page reports damaged rows
         if sentences := summarise_runs(found, find_config(folder)):
-            stem = folder / "pictures" / "devices"
-            for suffix in (".png", ".svg"):
-                stem.with_suffix(suffix).unlink(missing_ok=True)  # rows that are gone may have drawn it
-            yield next(iter(draw_chart_sheets(build_device_chart(found), stem)), None), sentences
+            paths = draw_chart_sheets(build_device_chart(found), folder / "pictures" / "devices")
+            yield next(iter(paths), None), sentences
 
 
 def draw_hard_case_sheets(

@@ -41,11 +41,6 @@ def draw_timing_plot(
     """
     words = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     chart = build_timing_chart(read_run_times(table), stale_ids, machine_words=words)
-    stem = path.with_suffix("")
     part = f", the first {_MAX_SCENES} of {len(chart.frames)} scenes" if len(chart.frames) > _MAX_SCENES else ""
     chart = replace(chart, title=f"Time by size, {title}{part}", frames=chart.frames[:_MAX_SCENES])
-    paths = draw_chart_sheets(chart, stem, sources)
-    if not paths:  # those of earlier rows would mislead
-        for suffix in (".png", ".svg"):
-            path.with_suffix(suffix).unlink(missing_ok=True)
-    return paths
+    return draw_chart_sheets(chart, path.with_suffix(""), sources)

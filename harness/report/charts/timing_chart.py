@@ -137,10 +137,7 @@ def build_run_accuracy_chart(
         title="Time and accuracy",
         note="Time of a step against the distance of its last iterate from a minimum: to the lower left is better.",
         frames=frames,
-        x=(
-            ChartAxis("step", _TIME_SCALE, "step", "a step"),
-            ChartAxis("least", _TIME_SCALE, "least", "the least step"),
-        ),
+        x=(_STEP_AXIS, _LEAST_AXIS),
         y=(ChartAxis("residual", AxisScale("last residual, J^½", "log", "power"), "residual"), _STRAIN_AXIS),
         hover=_HOVER,
         **_shared_fields(timed_runs, names, citations, machine_words),

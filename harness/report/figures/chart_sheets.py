@@ -28,7 +28,7 @@ _MAX_LONE_COLUMNS = 4
 def draw_chart_sheets(chart: ChartDescription, stem: Path, sources: str = "") -> list[Path]:
     """Draw the sheets of a chart as PNG and SVG, and return the files.
 
-    Its maps are on its own sheet, one below the other.
+    Its maps are on its own sheet, one below the other. Of a chart without panels an earlier sheet is deleted.
 
     Args:
         chart: the chart.
@@ -48,6 +48,9 @@ def draw_chart_sheets(chart: ChartDescription, stem: Path, sources: str = "") ->
             figure = compose_figure(_shorten_notes(panels), chart.title, SHEET_OPTIONS, columns)
             target = stem / sheet if sheet else stem
             paths += write_images(figure, target, chart.title, chart.machine_words, SHEET_OPTIONS, PAGE_DPI, sources)
+    if not paths:  # the sheet of earlier rows would mislead
+        for kind in SHEET_OPTIONS.formats:
+            stem.with_name(f"{stem.name}.{kind}").unlink(missing_ok=True)
     return paths
 
 
