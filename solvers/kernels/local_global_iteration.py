@@ -29,8 +29,10 @@ from springbench.solvers.kernels.edge_elements import add_edges
 from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, RESIDUAL_LAST, check_residual
 from springbench.solvers.kernels.spring_local_step import add_descent, add_projection, squared_norm
 from springbench.solvers.linalg.cholesky.thread_team import (
+    call_in_thread,
     complete_task,
     finish_phases,
+    raise_thread_error,
     release_phase,
     reset_team,
     try_claim,
@@ -255,7 +257,8 @@ def _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, fir
 @jit_inner_parallel
 def _run_threads(plan, bundles, edges, form, vectors, right, p, limits, team, threads):
     for thread in prange(threads):
-        _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, thread * plan.top_range[2] // threads)
+        first = thread * plan.top_range[2] // threads
+        call_in_thread(team, _run_thread, (plan, bundles, edges, form, vectors, right, p, limits, team, first))
 
 
 @jit_kernel
@@ -284,6 +287,7 @@ def run_iterations(plan, bundles, edges, form, vectors, right, p, limits, thread
         _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, 0)
     else:
         _run_threads(plan, bundles, edges, form, vectors, right, p, limits, team, threads)
+        raise_thread_error(team)
     x0, x1, x2, _ = vectors
     done = int(team.results[0])
     return done, team.results[1], (x0, x1, x2)[done % 3]

@@ -6,11 +6,14 @@ from threading import Thread
 
 import numpy as np
 import pytest
-from springbench.solvers.jit.kernel_compilation import jit_kernel
+from numba import prange
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_parallel, jit_kernel
 from springbench.solvers.linalg.cholesky.thread_team import (
     ThreadTeam,
+    call_in_thread,
     complete_task,
     finish_phases,
+    raise_thread_error,
     release_phase,
     reset_team,
     try_claim,
@@ -69,3 +72,43 @@ def test_one_that_comes_when_all_is_done_does_nothing():
     for k in range(2):
         work(team, k, 7, log, counts[k])
     assert counts.tolist() == [[24, 0], [0, 0]]
+
+
+@jit_inner
+def process_or_raise(team, failing_task, failing_phase):
+    """A thread that raises an exception at one task of one phase; the last phase is 3."""
+    phase = 0
+    while phase >= 0:
+        for task in range(len(team.task_sums)):
+            if try_claim(team, task, phase):
+                if task == failing_task and phase == failing_phase:
+                    raise ValueError("the task that fails")
+                if complete_task(team):
+                    if phase == 3:
+                        finish_phases(team)
+                    else:
+                        release_phase(team, phase + 1)
+        phase = wait_for_phase(team, phase)
+
+
+@jit_inner_parallel
+def run_in_two_threads(team, failing_task, failing_phase):
+    for _ in prange(2):
+        call_in_thread(team, process_or_raise, (team, failing_task, failing_phase))
+
+
+@jit_kernel
+def run_team(team, failing_task, failing_phase):
+    reset_team(team)
+    run_in_two_threads(team, failing_task, failing_phase)
+    raise_thread_error(team)
+
+
+@pytest.mark.parametrize("phase", [0, 2])
+@pytest.mark.parametrize("task", [0, 3])
+def test_an_exception_in_a_thread_ends_all_threads_and_is_raised(task: int, phase: int):
+    team = ThreadTeam.from_task_count(4)
+    for _ in range(20):  # now in one thread, now in the other
+        with pytest.raises(ValueError, match="the task that fails"):
+            run_team(team, task, phase)
+        run_team(team, -1, phase)  # the next run begins anew

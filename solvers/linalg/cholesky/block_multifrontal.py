@@ -42,8 +42,10 @@ from springbench.solvers.linalg.cholesky.factorisation_schedule import (
     SUBTREES,
 )
 from springbench.solvers.linalg.cholesky.thread_team import (
+    call_in_thread,
     complete_task,
     finish_phases,
+    raise_thread_error,
     read_shared,
     release_phase,
     reset_team,
@@ -107,6 +109,7 @@ def factorise_blocks(fronts, schedule, values, panels, x, scratch, team, threads
         _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, ZERO, ONE)
     else:
         _factorise_in_threads(fronts, schedule, values, panels, x, scratch, team, threads)
+        raise_thread_error(team)
     failure = _first_failure(scratch)
     return failure if failure < _NO_FAILURE else -1
 
@@ -129,18 +132,20 @@ def solve_blocks(fronts, schedule, panels, x, scratch, team, threads):
         _solve_in_thread(fronts, schedule, panels, x, scratch, team, ZERO, ONE)
     else:
         _solve_in_threads(fronts, schedule, panels, x, scratch, team, threads)
+        raise_thread_error(team)
 
 
 @jit_inner_parallel
 def _factorise_in_threads(fronts, schedule, values, panels, x, scratch, team, threads):
     for thread in prange(threads):
-        _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, thread, threads)
+        arguments = fronts, schedule, values, panels, x, scratch, team, thread, threads
+        call_in_thread(team, _factorise_in_thread, arguments)
 
 
 @jit_inner_parallel
 def _solve_in_threads(fronts, schedule, panels, x, scratch, team, threads):
     for thread in prange(threads):
-        _solve_in_thread(fronts, schedule, panels, x, scratch, team, thread, threads)
+        call_in_thread(team, _solve_in_thread, (fronts, schedule, panels, x, scratch, team, thread, threads))
 
 
 @jit_inner

@@ -3,6 +3,9 @@
 Threads claim tasks; none are assigned. The thread that completes the last task of a phase starts the next phase. A
 thread thus never waits for one that has not started, only for one that is processing a task. An idle thread spins until
 the next phase begins, and after some microseconds yields its core to other programs.
+
+Numba loses an exception that a thread of a parallel loop raises. `call_in_thread` stores it and ends all phases, and
+`raise_thread_error` raises it again after the loop.
 """
 
 from __future__ import annotations
@@ -12,12 +15,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
+from numba.core.callconv import RETCODE_USEREXC
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner
 
-_PHASE_INDEX, _DONE_INDEX, _CLAIMS_INDEX = 0, 8, 16
-"""Indices into `signals`; the first two have separate cache lines."""
+_PHASE_INDEX, _ERROR_INDEX, _DONE_INDEX, _CLAIMS_INDEX = 0, 1, 8, 16
+"""Indices into `signals`; the phase, which is polled, and the count of completed tasks have separate cache lines."""
+
+_ERROR_PLACE: Any = ir.Constant(ir.IntType(64), _ERROR_INDEX)
 
 _FINISHED = -1
 _MAX_SPINS = 2000
@@ -31,7 +38,8 @@ class ThreadTeam(NamedTuple):
     """Shared state of the threads.
 
     Attributes:
-        signals: the phase, the number of its completed tasks, and the last phase in which each task was claimed.
+        signals: the phase, the address of an exception or 0, the number of completed tasks of the phase, and the last
+            phase in which each task was claimed.
         task_sums: results of the tasks.
         results: final results of the step, (2,).
     """
@@ -93,11 +101,51 @@ def _store_release_code(typingctx: Any, signals: Any, place: Any, value: Any) ->
     return types.void(signals, types.int64, types.int64), generate
 
 
+def _call_storing_error_code(typingctx: Any, signals: Any, function: Any, arguments: Any) -> Any:
+    """Call a kernel; store the address of the exception that it raises in signals, and return whether it raised one."""
+    call = function.get_call_type(typingctx, arguments.types, {})
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        compiled = function.dispatcher.get_compile_result(call)
+        context.active_code_library.add_linking_library(compiled.library)
+        values = cgutils.unpack_tuple(builder, args[2])
+        status, _ = context.call_conv.call_function(
+            builder,
+            context.declare_function(builder.module, compiled.fndesc),
+            compiled.fndesc.restype,
+            compiled.fndesc.argtypes,
+            values,
+        )
+        with cgutils.if_unlikely(builder, status.is_error):
+            at = _element_pointer(context, builder, signature.args[0], args[0], _ERROR_PLACE)
+            builder.store_atomic(builder.ptrtoint(status.excinfoptr, ir.IntType(64)), at, "release", 8)
+        return status.is_error
+
+    return types.boolean(signals, function, arguments), generate
+
+
+def _raise_stored_error_code(typingctx: Any, signals: Any) -> Any:
+    """Raise the exception whose address is stored in signals, if there is one."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        at = _element_pointer(context, builder, signature.args[0], args[0], _ERROR_PLACE)
+        stored = builder.load_atomic(at, "acquire", 8)
+        with cgutils.if_unlikely(builder, cgutils.is_not_null(builder, stored)):
+            target = context.call_conv._get_excinfo_argument(builder.function)
+            builder.store(builder.inttoptr(stored, target.type.pointee), target)
+            context.call_conv._return_errcode_raw(builder, RETCODE_USEREXC)
+        return context.get_dummy_value()
+
+    return types.void(signals), generate
+
+
 # Numba passes the first argument itself, which type checkers cannot see.
 _compare_and_swap: Any = intrinsic(_compare_and_swap_code)
 _fetch_add_one: Any = intrinsic(_fetch_add_code)
 _load_acquire: Any = intrinsic(_load_acquire_code)
 _store_release: Any = intrinsic(_store_release_code)
+_call_storing_error: Any = intrinsic(_call_storing_error_code)
+_raise_stored_error: Any = intrinsic(_raise_stored_error_code)
 
 
 @jit_inner
@@ -149,6 +197,25 @@ def wait_for_phase(team, phase):
             _yield_core()
         now = _load_acquire(team.signals, _PHASE_INDEX)
     return now
+
+
+@jit_inner
+def call_in_thread(team, function, arguments):
+    """Call a thread's function; an exception ends the phases of all threads.
+
+    Args:
+        team: thread team.
+        function: inner kernel that processes tasks of the team.
+        arguments: tuple of its arguments.
+    """
+    if _call_storing_error(team.signals, function, arguments):
+        finish_phases(team)
+
+
+@jit_inner
+def raise_thread_error(team):
+    """Raise the exception that a thread has raised, if there is one; call it after the threads have ended."""
+    _raise_stored_error(team.signals)
 
 
 @jit_inner

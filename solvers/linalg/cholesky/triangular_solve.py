@@ -24,8 +24,10 @@ from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_parallel, jit_kernel
 from springbench.solvers.linalg.cholesky.thread_team import (
     ThreadTeam,
+    call_in_thread,
     complete_task,
     finish_phases,
+    raise_thread_error,
     release_phase,
     reset_team,
     try_claim,
@@ -177,7 +179,7 @@ def _run_thread(factor, b, out, first):
 def _run_threads(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team, b, out, threads):
     for thread in prange(threads):  # which takes no tuple with another in it
         whole = SupernodalFactor(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team)
-        _run_thread(whole, b, out, thread * (len(spans) - 1) // threads)
+        call_in_thread(team, _run_thread, (whole, b, out, thread * (len(spans) - 1) // threads))
 
 
 @jit_inner
@@ -196,6 +198,7 @@ def solve_supernodal(factor, b, out, threads):
     else:
         f = factor
         _run_threads(f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f.thread_team, b, out, threads)
+        raise_thread_error(f.thread_team)
 
 
 @jit_kernel
