@@ -1,7 +1,7 @@
 """Does a CUDA device change the choice of a solver? A step by methods on the device and on the processor, side by side.
 
-    python -m tests.bench.device [--scene SCENE] [--sizes 64 128 256 512] [--on device processor] [--threads 1]
-        [--methods NAME ...] [--rounds 5] [--save FILE.parquet]
+    python -m tests.bench.device [--scenes SCENE ...] [--sizes 64 128 256 512] [--on device processor] [--threads 1]
+        [--methods NAME ...] [--rounds 5] [--save FILE.parquet] [--publish results/published/devices]
 
 The step is one of a cloth as it falls. Methods that are on both are first compared by their iterates: the
 distance in units of what is required of it, 1e-10 m in float64 and 1e-5 of the springs' mean length in float32. Then
@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -40,6 +40,7 @@ from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 from springbench.solvers.registry import SOLVERS, load_target
 
+from tests.bench.scripted_study import describe_moment, publish_rows
 from tests.cuda.near import PRECISIONS, spacing
 
 SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
@@ -142,7 +143,7 @@ def measure(
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--scene", type=Path, default=SCENE)
+    parser.add_argument("--scenes", type=Path, nargs="+", default=[SCENE])
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256, 512])
     parser.add_argument("--frames", type=int, default=3, help="steps before the one that is solved")
     parser.add_argument("--on", nargs="+", choices=("device", "processor"), default=("device", "processor"))
@@ -154,7 +155,9 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=1e9, help="begin no method after this time")
     parser.add_argument("--save", type=Path)
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
     given, rows, begun = parser.parse_args(), list[dict[str, Any]](), perf_counter()
+    begin = describe_moment()
 
     def add(shared: dict[str, Any], new: Iterable[dict[str, Any]]) -> None:
         for row in new:
@@ -168,9 +171,9 @@ def main() -> None:
     methods = list(dict.fromkeys(given.methods))
     both = [name for name in methods if name in BOTH]
     with limit_threads(given.threads):
-        for size in given.sizes:
-            problem = build_step(given.scene, size, given.frames)
-            shared = {"scene": given.scene.stem, "size": size, "frame": given.frames + 1, "threads": given.threads}
+        for scene, size in product(given.scenes, given.sizes):
+            problem = build_step(scene, size, given.frames)
+            shared = {"scene": scene.stem, "size": size, "frame": given.frames + 1, "threads": given.threads}
             if "device" in given.on:
                 shared |= {"device": cuda_device.describe_device()["device"]}
                 add(shared, compare_iterates(problem, both))
@@ -184,14 +187,40 @@ def main() -> None:
                     if perf_counter() - begun < given.seconds:
                         solver = load_target(SOLVERS[name])()
                         add(shared | {"device": None}, measure(solver, name, problem, *stopping))
-    Console(width=120).print(tabulate(rows))
+    for scene in given.scenes:
+        Console(width=120).print(tabulate([row for row in rows if row["scene"] == scene.stem], scene.stem))
+    publish_rows(given.publish, given.scenes[0], "python -m tests.bench.device", compare_sides(rows), begin)
 
 
-def tabulate(rows: list[dict[str, Any]]) -> Table:
-    """Milliseconds of each method by size and tolerance."""
+def compare_sides(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row for each size and tolerance that both sides reached: the fastest method of each, and the ratio.
+
+    `time_ratio` is the time on the device over that on the processor, copies included. XPBD has no tolerance.
+    """
+    fastest: dict[tuple[str, int, float | None, bool], dict[str, Any]] = {}
+    for row in rows:
+        if row["kind"] == "time" and is_reached(row):
+            cell = (row["scene"], row["size"], row["rtol"], row["device"] is not None)
+            fastest[cell] = min(fastest.get(cell, row), row, key=lambda one: one["seconds"])
+    return [
+        {
+            "scene": scene,
+            "size": size,
+            "rtol": rtol,
+            "device_method": row["method"],
+            "processor_method": other["method"],
+            "time_ratio": row["seconds"] / other["seconds"],
+        }
+        for (scene, size, rtol, on_device), row in fastest.items()
+        if on_device and (other := fastest.get((scene, size, rtol, False)))
+    ]
+
+
+def tabulate(rows: list[dict[str, Any]], scene: str) -> Table:
+    """Milliseconds of each method by size and tolerance, on one scene."""
     timed = [row for row in rows if row["kind"] == "time"]
     cells = sorted({(row["size"], row["rtol"] or 0.0) for row in timed}, key=lambda cell: (cell[0], -cell[1]))
-    table = Table("method", "on", *(f"{size}, {rtol:g}" for size, rtol in cells), box=SIMPLE_HEAD, title="milliseconds")
+    table = Table("method", "on", *(f"{size}, {rtol:g}" for size, rtol in cells), box=SIMPLE_HEAD, title=f"{scene}, ms")
     for method, device in dict.fromkeys((row["method"], row["device"]) for row in timed):
         own = {(r["size"], r["rtol"] or 0.0): r for r in timed if (r["method"], r["device"]) == (method, device)}
         took = (f"{1e3 * own[c]['seconds']:.3g}" if c in own and is_reached(own[c]) else "" for c in cells)

@@ -12,7 +12,8 @@ A template is a Jinja2 file next to its page: `hard-cases.md.j2` makes `hard-cas
                        and orders the series, the other options are those of `PageChartOptions`
     figure(name, title, kind, study, alt, panels)
                        a link to a picture of a kind that `springbench figure` draws
-    provenance(study)  command, machine, load, date and commit of a study, in one line
+    provenance(study)  command, machine, load, date and commit of a study, in one line; with a remark if `study.json`
+                       has the key `record`: its rows were copied, for the measured ones were not stored
 
 and the filters `percent`, `sig(digits)` and `count`.
 """
@@ -121,7 +122,8 @@ class _PageFields:
         count = f"{about['runs']:,}" + (f" of {requested:,}" if requested else "")
         loads = [f"{load:.0f}" for load in about.get("load_average", ())]
         load = f", load {' to '.join(dict.fromkeys(loads))}" if loads else ""
-        return f"Data: `{about['command']}`, {count} runs, {where}{load}, {date}, commit {commits}."
+        record = f" {about['record']}" if "record" in about else ""
+        return f"Data: `{about['command']}`, {count} runs, {where}{load}, {date}, commit {commits}.{record}"
 
     def _add_panels(self, name: str, alt: str, title: str, panels: Sequence[FigurePanel], width: float) -> str:
         path = self.page.parent / PICTURE_FOLDER / f"{name}.png"
