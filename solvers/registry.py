@@ -31,6 +31,7 @@ SOLVERS = {
     "xpbd": "springbench.solvers.methods.position_based.xpbd:Xpbd",
     "xpbd-small-steps": "springbench.solvers.methods.position_based.xpbd:XpbdSmallSteps",
     "vbd": "springbench.solvers.methods.vertex_block.vbd:VertexBlockDescent",
+    "vbd-ogc": "springbench.solvers.methods.vertex_block.vbd_offset_contact:OffsetContactDescent",
     "symplectic-euler": "springbench.solvers.methods.time_stepping.symplectic_euler:SymplecticEuler",
     "velocity-verlet": "springbench.solvers.methods.time_stepping.explicit_integrators:VelocityVerlet",
     "blanes-moan-4": "springbench.solvers.methods.time_stepping.explicit_integrators:BlanesMoan4",

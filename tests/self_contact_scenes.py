@@ -21,7 +21,7 @@ CONTACT_THICKNESS, CONTACT_DHAT = 0.02, 0.03
 SURFACE_CONTACT_SOLVERS: dict[str, Solver] = {
     **{
         name: load_target(SOLVERS[name])()
-        for name in ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "sparse")
+        for name in ("newton", "newton-cg", "pncg", "lbfgs", "hybrid", "vbd", "vbd-ogc", "sparse")
     },
     **{name: load_target(SOLVERS[name])() for name in ("numba", "anderson", "chebyshev")},
     "lbfgs float32": Lbfgs(precision="float32"),

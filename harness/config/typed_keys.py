@@ -12,9 +12,9 @@ from springbench.harness.scenes.scene_spec import InitialGuess
 
 SolverName = Literal[
     "dense", "sparse", "numba", "anderson", "chebyshev", "lbfgs", "newton", "newton-cg", "hybrid", "xpbd",
-    "xpbd-small-steps", "vbd", "symplectic-euler", "velocity-verlet", "blanes-moan-4", "blanes-moan-6", "runge-kutta-4",
-    "tsitouras-5", "dormand-prince-8", "baraff-witkin", "ros2", "ros3p", "rodas", "pncg", "admm", "a-jacobi", "mgpbd",
-    "jgs2", "avbd", "eigen", "cholmod", "mujoco", "pypbd", "taichi", "newton-physics",
+    "xpbd-small-steps", "vbd", "vbd-ogc", "symplectic-euler", "velocity-verlet", "blanes-moan-4", "blanes-moan-6",
+    "runge-kutta-4", "tsitouras-5", "dormand-prince-8", "baraff-witkin", "ros2", "ros3p", "rodas", "pncg", "admm",
+    "a-jacobi", "mgpbd", "jgs2", "avbd", "eigen", "cholmod", "mujoco", "pypbd", "taichi", "newton-physics",
 ]  # fmt: skip
 """Names of the shipped solvers."""
 IntegratorName = Literal[

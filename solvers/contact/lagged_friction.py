@@ -78,7 +78,9 @@ class FrictionSolve(NamedTuple):
 
 
 def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: StopRule) -> FrictionSolve:
-    """Solve a step until friction has the normal forces of the solution; once without friction.
+    """Solve a step until friction has the normal forces of the solution.
+
+    It is solved once without friction, or by a method that evaluates friction itself.
 
     Args:
         prepared: the prepared solver.
@@ -87,7 +89,7 @@ def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: St
     """
     solution = prepared.solve(problem, stop)
     rounds = _max_friction_iterations(problem.system)
-    if not rounds:
+    if not rounds or getattr(prepared, "has_own_friction", False):
         return FrictionSolve(problem, solution, (solution.num_iterations,), None)
     counts, guess = [solution.num_iterations], problem.initial_guess
     earlier = deque[_Round](maxlen=PERIOD)

@@ -73,6 +73,11 @@ class IdleContactSolver:
                 return found
         return self.with_contact.solve(problem, stop)
 
+    @property
+    def has_own_friction(self) -> bool:
+        """Whether the method with contact evaluates friction itself, see `solve_with_friction`."""
+        return getattr(self.with_contact, "has_own_friction", False)
+
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)] at p (n, 3) [m], with contact."""
         return self.with_contact.residual_at(problem, p)

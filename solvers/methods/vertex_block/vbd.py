@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,43 +98,37 @@ class VertexBlockDescent(PrecisionOptions):
             from springbench.solvers.cuda.cuda_device import require_device  # imported only for a device
 
             require_device("vbd")
-        bare, n = without_barriers(without_vertex_contact(system)), system.num_vertices
-        parts, vertex_elements = decompose_energies(bare), VertexElements.from_system(system)
-        unknown = {*parts.unsupported_energies} - {type(energy).__name__ for energy in vertex_elements.energies}
-        if unknown:
-            raise Unsupported(
-                f"vbd: {', '.join(sorted(unknown))} states no elements of a projective energy, and so neither whose "
-                "neighbours its vertices are nor a bound of the second derivatives; a vertex's step needs both, the "
-                "neighbours for the colouring and the bound for the fallback step that cannot raise the energy"
-            )
-        made = VertexBlocks.from_system(system, parts, vertex_elements)
+        parts, vertex_elements, made = decompose_system(system, "vbd")
         if self.device == "cuda":
             from springbench.solvers.methods.vertex_block.device_vbd import prepare_vbd  # imported only for a device
 
             return prepare_vbd(system, parts, made, self.spectral_radius, self.real_dtype)
         gauge: Any = CompiledLocalGlobal().prepare(system)
-        shares = ObjectiveWeights.from_packets(
-            made.spring_packets, made.anchor_stiffness, made.row_of_vertex[system.pins.vertices[system.pins.exact_mask]]
-        )
-        found = PreparedVertexBlockDescent(
-            system,
-            parts,
-            vertex_elements.with_rows(made.row_of_vertex, n + 2),
-            self.spectral_radius,
-            kernels.ColourPackets(
-                made.spring_packets, shares, made.num_free, made.spring_packets.gather_lanes(made.majorant)
-            ),
-            made.row_of_vertex,
-            made.anchor_stiffness,
-            made.majorant[made.row_of_vertex],
-            gauge,
-            f"vertices in {made.num_colours} colours; for the residual alone {gauge.description}",
+        found = PreparedVertexBlockDescent.from_blocks(
+            system, parts, vertex_elements, made, self.spectral_radius, gauge
         )
         return skip_idle_contact(
             found,
             system,
             lambda: replace(found, system=without_barriers(system), residual_solver=gauge.contact_free),
         )
+
+
+def decompose_system(system: System, solver: str) -> tuple[SpringForm, VertexElements, VertexBlocks]:
+    """Decompose a system without its contact into springs, elements, and free vertices by colour.
+
+    Raises Unsupported, with the name of the solver, for energies without elements.
+    """
+    parts = decompose_energies(without_barriers(without_vertex_contact(system)))
+    vertex_elements = VertexElements.from_system(system)
+    unknown = {*parts.unsupported_energies} - {type(energy).__name__ for energy in vertex_elements.energies}
+    if unknown:
+        raise Unsupported(
+            f"{solver}: {', '.join(sorted(unknown))} states no elements of a projective energy, and so neither whose "
+            "neighbours its vertices are nor a bound of the second derivatives; a vertex's step needs both, the "
+            "neighbours for the colouring and the bound for the fallback step that cannot raise the energy"
+        )
+    return parts, vertex_elements, VertexBlocks.from_system(system, parts, vertex_elements)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +155,36 @@ class PreparedVertexBlockDescent(IterativeSolver):
     hessian_majorant: NDArray[np.float64]
     residual_solver: ContactFreeSolver
     description: str
+
+    @classmethod
+    def from_blocks(
+        cls,
+        system: System,
+        parts: SpringForm,
+        vertex_elements: VertexElements,
+        made: VertexBlocks,
+        spectral_radius: float,
+        residual_solver: ContactFreeSolver,
+    ) -> Self:
+        """Prepare sweeps from the parts of a system, see `decompose_system`."""
+        shares = ObjectiveWeights.from_packets(
+            made.spring_packets, made.anchor_stiffness, made.row_of_vertex[system.pins.vertices[system.pins.exact_mask]]
+        )
+        gauge = residual_solver.description
+        return cls(
+            system,
+            parts,
+            vertex_elements.with_rows(made.row_of_vertex, system.num_vertices + 2),
+            spectral_radius,
+            kernels.ColourPackets(
+                made.spring_packets, shares, made.num_free, made.spring_packets.gather_lanes(made.majorant)
+            ),
+            made.row_of_vertex,
+            made.anchor_stiffness,
+            made.majorant[made.row_of_vertex],
+            residual_solver,
+            f"vertices in {made.num_colours} colours" + (f"; for the residual alone {gauge}" if gauge else ""),
+        )
 
     @property
     def stats(self) -> dict[str, float]:

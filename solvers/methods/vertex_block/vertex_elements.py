@@ -18,7 +18,7 @@ from springbench.solvers.model.energies.element_energies import ElementLaw, Elem
 from springbench.solvers.model.step_problem import ProjectiveEnergy, StepProblem, System, is_lagged
 
 if TYPE_CHECKING:
-    from springbench.solvers.methods.vertex_block.incident_elements import IncidentElements
+    from springbench.solvers.methods.vertex_block.incident_elements import ElementKind, IncidentElements
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +89,17 @@ class VertexElements:
         energies."""
         if not self.energy_indices:
             return plain.run_iterations
-        from springbench.solvers.methods.vertex_block.incident_elements import ElementKind  # for those who need it
         from springbench.solvers.methods.vertex_block.vbd_element_sweeps import build_element_iteration
 
+        return build_element_iteration(*self.element_kinds)
+
+    @property
+    def element_kinds(self) -> list[ElementKind]:
+        """The laws and widths of the elements, in the order of `incident_elements`."""
+        from springbench.solvers.methods.vertex_block.incident_elements import ElementKind  # for those who need it
+
         widths = [one.vertices.shape[1] for one in self._elements_by_law(self.energies)]
-        return build_element_iteration(*(ElementKind(*kind) for kind in zip(self._unique_laws, widths, strict=True)))
+        return [ElementKind(*kind) for kind in zip(self._unique_laws, widths, strict=True)]
 
     @cached_property
     def _unique_laws(self) -> list[ElementLaw]:

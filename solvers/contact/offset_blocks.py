@@ -1,0 +1,159 @@
+"""Offset blocks: which pairs of nearby features are in contact in offset geometric contact (OGC).
+
+A surface is thickened by a block at each of its features: a triangle's along its normal, an edge's and a vertex's where
+no neighbouring feature is closer. A point x is in the block of
+
+    vertex i    if (x - x_i) . (x_i - x_j) >= 0 for all its neighbours j
+    edge ij     if (x - q) . (q - x_k) >= 0 for the third vertex k of all its triangles, q = foot of x_k on the line
+
+and its closest point on the feature is no end of it. A candidate pair is in contact if its closest features are in each
+other's blocks, as far as they are vertices, or edges of a pair of a point and a triangle. Forces are then perpendicular
+to the faces in contact. Source: Chen et al. 2025, "Offset geometric contact", ACM TOG 44(4); the conditions are those
+of `ipctk.ogc`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from springbench.solvers.contact.geometry.distance import (
+    dot3,
+    edge_edge_distance_vector,
+    load_point,
+    point_triangle_distance_vector,
+    subtract3,
+)
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+class SurfaceAdjacency(NamedTuple):
+    """Neighbours of the vertices of surfaces.
+
+    Attributes:
+        edge_starts: first entry of each vertex in `neighbours` (n + 1,).
+        neighbours: vertices that share an edge.
+        triangle_starts: first entry of each vertex in `opposite_edges` (n + 1,).
+        opposite_edges: the other two vertices of each triangle, (., 2).
+    """
+
+    edge_starts: IndexArray
+    neighbours: IndexArray
+    triangle_starts: IndexArray
+    opposite_edges: IndexArray
+
+    @classmethod
+    def from_primitives(cls, edges: IndexArray, triangles: IndexArray, num_vertices: int) -> SurfaceAdjacency:
+        """Build the adjacency of edges (m, 2) and triangles (f, 3); triangles that repeat a vertex are edges."""
+        ends = np.concatenate([edges, edges[:, ::-1]])
+        triangles = triangles[(np.diff(np.sort(triangles, axis=1), axis=1) > 0).all(axis=1)]
+        corners = np.concatenate([np.roll(triangles, -k, axis=1) for k in range(3)])
+        by_edge, by_triangle = (np.argsort(one[:, 0], kind="stable") for one in (ends, corners))
+        return cls(
+            _first_entries(ends[:, 0], num_vertices),
+            np.ascontiguousarray(ends[by_edge, 1]),
+            _first_entries(corners[:, 0], num_vertices),
+            np.ascontiguousarray(corners[by_triangle, 1:]),
+        )
+
+
+def _first_entries(owners: IndexArray, num_owners: int) -> IndexArray:
+    """Return the first entry of each owner (n + 1,) among entries sorted by their owners (k,)."""
+    return np.concatenate([[0], np.cumsum(np.bincount(owners, minlength=num_owners))]).astype(np.int64)
+
+
+@jit_inner
+def _is_in_vertex_block(adjacency, x, i, p):
+    """Return whether a point p is in the block of vertex i."""
+    centre = load_point(x, i)
+    away = subtract3(p, centre)
+    for entry in range(adjacency.edge_starts[i], adjacency.edge_starts[i + 1]):
+        if dot3(away, subtract3(centre, load_point(x, adjacency.neighbours[entry]))) < 0.0:
+            return False
+    return True
+
+
+@jit_inner
+def _is_in_edge_block(adjacency, x, i, j, p):
+    """Return whether a point p, with its closest point inside edge ij, is in the block of that edge."""
+    begin = load_point(x, i)
+    u = subtract3(load_point(x, j), begin)
+    length = dot3(u, u)
+    for entry in range(adjacency.triangle_starts[i], adjacency.triangle_starts[i + 1]):
+        one, other = adjacency.opposite_edges[entry, 0], adjacency.opposite_edges[entry, 1]
+        if one != j and other != j:
+            continue
+        third = load_point(x, other if one == j else one)
+        t = dot3(subtract3(third, begin), u) / length if length > 0.0 else 0.0
+        foot = begin[0] + t * u[0], begin[1] + t * u[1], begin[2] + t * u[2]
+        if dot3(subtract3(p, foot), subtract3(foot, third)) < 0.0:
+            return False
+    return True
+
+
+@jit_inner
+def _is_point_triangle_contact(adjacency, x, v, c1, c2, c3):
+    """Return whether vertex v[0] and the closest feature of a triangle are in each other's blocks."""
+    p = load_point(x, v[0])
+    if c1 != 0.0 and c2 != 0.0 and c3 != 0.0:
+        return True
+    first, second = (v[1] if c1 != 0.0 else v[2] if c2 != 0.0 else v[3]), -1
+    if c1 != 0.0 and c2 != 0.0:
+        second = v[2]
+    elif c3 != 0.0 and (c1 != 0.0 or c2 != 0.0):
+        second = v[3]
+    if second < 0 or second == first:
+        return _is_in_vertex_block(adjacency, x, first, p) and _is_in_vertex_block(
+            adjacency, x, v[0], load_point(x, first)
+        )
+    return _is_in_edge_block(adjacency, x, first, second, p)
+
+
+@jit_inner
+def _is_edge_edge_contact(adjacency, x, v, s, t):
+    """Return whether the closest features of edges v[0] v[1] and v[2] v[3] are in each other's blocks."""
+    one_end = -1 if 0.0 < s < 1.0 else v[0] if s <= 0.0 else v[1]
+    other_end = -1 if 0.0 < t < 1.0 else v[2] if t <= 0.0 else v[3]
+    a, b, c, d = load_point(x, v[0]), load_point(x, v[1]), load_point(x, v[2]), load_point(x, v[3])
+    p = a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1]), a[2] + s * (b[2] - a[2])
+    q = c[0] + t * (d[0] - c[0]), c[1] + t * (d[1] - c[1]), c[2] + t * (d[2] - c[2])
+    return (one_end < 0 or _is_in_vertex_block(adjacency, x, one_end, q)) and (
+        other_end < 0 or _is_in_vertex_block(adjacency, x, other_end, p)
+    )
+
+
+@jit_inner
+def measure_candidate(adjacency, x, v, edges, squared_radius):
+    """Return the squared distance of a pair of vertices v (4,), and whether it is closer and its features touch."""
+    a, b, c, d = load_point(x, v[0]), load_point(x, v[1]), load_point(x, v[2]), load_point(x, v[3])
+    if edges:
+        _, s, _, minus_t, z, _ = edge_edge_distance_vector(a, b, c, d)
+        squared = dot3(z, z)
+        return squared, squared < squared_radius and _is_edge_edge_contact(adjacency, x, v, s, 0.0 - minus_t)
+    _, c1, c2, c3, z = point_triangle_distance_vector(a, b, c, d)
+    squared = dot3(z, z)
+    return squared, squared < squared_radius and _is_point_triangle_contact(adjacency, x, v, c1, c2, c3)
+
+
+@jit_kernel
+def find_offset_contacts(adjacency, candidates, x, radius, is_contact, clearance):
+    """Find the pairs in contact, and the clearance of each vertex.
+
+    Args:
+        adjacency: neighbours of all vertices.
+        candidates: candidate pairs.
+        x: positions (n, 4) [m]; column 3 is padding.
+        radius: distance [m] beyond which pairs are no contacts.
+        is_contact: output (k,), whether a pair is closer than `radius` and its features are in contact.
+        clearance: (n,) [m], lowered to the smallest gap of all pairs of a vertex.
+    """
+    for e in range(len(candidates.vertices)):
+        v = candidates.vertices[e]
+        squared, is_contact[e] = measure_candidate(adjacency, x, v, e >= candidates.num_point_triangle, radius * radius)
+        gap = np.sqrt(squared) - candidates.distance_scale[e] * candidates.min_distance
+        for k in range(4):
+            clearance[v[k]] = min(clearance[v[k]], gap)

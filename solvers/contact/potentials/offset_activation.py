@@ -1,0 +1,43 @@
+"""Two-stage activation of offset geometric contact (OGC): quadratic at first contact, logarithmic near zero.
+
+    g(d) = (r - d)^2/2                          for r/2 <= d < r,        0 beyond r
+           (r/2)^2 (1/2 - ln(2 d/r))            for 0 < d < r/2
+
+per stiffness [N/m], with the contact radius r. Equal values, slopes and curvatures of both parts determine the factor
+and that they meet at r/2. Source: Chen et al. 2025, "Offset geometric contact", ACM TOG 44(4); ipctk has the same
+function as `TwoStageBarrier`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+
+
+@jit_inner
+def offset_force(d, radius):
+    """Return -g'(d) and g''(d) at a positive distance d [m]."""
+    if d >= radius:
+        return 0.0, 0.0
+    if 2.0 * d >= radius:
+        return radius - d, 1.0
+    factor = 0.25 * radius * radius
+    return factor / d, factor / (d * d)
+
+
+@jit_kernel
+def evaluate_offset_activation(distances, radius, value, force, curvature):
+    """Write g, -g' and g'' of positive distances.
+
+    Args:
+        distances: (k,) [m].
+        radius: contact radius [m].
+        value, force, curvature: outputs, (k,) each.
+    """
+    for k in range(len(distances)):
+        d = distances[k]
+        force[k], curvature[k] = offset_force(d, radius)
+        if 2.0 * d >= radius:
+            value[k] = 0.5 * max(0.0, radius - d) ** 2
+        else:
+            value[k] = 0.25 * radius * radius * (0.5 - np.log(2.0 * d / radius))
