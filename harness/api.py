@@ -289,7 +289,7 @@ def run_config(
     place = claim_folder(Path(results) / sweep.name, path)
     table = run_sweep(
         sweep.name, sweep.list_runs(), place, create_display(get_error_console()), lambda line: None, rerun=rerun
-    )
+    ).table
     run_reports(sweep.reports, table, place, sweep.options.time_limit)
     return _to_dataframe(table)
 

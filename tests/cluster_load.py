@@ -219,7 +219,8 @@ def simulate_cluster(count: int, runs: int, folder: Path, seconds: float) -> dic
     )
     values["ended"] = "all runs are done"
     try:
-        values["rows"] = len(run_sweep("sweep", found, folder / "r", display, print, scheduler_address=address))
+        swept = run_sweep("sweep", found, folder / "r", display, print, scheduler_address=address)
+        values["rows"] = len(swept.table)
     except TimeIsUp:
         values["ended"] = f"after {seconds:g} s; the same command, with the same folder, does the rest"
     took = {name: _process_cpu_seconds(pid) - before[name] for name, pid in pids.items()}

@@ -55,8 +55,8 @@ from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.solvers.platform_calls import can_isolate_processes
 
 if TYPE_CHECKING:
-    import pyarrow as pa
     from springbench.harness.config.config_loader import SweepPlan
+    from springbench.harness.experiments.sweep_runner import SweepResults
 
 app = typer.Typer(
     cls=ErrorReportingGroup,
@@ -151,7 +151,7 @@ def run(
     if sweep.options.record and not RECORDINGS.is_installed():
         _say(f"nothing is recorded, and no pictures are drawn: {RECORDINGS.describe_absence()}")
     folder = claim_folder(results / sweep.name, config)
-    table = run_sweep(
+    swept = run_sweep(
         sweep.name,
         sweep.list_runs(),
         folder,
@@ -165,7 +165,7 @@ def run(
         scheduler_address=scheduler,
         background_call=_preload_reports,
     )
-    raise typer.Exit(1 if _report_sweep(sweep, table, config, results, folder) else 0)
+    raise typer.Exit(1 if _report_sweep(sweep, swept, config, results, folder) else 0)
 
 
 def _preload_reports() -> None:
@@ -177,19 +177,19 @@ def _preload_reports() -> None:
         import_module("springbench.harness.report.site")
 
 
-def _report_sweep(sweep: SweepPlan, table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
+def _report_sweep(sweep: SweepPlan, swept: SweepResults, config: Path, results: Path, folder: Path) -> list[str]:
     """Report the results of a sweep, and return its failures.
 
     It prints the summary and draws the reports. The failures are one line for each failed run.
     """
-    from springbench.harness.experiments.sweep_plan import find_stale_run_ids
     from springbench.harness.experiments.sweep_runner import list_failed_runs
     from springbench.harness.report.report_plugins import run_reports
     from springbench.harness.report.site import refresh_results_page
     from springbench.harness.report.sweep_summary import build_closing_lines
     from springbench.harness.report.timing_table import build_summary_table
 
-    get_output_console().print(build_summary_table(table, find_stale_run_ids(sweep.list_runs(), table)))
+    table = swept.table
+    get_output_console().print(build_summary_table(table, swept.stale_ids))
     _say(f"rows, recordings and pictures are in {folder}")
     for path in run_reports(sweep.reports, table, folder, sweep.options.time_limit):
         _say(f"reported in {path}")

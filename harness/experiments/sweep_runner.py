@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, ExitStack, closing
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import pyarrow as pa
 from springbench.harness.config.sweep_config import RunSpec
@@ -51,6 +51,18 @@ def _connect_cluster(
     return connect_cluster(scheduler_address, runs, print_message)
 
 
+class SweepResults(NamedTuple):
+    """Results of a sweep.
+
+    Attributes:
+        table: rows of all runs.
+        stale_ids: ids of the runs whose rows come from other source code.
+    """
+
+    table: pa.Table
+    stale_ids: set[str]
+
+
 def run_sweep(
     name: str,
     runs: Sequence[RunSpec],
@@ -65,8 +77,8 @@ def run_sweep(
     num_workers: int | None = None,
     scheduler_address: str | None = None,
     background_call: Callable[[], object] = int,
-) -> pa.Table:
-    """Execute the missing runs of a sweep, draw its pictures and return all rows.
+) -> SweepResults:
+    """Execute the missing runs of a sweep, draw its pictures and return its results.
 
     Args:
         name: name of the sweep.
@@ -132,6 +144,7 @@ def run_sweep(
         from springbench.harness.report.sweep_pictures import PictureJob, draw_sweep_pictures
 
         table = parquet_rows.read_rows([p.files.rows_path for p in planned], required_columns=REQUIRED_COLUMNS)
+        stale_ids = find_stale_run_ids(runs, table)
         pictured = [PictureJob(p.run, p.files.recording_path, p.files.picture_path) for p in planned]
         draw = partial(
             draw_sweep_pictures,
@@ -140,11 +153,11 @@ def run_sweep(
             folder,
             table,
             num_concurrent=many,
-            stale_ids=find_stale_run_ids(runs, table),
+            stale_ids=stale_ids,
         )
         if drawing is None:
             draw(print_message)
-            return table
+            return SweepResults(table, stale_ids)
         try:
             drawing.run_task(
                 draw,
@@ -156,7 +169,7 @@ def run_sweep(
             raise RunFailed(
                 f"the process that draws {lost}; what was measured is kept, and the same command draws it"
             ) from None
-    return table
+    return SweepResults(table, stale_ids)
 
 
 def _preload_drawing() -> None:

@@ -75,7 +75,7 @@ def test_runs_are_done_by_jobs_that_are_submitted_and_cancelled(tmp_path: Path, 
         SilentDisplay(),
         messages.append,
         scheduler_address=str(tmp_path / "slurm.yaml"),
-    )
+    ).table
     assert set(table["status"].to_pylist()) == {"ok"}
     assert len(set(table["run_id"].to_pylist())) == 3
     assert parquet_rows.read_rows((tmp_path / "r" / "rows").glob("*.parquet")).num_rows == table.num_rows

@@ -29,7 +29,7 @@ from tests.progress_displays import SilentDisplay
 def done(sweep: Path, results: Path, address: str) -> pa.Table:
     found = load_config(sweep)
     results.mkdir(exist_ok=True)
-    return run_sweep(found.name, found.list_runs(), results, SilentDisplay(), print, scheduler_address=address)
+    return run_sweep(found.name, found.list_runs(), results, SilentDisplay(), print, scheduler_address=address).table
 
 
 def test_runs_are_done_by_workers_and_a_crash_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
