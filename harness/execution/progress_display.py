@@ -47,13 +47,19 @@ UNIT_COST = RunCost()
 
 
 class ThrottledMessages:
-    """Prints progress messages of work that is not a run, at most one per _MAX_SILENT_SECONDS."""
+    """Prints progress messages of work that is not a run, at most one per _MAX_SILENT_SECONDS.
 
-    def __init__(self, print_message: Callable[[str], None]) -> None:
-        self._say, self._last_print_time = print_message, monotonic()
+    A terminal can show all of them in one place (`springbench.harness.console.show_activity`).
+    """
+
+    def __init__(
+        self, print_message: Callable[[str], None], show_activity: Callable[[str], None] = lambda words: None
+    ) -> None:
+        self._say, self._show, self._last_print_time = print_message, show_activity, monotonic()
 
     def __call__(self, words: str) -> None:
-        """Print the message if the last one is old enough."""
+        """Show the message, and print it if the last one is old enough."""
+        self._show(words)
         if monotonic() - self._last_print_time > _MAX_SILENT_SECONDS:
             self._say(words)
             self._last_print_time = monotonic()
@@ -333,7 +339,7 @@ class ProgressBars:
 
 
 class ProgressLines:
-    """One line for each finished run, with the remaining time.
+    """A line at the start, and one for each finished run with the remaining time.
 
     After a period without output a status line is printed.
     """
@@ -351,6 +357,8 @@ class ProgressLines:
             RemainingTime(costs, num_concurrent),
             monotonic(),
         )
+        if costs:
+            self._print_line("starting")
 
     def start_run(self, title: str, ticks: int, cost: RunCost) -> RunProgress:
         """Add a run."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -405,6 +406,18 @@ def test_the_command_grades_one_submission_and_writes_its_steps(tmp_path, monkey
     assert all(float(line["residual"]) > 1e-6 for line in lines)
 
 
+def test_progress_of_a_grade_counts_the_minima_with_the_remaining_time(tmp_path):
+    path, scene = load_case(tmp_path, "rope")
+    built = build_scene(load_scene(path), 0)
+    submission = align_submission(built, PositionSequence(path, simulate(scene, 5)), 1)
+    lines: list[str] = []
+    StepJudge(built).judge_steps(submission, 60.0, lines.append)
+    assert lines[0] == "minimum 1 of 5"
+    assert [re.sub(r"\d+ s", "T", line) for line in lines[1:]] == [
+        f"minimum {k} of 5; about T left" for k in range(2, 6)
+    ]
+
+
 @pytest.mark.slow
 def test_the_command_grades_a_folder_of_students(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -428,6 +441,8 @@ def test_the_command_grades_a_folder_of_students(tmp_path, monkeypatch):
     }
     assert found["bob"]["mistake"] == "no inertia"
     assert "has 3 columns" in answer.output
+    assert "[0/4] grading ada" in answer.output
+    assert re.search(r"\[3/4\] grading fay; about \d+ s left", answer.output)
 
 
 def test_mistakes_of_the_command_line_are_refused(tmp_path, monkeypatch):

@@ -108,7 +108,7 @@ def test_a_line_comes_though_no_run_ends(clock: list[float]):
             run.report_tick(POLL)
 
     lines = capture_progress(ProgressLines, does).splitlines()
-    assert lines == ["[0/1] one: timed pass, 10 %"] * 3
+    assert lines == ["[0/1] starting", *["[0/1] one: timed pass, 10 %"] * 3]
 
 
 def test_progress_names_what_is_being_compiled(clock: list[float]):

@@ -61,6 +61,7 @@ def grade(
         )
 
     from springbench.harness.config.config_loader import is_assignment_file, load_scene_run
+    from springbench.harness.execution.progress_display import ThrottledMessages
     from springbench.harness.execution.worker_process import TaskLimits
     from springbench.harness.experiments.grading.grading import GradeRequest
     from springbench.harness.scenes.assignment_scene import ASSIGNMENT_ITERATIONS
@@ -70,8 +71,9 @@ def grade(
     request = GradeRequest(run.scene, run.size, required, first_frame, rest, array, budget)
     show_activity("grading")
     work = partial(_grade_students if students else _grade_one, request, positions)
+    report_progress = print_message if students else ThrottledMessages(print_message, show_activity)
     lines, table, cells, is_good = run_isolated(
-        work, run.scene.find_plugins(), TaskLimits(run.time_limit, run.memory_limit), print_message
+        work, run.scene.find_plugins(), TaskLimits(run.time_limit, run.memory_limit), report_progress
     )
     if students:
         get_output_console().print(_build_class_table(table))
@@ -94,7 +96,7 @@ def _grade_one(request: GradeRequest, path: Path, tick: ProgressCallback) -> _An
     from springbench.harness.experiments.grading.grade_tables import format_grade, list_step_lines, list_step_table
     from springbench.harness.experiments.grading.grading import CORRECT, SceneGrader
 
-    found = SceneGrader(request).grade_file(path)
+    found = SceneGrader(request).grade_file(path, tick)
     return [*format_grade(found)], list_step_table(found), list_step_lines(found), found.kind == CORRECT
 
 

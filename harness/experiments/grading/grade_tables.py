@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 from springbench.harness.errors import InputError
+from springbench.harness.execution.progress_display import UNIT_COST, RemainingTime, format_remaining
+from springbench.harness.execution.progress_events import ProgressCallback
 from springbench.harness.experiments.grading.grading import PositionGrade, SceneGrader, format_fit
 from springbench.harness.experiments.grading.motion_error import SMALLEST_ERROR
 from springbench.harness.experiments.grading.position_files import is_submission
@@ -82,7 +85,7 @@ class ClassRow:
 
 
 def grade_folder(
-    grader: SceneGrader, folder: Path, report_progress: Callable[[str], None] = lambda line: None
+    grader: SceneGrader, folder: Path, report_progress: ProgressCallback = lambda line: None
 ) -> list[ClassRow]:
     """Grade each file and folder of positions in a folder; those that cannot be read have a reason.
 
@@ -97,13 +100,16 @@ def grade_folder(
     paths |= {one.name: there for one, there in inner.items() if there}
     if not paths:
         raise InputError(f"{folder}: has no files of positions and no folders of them")
-    rows = list[ClassRow]()
+    rows, pace = list[ClassRow](), RemainingTime([UNIT_COST] * len(paths))
     for name, path in sorted(paths.items()):
-        report_progress(f"grading {name}")
+        title = f"[{len(rows)}/{len(paths)}] grading {name}"
+        report_progress("; ".join(filter(None, (title, format_remaining(pace.estimate_seconds())))))
+        began = monotonic()
         try:
             rows.append(ClassRow(name, grader.grade_file(path)))
         except InputError as error:
             rows.append(ClassRow(name, None, str(error)))
+        pace.record_run(UNIT_COST, monotonic() - began)
     return rows
 
 

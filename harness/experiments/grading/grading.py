@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from springbench.harness.errors import InputError
+from springbench.harness.execution.progress_events import ProgressCallback
 from springbench.harness.experiments.grading.fingerprints import FingerprintFinder, ProgramFingerprint
 from springbench.harness.experiments.grading.motion_error import ErrorShares, MotionReference
 from springbench.harness.experiments.grading.motion_quantities import MotionQuantities, measure_motion
@@ -132,19 +133,24 @@ class SceneGrader:
         except InputError as error:
             self._finder_note = f"mistakes are not looked for: {error.mistakes[0].problem.partition('; leave out')[0]}"
 
-    def grade_file(self, path: Path) -> PositionGrade:
+    def grade_file(self, path: Path, report_progress: ProgressCallback = lambda line: None) -> PositionGrade:
         """Read and grade a submission; raises InputError for a file that cannot be graded."""
         read = read_position_file(path, len(self.scene.mesh.rest_positions), self.request.array)
-        return self.grade_submission(align_submission(self.scene, read, self.request.first_frame, self._rest))
+        submission = align_submission(self.scene, read, self.request.first_frame, self._rest)
+        return self.grade_submission(submission, report_progress)
 
-    def grade_submission(self, submission: SubmittedMotion) -> PositionGrade:
+    def grade_submission(
+        self, submission: SubmittedMotion, report_progress: ProgressCallback = lambda line: None
+    ) -> PositionGrade:
         """Grade a submission."""
         if not submission.num_steps:
             raise InputError(f"{submission.source}: has only the start; wanted the positions after some steps")
         begun = time.monotonic()
+        report_progress("comparing the steps with those of known programs")
         fingerprint = self.find_fingerprint(submission)
         left = max(1.0, self.request.seconds - (time.monotonic() - begun))
-        steps = self._judge.judge_steps(submission, left)
+        steps = self._judge.judge_steps(submission, left, report_progress)
+        report_progress(f"integrating the motion, at most {self.request.seconds:g} s")
         shares, note = self._reference.measure_shares(submission)
         kind, verdict = self._decide(fingerprint, steps)
         quantities = measure_motion(self.scene, submission)

@@ -24,6 +24,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from springbench.harness.execution.progress_display import format_remaining
+from springbench.harness.execution.progress_events import ProgressCallback
 from springbench.harness.experiments.grading.spring_terms import build_step_problem
 from springbench.harness.experiments.grading.submission import SubmittedMotion
 from springbench.harness.reference.certified_minimum import MinimumCertificate, refine_minimum
@@ -101,13 +103,25 @@ class StepJudge:
         begun = replace(problem.step_start, normal_force_positions=submission.position_after(step))
         return replace(problem, step_start=begun)
 
-    def judge_steps(self, submission: SubmittedMotion, seconds: float) -> list[StepVerdict]:
-        """Judge all steps; certified minima are computed for as many of them as the time [s] allows."""
-        verdicts = {step: self._judge_residual(submission, step) for step in range(1, submission.num_steps + 1)}
-        until = time.monotonic() + seconds
-        for step in sorted(spread_order(submission.num_steps), key=lambda step: not verdicts[step].is_doubtful):
-            if time.monotonic() > until:
+    def judge_steps(
+        self, submission: SubmittedMotion, seconds: float, report_progress: ProgressCallback = lambda line: None
+    ) -> list[StepVerdict]:
+        """Judge all steps; certified minima are computed for as many of them as the time allows.
+
+        Args:
+            submission: the positions.
+            seconds: time limit of the minima [s].
+            report_progress: called with a line for each minimum.
+        """
+        n = submission.num_steps
+        verdicts = {step: self._judge_residual(submission, step) for step in range(1, n + 1)}
+        began = time.monotonic()
+        for done, step in enumerate(sorted(spread_order(n), key=lambda step: not verdicts[step].is_doubtful)):
+            elapsed = time.monotonic() - began
+            if elapsed > seconds:
                 break
+            left = min(seconds - elapsed, elapsed / done * (n - done)) if done else None
+            report_progress("; ".join(filter(None, (f"minimum {done + 1} of {n}", format_remaining(left)))))
             verdicts[step] = self._judge_minimum(submission, verdicts[step])
         return list(verdicts.values())
 
