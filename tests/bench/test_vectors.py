@@ -4,7 +4,7 @@ from pathlib import Path
 
 from springbench.solvers.simd import llvm_vectors
 
-from tests.bench.vectors import CASES
+from tests.bench.vectors import CASES, of_springs
 
 
 def test_every_file_of_vectors_is_measured_but_what_they_share():
@@ -13,3 +13,9 @@ def test_every_file_of_vectors_is_measured_but_what_they_share():
         path.stem for path in solvers.glob("methods/**/*_packets.py")
     }
     assert files - {"__init__", "llvm_vectors", "spring_packets"} == CASES.keys()
+
+
+def test_the_norm_of_q_reads_within_its_displacement():
+    (norm,) = (case for case in of_springs() if case.what == "norm of Q")
+    packets, displacement = norm.arguments[0], norm.arguments[3]
+    assert max(packets.row_offset.max(), packets.neighbour_offset.max()) + 3 <= len(displacement)

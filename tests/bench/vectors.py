@@ -143,11 +143,13 @@ def of_springs() -> Iterator[Case]:
     yield Case(
         "gradient", spring_local_step.add_descent, (parts, *whole, p, state.right_hand_side, out, 0), short, (5,)
     )
+    displacement = np.zeros_like(p)  # longer than the direction: packets read rows of pinned vertices and padding too
+    displacement[: len(window.direction)] = window.direction
     norm = (
         state.norm_packets,
         0,
         len(state.norm_packets.packet_start) - 1,
-        window.direction.copy(),
+        displacement,
         state.iteration_plan.norm_diagonal,
     )
     yield Case("norm of Q", spring_local_step.squared_norm, norm, {"spring_squared_norm": plain.energy}, ())
