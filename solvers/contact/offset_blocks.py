@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.contact.geometry.distance import (
+    compute_pair_distance,
     dot3,
     edge_edge_distance_vector,
     load_point,
@@ -127,33 +128,42 @@ def _is_edge_edge_contact(adjacency, x, v, s, t):
 
 
 @jit_inner
-def measure_candidate(adjacency, x, v, edges, squared_radius):
-    """Return the squared distance of a pair of vertices v (4,), and whether it is closer and its features touch."""
+def _is_contact(adjacency, x, v, edges):
+    """Return whether the closest features of a pair with vertices v (4,) are in each other's blocks."""
     a, b, c, d = load_point(x, v[0]), load_point(x, v[1]), load_point(x, v[2]), load_point(x, v[3])
     if edges:
-        _, s, _, minus_t, z, _ = edge_edge_distance_vector(a, b, c, d)
-        squared = dot3(z, z)
-        return squared, squared < squared_radius and _is_edge_edge_contact(adjacency, x, v, s, 0.0 - minus_t)
-    _, c1, c2, c3, z = point_triangle_distance_vector(a, b, c, d)
-    squared = dot3(z, z)
-    return squared, squared < squared_radius and _is_point_triangle_contact(adjacency, x, v, c1, c2, c3)
+        _, s, _, minus_t, _, _ = edge_edge_distance_vector(a, b, c, d)
+        return _is_edge_edge_contact(adjacency, x, v, s, 0.0 - minus_t)
+    _, c1, c2, c3, _ = point_triangle_distance_vector(a, b, c, d)
+    return _is_point_triangle_contact(adjacency, x, v, c1, c2, c3)
 
 
 @jit_kernel
-def find_offset_contacts(adjacency, candidates, x, radius, is_contact, clearance):
-    """Find the pairs in contact, and the clearance of each vertex.
+def find_offset_contacts(adjacency, candidates, x, reach, bound_fraction, gap, is_contact, clearance):
+    """Find the pairs in contact, or that bounded displacements may bring into contact, and clearances.
 
     Args:
         adjacency: neighbours of all vertices.
-        candidates: candidate pairs.
+        candidates: candidate pairs, whose `dhat` is the contact radius.
         x: positions (n, 4) [m]; column 3 is padding.
-        radius: distance [m] beyond which pairs are no contacts.
-        is_contact: output (k,), whether a pair is closer than `radius` and its features are in contact.
+        reach: gap [m] beyond which pairs are ignored.
+        bound_fraction: displacement bound of a vertex relative to its clearance.
+        gap: output (k,), distance beyond the minimum distance of each pair [m].
+        is_contact: output (k,).
         clearance: (n,) [m], lowered to the smallest gap of all pairs of a vertex.
     """
     for e in range(len(candidates.vertices)):
         v = candidates.vertices[e]
-        squared, is_contact[e] = measure_candidate(adjacency, x, v, e >= candidates.num_point_triangle, radius * radius)
-        gap = np.sqrt(squared) - candidates.distance_scale[e] * candidates.min_distance
+        d = compute_pair_distance(x, v, e >= candidates.num_point_triangle)
+        gap[e] = d - candidates.distance_scale[e] * candidates.min_distance
         for k in range(4):
-            clearance[v[k]] = min(clearance[v[k]], gap)
+            clearance[v[k]] = min(clearance[v[k]], gap[e])
+    for e in range(len(candidates.vertices)):
+        v, edges = candidates.vertices[e], e >= candidates.num_point_triangle
+        one, other = clearance[v[0]], max(clearance[v[2]], clearance[v[3]])
+        if edges:
+            one = max(one, clearance[v[1]])
+        else:
+            other = max(other, clearance[v[1]])
+        farthest = candidates.distance_scale[e] * candidates.dhat + bound_fraction * (one + other)
+        is_contact[e] = gap[e] < min(reach, farthest) and _is_contact(adjacency, x, v, edges)

@@ -75,19 +75,22 @@ class OffsetSurface(NamedTuple):
         adjacency = SurfaceAdjacency.from_primitives(edges, triangles, 1 + int(edges.max(initial=-1)))
         return cls(adjacency, float(sides[0].edge_lengths.mean()), mesh.stiffness, [])
 
-    def detect_contacts(self, contact: BarrierContact, p: Positions, reach: float) -> OffsetCollisions:
-        """Detect the contacts at positions.
+    def detect_contacts(
+        self, contact: BarrierContact, p: Positions, reach: float, bound_fraction: float
+    ) -> OffsetCollisions:
+        """Detect the contacts at positions, and those that bounded displacements may lead to.
 
         Args:
             contact: the energy of the step.
             p: positions of the mesh (n, 3) [m].
             reach: largest gap [m] of the pairs that are found, at least the contact radius.
+            bound_fraction: displacement bound of a vertex relative to its clearance.
         """
         p, mesh = contact.append_obstacle_positions(p), contact.collision_mesh
-        found, limit = self._find_candidates(contact, p, reach), mesh.min_distance + reach
+        found = self._find_candidates(contact, p, reach)
         x, touches = pad_positions(p), np.empty(len(found.vertices), np.bool_)
-        clearance = np.full(len(p), reach)
-        offset_blocks.find_offset_contacts(self.adjacency, found, x, limit, touches, clearance)
+        clearance, gap = np.full(len(p), reach), np.empty(len(found.vertices))
+        offset_blocks.find_offset_contacts(self.adjacency, found, x, reach, bound_fraction, gap, touches, clearance)
         points = int(touches[: found.num_point_triangle].sum())
         kept = found._replace(
             vertices=found.vertices[touches],

@@ -85,7 +85,10 @@ def blocks(contact: SelfContact, p: Positions, radius: float) -> tuple[Candidate
     pairs = mesh.find_proximity_candidates(p, radius)
     adjacency = SurfaceAdjacency.from_primitives(mesh.edges.primitives, mesh.triangles.primitives, len(p))
     touches, clearance = np.empty(len(pairs.vertices), bool), np.full(len(p), np.inf)
-    find_offset_contacts(adjacency, pairs, pad_positions(p), radius, touches, clearance)
+    gap = np.empty(len(pairs.vertices))
+    find_offset_contacts(
+        adjacency, pairs._replace(dhat=np.inf), pad_positions(p), np.inf, FRACTION, gap, touches, clearance
+    )
     return pairs, touches, clearance
 
 
@@ -136,7 +139,7 @@ def test_displacements_within_their_bounds_never_collide(seed, share):
     ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
     contact, p, triangles = crumpled(seed)
     mesh = ipctk.CollisionMesh(p, contact.collision_mesh.edges.primitives, triangles)
-    clearance = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1).clearance
+    clearance = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION).clearance
     assert (clearance > 0.0).all()
     q = displaced(seed, p, FRACTION * clearance, share)
     assert ipctk.is_step_collision_free(mesh, p, q)
@@ -147,8 +150,10 @@ def test_larger_displacements_do_collide():
     ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
     contact, p, triangles = crumpled(1)
     mesh = ipctk.CollisionMesh(p, contact.collision_mesh.edges.primitives, triangles)
-    clearance = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1).clearance + CONTACT_THICKNESS
-    assert not ipctk.is_step_collision_free(mesh, p, displaced(1, p, clearance, 0.6))
+    clearance = (
+        OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION).clearance + CONTACT_THICKNESS
+    )
+    assert not ipctk.is_step_collision_free(mesh, p, displaced(1, p, found.clearance + CONTACT_THICKNESS, 0.6))
 
 
 @jit_kernel

@@ -57,6 +57,10 @@ from springbench.solvers.model.step_problem import (
 )
 from springbench.solvers.simd.spring_packets import LANES
 
+_REACH_GROWTH, _UNOBSTRUCTED_FRACTION = 4.0, 0.5
+"""Growth of a detection's reach after one in which more than this fraction of the vertices had nothing within it. The
+reach ends at what the predicted displacement needs, or at a mean edge, where the mesh itself is near."""
+
 
 @dataclass(frozen=True)
 class OffsetContactDescent:
@@ -212,10 +216,11 @@ class OffsetContactState(SweepState):
         ahead = vertex_terms.compute_anchor_positions(problem)
         p = vertex_terms.apply_exact_pins(guess, problem)
         farthest = float(np.sqrt(np.einsum("ij,ij->i", ahead - p, ahead - p)).max(initial=0.0))
-        self._reaches = [
+        self._max_reaches = [
             max(energy.collision_mesh.dhat, min(farthest / prepared.bound_fraction, surface.mean_edge_length))
             for energy, surface in zip(self._contacts, prepared.surfaces, strict=True)
         ]
+        self._reaches = [energy.collision_mesh.dhat for energy in self._contacts]
         self._detect_contacts(p)
         free = prepared.system.free_vertices
         self._rows.reshape(-1, 4)[prepared.sweeps.row_of_vertex[free], :3] = ahead[free]
@@ -261,9 +266,12 @@ class OffsetContactState(SweepState):
     def _detect_contacts(self, p: Positions) -> None:
         """Detect contacts at p (n, 3) [m], and pack them by rows."""
         found = [
-            surface.detect_contacts(energy, p, reach)
+            surface.detect_contacts(energy, p, reach, self._offset.bound_fraction)
             for surface, energy, reach in zip(self._offset.surfaces, self._contacts, self._reaches, strict=True)
         ]
+        for k, one in enumerate(found):
+            if np.mean(one.clearance[: len(p)] >= self._reaches[k]) > _UNOBSTRUCTED_FRACTION:
+                self._reaches[k] = min(_REACH_GROWTH * self._reaches[k], self._max_reaches[k])
         self._packed, self._needs_detection = self._pack_contacts(found, p), False
         self.num_detections += 1
 
