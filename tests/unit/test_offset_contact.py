@@ -150,9 +150,7 @@ def test_larger_displacements_do_collide():
     ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
     contact, p, triangles = crumpled(1)
     mesh = ipctk.CollisionMesh(p, contact.collision_mesh.edges.primitives, triangles)
-    clearance = (
-        OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION).clearance + CONTACT_THICKNESS
-    )
+    found = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION)
     assert not ipctk.is_step_collision_free(mesh, p, displaced(1, p, found.clearance + CONTACT_THICKNESS, 0.6))
 
 
