@@ -54,20 +54,21 @@ class BlockIndices(NamedTuple):
 
 
 @jit_kernel
-def locate_blocks(number, starts, columns, vertices, out):
+def locate_blocks(number, starts, columns, transposed, vertices, out):
     """Write the block of each vertex pair within rows of vertices (m, k) to `out` (m, k^2).
 
-    It is -1 if one vertex is not free. Returns False if a block is missing. The matrix has sorted columns; `number` is
-    the index of each vertex among the free ones, or -1.
+    It is -1 if one vertex is not free. Returns False if a block is missing. The matrix has sorted columns and a
+    symmetric pattern; `transposed` is the block (j, i) of each block (i, j); `number` is the index of each vertex among
+    the free ones, or -1.
     """
     many = vertices.shape[1]
     for e in range(len(vertices)):
         for a in range(many):
             i = number[vertices[e, a]]
-            for b in range(many):
-                j, at = number[vertices[e, b]], many * a + b
+            for b in range(a + 1):
+                j = number[vertices[e, b]]
                 if i < 0 or j < 0:
-                    out[e, at] = -1
+                    out[e, many * a + b] = out[e, many * b + a] = -1
                     continue
                 low, high = starts[i], starts[i + 1] - 1
                 while low < high:
@@ -78,25 +79,58 @@ def locate_blocks(number, starts, columns, vertices, out):
                         high = middle
                 if columns[low] != j:
                     return False
-                out[e, at] = low
+                out[e, many * a + b], out[e, many * b + a] = low, transposed[low]
     return True
 
 
 @jit_kernel
-def list_vertex_pairs(number, size, vertices, out):
-    """Write each pair of different free vertices of each row (m, k) to `out`, as lower index times `size` plus higher.
+def list_vertex_pairs(number, vertices, starts, higher, last_lower, pairs):
+    """Write the different pairs of free vertices within rows of vertices (m, k), in ascending order.
 
-    Returns the number of pairs; `number` is that of `locate_blocks`.
+    Pairs are grouped by their lower index, so that only the few different ones of a group are sorted.
+
+    Args:
+        number: that of `locate_blocks`.
+        vertices: vertices (m, k), -1 for none.
+        starts: scratch (f + 1,) for f free vertices.
+        higher: scratch of m k (k - 1)/2 indices.
+        last_lower: scratch (f,).
+        pairs: output, lower and higher free index of each pair, (m k (k - 1)/2, 2).
+
+    Returns:
+        Number of pairs.
     """
-    count = 0
-    for e in range(len(vertices)):
-        for a in range(vertices.shape[1]):
-            i = number[vertices[e, a]]
-            for b in range(a):
-                j = number[vertices[e, b]]
-                if i >= 0 and j >= 0 and i != j:
-                    out[count] = min(i, j) * size + max(i, j)
-                    count += 1
+    starts[:], last_lower[:] = 0, -1
+    for is_counting in (True, False):
+        for e in range(len(vertices)):
+            for a in range(vertices.shape[1]):
+                i = number[vertices[e, a]]
+                for b in range(a):
+                    j = number[vertices[e, b]]
+                    if i >= 0 and j >= 0 and i != j:
+                        lower = min(i, j)
+                        if is_counting:
+                            starts[lower + 1] += 1
+                        else:
+                            higher[starts[lower]] = max(i, j)
+                            starts[lower] += 1
+        if is_counting:
+            for i in range(len(last_lower)):
+                starts[i + 1] += starts[i]
+    count, begin = 0, 0
+    for lower in range(len(last_lower)):  # each start is now the end of its group
+        first = count
+        for k in range(begin, starts[lower]):
+            j = higher[k]
+            if last_lower[j] == lower:
+                continue
+            last_lower[j], at = lower, count
+            while at > first and pairs[at - 1, 1] > j:
+                pairs[at, 0], pairs[at, 1] = lower, pairs[at - 1, 1]
+                at -= 1
+            pairs[at, 0], pairs[at, 1] = lower, j
+            count += 1
+        begin = starts[lower]
     return count
 
 

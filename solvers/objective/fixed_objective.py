@@ -123,10 +123,11 @@ class FixedObjective:
     def free_vertex_pairs(self, vertices: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return all pairs of different free vertices within each row (a, k), by free index, unique and ascending."""
         (a, k), size = vertices.shape, len(self.system.free_vertices)
-        keys = np.empty(a * k * (k - 1) // 2, np.int64)
-        return np.divmod(
-            np.unique(keys[: spring_hessian.list_vertex_pairs(self.free_index, size, vertices, keys)]), size
-        )
+        capacity = a * k * (k - 1) // 2
+        pairs, scratch = np.empty((capacity, 2), np.int64), np.empty(capacity, np.int64)
+        groups = np.empty(size + 1, np.int64), scratch, np.empty(size, np.int64)
+        count = spring_hessian.list_vertex_pairs(self.free_index, vertices, *groups, pairs)
+        return pairs[:count, 0], pairs[:count, 1]
 
     def _build_matrix(self, graph: csr_array, i: NDArray[np.int64], j: NDArray[np.int64]) -> BlockMatrix:
         return BlockMatrix.from_graph(

@@ -52,6 +52,7 @@ class BlockMatrix:
         self._block_keys = rows * self._num_free + graph.indices
         self.diagonal_entries = self.entry_indices(*np.tile(np.arange(3 * len(system.free_vertices)), (2, 1)))
         self._element_indices: dict[int, tuple[IndexArray, IndexArray]] = {}
+        self._index_memory: dict[int, IndexArray] = {}
 
     @classmethod
     def from_graph(
@@ -112,13 +113,29 @@ class BlockMatrix:
         if k == 1:
             self._element_indices[energy] = vertices, self.block_indices.diagonal_block[vertices]
             return True
-        out = np.empty((m, k * k), np.int64)
+        # Pairs differ at each point, and the system clears each page of new memory: the previous indices are replaced.
+        self._element_indices.pop(energy, None)
+        memory = self._index_memory.get(energy)
+        if memory is None or memory.shape[1] != k * k or len(memory) < m:
+            memory = self._index_memory[energy] = np.empty((m + m // 4, k * k), np.int64)
+        out = memory[:m]
         if not spring_hessian.locate_blocks(
-            self._free_index, graph.indptr, graph.indices, np.ascontiguousarray(vertices), out
+            self._free_index,
+            graph.indptr,
+            graph.indices,
+            self._transposed_blocks,
+            np.ascontiguousarray(vertices),
+            out,
         ):
             return False
         self._element_indices[energy] = vertices, out
         return True
+
+    @cached_property
+    def _transposed_blocks(self) -> IndexArray:
+        """Index of the block (j, i) of each block (i, j), (b,)."""
+        blocks = csr_array((np.arange(self.graph.nnz), self.graph.indices, self.graph.indptr), shape=self.graph.shape)
+        return np.asarray(csr_array(blocks.T).data, np.int64)
 
     def _pair_block_indices(self, i: IndexArray, j: IndexArray) -> IndexArray:
         """Return the blocks between vertices i and j, of one shape; -1 if one is not free."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from springbench.solvers.model.barrier_energy import BarrierEnergy, PairBlocks
 from springbench.solvers.model.step_problem import Positions
 from springbench.solvers.objective.fixed_objective import FixedObjective
@@ -47,7 +46,6 @@ class BarrierHessian:
 
     def __init__(self, energies: list[BarrierEnergy], p: Positions) -> None:
         self._barrier_energies, self._positions = energies, p
-        self._endpoint_values: dict[float, NDArray[np.float64]] = {}
 
     @cached_property
     def pair_blocks(self) -> list[PairBlocks]:
@@ -60,20 +58,8 @@ class BarrierHessian:
         return [energy.block_vertices(self._positions) for energy in self._barrier_energies]
 
     def add_to_matrix(self, negative_fraction: float, matrix: BlockMatrix) -> None:
-        """Add the blocks to the matrix.
-
-        They are linear in the fraction of their negative part.
-        """
-        if any(map(len, self.block_vertices)):
-            for end, share in ((1.0, negative_fraction), (0.0, 1.0 - negative_fraction)):
-                if share:
-                    matrix.values += share * self._values_at_endpoint(end, matrix)
-
-    def _values_at_endpoint(self, endpoint: float, matrix: BlockMatrix) -> NDArray[np.float64]:
-        if endpoint not in self._endpoint_values:
-            out = self._endpoint_values[endpoint] = np.zeros_like(matrix.values)
-            for k, (energy, vertices) in enumerate(zip(self._barrier_energies, self.block_vertices, strict=True)):
-                energy.add_hessian_blocks(
-                    self._positions, endpoint, matrix.element_block_indices(-1 - k, vertices), out
-                )
-        return self._endpoint_values[endpoint]
+        """Add the blocks to the matrix, with a fraction of their negative parts."""
+        for k, (energy, vertices) in enumerate(zip(self._barrier_energies, self.block_vertices, strict=True)):
+            if len(vertices):
+                indices = matrix.element_block_indices(-1 - k, vertices)
+                energy.add_hessian_blocks(self._positions, negative_fraction, indices, matrix.values)

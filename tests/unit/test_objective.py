@@ -207,3 +207,20 @@ def test_springs_of_no_length_have_the_curvature_that_the_energy_says():
     H = exact_hessian(problem, p)
     x = np.random.default_rng(0).normal(size=(3, 3))
     np.testing.assert_allclose(step.hessian(p).matvec(x).ravel(), H @ x.ravel(), rtol=SUMS)
+
+
+def test_pairs_of_free_vertices_are_listed_once_and_in_order():
+    problem = build_first_problem(build_cloth(5, "exact"))
+    objective, rng = FixedObjective(problem.system), np.random.default_rng(3)
+    number = objective.free_index
+    vertices = rng.integers(-1, problem.system.num_vertices, (400, 4))
+    expected = {
+        (int(min(i, j)), int(max(i, j)))
+        for row in number[vertices]
+        for i in row
+        for j in row
+        if i != j and min(i, j) >= 0
+    }
+    assert (number[:-1] < 0).any()  # some vertices are not free
+    i, j = objective.free_vertex_pairs(vertices)
+    assert list(zip(i.tolist(), j.tolist(), strict=True)) == sorted(expected)

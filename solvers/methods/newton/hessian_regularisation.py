@@ -33,7 +33,7 @@ SHIFT_SCHEDULE = ((1.0, 0.0), (0.9, 0.0), (0.5, 0.0), (0.0, 0.0), *((0.0, by) fo
 """Pairs of the negative fraction (of the springs' transverse part) and the multiple of a diagonal; the first that has a
 factor is used."""
 
-_CONTACT_SCHEDULE = (*((keep, 0.0) for keep in (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.25)), *SHIFT_SCHEDULE[3:])
+_CONTACT_SCHEDULE = (*((keep, 0.0) for keep in (1.0, 0.75, 0.5, 0.25)), *SHIFT_SCHEDULE[3:])
 """The schedule with active collisions."""
 
 IndefiniteStrategy = Literal["shift-schedule", "clamp", "absolute", "trust-region", "progressive"]
