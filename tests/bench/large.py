@@ -1,12 +1,14 @@
 """Cost of large meshes: processor time, memory and residual of the runs of a sweep, once each.
 
     python -m tests.bench.large [CONFIG] [--only WORDS] [--sizes SIZE ...] [--publish results/published/growth-large]
+    python -m tests.bench.large configs/contact.yaml --last-step --threads 2
 
 CONFIG is `configs/growth-large.yaml` if left out; WORDS are of a run's scene, size, solver and first guess, in this
 order, as in "flag-in-wind 122". Each run has a process of its own, whose peak of memory includes the reference
 evaluator. Preparing and steps are timed separately, after one iteration that warms up; a step's time is the mean over
-frames. The residual is the largest |Q^-1 grad g|_Q over the frames, relative to that at the frame's current positions.
-`growth` is the exponent of the vertices in a step's processor time, from the same solver's smallest mesh on.
+frames, or with `--last-step` that of the last one, e.g. the third in contact. The residual is the largest
+|Q^-1 grad g|_Q over the frames, relative to that at the frame's current positions. `growth` is the exponent of the
+vertices in a step's processor time, from the same solver's smallest mesh on.
 """
 
 from __future__ import annotations
@@ -48,9 +50,12 @@ class Cost(NamedTuple):
     peak_gib: float
 
 
-def measure_run(run: RunSpec) -> Cost:
-    """Execute a run; its residuals are evaluated while no clock runs."""
-    with limit_threads(1):
+def measure_run(run: RunSpec, threads: int, first_frame: int) -> Cost:
+    """Execute a run by a number of threads; its residuals are evaluated while no clock runs.
+
+    The steps before the frame `first_frame` are done, and not measured.
+    """
+    with limit_threads(threads):
         scene = build_scene(run.scene, run.size, run.integrator)
         stop = build_stop_rule(run.max_iterations, run.rtol)
         assert isinstance(stop, StopRule), "a tolerance by the step error has no initial residual"
@@ -61,9 +66,11 @@ def measure_run(run: RunSpec) -> Cost:
         prepared.solve(first, StopRule(1, stop.rtol))
         oracle, step, wall, iterations, left = ReferenceEvaluator(scene.system), 0.0, 0.0, 0, 0.0
         steps = simulate_scene(scene, prepared, stop, initial_guess=run.initial_guess, frames=run.frames)
-        for _ in range(run.frames):
+        for frame in range(run.frames):
             began, then = process_time(), perf_counter()
             done = next(steps)
+            if frame < first_frame:
+                continue
             step, wall = step + process_time() - began, wall + perf_counter() - then
             iterations += done.num_iterations
             stated = done.problem
@@ -71,7 +78,7 @@ def measure_run(run: RunSpec) -> Cost:
                 left, oracle.compute_residual(stated, done.solution.positions) / oracle.compute_initial_residual(stated)
             )
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    frames = run.frames
+    frames = run.frames - first_frame
     return Cost(len(scene.mesh.rest_positions), ready, step / frames, wall / frames, iterations / frames, left, peak)
 
 
@@ -81,6 +88,8 @@ def main() -> None:
     parser.add_argument("config", nargs="?", type=Path, default=GROWTH, metavar="CONFIG")
     parser.add_argument("--only", default="", metavar="WORDS")
     parser.add_argument("--sizes", nargs="*", type=int, help="mesh sizes; all by default")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--last-step", action="store_true", help="measure the last frame alone")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
     smallest: dict[tuple[str, str, str], Cost] = {}
@@ -91,7 +100,8 @@ def main() -> None:
         if options.only not in title or run.size not in (options.sizes or [run.size]):
             continue
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-            cost = alone.submit(measure_run, run).result()
+            first = run.frames - 1 if options.last_step else 0
+            cost = alone.submit(measure_run, run, options.threads, first).result()
         columns = {"scene": run.scene_name, "size": run.size, "solver": run.solver.name}
         rows.append(columns | {"initial_guess": run.initial_guess} | cost._asdict())
         least = smallest.setdefault((run.scene_name, run.solver.name, run.initial_guess), cost)
@@ -99,7 +109,9 @@ def main() -> None:
         growth = f"{log(ratio) / log(cost.vertices / least.vertices):.2f}" if least is not cost else ""
         line = f"{title} | {cost.vertices:,} | {cost.prepare_seconds:.2f} | {cost.cpu_seconds:.3g} | {cost.seconds:.3g}"
         print(f"{line} | {cost.num_iterations:.1f} | {cost.residual:.2e} | {cost.peak_gib:.2f} | {growth}", flush=True)
-    publish_rows(options.publish, options.config, "python -m tests.bench.large", rows, begin)
+    command = "python -m tests.bench.large" + (f" {options.config}" if options.config != GROWTH else "")
+    command += f" --last-step --threads {options.threads}" if options.last_step else ""
+    publish_rows(options.publish, options.config, command, rows, begin)
 
 
 if __name__ == "__main__":
