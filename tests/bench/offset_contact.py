@@ -1,0 +1,266 @@
+"""Offset geometric contact (`vbd-ogc`) compared with barriers: time, penetration, and the error that it leaves.
+
+    python -m tests.bench.offset_contact [--rounds 2] [--scenes SCENE ...] [--publish results/published/offset-contact]
+
+Rough motions: each solver simulates the first frames of a scene, all in turn step by step on one thread; of each step
+the least processor time of the rounds counts. Barrier solvers end at a relative residual of 1e-3 or after 100
+iterations, `vbd-ogc` after a fixed number.
+
+    collisions      frames with an edge through a triangle or a pair within its minimum distance, and pairs of
+                    consecutive frames whose linear path ipctk's continuous collision detection rejects
+    error           of the last positions, root mean square distance from `hybrid` to a residual of 1e-6 [mm]
+
+One step: that of `hybrid` at the last frame, solved in 10 to 300 iterations from the same start.
+
+    residual        of the barrier objective, relative to the start
+    error           root mean square distance from the minimum that `newton` finds [mm]
+    change          the same from the iterate after the largest number of iterations: it falls if there is a fixed point
+    radius          the error of 300 iterations where contacts act within a fraction of the minimum distance
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from time import thread_time
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from springbench.harness.config.config_loader import load_scene
+from springbench.harness.execution.machine_info import describe_machine, limit_threads
+from springbench.harness.scenes.collision_primitives import collision_primitives
+from springbench.harness.scenes.scene_builder import Scene, build_scene
+from springbench.harness.simulation.instrumentation_pass import count_intersections
+from springbench.harness.simulation.time_loop import MotionState, build_problem, prepare, simulate_scene
+from springbench.solvers.contact.contact_potential import BarrierContact
+from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
+from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
+from springbench.solvers.methods.vertex_block.vbd_offset_contact import OffsetContactDescent
+from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule
+
+from tests.bench.scripted_study import describe_moment, publish_rows
+
+CONFIGS = Path(__file__).parents[2] / "configs"
+SCENES: dict[str, tuple[int, int]] = {"ten-sheets": (3, 16), "net-on-block": (5, 30), "touching-curtain": (9, 40)}
+"""Size and frames of scenes of `configs/touch`: layers that press each other, ropes on a block, a cloth in folds."""
+
+
+class Contender(NamedTuple):
+    """A solver with its stop rule."""
+
+    solver: Solver
+    stop: StopRule
+
+
+BARRIERS = StopRule(100, 1e-3)
+CONTENDERS: dict[str, Contender] = {
+    "vbd-ogc, 20": Contender(OffsetContactDescent(), StopRule(20)),
+    "vbd-ogc, 100": Contender(OffsetContactDescent(), StopRule(100)),
+    "vbd": Contender(VertexBlockDescent(), BARRIERS),
+    "hybrid": Contender(HybridNewton(), BARRIERS),
+    "newton": Contender(NewtonSolver(), BARRIERS),
+}
+REFERENCE = Contender(HybridNewton(), StopRule(300, 1e-6))
+STEP_SOLVERS: dict[str, Solver] = {
+    "vbd-ogc": OffsetContactDescent(),
+    "vbd-ogc, redetection_fraction 0": OffsetContactDescent(redetection_fraction=0.0),
+    "vbd": VertexBlockDescent(),
+}
+ITERATIONS = (10, 30, 100, 300)
+RADIUS_RATIOS = (1.0, 0.25, 0.0625)
+
+
+class Motion(NamedTuple):
+    """A motion: positions of each frame, least processor time of each step [s], and mean number of iterations."""
+
+    positions: list[Positions]
+    step_seconds: list[float]
+    mean_iterations: float
+
+
+def simulate_interleaved(scene: Scene, frames: int, contenders: Sequence[Contender], rounds: int) -> list[Motion]:
+    """Simulate a scene by several solvers step by step in turn, and return their motions."""
+    prepared = [prepare(scene, one.solver) for one in contenders]
+    seconds, counts = np.full((len(contenders), frames), np.inf), np.zeros((len(contenders), frames))
+    positions: list[list[Positions]] = []
+    for number in range(rounds):
+        positions = [[] for _ in contenders]
+        steps = [
+            iter(simulate_scene(scene, made, one.stop, initial_guess="extrapolated", frames=frames))
+            for made, one in zip(prepared, contenders, strict=True)
+        ]
+        for k in range(frames):
+            for j in range(len(contenders)) if (k + number) % 2 else reversed(range(len(contenders))):
+                began = thread_time()
+                step = next(steps[j])
+                seconds[j, k] = min(seconds[j, k], thread_time() - began)
+                counts[j, k] = step.num_iterations
+                positions[j].append(step.positions.copy())
+    return [Motion(p, s.tolist(), float(c.mean())) for p, s, c in zip(positions, seconds, counts, strict=True)]
+
+
+def count_bad_frames(scene: Scene, positions: Sequence[Positions]) -> int:
+    """Count the frames with an intersection, or a pair within its minimum distance; obstacles are at rest."""
+    contacts = [energy for energy in scene.system.energies if isinstance(energy, BarrierContact)]
+    return sum(
+        bool(count_intersections(scene, p, 0.0)) or any(contact.find_violated_pairs(p) for contact in contacts)
+        for p in positions
+    )
+
+
+def count_rejected_paths(scene: Scene, positions: Sequence[Positions]) -> int:
+    """Count the pairs of consecutive frames whose linear path ipctk rejects for the mesh against itself."""
+    import ipctk  # an optional extra
+
+    edges, faces = collision_primitives(scene.mesh)
+    mesh = ipctk.CollisionMesh(scene.mesh.rest_positions, edges, faces[faces[:, 1] != faces[:, 2]])
+    return sum(not ipctk.is_step_collision_free(mesh, before, after) for before, after in pairwise(positions))
+
+
+def measure_distance_mm(p: Positions, q: Positions) -> float:
+    """Return the root mean square distance of positions (n, 3) [m] in mm."""
+    return 1e3 * float(np.sqrt(((p - q) ** 2).sum(axis=1).mean()))
+
+
+def measure_motions(name: str, rounds: int) -> list[dict[str, Any]]:
+    """Measure the motion of a scene by each solver: a row for each."""
+    scene, frames = build_touching_scene(name), SCENES[name][1]
+    (reference,) = simulate_interleaved(scene, frames, [REFERENCE], 1)
+    motions = simulate_interleaved(scene, frames, list(CONTENDERS.values()), rounds)
+    return [
+        {
+            "kind": "motion",
+            "scene": name,
+            "solver": solver,
+            "vertices": scene.system.num_vertices,
+            "frames": frames,
+            "iterations": motion.mean_iterations,
+            "step_milliseconds": 1e3 * float(np.mean(motion.step_seconds)),
+            "num_bad_frames": count_bad_frames(scene, motion.positions),
+            "num_rejected_paths": count_rejected_paths(scene, motion.positions),
+            "error_mm": measure_distance_mm(motion.positions[-1], reference.positions[-1]),
+        }
+        for solver, motion in zip(CONTENDERS, motions, strict=True)
+    ]
+
+
+def find_last_step(scene: Scene, frames: int) -> StepProblem:
+    """Return the step after some frames by `hybrid`."""
+    steps = simulate_scene(
+        scene, prepare(scene, REFERENCE.solver), REFERENCE.stop, initial_guess="previous", frames=frames
+    )
+    state: MotionState = list(steps)[-1].state
+    return build_problem(scene, state, "previous")
+
+
+def build_touching_scene(name: str, radius_ratio: float = 1.0) -> Scene:
+    """Build a scene with contact radii relative to its minimum distances."""
+    spec = load_scene(CONFIGS / "touch" / f"{name}.yaml")
+    effects: list[Any] = list(spec.effects)
+    for k, one in enumerate(effects):
+        if "contact" in one.kind:
+            effects[k] = one.model_copy(update={"dhat": radius_ratio * one.min_distance})
+    return build_scene(spec.model_copy(update={"effects": tuple(effects)}), SCENES[name][0], log_warnings=False)
+
+
+def measure_radii(name: str) -> list[dict[str, Any]]:
+    """Measure the error of one step by contact radius: a row for each."""
+    rows: list[dict[str, Any]] = []
+    for ratio in RADIUS_RATIOS:
+        scene = build_touching_scene(name, ratio)
+        problem = find_last_step(scene, SCENES[name][1])
+        minimum = prepare(scene, NewtonSolver()).solve(problem, StopRule(300, 1e-9)).positions
+        p = prepare(scene, OffsetContactDescent()).solve(problem, StopRule(ITERATIONS[-1])).positions
+        error = measure_distance_mm(p, minimum)
+        rows.append({"kind": "radius", "scene": name, "solver": "vbd-ogc", "radius_ratio": ratio, "error_mm": error})
+    return rows
+
+
+def measure_step(name: str) -> list[dict[str, Any]]:
+    """Measure one step of a scene by numbers of iterations: a row for each solver and number."""
+    scene = build_touching_scene(name)
+    problem = find_last_step(scene, SCENES[name][1])
+    minimum = prepare(scene, NewtonSolver()).solve(problem, StopRule(300, 1e-9)).positions
+    gauge: Any = CompiledLocalGlobal().prepare(scene.system)
+    residual = gauge.build_residual(problem)
+    start = residual(problem.current_positions)
+    rows: list[dict[str, Any]] = []
+    for solver, method in STEP_SOLVERS.items():
+        prepared = prepare(scene, method)
+        iterates = [prepared.solve(problem, StopRule(count)).positions.copy() for count in ITERATIONS]
+        rows += [
+            {
+                "kind": "step",
+                "scene": name,
+                "solver": solver,
+                "iterations": float(count),
+                "residual": residual(p) / start,
+                "error_mm": measure_distance_mm(p, minimum),
+                "change_mm": measure_distance_mm(p, iterates[-1]),
+                "num_active": sum(
+                    len(one.block_vertices(p)) for one in problem.energies if isinstance(one, BarrierContact)
+                ),
+            }
+            for count, p in zip(ITERATIONS, iterates, strict=True)
+        ]
+    return rows
+
+
+def tabulate_motions(rows: Sequence[dict[str, Any]]) -> Table:
+    """Build the table of motions."""
+    table = Table(
+        "scene", "solver", "iterations", "ms a step", "bad frames", "rejected paths", "error, mm", box=SIMPLE_HEAD
+    )
+    table.title = f"rough motions with contact; {describe_machine().cpu}"
+    for row in rows:
+        table.add_row(
+            row["scene"],
+            row["solver"],
+            f"{row['iterations']:.0f}",
+            f"{row['step_milliseconds']:.2f}",
+            str(row["num_bad_frames"]),
+            str(row["num_rejected_paths"]),
+            f"{row['error_mm']:.3g}",
+        )
+    return table
+
+
+def tabulate_steps(rows: Sequence[dict[str, Any]]) -> Table:
+    """Build the table of single steps."""
+    table = Table("scene", "solver", "iterations", "residual", "error, mm", "change, mm", box=SIMPLE_HEAD)
+    for row in rows:
+        numbers = (f"{row[key]:.2g}" for key in ("residual", "error_mm", "change_mm"))
+        table.add_row(row["scene"], row["solver"], f"{row['iterations']:.0f}", *numbers)
+    return table
+
+
+def main() -> None:
+    """Print both tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    options = parser.parse_args()
+    begin, motions, steps, radii = describe_moment(), *(list[dict[str, Any]]() for _ in range(3))
+    with limit_threads(1):
+        for name in options.scenes:
+            steps += measure_step(name)
+            radii += measure_radii(name)
+            motions += measure_motions(name, options.rounds)
+            Console(width=120).print(tabulate_steps(steps[-len(STEP_SOLVERS) * len(ITERATIONS) :]))
+            Console(width=120).print(tabulate_motions(motions[-len(CONTENDERS) :]))
+            for row in radii[-len(RADIUS_RATIOS) :]:
+                Console(width=120).print(f"{name}: radius {row['radius_ratio']:g}, error {row['error_mm']:.3g} mm")
+    config = CONFIGS / "touch" / "net-on-block.yaml"
+    publish_rows(options.publish, config, "python -m tests.bench.offset_contact", motions + steps + radii, begin)
+
+
+if __name__ == "__main__":
+    main()
