@@ -314,7 +314,7 @@ def _to_plain_data(value: Any, at: ConfigKey = ()) -> Any:
     came = f"the class {of.__name__}" if of is value else f"an object of {of.__name__}"
     file = Path(getattr(sys.modules.get(of.__module__), "__file__", None) or "mine.py").name
     wanted = f'its name; write the class into a file beside the scenes, and give "./{file}:{of.__name__}"'
-    raise InputError(InputMistake(f"came {came}; wanted {wanted}", key=format_key(at)))
+    raise InputError(InputMistake(f"got {came}; expected {wanted}", key=format_key(at)))
 
 
 def load_rows(folder: str | Path) -> Any:

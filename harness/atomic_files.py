@@ -81,12 +81,12 @@ def open_lock_file(path: Path, access: int = os.O_RDWR, *, hint: str = "") -> in
         what = (
             f"cannot be opened ({describe_cause(error)})" if stat.S_ISREG(mode) else f"is {_describe_file_type(mode)}"
         )
-        raise InputError(InputMistake(f"{what}; wanted a plain file to lock: remove it{hint}", path)) from error
+        raise InputError(InputMistake(f"{what}; expected a plain file to lock: remove it{hint}", path)) from error
     mode = os.fstat(lock).st_mode
     if not stat.S_ISREG(mode):
         os.close(lock)
         raise InputError(
-            InputMistake(f"is {_describe_file_type(mode)}; wanted a plain file to lock: remove it{hint}", path)
+            InputMistake(f"is {_describe_file_type(mode)}; expected a plain file to lock: remove it{hint}", path)
         )
     return lock
 

@@ -228,7 +228,7 @@ def accuracy(
         isolated=not in_process,
     )
     drawn = draw_accuracy_report(folder, files)
-    _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and tables tell of them")
+    _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and tables show them")
     refresh_results_page(results, folder, _say)
     failed = list_failed_units(files)
     for line in failed:

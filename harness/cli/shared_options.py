@@ -57,7 +57,7 @@ CompareOption = Annotated[
 def require_output_file(path: Path | None, suffix: str, option: str) -> None:
     """Raise InputError unless a file with this suffix can be written at a path of an option; None is no file."""
     if path and (path.suffix != suffix or not path.parent.is_dir() or (os.path.lexists(path) and not path.is_file())):
-        raise InputError(f"{option}: came {path}; wanted a file that ends in {suffix}, in a folder that exists")
+        raise InputError(f"{option}: got {path}; expected a file that ends in {suffix}, in a folder that exists")
 
 
 class ErrorReportingGroup(TyperGroup):

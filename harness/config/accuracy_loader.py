@@ -198,5 +198,5 @@ class _StudyExpansion:
         """Return the names that a study selects, or all if it selects none."""
         for name in requested:
             if name not in known:
-                self.document.add_mistake(f"came {quote_value(name)}; expected {suggest_name(name, known)}", (*at, key))
+                self.document.add_mistake(f"got {quote_value(name)}; expected {suggest_name(name, known)}", (*at, key))
         return [name for name in known if name in requested or not requested]

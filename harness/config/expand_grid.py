@@ -139,7 +139,7 @@ class GridExpansion:
                 for key, names in known.items():
                     for name in getattr(entry, key):
                         if name not in names:
-                            problem = f"came {quote_value(name)}; expected {suggest_name(name, names)}"
+                            problem = f"got {quote_value(name)}; expected {suggest_name(name, names)}"
                             self.document.add_mistake(problem, (part, i, key))
 
     def _check_error_target(self) -> None:

@@ -49,7 +49,7 @@ def open_scheduler(scheduler_address: str) -> Generator[Any]:
     if kind == "local":
         if not many.isdecimal() or not 1 <= int(many) <= 1024:
             raise InputError(
-                InputMistake(f"came {scheduler_address}; wanted local:N with a number of workers", key="--scheduler")
+                InputMistake(f"got {scheduler_address}; expected local:N with a number of workers", key="--scheduler")
             )
         try:
             secure = Security.temporary()
@@ -109,6 +109,6 @@ def _start_batch_cluster(path: Path) -> Any:
     try:
         found = made(**options)
     except (TypeError, ValueError) as error:
-        raise InputError(InputMistake(f"{kind}Cluster refuses: {error}", path)) from None
+        raise InputError(InputMistake(f"{kind}Cluster reports: {error}", path)) from None
     found.scale(jobs=jobs)
     return found

@@ -197,7 +197,7 @@ def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callab
         off = about.clock_seconds - min(max(about.clock_seconds, before), time())
         if abs(off) > MAX_CLOCK_OFFSET:
             print_message(
-                f"the clock of {worker} is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}; its rows tell by it"
+                f"the clock of {worker} is {abs(off):.0f} s {'ahead' if off > 0 else 'behind'}; so are its rows"
             )
     if problems:
         raise InputError([InputMistake(problem, key="--scheduler") for problem in problems])

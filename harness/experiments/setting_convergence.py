@@ -113,7 +113,7 @@ def complete_settings(settings: Sequence[StepSetting], solver: SolverSpec) -> li
             there = "iterates within a substep" if iterates else "has no iterations within a substep"
             wanted = f"{one.substeps}x10" if iterates else str(one.substeps)
             raise InputError(
-                InputMistake(f"came {one}; {solver.name} {there}: expected such as {wanted}", key="--setting")
+                InputMistake(f"got {one}; {solver.name} {there}: expected such as {wanted}", key="--setting")
             )
     return list(dict.fromkeys(settings)) or [StepSetting(1, DEFAULT_ITERATIONS if iterates else 0)]
 

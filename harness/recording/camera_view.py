@@ -142,9 +142,9 @@ class ViewExtent:
         words = [format_percent(strain_range * share) for share in (-1, -0.5, 0, 0.5, 1)]
         words[2] = "strain 0"
         marks = [[at, low, near] for at in across[:: (NUM_LEVELS - 1) // 4]]
-        for k, way, end in ((0, -1, strain_limits[0]), (len(across) - 1, 1, strain_limits[1])):
-            if way * end > strain_range:
-                tip = [across[k] + way * 2 * (top - low), (low + top) / 2, near]
+        for k, sign, end in ((0, -1, strain_limits[0]), (len(across) - 1, 1, strain_limits[1])):
+            if sign * end > strain_range:
+                tip = [across[k] + sign * 2 * (top - low), (low + top) / 2, near]
                 edges = np.vstack([edges, tip @ sight.axes])
                 faces = np.vstack([faces, [2 * k, 2 * k + 1, len(edges) - 1]])
                 colours = np.vstack([colours, colours[2 * k]])

@@ -210,8 +210,8 @@ def _is_continuum(problem: StepProblem, p: Positions, found: HessianCurvature, n
     The objective is compared on both sides of p along the degenerate direction.
     """
     lowest, noise = problem.value(p), LEVEL_ROUNDOFF * EPS * problem.value_scale(p)
-    for way in (WALK_FRACTION, -WALK_FRACTION):
-        q = p + way / CERTIFIED_RTOL * float(near.max()) * found.direction / np.abs(found.direction).max()
+    for offset in (WALK_FRACTION, -WALK_FRACTION):
+        q = p + offset / CERTIFIED_RTOL * float(near.max()) * found.direction / np.abs(found.direction).max()
         for _ in range(MAX_REFACTORISATIONS):
             here = compute_curvature(problem, q)
             if here.is_saddle or not np.isfinite(here.min_eigenvalue):

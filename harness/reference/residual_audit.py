@@ -70,7 +70,7 @@ class AuditedSolver(DelegatingSolver):
         yardstick = self._stationarity.compute_initial_residual(problem)
         message, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
         if np.isnan(found.residual) and found.num_iterations:
-            raise RunFailed(f"{message}; wanted |Q^-1 grad g|_Q, which is {truth:.3g} (or `is_minimiser = False`)")
+            raise RunFailed(f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g} (or `is_minimiser = False`)")
         claimed = RESIDUAL_SLACK * found.residual / yardstick + round_off
         enough = RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / yardstick if yardstick else 0.0) + round_off
         if found.termination_reason != "converged":

@@ -68,7 +68,7 @@ def _run_plugin_report(name: PluginName, table: pa.Table, folder: Path, tick: Pr
     wrote: object = report(table, folder)
     paths: list[object] = list(wrote) if isinstance(wrote, list | tuple) else [None]  # pyright: ignore[reportUnknownArgumentType]
     if not all(isinstance(path, Path | str) for path in paths):
-        raise RunFailed(f"it returned a {type(wrote).__name__}; wanted a list of the files that it wrote")
+        raise RunFailed(f"it returned a {type(wrote).__name__}; expected a list of the files that it wrote")
     return [Path(str(path)) for path in paths]
 
 

@@ -90,7 +90,7 @@ def run_query(sql: str, results: Path, *, max_rows: int = MAX_SHOWN_ROWS, cpu_se
         InputError: if there are no rows, if the query exceeds a limit, or, with DuckDB's message, if it is invalid.
     """
     if not 0.0 < cpu_seconds <= 1e6:
-        raise InputError(InputMistake(f"came {cpu_seconds:g}; wanted a number of seconds above 0", key="--cpu-limit"))
+        raise InputError(InputMistake(f"got {cpu_seconds:g}; expected a number of seconds above 0", key="--cpu-limit"))
     folders = {table: row_store.find_row_folders(results, table, "*/") for table in _TABLE_SCHEMAS}
     every = list(chain(*folders.values()))
     files = sum(len(row_store.list_unit_files(folder)) for folder in every)
@@ -123,7 +123,7 @@ def _execute_query(sql: str, units: dict[str, list[Path]], max_rows: int, *, in_
             _register_tables(connection, units, as_views=reads and not in_memory)
             found: Any = connection.execute(sql)
             if found is None or found.description is None:
-                raise InputError("query: came without a statement; wanted one, such as SELECT count(*) FROM rows")
+                raise InputError("query: has no statement; expected one, such as SELECT count(*) FROM rows")
             values, characters = list[tuple[Any, ...]](), 0
             while len(values) <= max_rows and characters < _MAX_CHARACTERS and (row := found.fetchone()):
                 values.append(_plain_values(row))

@@ -74,7 +74,7 @@ def suggest_commands(timed_runs: Sequence[RunTimes], config: Path, results: Path
     scenes = {run.scene: None for run in timed_runs}
     if scene := next(filter(None, (_find_scene_file(config, name) for name in scenes)), None):
         suggestions.append(
-            ("springbench recommend --error 1e-2", get_config_name(scene), "the cheapest way to an error of 1 %")
+            ("springbench recommend --error 1e-2", get_config_name(scene), "the cheapest method for an error of 1 %")
         )
     suggestions.append(("springbench report", results, "bring the page up to date, with recordings that it replays"))
     return [line for words, path, why in suggestions for line in (f"  # {why}", f"  {words} {shlex.quote(str(path))}")]

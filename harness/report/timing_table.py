@@ -221,7 +221,7 @@ DISSIPATION_NOTE = (
 )
 """Meanings of the marks in the table."""
 SHARED_TIMING_NOTE = (
-    "timed beside others, up to {} at once, each on cores of its own: slower than alone by what they share"
+    "timed while others ran, up to {} at once, each on cores of its own: slower than alone by what they share"
 )
 
 

@@ -57,7 +57,7 @@ def claim_folder(folder: Path, config: Path) -> Path:
             )
         )
     if owner != config.resolve():
-        way = os.path.relpath(config.resolve(), folder.resolve())
+        relative_path = os.path.relpath(config.resolve(), folder.resolve())
         with atomic_write(folder / OWNER_FILE) as partial:
-            partial.write_bytes(os.fsencode(way) + b"\n")
+            partial.write_bytes(os.fsencode(relative_path) + b"\n")
     return folder

@@ -128,7 +128,7 @@ def find_study(published: Path, name: str) -> PublishedStudy:
     """Find a study by its name. Raises InputError if there is none."""
     studies = {study.study_name: study for study in list_studies(published)}
     if name not in studies:
-        raise InputError(InputMistake(f"came {name!r}; wanted {suggest_name(name, studies)}", key="STUDY"))
+        raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, studies)}", key="STUDY"))
     return studies[name]
 
 

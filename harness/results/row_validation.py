@@ -132,8 +132,8 @@ class InvalidValue(NamedTuple):
     def __str__(self) -> str:
         came = repr(self.value[:_MAX_QUOTED_LENGTH] if isinstance(self.value, str) else self.value)
         return (
-            f"came {came if len(came) <= _MAX_QUOTED_LENGTH else came[:_MAX_QUOTED_LENGTH] + '…'}; "
-            f"wanted {self.expected}"
+            f"got {came if len(came) <= _MAX_QUOTED_LENGTH else came[:_MAX_QUOTED_LENGTH] + '…'}; "
+            f"expected {self.expected}"
         )
 
 

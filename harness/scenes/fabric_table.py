@@ -101,7 +101,7 @@ def find_fabric(name: str) -> PublishedFabric:
         ValueError: for an unknown name.
     """
     if name not in PUBLISHED_FABRICS:
-        raise ValueError(f"came {name[:60]!r}; should be {suggest_name(name, PUBLISHED_FABRICS)}")
+        raise ValueError(f"got {name[:60]!r}; should be {suggest_name(name, PUBLISHED_FABRICS)}")
     return PUBLISHED_FABRICS[name]
 
 

@@ -303,7 +303,7 @@ def find_implausible_materials(effects: Sequence[SceneEffect], mesh: Mesh, mass:
 
 def _compute_vertex_masses(spec: SceneSpec, mesh: Mesh) -> NDArray[np.float64]:
     if spec.mass is not None and spec.mass_per_area is not None:
-        raise InputError(InputMistake("is given beside `mass`; leave out one of them", key="mass_per_area"))
+        raise InputError(InputMistake("is given, and so is `mass`; leave out one of them", key="mass_per_area"))
     if spec.mass is not None:
         return spec.mass * mesh.mass_fractions
     if spec.mass_per_area is not None:

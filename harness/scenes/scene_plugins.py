@@ -44,7 +44,7 @@ def load_plugin(document: ConfigDocument, plugin: PluginName, part_kind: str, ke
     try:
         with preserve_working_directory():
             made = load_target(plugin.import_target)
-        problem = "" if fits(made) else f"is no {part_kind}; wanted {wanted}"
+        problem = "" if fits(made) else f"is no {part_kind}; expected {wanted}"
         if lacks := sorted(getattr(made, "__abstractmethods__", ())):
             problem = problem or f"has no method `{'`, `'.join(lacks)}`, which its base class requires"
     except AttributeError as error:
@@ -218,7 +218,7 @@ def build_checked_contribution(
             f"{plugin}: `build_contribution` wrote to the mesh or the masses, which it was given; change copies"
         )
     if not isinstance(made, EffectContribution):
-        wanted = "wanted a springbench.harness.scenes.effects.effect_interface.EffectContribution"
+        wanted = "expected a springbench.harness.scenes.effects.effect_interface.EffectContribution"
         raise InputError(f"{plugin}: `build_contribution` returned {_describe_value(made)}; {wanted}")
     with attribute_errors(plugin, "build_contribution"):
         for field in fields(made):
@@ -258,7 +258,7 @@ class _CheckedFunction:
             found: Any = self.function(*(one.copy() if _is_array(one) else one for one in arguments))
             wanted = self.num_vertices, 3
             if not _is_array(found) or found.shape != wanted:
-                raise ValueError(f"gave {_describe_value(found)}; wanted a {self.quantity} of shape {wanted}")
+                raise ValueError(f"gave {_describe_value(found)}; expected a {self.quantity} of shape {wanted}")
         return found
 
 
@@ -295,7 +295,7 @@ def _require_indices(array: Any, shape: tuple[int | None, ...], what: str, count
 def _require_pin(pin: Any, count: int) -> None:
     _require_true(
         isinstance(pin, PinGroup),
-        f"`pins` holds {_describe_value(pin)}; wanted springbench.harness.scenes.effects.effect_interface.PinGroup",
+        f"`pins` holds {_describe_value(pin)}; expected springbench.harness.scenes.effects.effect_interface.PinGroup",
     )
     _require_indices(pin.vertices, (None,), "`vertices` of a pin", count)
     _require_array(pin.targets, (len(pin.vertices), 3), "`targets` of a pin")
@@ -310,7 +310,7 @@ def check_plugin_mesh(plugin: PluginName, mesh: Any) -> Mesh:
     with attribute_errors(plugin, "generate_mesh"):
         _require_true(
             isinstance(mesh, Mesh),
-            f"returned {_describe_value(mesh)}; wanted a springbench.harness.scenes.mesh.mesh.Mesh",
+            f"returned {_describe_value(mesh)}; expected a springbench.harness.scenes.mesh.mesh.Mesh",
         )
         _require_array(mesh.rest_positions, (None, 3), "`rest_positions`")
         n, m = len(mesh.rest_positions), len(mesh.springs)
@@ -324,7 +324,7 @@ def check_plugin_mesh(plugin: PluginName, mesh: Any) -> Mesh:
         )
         if unknown := mesh.spring_families.keys() - {STRETCH, SHEAR, BEND}:
             raise ValueError(
-                f"`spring_families` has {sorted(map(str, unknown))[0]!r}; wanted {STRETCH}, {SHEAR} and {BEND}"
+                f"`spring_families` has {sorted(map(str, unknown))[0]!r}; expected {STRETCH}, {SHEAR} and {BEND}"
             )
         for name, members in mesh.spring_families.items():
             _require_indices(members, (None,), f"`spring_families[{name!r}]`", m)
@@ -337,7 +337,7 @@ def check_plugin_mesh(plugin: PluginName, mesh: Any) -> Mesh:
             _require_true(bool((mesh.mass >= 0.0).all()), "`mass` has values below 0")
         for name, values in mesh.attributes.items():
             _require_array(values, (n,), f"`attributes[{name!r}]`")
-        _require_true(mesh.dimension in (1, 2, 3), f"`dimension` is {mesh.dimension!r}; wanted 1, 2 or 3")
+        _require_true(mesh.dimension in (1, 2, 3), f"`dimension` is {mesh.dimension!r}; expected 1, 2 or 3")
         spacing: Any = mesh.spacing
         _require_true(isinstance(spacing, float | int) and 0.0 < spacing < math.inf, f"`spacing` is {spacing!r} m")
         if (same := mesh.springs[:, 0] == mesh.springs[:, 1]).any():

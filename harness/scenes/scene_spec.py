@@ -41,7 +41,7 @@ def registered_name(table: PluginTable) -> Any:
     def checked(value: str, info: ValidationInfo) -> str:
         name = table.resolve_name(value, Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")))
         if name not in table:
-            raise ValueError(f"came {json.dumps(value)[:60]}; should be {suggest_name(value, table)}")
+            raise ValueError(f"got {json.dumps(value)[:60]}; should be {suggest_name(value, table)}")
         return name
 
     shipped = [name for one in table.builtin_tables for name in one]

@@ -78,7 +78,8 @@ def compute_spring_stiffness(
     if scaling_rule not in SCALING_RULES:
         raise InputError(
             InputMistake(
-                f"unknown rule {scaling_rule!r}; wanted {suggest_name(scaling_rule, SCALING_RULES)}", key="scaling_rule"
+                f"unknown rule {scaling_rule!r}; expected {suggest_name(scaling_rule, SCALING_RULES)}",
+                key="scaling_rule",
             )
         )
     if reference_size is not None and scaling_rule != "liu2013":
@@ -94,7 +95,7 @@ def compute_spring_stiffness(
             )
             continue
         if not 0 <= constant < np.inf and (family == BEND or constant != np.inf):
-            raise InputError(InputMistake(f"{constant} is no stiffness; wanted a finite number >= 0", key=family))
+            raise InputError(InputMistake(f"{constant} is no stiffness; expected a finite number >= 0", key=family))
         k[of] = constant * SCALING_RULES[scaling_rule](mesh, family, reference_size)
     return _subtract_bend_stiffness(mesh, k) if scaling_rule == "continuum" else k
 
@@ -111,7 +112,7 @@ def _subtract_bend_stiffness(mesh: Mesh, k: NDArray[np.float64]) -> NDArray[np.f
         least = mesh.spacing * (more / had) ** 0.5 if had else np.inf
         problem = (
             f"its springs alone would resist stretch by {more:.4g} N/m at a spacing of {mesh.spacing:.4g} m, and "
-            f"`stretch` is {had:.4g} N/m; wanted a spacing of at least {least:.4g} m, less `bend` or more `stretch`"
+            f"`stretch` is {had:.4g} N/m; expected a spacing of at least {least:.4g} m, less `bend` or more `stretch`"
         )
         raise InputError(InputMistake(problem, key="bend"))
     k[along] -= added
@@ -157,7 +158,7 @@ def _area_scale(mesh: Mesh, family: str, reference: int | None) -> NDArray[np.fl
 
 def _liu2013_scale(mesh: Mesh, family: str, reference: int | None) -> float:
     if reference is None or reference < 2:
-        problem = f"came {reference}; liu2013 needs the mesh size, at least 2, at which the constants hold"
+        problem = f"got {reference}; liu2013 needs the mesh size, at least 2, at which the constants hold"
         raise InputError(InputMistake(problem, key="reference_size"))
     if mesh.resolution < 2:
         problem = f"liu2013 needs a mesh that has a size of at least 2, this one has {mesh.resolution or 'none'}"

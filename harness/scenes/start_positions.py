@@ -119,7 +119,7 @@ class MergedStart(RestStart):
     def compute_positions(self, rest_positions: Positions) -> Positions:
         """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m]."""
         if max(self.vertices) >= len(rest_positions):
-            problem = f"came {max(self.vertices)}; the mesh has the vertices 0 to {len(rest_positions) - 1}"
+            problem = f"got {max(self.vertices)}; the mesh has the vertices 0 to {len(rest_positions) - 1}"
             raise InputError(InputMistake(problem, key="start.vertices"))
         p = rest_positions.copy()
         p[list(self.vertices[1:])] = rest_positions[self.vertices[0]]

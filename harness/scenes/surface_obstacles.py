@@ -56,7 +56,7 @@ class TriangleSurface(ConfigModel):
         n = len(info.data.get("points", ())) or np.inf  # invalid points are reported separately
         for k, corners in enumerate(triangles):
             if not all(0 <= i < n for i in corners) or len(set(corners)) < 3:
-                raise ValueError(f"number {k} is {corners}; wanted three different points from 0 to {n - 1}")
+                raise ValueError(f"number {k} is {corners}; expected three different points from 0 to {n - 1}")
         return triangles
 
 
@@ -79,8 +79,8 @@ class RecordedFrames(ConfigModel):
         path = self.positions if isinstance(self.positions, Path) else None
         found = read_npz_array(path, "positions") if path else np.array(self.positions)
         if found.ndim != 3 or found.shape[2] != 3 or not found.size or not (np.abs(found) <= MAX_COORDINATE).all():
-            wanted = f"wanted numbers up to {MAX_COORDINATE:g} m of shape (frames, points, 3)"
-            problem = f"came positions {found.shape}; {wanted}"
+            wanted = f"expected numbers up to {MAX_COORDINATE:g} m of shape (frames, points, 3)"
+            problem = f"got positions {found.shape}; {wanted}"
             raise InputError(InputMistake(problem, path) if path else f"frames: {problem}")
         return found
 
@@ -166,7 +166,7 @@ class MeshObstacle(ConfigModel):
             if len(points) != self.frames.frame_positions.shape[1]:
                 came = f"{self.frames.frame_positions.shape[1]:,} points for a mesh of {len(points):,}"
                 path = self.frames.positions if isinstance(self.frames.positions, Path) else None
-                raise InputError(InputMistake(f"came {came}; wanted as many", path, key="frames"))
+                raise InputError(InputMistake(f"got {came}; expected as many", path, key="frames"))
             points = self.frames.frame_positions[0]
         return self.scale * points + np.array(self.offset), triangles
 

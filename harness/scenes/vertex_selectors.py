@@ -124,10 +124,10 @@ class VertexSelection(ConfigModel):
         n, rest = len(mesh.rest_positions), mesh.rest_positions
         for part in self.parts:
             if part not in mesh.parts:
-                raise InputError(f"{name}: parts: came {part!r}; this mesh has {suggest_name(part, mesh.parts)}")
+                raise InputError(f"{name}: parts: got {part!r}; this mesh has {suggest_name(part, mesh.parts)}")
         outside = [i for i in self.indices if i >= n]
         if outside:
-            raise InputError(f"{name}: indices: came {outside[0]}; the mesh has the vertices 0 to {n - 1}")
+            raise InputError(f"{name}: indices: got {outside[0]}; the mesh has the vertices 0 to {n - 1}")
         sets = [mesh.parts[part] for part in self.parts] + [np.array(self.indices, np.int64)]
         if self.box:
             inside = (rest >= self.box.low) & (rest <= self.box.high)
@@ -174,14 +174,14 @@ def _describe_value(value: Any) -> str:
 
 def _select_loops(found: list[BoundaryLoop], wanted: tuple[int, ...], name: str, what: str) -> list[IndexArray]:
     if missing := [k for k in wanted if k >= len(found)]:
-        raise InputError(f"{name}: came {missing[0]}; the mesh has {len(found)} {what}, counted from 0")
+        raise InputError(f"{name}: got {missing[0]}; the mesh has {len(found)} {what}, counted from 0")
     return [found[k].vertices for k in wanted]
 
 
 def _select_by_attribute(mesh: Mesh, wanted: AttributeRange, name: str) -> IndexArray:
     if wanted.name not in mesh.attributes:
         known = suggest_name(wanted.name, mesh.attributes) if mesh.attributes else "none; meshes from files may"
-        raise InputError(f"{name}: came {wanted.name!r}; this mesh has {known}")
+        raise InputError(f"{name}: got {wanted.name!r}; this mesh has {known}")
     values = mesh.attributes[wanted.name]
     low, high = (end if end is not None else sign * np.inf for end, sign in ((wanted.low, -1), (wanted.high, 1)))
     return np.flatnonzero((values >= low) & (values <= high))

@@ -197,11 +197,9 @@ def _describe_problem(detail: ErrorDetails, model: type[BaseModel], key: ConfigK
         came = detail.get("ctx", {}).get("tag")
         if came is not None:
             return f"unknown kind {quote_value(came)}; expected {suggest_name(came, kinds)}"
-        return (
-            f"came {quote_value(detail['input'])}{_EXPECTED_PREFIX}a mapping with a `kind`, {suggest_name('', kinds)}"
-        )
+        return f"got {quote_value(detail['input'])}{_EXPECTED_PREFIX}a mapping with a `kind`, {suggest_name('', kinds)}"
     wanted = message.removeprefix("Input should be ").replace("a valid array", "a list")
-    return f"came {quote_value(detail['input'])}{_EXPECTED_PREFIX}{wanted}"
+    return f"got {quote_value(detail['input'])}{_EXPECTED_PREFIX}{wanted}"
 
 
 def _models_at(model: type[BaseModel], location: ConfigKey) -> list[type[BaseModel]]:

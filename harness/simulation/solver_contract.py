@@ -119,12 +119,12 @@ class ContractCheckedSolver(DelegatingSolver):
         self._contract.require_unmodified(line)
         if not isinstance(found, Solution):
             raise RunFailed(
-                f"{line}: gave a {type(found).__name__}; wanted a springbench.solvers.model.step_problem.Solution"
+                f"{line}: gave a {type(found).__name__}; expected a springbench.solvers.model.step_problem.Solution"
             )
         p: Any = found.positions
         came = f"{p.dtype} of shape {p.shape}" if _is_array(p) else f"a {type(p).__name__}"
         if came != (wanted := f"float64 of shape {problem.inertial_target.shape}"):
-            raise RunFailed(f"{line}: gave positions as {came}; wanted {wanted}")
+            raise RunFailed(f"{line}: gave positions as {came}; expected {wanted}")
         return found
 
     def _locate_write(self, problem: StepProblem, stop: StopRule) -> str:

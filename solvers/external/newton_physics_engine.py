@@ -119,7 +119,7 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
         """Build the network in the engine; return its stepper and a description."""
         if not self.iterations_per_substep >= 1:
             raise Unsupported(
-                f"newton-physics: iterations_per_substep came as {self.iterations_per_substep}; wanted 1 or more"
+                f"newton-physics: iterations_per_substep is {self.iterations_per_substep}; expected 1 or more"
             )
         warp = import_module("warp")
         if self.device == "cuda" and not warp.is_cuda_available():

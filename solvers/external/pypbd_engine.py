@@ -92,7 +92,7 @@ class PyPbdEngine(ExternalEngine):
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_PyPbdStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
         if not self.iterations_per_substep >= 1:
-            raise Unsupported(f"pypbd: iterations_per_substep came as {self.iterations_per_substep}; wanted 1 or more")
+            raise Unsupported(f"pypbd: iterations_per_substep is {self.iterations_per_substep}; expected 1 or more")
         made = _PyPbdStepper(library, network, self.iterations_per_substep)
         return made, f"{self.iterations_per_substep} iterations a substep, in {made.precision}"
 

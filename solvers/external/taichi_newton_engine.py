@@ -95,9 +95,9 @@ class TaichiNewtonEngine(ExternalEngine):
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_TaichiStepper, str]:
         """Build the network in the engine; return its stepper and a description."""
         if not self.iterations_per_substep >= 1:
-            raise Unsupported(f"taichi: iterations_per_substep came as {self.iterations_per_substep}; wanted 1 or more")
+            raise Unsupported(f"taichi: iterations_per_substep is {self.iterations_per_substep}; expected 1 or more")
         if not 0.0 < self.cg_rtol < 1.0:
-            raise Unsupported(f"taichi: cg_rtol came as {self.cg_rtol}; wanted a part of the gradient, such as 1e-6")
+            raise Unsupported(f"taichi: cg_rtol is {self.cg_rtol}; expected a part of the gradient, such as 1e-6")
         made = _TaichiStepper(library, network, self.iterations_per_substep, self.cg_rtol)
         return made, f"{self.iterations_per_substep} iterations of Newton's method a substep, in float64, on one thread"
 

@@ -162,14 +162,14 @@ def _parse_plugin_name(name: str, folder: Path) -> PluginName:
     place, _, attribute = name.rpartition(":")
     if not attribute.isidentifier():
         raise InvalidPluginName(
-            f"came {name!r}; wanted `module:Name`, or `./file.py:Name` for a file beside the config"
+            f"got {name!r}; expected `module:Name`, or `./file.py:Name` for a file beside the config"
         )
     if not place.endswith(".py") and "/" not in place:
         if not all(part.isidentifier() for part in place.split(".")):
-            raise InvalidPluginName(f"came {name!r}; wanted the name of a module in front of the colon")
+            raise InvalidPluginName(f"got {name!r}; expected the name of a module in front of the colon")
         return _plugin_of_module(name, name, None)
     if not place.startswith("./"):
-        raise InvalidPluginName(f"came {name!r}; a file is named from the config's folder on: ./file.py:{attribute}")
+        raise InvalidPluginName(f"got {name!r}; a file is named from the config's folder on: ./file.py:{attribute}")
     home = folder.resolve()
     path = Path(os.path.normpath(home / place))
     if not path.is_relative_to(home) or path.resolve() != path:

@@ -237,7 +237,7 @@ SOLVING = {
     "a fault in its residual": Hostile("measuring", "return 'small'", "solver", FAILED, ""),
 }
 BINDING = {
-    "binds nothing": Hostile("binding", "return None", "effect", MISTAKE, "`build_contribution` returned None; wanted"),
+    "binds nothing": Hostile("binding", "return None", "effect", MISTAKE, "`build_contribution` returned None; expected"),
     "binds a text": Hostile("binding", "return 'x'", "effect", MISTAKE, "`build_contribution` returned a str"),
     "writes to the mesh": Hostile("binding", "mesh.rest_positions[0] = 1", "effect", MISTAKE, "read-only"),
     "writes to the mesh by force": Hostile(
@@ -300,7 +300,7 @@ BINDING = {
         "above 0",
     ),
     "forces nothing": Hostile(
-        "forcing", "return None", "effect", FAILED, "gave None; wanted a force [N] of shape (4, 3)"
+        "forcing", "return None", "effect", FAILED, "gave None; expected a force [N] of shape (4, 3)"
     ),
     "forces too little": Hostile("forcing", "return p[:, :2]", "effect", FAILED, "float64 of shape (4, 2)"),
     "forces NaN": Hostile("forcing", "return p * np.nan", "effect", FAILED, ""),
@@ -308,11 +308,11 @@ BINDING = {
     "exits by force": Hostile("forcing", "sys.exit(0)", "effect", FAILED, "raised SystemExit: 0"),
     "hangs by force": Hostile("forcing", HANG, "effect", FAILED, LIMIT),
     "writes by force": Hostile("forcing", "p[:] = 7", "effect", FINE, ""),
-    "filters to nothing": Hostile("filtering", "return None", "effect", FAILED, "gave None; wanted a velocity [m/s]"),
+    "filters to nothing": Hostile("filtering", "return None", "effect", FAILED, "gave None; expected a velocity [m/s]"),
 }
 MESHES = {
     "is none": Hostile(
-        "generating", "return None", "mesh", MISTAKE, "returned None; wanted a springbench.harness.scenes.mesh"
+        "generating", "return None", "mesh", MISTAKE, "returned None; expected a springbench.harness.scenes.mesh"
     ),
     "has NaN": Hostile(
         "generating",
@@ -373,7 +373,7 @@ MESHES = {
         "generating", "return replace(made, triangles=np.array([[0, 1, 99]]))", "mesh", MISTAKE, "`triangles` names 99"
     ),
     "has seven dimensions": Hostile(
-        "generating", "return replace(made, dimension=7)", "mesh", MISTAKE, "wanted 1, 2 or 3"
+        "generating", "return replace(made, dimension=7)", "mesh", MISTAKE, "expected 1, 2 or 3"
     ),
     "raises": Hostile(
         "generating", "raise KeyError(3)", "mesh", MISTAKE, "`generate_mesh` raised KeyError: 3 (mine.py:"
@@ -389,7 +389,7 @@ MESHES = {
 }
 OTHERS = {
     "an integrator that is a number": Hostile(
-        "integrator", "EULER = 7", "integrator", MISTAKE, "is no integrator; wanted"
+        "integrator", "EULER = 7", "integrator", MISTAKE, "is no integrator; expected"
     ),
     "an integrator that predicts nothing": Hostile("predicting", "return None", "integrator", FAILED, ""),
     "an integrator that raises": Hostile(
@@ -404,7 +404,7 @@ OTHERS = {
         "integrator", "EULER = replace(EULER, inertia_factor='one')", "integrator", MISTAKE, ""
     ),
     "a report of nothing": Hostile(
-        "reporting", "return None", "report", FAILED, "it returned a NoneType; wanted a list"
+        "reporting", "return None", "report", FAILED, "it returned a NoneType; expected a list"
     ),
     "a report that raises": Hostile("reporting", "raise KeyError(3)", "report", FAILED, "raised KeyError: 3 (mine.py:"),
     "a report that exits": Hostile("reporting", "sys.exit(0)", "report", FAILED, "raised SystemExit: 0"),

@@ -158,7 +158,7 @@ def test_a_search_time_that_is_used_up_is_stated_and_the_search_goes_on_from_the
 @pytest.mark.parametrize("option", ["error", "t_end", "time_limit", "search_time"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
 def test_what_is_no_number_above_zero_is_a_mistake(scene: Path, option: str, value: float) -> None:
-    with pytest.raises(InputError, match="wanted a number above 0"):
+    with pytest.raises(InputError, match="expected a number above 0"):
         recommend(scene, **{"error": 0.1, option: value})
 
 
@@ -166,7 +166,7 @@ def test_a_mesh_has_to_have_a_size(scene: Path) -> None:
     scene.write_text(SCENE.replace("default_size: 4", ""))
     with pytest.raises(InputError, match=r"^--size: is missing; the scene chain needs a mesh size"):
         recommend(scene, 0.1)
-    with pytest.raises(InputError, match=r"^--size: came 1; should be greater than or equal to 2$"):
+    with pytest.raises(InputError, match=r"^--size: got 1; should be greater than or equal to 2$"):
         recommend(scene, 0.1, size=1)
 
 
@@ -181,7 +181,7 @@ def test_the_command_shows_what_it_predicts_and_what_it_measured(
     captured = capsys.readouterr()
     assert not ended.value.code, captured.err
     assert all(word in captured.out for word in ("predicted", "measured", "sparse", "time step"))
-    assert list((scene.parent / "results" / "recommend-chain" / "pictures").glob("ways-chain-4-0_1-0_2.png"))
+    assert list((scene.parent / "results" / "recommend-chain" / "pictures").glob("methods-chain-4-0_1-0_2.png"))
     said = (captured.out + captured.err).splitlines()
     command = next(line for line in said if line.startswith("  springbench run "))
     _, _, config, *given = shlex.split(command)
@@ -300,7 +300,7 @@ def test_a_budget_that_nothing_meets_names_the_cheapest(scene: Path) -> None:
 def test_the_search_can_be_of_one_solver(scene: Path) -> None:
     found, _ = recommend(scene, 0.5, engine="numba")
     assert {method.work_spec.solver.name for method in found.measured_methods} == {"numba"}
-    with pytest.raises(InputError, match=r"--engine: came 'mujocko'; expected .*mujoco"):
+    with pytest.raises(InputError, match=r"--engine: got 'mujocko'; expected .*mujoco"):
         recommend(scene, 0.5, engine="mujocko")
 
 
@@ -320,5 +320,5 @@ def test_a_budget_has_a_unit(text: str, seconds: float) -> None:
 
 @pytest.mark.parametrize("text", ["4", "ms", "-1ms", "0s", "nan s", "infs", "4 min"])
 def test_a_budget_without_a_unit_is_a_mistake(text: str) -> None:
-    with pytest.raises(InputError, match=r"--budget: came .*; expected a number above 0 with its unit"):
+    with pytest.raises(InputError, match=r"--budget: got .*; expected a number above 0 with its unit"):
         parse_duration(text, "--budget")

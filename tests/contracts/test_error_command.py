@@ -41,9 +41,9 @@ SCENES = Path(__file__).parents[2] / "configs" / "scenes"
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--error", "2"), "--error: came 2; wanted a number between 0 and 1"),
-        (("--error", "nan"), "--error: came nan"),
-        (("--error", "1e-3", "--t-end", "-1"), "--t-end: came -1; wanted seconds above 0"),
+        (("--error", "2"), "--error: got 2; expected a number between 0 and 1"),
+        (("--error", "nan"), "--error: got nan"),
+        (("--error", "1e-3", "--t-end", "-1"), "--t-end: got -1; expected seconds above 0"),
         (("--error", "1e-3", "--solver", "newton"), "--solver: with --error, solver and steps are chosen"),
         (("--error", "1e-3", "--integrator", "bdf2"), "--integrator: with --error"),
         (("--t-end", "1"), "--t-end: is of a run with --error"),

@@ -39,7 +39,7 @@ def test_rows_that_do_not_fit_are_named_and_left_out(tmp_path: Path):
     said = "".join(found.said.split())
     assert found.code == 0
     for file, (name, (column, _)) in zip(files, LEFT_OUT.items(), strict=True):
-        assert f"{file.name}:{column}:came" in said, name
+        assert f"{file.name}:{column}:got" in said, name
     assert not list(tmp_path.parent.rglob("evil*"))
 
 
@@ -119,7 +119,7 @@ def test_a_recording_is_looked_for_below_its_folder(tmp_path: Path, recording: s
             row["recording_path"] = recording
     synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", given_rows)
     found = reported(tmp_path)
-    assert "recording_path: came" in " ".join(found.said.split())
+    assert "recording_path: got" in " ".join(found.said.split())
 
 
 def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path):

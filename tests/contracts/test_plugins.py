@@ -281,15 +281,15 @@ def test_a_file_with_a_blank_in_its_name_and_a_field_that_is_an_array_are_verifi
 
 
 REFUSED = {
-    "../mine.py:Mine": "wanted",
-    "/mine.py:Mine": "wanted",
+    "../mine.py:Mine": "expected",
+    "/mine.py:Mine": "expected",
     "mine.py:Mine": "named from the config's folder on: ./file.py:Mine",
     "./../mine.py:Mine": "leaves the config's folder",
     "./own/../../mine.py:Mine": "leaves the config's folder",
     "./link.py:Mine": "leaves the config's folder",
     "./linked/mine.py:Mine": "leaves the config's folder",
     "./nothing.py:Mine": "there is no file",
-    "./mine.py:": "wanted",
+    "./mine.py:": "expected",
     "nobodys:Mine": "which Python does not find",
     "springbench.solvers.nothing:Mine": "which Python does not find",
 }
@@ -309,11 +309,11 @@ def test_code_elsewhere_is_refused(name: str, plugin_folder: Path):
 
 WRONG = {
     ("solver", "./mine.py:Nothing"): "./mine.py:Nothing cannot be loaded: ./mine.py has no Nothing",
-    ("solver", "./mine.py:tell"): "./mine.py:tell is no solver; wanted a frozen dataclass",
-    ("effect", "./mine.py:Mine"): "./mine.py:Mine is no effect; wanted a subclass",
-    ("mesh", "./mine.py:Hum"): "./mine.py:Hum is no mesh; wanted a subclass",
-    ("integrator", "./mine.py:Mine"): "./mine.py:Mine is no integrator; wanted an object",
-    ("report", "./mine.py:EULER"): "./mine.py:EULER is no report; wanted a function",
+    ("solver", "./mine.py:tell"): "./mine.py:tell is no solver; expected a frozen dataclass",
+    ("effect", "./mine.py:Mine"): "./mine.py:Mine is no effect; expected a subclass",
+    ("mesh", "./mine.py:Hum"): "./mine.py:Hum is no mesh; expected a subclass",
+    ("integrator", "./mine.py:Mine"): "./mine.py:Mine is no integrator; expected an object",
+    ("report", "./mine.py:EULER"): "./mine.py:EULER is no report; expected a function",
 }
 
 
@@ -329,5 +329,5 @@ def test_what_a_name_leads_to_is_checked_when_it_is_run(part: str, name: str, pl
 def test_wrong_parameters_of_own_code_are_reported_with_their_line(plugin_folder: Path):
     sweep = configs(plugin_folder, WAYS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5", "patience: soon"))
-    with pytest.raises(InputError, match=r"sweep\.yaml:2: solvers\[0\]\.patience: came \"soon\"; should be"):
+    with pytest.raises(InputError, match=r"sweep\.yaml:2: solvers\[0\]\.patience: got \"soon\"; should be"):
         load_config(sweep)

@@ -75,5 +75,5 @@ class Mine:
 
 
 def test_a_class_in_a_sweep_is_answered_by_how_to_name_it():
-    with pytest.raises(InputError, match=r'solvers\[1\]: came the class Mine; wanted .* "./test_api_types.py:Mine"'):
+    with pytest.raises(InputError, match=r'solvers\[1\]: got the class Mine; expected .* "./test_api_types.py:Mine"'):
         springbench.run_config({"scenes": ["a.yaml"], "solvers": ["sparse", Mine]}, name="a")  # type: ignore[list-item]

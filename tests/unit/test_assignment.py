@@ -126,7 +126,7 @@ def test_vertices_that_no_face_uses_stay_without_mass(tmp_path):
         ({"obj": None}, "obj", "is missing: Path of the OBJ file"),
         ({"k": None}, "k", "is missing: Stiffness"),
         ({"b": None}, "b", "is missing: Pinned"),
-        ({"bc": [[0, 0, 0]]}, "bc", "unknown key; wanted one of b, k, m, obj, png"),
+        ({"bc": [[0, 0, 0]]}, "bc", "unknown key; expected one of b, k, m, obj, png"),
         ({"objs": 1}, "objs", "did you mean 'obj'?"),
         ({"obj": 3}, "obj", "string"),
         ({"k": "500"}, "k", "number"),
@@ -175,7 +175,7 @@ def test_all_mistakes_come_at_once(tmp_path):
     [
         ("", None, "is empty"),
         ('{"obj": "mesh.obj",\n "k": 5,,}', 2, "is no JSON"),
-        ("[1, 2]", None, "came a list"),
+        ("[1, 2]", None, "got a list"),
         ('{"k": 1, "k": 2}', None, "'k' comes twice"),
         ("[" * 100_000, None, "cannot be read as JSON"),
         ('{"k": ' + "1" * 5000 + "}", None, "cannot be read as JSON"),

@@ -94,7 +94,7 @@ def test_clocks_that_differ_are_said(off: float, words: str):
     [
         ("tcp://127.0.0.1:1", "no scheduler answers"),
         ("nowhere", "no scheduler answers"),
-        ("local:none", "wanted local:N"),
+        ("local:none", "expected local:N"),
         ("absent.yaml", "expected a mapping"),
     ],
 )

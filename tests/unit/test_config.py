@@ -102,14 +102,14 @@ class Outer(ConfigModel):
 
 CHECKS: dict[str, tuple[dict[str, Any], list[str]]] = {
     "missing key": ({"place": [0, 0, 0]}, ["c.yaml:4: part.count: is missing"]),
-    "boolean as integer": ({"count": True}, ["c.yaml:5: part.count: came true; should be a valid integer"]),
-    "text as integer": ({"count": "3"}, ['c.yaml:5: part.count: came "3"; should be a valid integer']),
-    "fraction as integer": ({"count": 3.5}, ["c.yaml:5: part.count: came 3.5; should be a valid integer"]),
+    "boolean as integer": ({"count": True}, ["c.yaml:5: part.count: got true; should be a valid integer"]),
+    "text as integer": ({"count": "3"}, ['c.yaml:5: part.count: got "3"; should be a valid integer']),
+    "fraction as integer": ({"count": 3.5}, ["c.yaml:5: part.count: got 3.5; should be a valid integer"]),
     "short list": ({"count": 1, "place": [0, 1]}, ["c.yaml:4: part.place: has too few items"]),
-    "item": ({"count": 1, "place": [0, 1, "z"]}, ['c.yaml:4: part.place[2]: came "z"; should be a valid number']),
+    "item": ({"count": 1, "place": [0, 1, "z"]}, ['c.yaml:4: part.place[2]: got "z"; should be a valid number']),
     "member of a union": (
         {"count": 1, "weight": "x"},
-        ["c.yaml:4: part.weight: came \"x\"; should be a valid number or 'exact'"],
+        ["c.yaml:4: part.weight: got \"x\"; should be a valid number or 'exact'"],
     ),
     "unknown key": (
         {"count": 1, "wight": 2},
@@ -129,8 +129,8 @@ CHECKS: dict[str, tuple[dict[str, Any], list[str]]] = {
     "two mistakes": (
         {"count": 0.5, "inner": 3},
         [
-            "c.yaml:4: part.inner: came 3; should be an object",
-            "c.yaml:5: part.count: came 0.5; should be a valid integer",
+            "c.yaml:4: part.inner: got 3; should be an object",
+            "c.yaml:5: part.count: got 0.5; should be a valid integer",
         ],
     ),
 }

@@ -169,7 +169,7 @@ def test_attachments_pull_to_the_points_that_they_name():
     np.testing.assert_allclose(compute_rest_shape(mesh)[[0, 2]], each, rtol=0, atol=1e-6)  # as above
     mesh = build_test_scene(ChainMesh(), AttachmentsEffect(parts=("ends",), stiffness=3.0, anchors=one), size=3)
     np.testing.assert_allclose(compute_rest_shape(mesh)[[0, 2]], one * 2, rtol=0, atol=1e-6)
-    with pytest.raises(InputError, match="came 2 points for 1 vertices"):
+    with pytest.raises(InputError, match="got 2 points for 1 vertices"):
         build_test_scene(ChainMesh(), AttachmentsEffect(parts=("first",), stiffness=3.0, anchors=each), size=3)
 
 

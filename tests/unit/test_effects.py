@@ -208,7 +208,7 @@ def test_a_holeless_sheet_and_unknown_numbers_are_refused():
     for selectors, message in (
         ({"holes": (0,)}, "the mesh has 0 holes"),
         ({"boundary_loops": (1,)}, "the mesh has 1 boundary loops"),
-        ({"attribute": {"name": "heat"}}, "came 'heat'; this mesh has none"),
+        ({"attribute": {"name": "heat"}}, "got 'heat'; this mesh has none"),
         ({"sphere": {"center": (9.0, 0.0, 0.0), "radius": 0.1}}, "no vertex of the mesh lies in the sphere"),
     ):
         with pytest.raises(InputError, match=message):
@@ -229,7 +229,7 @@ def test_selectors_that_are_not_used_are_not_written_down():
 
 REFUSED = {
     "an unknown part": ({"parts": ("topp",)}, "did you mean 'top'"),
-    "a vertex beyond the last": ({"indices": (0, N)}, f"came {N}; the mesh has the vertices 0 to {N - 1}"),
+    "a vertex beyond the last": ({"indices": (0, N)}, f"got {N}; the mesh has the vertices 0 to {N - 1}"),
     "an empty box": ({"box": {"low": (5.0, 5.0, 5.0), "high": (6.0, 6.0, 6.0)}}, "no vertex of the mesh lies in"),
 }
 

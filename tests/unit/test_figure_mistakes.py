@@ -20,28 +20,28 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 BAD = {
-    "unknown kind": (["timin"], "KIND: came 'timin'; wanted one of", "did you mean 'timing'?"),
-    "a width without a unit": (["timing", "--width", "85"], "--width: came '85'; wanted a length such as 85mm", ""),
-    "a width of no figure": (["timing", "--width", "3mm"], "--width: came 3mm; wanted from 40mm to 400mm", ""),
-    "an unknown format": (["timing", "--format", "pdf,gif"], "--format: came 'gif'; wanted one of pdf, png, svg", ""),
-    "no format": (["timing", "--format", ","], "--format: came ''; wanted one of pdf, png, svg", ""),
-    "small type": (["timing", "--font-size", "5"], "--font-size: came 5; wanted from 6 to 24 points", ""),
+    "unknown kind": (["timin"], "KIND: got 'timin'; expected one of", "did you mean 'timing'?"),
+    "a width without a unit": (["timing", "--width", "85"], "--width: got '85'; expected a length such as 85mm", ""),
+    "a width of no figure": (["timing", "--width", "3mm"], "--width: got 3mm; expected from 40mm to 400mm", ""),
+    "an unknown format": (["timing", "--format", "pdf,gif"], "--format: got 'gif'; expected one of pdf, png, svg", ""),
+    "no format": (["timing", "--format", ","], "--format: got ''; expected one of pdf, png, svg", ""),
+    "small type": (["timing", "--font-size", "5"], "--font-size: got 5; expected from 6 to 24 points", ""),
     "no such panel": (
         ["timing", "--panels", "gap:tine"],
-        "--panels: came 'gap:tine'; wanted parts of",
+        "--panels: got 'gap:tine'; expected parts of",
         "geometry-flat:step",
     ),
     "curves and a map": (
         ["hard", "--panels", "shares,map:geometry"],
-        "--panels: came shares:right, map:geometry, of which some are curves and some are maps",
+        "--panels: got shares:right, map:geometry, of which some are curves and some are maps",
         "draw the others as a figure of their own",
     ),
     "nothing of that kind": (["convergence"], "holds no accuracy rows; run `springbench accuracy CONFIG`", ""),
-    "no ablation": (["ablation"], "wanted the rows of `springbench ablate SCENE`", ""),
-    "no speed": (["speed"], "wanted the rows of `springbench roofline CONFIG`", ""),
+    "no ablation": (["ablation"], "expected the rows of `springbench ablate SCENE`", ""),
+    "no speed": (["speed"], "expected the rows of `springbench roofline CONFIG`", ""),
     "no recordings": (["run"], "holds no recordings; run a sweep with `record: true`", ""),
-    "type that does not fit": (["timing", "--width", "40mm", "--font-size", "20"], "wanted a wider figure", "is cut"),
-    "a report without panels": (["medians"], "KIND: came 'medians'; wanted one of", ""),
+    "type that does not fit": (["timing", "--width", "40mm", "--font-size", "20"], "expected a wider figure", "is cut"),
+    "a report without panels": (["medians"], "KIND: got 'medians'; expected one of", ""),
 }
 
 

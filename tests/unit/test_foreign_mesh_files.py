@@ -98,7 +98,7 @@ def test_a_ply_gives_a_mesh_with_its_numbers_in_double_precision(tmp_path):
         (b"property float x", b"property half x", "the line 'property half x'"),
         (b"format ascii 1.0\n", b"", "names no format"),
         (b"element face 1", b"element face 2", "promises 2 rows of face"),
-        (b"4 0 1 2 3", b"4 0 1 2.5 3", "the vertex 2.5; wanted a whole number"),
+        (b"4 0 1 2 3", b"4 0 1 2.5 3", "the vertex 2.5; expected a whole number"),
         (b"4 0 1 2 3", b"-4 0 1 2 3", "the length -4"),
         (b"4 0 1 2 3", b"4 0 1 two 3", "is no number"),
         (b"4 0 1 2 3", b"9 0 1 2 3", "fewer follow"),

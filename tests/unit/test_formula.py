@@ -20,8 +20,8 @@ from tests.scene_builders import build_cloth, build_first_problem
 ROOT = Path(__file__).resolve().parents[2]
 
 WRONG: dict[str, tuple[Callable[..., Any], str]] = {
-    "nothing": (lambda self, p, before, correction: None, "gave a NoneType; wanted float64 of shape"),
-    "two coordinates": (lambda self, p, before, correction: p[:, :2], r"gave float64 of shape \(\d+, 2\); wanted"),
+    "nothing": (lambda self, p, before, correction: None, "gave a NoneType; expected float64 of shape"),
+    "two coordinates": (lambda self, p, before, correction: p[:, :2], r"gave float64 of shape \(\d+, 2\); expected"),
     "single precision": (lambda self, p, before, correction: p.astype(np.float32), "gave float32 of shape"),
     "too few arguments": (lambda self, p, before: p, "should take p, before and correction"),
 }

@@ -147,17 +147,17 @@ def test_every_format_gives_the_same_positions(form, tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("p.csv", "1,2,3\n", "3 columns; wanted one line a frame of 12 numbers"),
-        ("p.csv", "0,0,0,0,0,0,0,0,0,0,0,0\n1,2\n", "p.csv:2: has 2 columns; wanted 12"),
+        ("p.csv", "1,2,3\n", "3 columns; expected one line a frame of 12 numbers"),
+        ("p.csv", "0,0,0,0,0,0,0,0,0,0,0,0\n1,2\n", "p.csv:2: has 2 columns; expected 12"),
         ("p.csv", "0,0,0,0,0,0,0,0,0,0,0,0\n1,two\n", "p.csv:2: is not all numbers"),
         ("p.csv", "frame,vertex,x,y,z\n1,1,0,0,0\n", "each of 4 vertices once"),
-        ("p.csv", "frame,x,y,z\n1,0,0,0\n", "wanted `vertex` too"),
+        ("p.csv", "frame,x,y,z\n1,0,0,0\n", "expected `vertex` too"),
         ("p.csv", "", "is empty"),
-        ("p.csv", "frame,vertex,x,y,z\n1,0.5,0,0,0\n", "its column vertex has 0.5; wanted whole numbers"),
-        ("p.csv", "frame,vertex,x,y,z\nnan,1,0,0,0\n", "its column frame has nan; wanted whole numbers"),
-        ("p.csv", "time,vertex,x,y,z\ninf,1,0,0,0\n", "its column time has inf; wanted seconds"),
+        ("p.csv", "frame,vertex,x,y,z\n1,0.5,0,0,0\n", "its column vertex has 0.5; expected whole numbers"),
+        ("p.csv", "frame,vertex,x,y,z\nnan,1,0,0,0\n", "its column frame has nan; expected whole numbers"),
+        ("p.csv", "time,vertex,x,y,z\ninf,1,0,0,0\n", "its column time has inf; expected seconds"),
         ("p.csv", "x,x\n0,0\n", "names the column 'x' twice"),
-        ("p.csv", "0," * 1000, "p.csv:1: has a line of more than 896 characters; wanted at most 14 numbers"),
+        ("p.csv", "0," * 1000, "p.csv:1: has a line of more than 896 characters; expected at most 14 numbers"),
         ("p.stl", "", "has the suffix '.stl'"),
         ("p.npz", "no zip", "p.npz"),
         ("p.npy", "no array", "p.npy"),
@@ -181,7 +181,7 @@ def test_the_only_array_of_a_file_is_read_and_named(tmp_path):
     with pytest.raises(InputError, match="it holds U, V"):
         read_position_file(tmp_path / "q.npz", 5)
     np.save(tmp_path / "t.npy", np.zeros((5, 3, 3)))
-    with pytest.raises(InputError, match=r"\(vertices, frames, 3\) = \(5, 3, 3\); wanted \(frames, "):
+    with pytest.raises(InputError, match=r"\(vertices, frames, 3\) = \(5, 3, 3\); expected \(frames, "):
         read_position_file(tmp_path / "t.npy", 5)
 
 

@@ -143,7 +143,7 @@ def test_what_is_in_the_way_of_a_lock_is_named_at_once(what: str, tmp_path: Path
     }
     for name, lock in places.items():
         IN_THE_WAY[what](Path(name))
-        with pytest.raises(InputError, match=f"{name}: is {what}; wanted a plain file"), lock():
+        with pytest.raises(InputError, match=f"{name}: is {what}; expected a plain file"), lock():
             pass
         os.rename(name, "elsewhere" + name.replace("/", "-"))
 

@@ -260,7 +260,7 @@ def test_cells_that_no_springs_are_made_of_are_named(tmp_path):
     path = tmp_path / "mesh.vtu"
     cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     meshio.Mesh(cube, [("hexahedron", np.array([[0, 4, 6, 2, 1, 5, 7, 3]]))]).write(path)
-    with pytest.raises(InputError, match="hexahedron; wanted line, triangle, quad"):
+    with pytest.raises(InputError, match="hexahedron; expected line, triangle, quad"):
         FileMesh(path=path).build_mesh(0)
 
 

@@ -159,9 +159,9 @@ def test_a_gates_file_is_run_without_python(tmp_path: Path):
     [
         ("solver: sparce, baseline: dense, max_ratio: 1", 'gates.yaml:2: gates[0]: unknown name "sparce"; expected'),
         ("solver: sparse, baseline: dense", "gates.yaml:2: gates[0].max_ratio: is missing"),
-        ("solver: sparse, baseline: dense, max_ratio: -1", "gates[0].max_ratio: came -1; should be greater than 0"),
+        ("solver: sparse, baseline: dense, max_ratio: -1", "gates[0].max_ratio: got -1; should be greater than 0"),
         ("solver: xpbd, baseline: sparse, max_ratio: 9", "gates.yaml:2: gates[0]: the answers differ by"),
-        ("solver: sparse, baseline: dense, max_ratio: 1, clock: sun", 'gates[0].clock: came "sun"'),
+        ("solver: sparse, baseline: dense, max_ratio: 1, clock: sun", 'gates[0].clock: got "sun"'),
     ],
 )
 def test_a_mistake_in_a_gates_file_is_reported_with_its_line(tmp_path: Path, gate: str, message: str):

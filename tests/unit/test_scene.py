@@ -45,7 +45,7 @@ def test_a_woven_cloth_of_a_mass_per_area_weighs_that_and_the_reference_terms_ag
     assert verify_terms(spec, made, "implicit-euler") == "agrees"
     for mesh, more, message in (
         (ChainMesh(), {}, "needs a surface"),
-        (SkirtMesh(), {"mass": 1.0}, "is given beside `mass`"),
+        (SkirtMesh(), {"mass": 1.0}, "is given, and so is `mass`"),
     ):
         with pytest.raises(InputError, match=message):
             build_scene(SceneSpec.model_validate({"mesh": mesh, **given, **more}), 8)

@@ -347,13 +347,13 @@ def test_the_command_writes_the_map_its_numbers_and_the_settings(scene: Path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--solver", "sparce"], "--solver: came 'sparce'; expected"),
-        (["--solver", "sparse", "--setting", "0x4"], "--setting: came '0x4'; expected substeps x iterations"),
-        (["--solver", "sparse", "--setting", "4"], "--setting: came 4 substeps; sparse iterates within a substep"),
+        (["--solver", "sparce"], "--solver: got 'sparce'; expected"),
+        (["--solver", "sparse", "--setting", "0x4"], "--setting: got '0x4'; expected substeps x iterations"),
+        (["--solver", "sparse", "--setting", "4"], "--setting: got 4 substeps; sparse iterates within a substep"),
         (["--solver", "velocity-verlet", "--setting", "4x2"], "has no iterations within a substep"),
-        (["--solver", "sparse", "--error", "-1"], "--error: came -1; expected a number above 0"),
-        (["--solver", "sparse", "--parameter", "omega"], "--parameter: came 'omega'; expected KEY=VALUE"),
-        (["--solver", "sparse", "--t-end", "nan"], "--t-end: came nan"),
+        (["--solver", "sparse", "--error", "-1"], "--error: got -1; expected a number above 0"),
+        (["--solver", "sparse", "--parameter", "omega"], "--parameter: got 'omega'; expected KEY=VALUE"),
+        (["--solver", "sparse", "--t-end", "nan"], "--t-end: got nan"),
     ],
 )
 def test_mistakes_are_named(scene: Path, arguments: list[str], message: str):

@@ -71,16 +71,16 @@ WRONG = {
     "float32": Wrong(
         "return replace(found, positions=found.positions.astype(np.float32))",
         "def solve",
-        "gave positions as float32 of shape (16, 3); wanted float64 of shape (16, 3)",
+        "gave positions as float32 of shape (16, 3); expected float64 of shape (16, 3)",
     ),
     "another shape": Wrong(
         "return replace(found, positions=found.positions.ravel())",
         "def solve",
-        "gave positions as float64 of shape (48,); wanted float64 of shape (16, 3)",
+        "gave positions as float64 of shape (48,); expected float64 of shape (16, 3)",
     ),
-    "a list": Wrong("return replace(found, positions=[])", "def solve", "gave positions as a list; wanted float64"),
+    "a list": Wrong("return replace(found, positions=[])", "def solve", "gave positions as a list; expected float64"),
     "no answer": Wrong(
-        "return None", "def solve", "gave a NoneType; wanted a springbench.solvers.model.step_problem.Solution"
+        "return None", "def solve", "gave a NoneType; expected a springbench.solvers.model.step_problem.Solution"
     ),
     "writes to the target": Wrong(
         "problem.inertial_target[:] += 0.1", "problem.inertial_target", "wrote to problem.inertial_target"

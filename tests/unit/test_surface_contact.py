@@ -196,7 +196,7 @@ def test_the_reference_terms_agree_on_an_obstacle_that_deforms(tmp_path):
 def test_frames_of_another_mesh_are_refused(tmp_path):
     np.savez(tmp_path / "ball.npz", positions=np.zeros((2, 5, 3)))
     frames = {"positions": str(tmp_path / "ball.npz")}
-    for given, words in ((frames, "came 5 points for a mesh of"), ({"positions": [[[0, 0, 0]]]}, "came 1 points")):
+    for given, words in ((frames, "got 5 points for a mesh of"), ({"positions": [[[0, 0, 0]]]}, "got 1 points")):
         with pytest.raises(ValidationError, match=words):
             draped(BALL.model_dump() | {"mesh": {"kind": "balloon"}, "frames": given})
 

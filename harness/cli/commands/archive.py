@@ -30,7 +30,7 @@ def compact(
 
     if not 0.0 <= min_age_days < 1e6:
         raise InputError(
-            InputMistake(f"came {min_age_days:g}; wanted a number of days, 0 or more", key="--min-age-days")
+            InputMistake(f"got {min_age_days:g}; expected a number of days, 0 or more", key="--min-age-days")
         )
     pack(results, print_message, min_age_days=min_age_days)
 

@@ -65,11 +65,11 @@ def convergence(
     given = [_read_setting(text) for text in setting or ()]
     for key, value in (("--error", error), ("--time-limit", time_limit), ("--search-time", search_time)):
         if not 0.0 < value < 1e5:
-            raise InputError(InputMistake(f"came {value:g}; expected a number above 0", key=key))
+            raise InputError(InputMistake(f"got {value:g}; expected a number above 0", key=key))
     if t_end is not None and not 0.0 < t_end <= 1e4:
-        raise InputError(InputMistake(f"came {t_end:g}; expected seconds above 0, at most 10,000", key="--t-end"))
+        raise InputError(InputMistake(f"got {t_end:g}; expected seconds above 0, at most 10,000", key="--t-end"))
     if integrator is not None and integrator not in INTEGRATOR_TABLE:
-        problem = f"came {integrator!r}; expected {suggest_name(integrator, INTEGRATOR_TABLE)}"
+        problem = f"got {integrator!r}; expected {suggest_name(integrator, INTEGRATOR_TABLE)}"
         raise InputError(InputMistake(problem, key="--integrator"))
     spec = load_scene(scene)
     spec.require_fixed_time_step()
@@ -98,7 +98,7 @@ def _read_setting(text: str) -> StepSetting:
         return parse_setting(text)
     except ValueError:
         wanted = "substeps x iterations, such as 2x5, or substeps alone, such as 8"
-        problem = f"came {text[:40]!r}; expected {wanted}, up to {MAX_SETTING:,} each"
+        problem = f"got {text[:40]!r}; expected {wanted}, up to {MAX_SETTING:,} each"
         raise InputError(InputMistake(problem, key="--setting")) from None
 
 
@@ -120,12 +120,12 @@ def read_solver_options(path: Path, name: str, parameters: tuple[str, ...] | lis
     from springbench.solvers.registry import SOLVER_TABLE
 
     if name not in SOLVER_TABLE:
-        raise InputError(InputMistake(f"came {name!r}; expected {suggest_name(name, SOLVER_TABLE)}", key="--solver"))
+        raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, SOLVER_TABLE)}", key="--solver"))
     chosen: dict[str, Any] = {"name": name}
     for text in parameters:
         key, sign, value = text.partition("=")
         if not (key and sign and value):
-            raise InputError(InputMistake(f"came {text!r}; expected KEY=VALUE", key="--parameter"))
+            raise InputError(InputMistake(f"got {text!r}; expected KEY=VALUE", key="--parameter"))
         chosen[key] = parse_scalar(value)
     document = ConfigDocument(path, {"solvers": [chosen]})
     found = read_solvers(document)

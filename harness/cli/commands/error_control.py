@@ -142,11 +142,13 @@ def _execute_error_control(
             seen = compute_predictability_horizon(error_target, error, print_message)
             answer = _search_method(error_target, error, seen, [] if rerun else before, print_message)
     path, best = answer.best_trial.trajectory, answer.best_trial
-    print_message(f"asked {error:g}, estimated {best.error_estimated:.1g}, {path.cpu_seconds:.3g} s of processor time")
+    print_message(
+        f"requested {error:g}, estimated {best.error_estimated:.1g}, {path.cpu_seconds:.3g} s of processor time"
+    )
     factors = f", {path.num_factorisations} factorisations" if path.num_factorisations else ""
     print_message(
         f"by {best.method}: {path.num_accepted_steps} steps, {path.num_rejected_steps} rejected{factors}"
-        + (f"; more exact than asked, for {answer.note}" if answer.note else "")
+        + (f"; more accurate than requested, for {answer.note}" if answer.note else "")
     )
     print_message(f"choosing, and a closer motion for the estimate, took {answer.search_seconds:.3g} s besides")
     motion_scene = error_target.build_scene(error_target.frame_seconds, "substepping")
@@ -211,11 +213,13 @@ def _search_method(
     if not pairs:
         return search_cheapest_method(error_target, error, growth, print_message)
     names = ", ".join(format_method_name(integrator, solver.name) for integrator, solver in pairs)
-    print_message(f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --rerun tries all ways")
+    print_message(
+        f"worth trying by rows measured before, for an error of {nearest:g}: {names}; --rerun tries all methods"
+    )
     try:
         return search_cheapest_method(error_target, error, growth, print_message, pairs)
     except RunFailed as failed:
-        print_message(f"{failed}; so all ways are tried")
+        print_message(f"{failed}; so all methods are tried")
         return search_cheapest_method(error_target, error, growth, print_message)
 
 
@@ -251,7 +255,9 @@ def _verify_error(
         print_message(f"the reference cannot grade it: {failed}")
         return None
     measured = trajectory.measure_error(-1, p)
-    print_message(f"by the reference it errs by {measured:.2g}, {'as' if measured <= error else 'not as'} asked")
+    print_message(
+        f"by the reference its error is {measured:.2g}, {'within' if measured <= error else 'above'} that requested"
+    )
     return measured
 
 
@@ -263,9 +269,9 @@ def _check_options(error: float, t_end: float | None, rejected_options: Mapping[
         if value
     ]
     if not 0.0 < error < 1.0:
-        mistakes.append(InputMistake(f"came {error:g}; wanted a number between 0 and 1", key="--error"))
+        mistakes.append(InputMistake(f"got {error:g}; expected a number between 0 and 1", key="--error"))
     if t_end is not None and not (isfinite(t_end) and 0.0 < t_end <= 1e4):
-        mistakes.append(InputMistake(f"came {t_end:g}; wanted seconds above 0, at most 10,000", key="--t-end"))
+        mistakes.append(InputMistake(f"got {t_end:g}; expected seconds above 0, at most 10,000", key="--t-end"))
     if mistakes:
         raise InputError(mistakes)
 

@@ -50,7 +50,7 @@ def export_script(
     found = [label for label in engines if label.endswith(point)]
     if len(found) != 1:
         problem = (
-            f"came {point!r}, which {len(found)} points of outside engines end "
+            f"got {point!r}, which {len(found)} points of outside engines end "
             f"with; `springbench export-script {config}` "
         )
         raise InputError(InputMistake(f"{problem}lists them", key="POINT"))

@@ -36,7 +36,7 @@ def figure(
     wanted = parse_figure_options(width, formats, size, panels, has_title=not without_title, is_transparent=transparent)
     found = find(kind)
     if not results.is_dir():
-        raise InputError(InputMistake(f"is no folder; wanted one with {found.required_rows}", results))
+        raise InputError(InputMistake(f"is no folder; expected one with {found.required_rows}", results))
 
     from springbench.harness.experiments.stale_results import find_stale_runs
     from springbench.harness.report.figures.figure_maker import make_figure

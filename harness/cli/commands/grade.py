@@ -54,7 +54,7 @@ def grade(
     """Grade positions: does each step minimise its objective, how large is the error, which mistake explains it."""
     require_output_file(csv, ".csv", "--csv")
     if isnan(budget):
-        raise InputError("--budget: came nan; wanted seconds")
+        raise InputError("--budget: got nan; expected seconds")
     if students and not positions.is_dir():
         raise InputError(
             InputMistake("is no folder; --students needs one with a submission of each student", positions)

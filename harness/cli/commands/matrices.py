@@ -34,7 +34,7 @@ def matrices(
     """Print E, A, C, M, Q, y, d and b of a scene, and write them as .npz, Matrix Market and a picture."""
     folder = output or Path(f"{scene.stem}-matrices")
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"--output: came {folder}, a file; wanted a folder, which is made if it is missing")
+        raise InputError(f"--output: got {folder}, a file; expected a folder, which is made if it is missing")
 
     from springbench.harness.config.config_loader import load_scene_run
     from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS

@@ -67,7 +67,7 @@ def _load_source(file: Path, options: dict[str, Any]) -> tuple[FileMesh, MeshSup
     with _silence_log():  # the report repeats the remarks on the mesh
         scene = load_scene(file)
         if not isinstance(scene.mesh, FileMesh):
-            raise InputError(InputMistake("names no mesh file; wanted `mesh: {kind: file, path: ...}`", file))
+            raise InputError(InputMistake("names no mesh file; expected `mesh: {kind: file, path: ...}`", file))
         replaced = {"scale", "units"} if options.keys() & {"scale", "units"} else set[str]()
         source = _validate_source(scene.mesh.model_dump(exclude_unset=True, exclude=replaced) | options)
         return source, find_mesh_support(scene, source.build_mesh())
@@ -85,7 +85,7 @@ def _validate_source(keys: dict[str, Any]) -> FileMesh:
 
 def _convert_error(detail: Any) -> InputMistake:
     key = "".join(f"--{part}" for part in detail["loc"][:1])
-    return InputMistake(f"{detail['msg']}, came {str(detail['input'])[:40]!r}" if key else detail["msg"], key=key)
+    return InputMistake(f"{detail['msg']}, got {str(detail['input'])[:40]!r}" if key else detail["msg"], key=key)
 
 
 @contextmanager

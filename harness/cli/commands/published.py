@@ -50,7 +50,7 @@ def publish_study(
         raise InputError(InputMistake("does not state its config; give --config", results[0]))
     for path in (*results, provenance):
         if path and not path.exists():
-            raise InputError(InputMistake("is not there; wanted results, or a Parquet file of measurements", path))
+            raise InputError(InputMistake("is not there; expected results, or a Parquet file of measurements", path))
     write_study(results, owner, published, print_message, provenance)
 
 
@@ -62,7 +62,7 @@ def compare(
     from springbench.harness.report.published_comparison import build_comparison_table, compare_with_published
 
     if not results.is_dir():
-        raise InputError(InputMistake("is no folder; wanted results of `springbench run`", results))
+        raise InputError(InputMistake("is no folder; expected results of `springbench run`", results))
     lines = compare_with_published(results, published_set.list_studies(published))
     get_output_console().print(split_wide_table(build_comparison_table(lines), key_columns=3))
 

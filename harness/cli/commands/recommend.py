@@ -78,7 +78,7 @@ def recommend(
         rows += [("runner-up", found.find_runner_up())]
         rows += [("half the time", found.select_best(0.5)), ("twice the time", found.select_best(2.0))]
     heading = "error" if integrated else f"error ({found.checked_method.reference_kind})"
-    table = Table("", heading, "wall s per simulated s" if budget is None else "ms a frame", "way")
+    table = Table("", heading, "wall s per simulated s" if budget is None else "ms a frame", "method")
     for name, method in rows:
         if method is None:
             table.add_row(name, "–", "–", "nothing that was measured")
@@ -97,7 +97,7 @@ def recommend(
     folder = results / f"recommend-{scene.stem}" / "pictures"
     t_end = found.best_method.work_spec.t_end
     requested = f"{error:g}" if error else f"{budget}"
-    name = f"ways-{scene.stem}-{found.best_method.work_spec.case.size}-{requested}-{t_end:g}".replace(".", "_")
+    name = f"methods-{scene.stem}-{found.best_method.work_spec.case.size}-{requested}-{t_end:g}".replace(".", "_")
     facts = [f"{t_end:g} s simulated", "time stepping and solver together"]
     facts += [] if integrated else [f"by a {found.checked_method.reference_kind} reference"]
     chart = build_recommendation_chart(title, facts, points, RecommendationLimits(error, found.cost_limit))
@@ -123,5 +123,5 @@ def parse_duration(text: str, option: str) -> float:
         if unit in _UNITS and 0.0 < float(number) < inf:
             return float(number) * _UNITS[unit]
     raise InputError(
-        InputMistake(f"came {text!r}; expected a number above 0 with its unit: 4ms, 250us or 0.1s", key=option)
+        InputMistake(f"got {text!r}; expected a number above 0 with its unit: 4ms, 250us or 0.1s", key=option)
     )

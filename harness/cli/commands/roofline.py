@@ -39,7 +39,7 @@ def roofline(
     from springbench.harness.results.folder_ownership import claim_folder
 
     if not 0.0 < budget < math.inf:
-        raise InputError(InputMistake(f"came {budget:g}; wanted a number of seconds above 0", key="--budget"))
+        raise InputError(InputMistake(f"got {budget:g}; expected a number of seconds above 0", key="--budget"))
     sweep = load_sweep(config)
     require_fixed_steps(sweep.list_runs())
     if any(run.rtol == AUTO for run in sweep.list_runs()):

@@ -31,7 +31,7 @@ def validate(
     known = list_case_names()
     for name in case or ():
         if name not in known:
-            raise InputError(f"--case: came {name!r}; wanted {suggest_name(name, known)}")
+            raise InputError(f"--case: got {name!r}; expected {suggest_name(name, known)}")
     if output.exists() and not output.is_dir():
         raise InputError(f"--output: {output} is no folder; give the name of one")
     cases, began = case or known, monotonic()

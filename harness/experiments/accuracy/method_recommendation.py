@@ -171,7 +171,7 @@ def find_engine_integrator(solver: Any) -> str:
 def _load_solver(name: str) -> Any:
     known = [*SOLVERS, *OPTIONAL_SOLVERS]
     if name not in known:
-        raise InputError(InputMistake(f"came {name!r}; expected {suggest_name(name, known)}", key="--engine"))
+        raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, known)}", key="--engine"))
     return load_target(SOLVER_TABLE[name])
 
 
@@ -305,7 +305,7 @@ class MethodRecommendation:
         ratio = now.seconds_per_simulated_second / before.seconds_per_simulated_second
         if not 1.0 / _MAX_TIME_RATIO <= ratio <= _MAX_TIME_RATIO:
             return (
-                f"the error is as predicted, the time {ratio:.2g} times that: other programs ran beside one of the "
+                f"the error is as predicted, the time {ratio:.2g} times that: other programs ran during one of the "
                 "two, so repeat the command on an idle machine before you rely on the time"
             )
         return f"as predicted: the same error, {ratio:.2g} times the time"
@@ -352,7 +352,7 @@ def recommend_method(
     }
     for key, value in options.items():
         if value is not None and not 0 < value < math.inf:
-            raise InputError(InputMistake(f"came {value:g}; wanted a number above 0", key=key))
+            raise InputError(InputMistake(f"got {value:g}; expected a number above 0", key=key))
     scene = load_scene(path)
     scene.require_fixed_time_step()
     size = (size or scene.default_size or 0) if isinstance(scene.mesh, MeshGenerator) else 0

@@ -160,7 +160,7 @@ class PublishedRun:
 @contextmanager
 def unpack_archive(archive: Path) -> Generator[Path]:
     """Unpack an archive to a temporary folder. Raises InputError for a damaged or oversized archive."""
-    wanted = "wanted an archive that `springbench publish` wrote (.zip)"
+    wanted = "expected an archive that `springbench publish` wrote (.zip)"
     if not archive.is_file():  # a device or a pipe would be read for ever
         raise InputError(InputMistake(f"is {'no plain file' if archive.exists() else 'not there'}; {wanted}", archive))
     with TemporaryDirectory() as scratch:
@@ -215,7 +215,7 @@ def verify_checksums(folder: Path) -> list[VerifiedClaim]:
     sums = folder / CHECKSUM_FILE
     if not sums.is_file() or sums.stat().st_size > _MAX_CHECKSUM_BYTES:
         raise InputError(
-            InputMistake(f"holds no {CHECKSUM_FILE}; wanted an archive that `springbench publish` wrote", folder)
+            InputMistake(f"holds no {CHECKSUM_FILE}; expected an archive that `springbench publish` wrote", folder)
         )
     lines = [line.partition("  ") for line in os.fsdecode(sums.read_bytes()).splitlines()]
     stated = {name: digest for digest, _, name in lines if name}
@@ -536,7 +536,7 @@ def _verify_time_ratio(
     old: tuple[PublishedRun, PublishedRun], new: tuple[list[ResultRow], list[ResultRow]]
 ) -> VerifiedClaim:
     was, now = ([_read_step_seconds(run) for run in pair] for pair in ((old[0].rows, old[1].rows), new))
-    what = f"{old[0].title} beside {old[1].run.solver.name}, ratio of times"
+    what = f"{old[0].title} relative to {old[1].run.solver.name}, ratio of times"
     if not was[0].keys() & was[1].keys() & now[0].keys() & now[1].keys():
         return VerifiedClaim(what, ClaimVerdict.INCONCLUSIVE, "they have no step in common that has a time")
     published, here = (bootstrap_statistics.estimate_slowdown(*pair).estimate for pair in (was, now))

@@ -72,7 +72,7 @@ def publish_results(
         WriteError: the archive cannot be written.
     """
     if archive.suffix.lower() != ".zip" or archive.is_dir():
-        raise InputError(InputMistake("wanted the name of a file that ends in .zip", archive, key="--output"))
+        raise InputError(InputMistake("expected the name of a file that ends in .zip", archive, key="--output"))
     if not archive.parent.is_dir():
         raise InputError(InputMistake(f"there is no folder {archive.parent}; make it first", archive, key="--output"))
     content: dict[str, FileContent] = {}
@@ -87,8 +87,8 @@ def publish_results(
             files = _list_required_files(config)
             refused += [InputMistake(why, file) for file in files if (why := _explain_exclusion(file, config.parent))]
             content |= {f"configs/{name}/{os.path.relpath(file, config.parent)}": file for file in files}
-            way = os.path.relpath(f"configs/{name}/{config.name}", f"results/{name}")
-            content[f"results/{name}/{CLAIM}"] = os.fsencode(f"{way}\n")
+            relative_path = os.path.relpath(f"configs/{name}/{config.name}", f"results/{name}")
+            content[f"results/{name}/{CLAIM}"] = os.fsencode(f"{relative_path}\n")
         else:
             gone = f"what it names as its config, {config}, is none" if config else "its config is not there any more"
             print_message(f"{folder}: {gone}, so its runs cannot be repeated")

@@ -70,7 +70,7 @@ def write_study(
         InputError: there are no rows, runs of several configs, or the published set would become too large.
     """
     if not config.is_file():
-        raise InputError(InputMistake("is not there; wanted the config of these results", config, key="--config"))
+        raise InputError(InputMistake("is not there; expected the config of these results", config, key="--config"))
     by_part = [_read_part(part) for part in parts]
     made = _read_measurements(provenance) if provenance else None
     found = {
@@ -79,7 +79,9 @@ def write_study(
         if (several := [tables[table] for tables in by_part if table in tables])
     }
     if not found:
-        raise InputError(InputMistake("holds no rows; wanted the folder of one sweep, such as results/hard", parts[0]))
+        raise InputError(
+            InputMistake("holds no rows; expected the folder of one sweep, such as results/hard", parts[0])
+        )
     is_timed = any(_is_timed(rows) for rows in found.values())
     folder = published / config.stem
     published.mkdir(parents=True, exist_ok=True)
@@ -210,7 +212,7 @@ def _read_measurements(path: Path) -> pa.Table:
     try:
         table = pq.read_table(path, partitioning=None)
     except (pa.ArrowException, OSError) as error:
-        problem = explain_unreadable_file(path) or f"holds no table ({error}); wanted a Parquet file"
+        problem = explain_unreadable_file(path) or f"holds no table ({error}); expected a Parquet file"
         raise InputError(InputMistake(problem, path)) from error
     return table.select([name for name in table.column_names if name != row_store.FILE_COLUMN])
 

@@ -172,7 +172,7 @@ def list_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
     if one.is_substepping:
         return [("substepping", solver)]
     if not is_minimiser(load_target(SOLVER_TABLE[solver.name])):
-        raise Unsupported(f"{solver.name}: tells no error of its steps and does not minimise those of an integrator")
+        raise Unsupported(f"{solver.name}: estimates no error of a step and does not minimise those of an integrator")
     return [(name, solver) for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order]
 
 
@@ -201,7 +201,7 @@ def prepare_candidate_methods(
             reasons.append(f"{method}: {str(error).removeprefix(f'{solver.name}: ')}")
             print_message(f"  not by {reasons[-1]}")
     if not found:
-        raise RunFailed(f"no method that keeps to an error knows this scene: {'; '.join(reasons)}")
+        raise RunFailed(f"no method with error control supports this scene: {'; '.join(reasons)}")
     return found
 
 

@@ -72,7 +72,7 @@ class ErrorControlledRun:
             **best.columns,
             "search_seconds": self.search_result.search_seconds,
             "solver_description": "; ".join(
-                [f"{best.method} of {len(self.search_result.trials)} ways", *self.messages]
+                [f"{best.method} of {len(self.search_result.trials)} methods", *self.messages]
             ),
         }
         seen = [self._build_frame_columns(k, self.positions[k], balance) for k, balance in balances.items()]

@@ -249,7 +249,7 @@ class _MethodSearch:
         self._free_vertices = error_target.build_scene(error_target.frame_seconds, "substepping").system.free_vertices
 
     def find_cheapest(self, candidates: Sequence[tuple[str, SolverSpec]]) -> SearchResult:
-        self._print_message("ways to the error:")
+        self._print_message("methods for the error:")
         tolerance = 0.2 * self._max_error * self._growth.scale
         known = prepare_candidate_methods(self._error_target, self._print_message, candidates)
         began = perf_counter()
@@ -305,13 +305,13 @@ class _MethodSearch:
         """
         found, late = list[Trial](), dict[Method, float]()
 
-        def run_trial(asked: _MethodSetting, time_limit: float) -> TrialOutcome[Trial]:
-            late.pop(asked[0], None)
-            outcome = self._run_trial(*asked, time_limit)
+        def run_trial(setting: _MethodSetting, time_limit: float) -> TrialOutcome[Trial]:
+            late.pop(setting[0], None)
+            outcome = self._run_trial(*setting, time_limit)
             if outcome.result:
                 found.append(outcome.result)
             elif outcome.is_late:
-                late[asked[0]] = time_limit
+                late[setting[0]] = time_limit
             return outcome
 
         candidates = [(0.0, _propose_first_setting(one, one.stepper.initial_setting(step_atol))) for one in methods]
@@ -455,7 +455,7 @@ class _MethodSearch:
         ]
         answer = search_best_first(
             candidates,
-            lambda asked, limit: self._run_trial(*asked, limit, reference_trial),
+            lambda setting, limit: self._run_trial(*setting, limit, reference_trial),
             self._max_error,
             GiveUpRule(_MAX_COST_RATIO, _MAX_COST_RATIO * _MIN_TIMED_SECONDS),
             ends_at_answer=True,

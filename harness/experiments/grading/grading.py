@@ -144,7 +144,7 @@ class SceneGrader:
     ) -> PositionGrade:
         """Grade a submission."""
         if not submission.num_steps:
-            raise InputError(f"{submission.source}: has only the start; wanted the positions after some steps")
+            raise InputError(f"{submission.source}: has only the start; expected the positions after some steps")
         begun = time.monotonic()
         report_progress("comparing the steps with those of known programs")
         fingerprint = self.find_fingerprint(submission)

@@ -88,7 +88,7 @@ def _read_matrix(path: Path) -> Any:
     found = found if isinstance(found, np.ndarray) else coo_array(found)
     values: Any = found if isinstance(found, np.ndarray) else found.data
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"it holds values of type {values.dtype}; wanted real numbers")
+        raise ValueError(f"it holds values of type {values.dtype}; expected real numbers")
     if not np.isfinite(values).all():
         raise ValueError("it holds numbers that are not finite")
     return found

@@ -83,7 +83,7 @@ def read_position_file(path: Path, num_vertices: int, array: str = DEFAULT_ARRAY
     if n != num_vertices:
         problem = f"has {n:,} vertices; the scene has {num_vertices:,}. Is it of another scene or size?"
         if k == num_vertices:
-            problem = f"has the shape (vertices, frames, 3) = ({k}, {n}, 3); wanted (frames, vertices, 3)"
+            problem = f"has the shape (vertices, frames, 3) = ({k}, {n}, 3); expected (frames, vertices, 3)"
         raise InputError(InputMistake(problem, path))
     return found
 
@@ -97,7 +97,7 @@ def read_rest_positions(path: Path, num_vertices: int) -> NDArray[np.float64]:
         return points
     found = read_position_file(path, num_vertices)
     if len(found.positions) != 1:
-        raise InputError(InputMistake(f"has {len(found.positions)} frames; wanted one, the rest positions", path))
+        raise InputError(InputMistake(f"has {len(found.positions)} frames; expected one, the rest positions", path))
     if not np.isfinite(found.positions).all():
         raise InputError(InputMistake("has rest positions that are not finite", path))
     return found.positions[0]
@@ -111,7 +111,7 @@ def is_submission(path: Path) -> bool:
 
 
 def _describe_formats() -> str:
-    return f"wanted {', '.join(POSITION_SUFFIXES)}, or a folder of {' or '.join(MESH_SUFFIXES)} files, one a frame"
+    return f"expected {', '.join(POSITION_SUFFIXES)}, or a folder of {' or '.join(MESH_SUFFIXES)} files, one a frame"
 
 
 def _read_npz(path: Path, n: int, array: str) -> PositionSequence:
@@ -145,7 +145,7 @@ def _to_frames(values: NDArray[np.float64], n: int, path: Path) -> NDArray[np.fl
     if values.shape == (n, 3):
         return values[None]
     wanted = f"(frames, {n}, 3) or (frames, {3 * n})"
-    raise InputError(InputMistake(f"its array has the shape {values.shape}; wanted {wanted}", path))
+    raise InputError(InputMistake(f"its array has the shape {values.shape}; expected {wanted}", path))
 
 
 def _read_table(path: Path, n: int, array: str) -> PositionSequence:
@@ -157,7 +157,7 @@ def _read_table(path: Path, n: int, array: str) -> PositionSequence:
         with path.open(encoding="utf-8-sig") as file:
             for number, line in enumerate(iter(lambda: file.readline(longest + 1), ""), 1):
                 if len(line) > longest:
-                    problem = f"has a line of more than {longest:,} characters; wanted at most {3 * n + 2} numbers"
+                    problem = f"has a line of more than {longest:,} characters; expected at most {3 * n + 2} numbers"
                     raise InputError(InputMistake(problem, path, number))
                 cells = [cell for cell in re.split(r"[,;\s]+", line.strip()) if cell]
                 if not cells or cells[0].startswith("#"):
@@ -171,7 +171,7 @@ def _read_table(path: Path, n: int, array: str) -> PositionSequence:
                     continue
                 width = width or len(names) or len(row)
                 if len(row) != width:
-                    problem = f"has {len(row)} columns; wanted {width}, as the first line has"
+                    problem = f"has {len(row)} columns; expected {width}, as the first line has"
                     raise InputError(InputMistake(problem, path, number))
                 values.extend(row)
                 numbers.append(number)
@@ -188,7 +188,7 @@ def _read_table(path: Path, n: int, array: str) -> PositionSequence:
     coordinates = [column for column in range(table.shape[1]) if not (names and names[column] in leading)]
     if len(coordinates) != 3 * n:
         wanted = f"one line a frame of {3 * n} numbers, or the columns frame, vertex, x, y, z"
-        raise InputError(InputMistake(f"has {len(coordinates)} columns; wanted {wanted}", path, numbers[0]))
+        raise InputError(InputMistake(f"has {len(coordinates)} columns; expected {wanted}", path, numbers[0]))
     frames = _to_whole_numbers(leading["frame"], "frame", path) if "frame" in leading else None
     times = _to_times(leading["time"], path) if "time" in leading else None
     return PositionSequence(path, table[:, coordinates].reshape(-1, n, 3), frames, times)
@@ -199,7 +199,7 @@ def _read_long_table(path: Path, n: int, names: list[str], table: NDArray[np.flo
     key = next((name for name in ("frame", "time") if name in names), None)
     if key is None or "vertex" not in names:
         missing = "frame" if key is None else "vertex"
-        raise InputError(InputMistake(f"has the columns {', '.join(names)}; wanted `{missing}` too", path, 1))
+        raise InputError(InputMistake(f"has the columns {', '.join(names)}; expected `{missing}` too", path, 1))
     column = table[:, names.index(key)]
     frames, times = (_to_whole_numbers(column, key, path), None) if key == "frame" else (None, _to_times(column, path))
     values, rows = np.unique(column, return_inverse=True)
@@ -208,12 +208,14 @@ def _read_long_table(path: Path, n: int, names: list[str], table: NDArray[np.flo
     vertices = vertices - first
     expected = len(values) * n
     if vertices.min(initial=0) < 0 or vertices.max(initial=0) >= n or len(vertices) != expected:
-        problem = f"has {len(vertices):,} lines and vertices up to {vertices.max(initial=0) + first}; wanted each of "
+        problem = f"has {len(vertices):,} lines and vertices up to {vertices.max(initial=0) + first}; expected each of "
         raise InputError(InputMistake(f"{problem}{n:,} vertices once in each of {len(values)} frames", path))
     counts = np.bincount(rows * n + vertices, minlength=expected)
     if (counts != 1).any():
         row, vertex = divmod(int(np.flatnonzero(counts != 1)[0]), n)
-        problem = f"has vertex {vertex + first} {counts[row * n + vertex]} times in {key} {values[row]:g}; wanted once"
+        problem = (
+            f"has vertex {vertex + first} {counts[row * n + vertex]} times in {key} {values[row]:g}; expected once"
+        )
         raise InputError(InputMistake(problem, path))
     p = np.empty((len(values), n, 3))
     p[rows, vertices] = table[:, [names.index(axis) for axis in _LONG_COLUMNS]]
@@ -224,7 +226,7 @@ def _to_whole_numbers(column: NDArray[np.float64], name: str, path: Path) -> NDA
     """Return a column of frame or vertex numbers as integers."""
     is_wrong = ~(np.abs(column) < 2.0**53) | (column != np.trunc(column))
     if is_wrong.any():
-        problem = f"its column {name} has {column[is_wrong][0]:g}; wanted whole numbers"
+        problem = f"its column {name} has {column[is_wrong][0]:g}; expected whole numbers"
         raise InputError(InputMistake(problem, path))
     return column.astype(np.int64)
 
@@ -233,7 +235,7 @@ def _to_times(column: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
     """Return a column of times [s], which must be finite."""
     if not np.isfinite(column).all():
         wrong = column[~np.isfinite(column)][0]
-        raise InputError(InputMistake(f"its column time has {wrong:g}; wanted seconds", path))
+        raise InputError(InputMistake(f"its column time has {wrong:g}; expected seconds", path))
     return column
 
 
@@ -252,7 +254,7 @@ def _read_folder(folder: Path, n: int, array: str) -> PositionSequence:
     frames = [number for number, _ in by_number]
     gap = next((a for a, b in pairwise(frames) if b != a + 1), None)
     if gap is not None:
-        problem = f"has files {gap} and {frames[frames.index(gap) + 1]} in a row; wanted one file for every frame"
+        problem = f"has files {gap} and {frames[frames.index(gap) + 1]} in a row; expected one file for every frame"
         raise InputError(InputMistake(problem, folder))
     points = [_read_mesh_points(one) for _, one in by_number]
     sizes = [len(one) for one in points]

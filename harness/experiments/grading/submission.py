@@ -147,7 +147,7 @@ def align_submission(
             f"frames: the first is frame {first_frame}, as {'stated' if stated is None else 'the file states'}"
         )
     if first_frame not in (0, 1):
-        raise mistake(f"begins with frame {first_frame}; wanted 0, the start, or 1, after the first step")
+        raise mistake(f"begins with frame {first_frame}; expected 0, the start, or 1, after the first step")
     _check_times(scene, read, first_frame)
     match = _choose_match(scene, read, rest, found if first_frame == 0 else None, first_frame, notes)
     p = p[:, match.vertices]

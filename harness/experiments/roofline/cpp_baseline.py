@@ -27,7 +27,11 @@ MALLOC_TUNABLES = ":".join(
 )
 """Settings of the GNU C library for cheap temporaries: transparent huge pages, and freed memory is not returned."""
 
-EXIT_MESSAGES = {2: "wanted a scene and a file for positions", 3: "the scene's file is too short", 4: "Q has no factor"}
+EXIT_MESSAGES = {
+    2: "expected a scene and a file for positions",
+    3: "the scene's file is too short",
+    4: "Q has no factor",
+}
 
 
 def compile_baseline(folder: Path) -> Path:
@@ -56,7 +60,7 @@ class CppBaseline:
             RunFailed: the program ended.
         """
         if problem.system.pins.exact_mask.any():
-            raise Unsupported("the yardstick knows pins by penalty only")
+            raise Unsupported("the C++ baseline supports pins by penalty only")
         scene, self._positions = folder / "scene.bin", folder / "positions.bin"
         write_problem(scene, problem, springs)
         self._shape = problem.inertial_target.shape

@@ -214,10 +214,10 @@ def find_figure_kind(name: str) -> FigureKind:
         return FIGURE_KINDS[name]
     known = {*FIGURE_KINDS, *(other for other in REPORT_TABLE if other not in REPORT_TABLE.builtin_tables[0])}
     if name not in known:
-        raise InputError(InputMistake(f"came {name!r}; wanted {suggest_name(name, known)}", key="KIND"))
+        raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, known)}", key="KIND"))
     report: Any = load_target(REPORT_TABLE[name])
     if not callable(getattr(report, "panels", None)):
-        why = f"the report {name!r} draws no figure; wanted one that has `panels(rows)`, which returns panels"
+        why = f"the report {name!r} draws no figure; expected one that has `panels(rows)`, which returns panels"
         raise InputError(InputMistake(why, key="KIND"))
     return FigureKind(name, _SWEEP_ROWS, _without_stale(partial(_plugin_entries, name, report)))
 

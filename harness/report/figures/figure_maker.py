@@ -53,23 +53,23 @@ def make_figure(
     """
     entries = kind.list_panels(results, find_stale)
     if not entries:
-        raise InputError(InputMistake(f"holds nothing to draw as {name}; wanted {kind.required_rows}", results))
+        raise InputError(InputMistake(f"holds nothing to draw as {name}; expected {kind.required_rows}", results))
     usual = [one for one in kind.default_panels if any(set(one) <= set(known.name_parts) for known in entries)]
     picked = panel_selection.select_entries(entries, options.selectors or usual)
     panels = kind.prepare_panels(picked)
     if len({type(panel) for panel in panels}) > 1:
         parts = ", ".join(":".join(one.name_parts) for one in picked)
-        why = f"came {parts}, of which some are curves and some are maps; wanted one of both: their data differ"
+        why = f"got {parts}, of which some are curves and some are maps; expected one of both: their data differ"
         raise InputError(InputMistake(f"{why}; draw the others as a figure of their own", key="--panels"))
     figure = compose_figure(panels, kind.title, options)
     wrong = find_layout_faults(figure)
     if wrong:
         more = f" and {len(wrong) - _MAX_LISTED} more" if len(wrong) > _MAX_LISTED else ""
         why = (
-            f"came {options.width_mm:g} mm for type of {options.font_size:g} points, in "
+            f"got {options.width_mm:g} mm for type of {options.font_size:g} points, in "
             f"which {'; '.join(wrong[:_MAX_LISTED])}{more}"
         )
-        raise InputError(InputMistake(f"{why}; wanted a wider figure, smaller type or fewer panels", key="--width"))
+        raise InputError(InputMistake(f"{why}; expected a wider figure, smaller type or fewer panels", key="--width"))
     parts = [part for selector in options.selectors for part in selector]
     stem = folder / "-".join(dict.fromkeys([name, *parts]))
     paths = figure_files.write_figure(figure, panels, stem, kind.title, options)

@@ -69,9 +69,13 @@ def parse_figure_options(
     wanted = tuple(dict.fromkeys(word.strip().lower() for word in formats.split(",") if word.strip()))
     for word in wanted or ("",):
         if word not in FIGURE_FORMATS:
-            mistakes.append(InputMistake(f"came {word!r}; wanted {suggest_name(word, FIGURE_FORMATS)}", key="--format"))
+            mistakes.append(
+                InputMistake(f"got {word!r}; expected {suggest_name(word, FIGURE_FORMATS)}", key="--format")
+            )
     if not MIN_FONT_SIZE <= font_size <= 24.0:
-        why = f"came {font_size:g}; wanted from {MIN_FONT_SIZE:g} to 24 points, as smaller type cannot be read in print"
+        why = (
+            f"got {font_size:g}; expected from {MIN_FONT_SIZE:g} to 24 points, as smaller type cannot be read in print"
+        )
         mistakes.append(InputMistake(why, key="--font-size"))
     if mistakes:
         raise InputError(mistakes)
@@ -83,11 +87,11 @@ def _parse_length(words: str, mistakes: list[InputMistake]) -> float:
     found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*(mm|cm|in|pt)\s*", words)
     if found is None:
         mistakes.append(
-            InputMistake(f"came {words!r}; wanted a length such as 85mm, 8.5cm, 3.35in or 241pt", key="--width")
+            InputMistake(f"got {words!r}; expected a length such as 85mm, 8.5cm, 3.35in or 241pt", key="--width")
         )
         return 0.0
     length = float(found[1]) * _MILLIMETRES_PER_UNIT[found[2]]
     if not _MIN_WIDTH <= length <= _MAX_WIDTH:
-        wanted = f"came {words}; wanted from {_MIN_WIDTH:g}mm to {_MAX_WIDTH:g}mm"
+        wanted = f"got {words}; expected from {_MIN_WIDTH:g}mm to {_MAX_WIDTH:g}mm"
         mistakes.append(InputMistake(wanted, key="--width"))
     return length

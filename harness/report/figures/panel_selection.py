@@ -55,14 +55,14 @@ def select_entries(entries: Sequence[PanelEntry], selectors: Sequence[tuple[str,
         named = [entry for entry in entries if set(selector) <= set(entry.name_parts)]
         if not named:
             raise InputError(
-                InputMistake(f"came {':'.join(selector)!r}; wanted parts of {_join_names(entries)}", key="--panels")
+                InputMistake(f"got {':'.join(selector)!r}; expected parts of {_join_names(entries)}", key="--panels")
             )
         if not any(part in entry.group for part in selector for entry in named):
             named = [entry for entry in named if entry.group == named[0].group]
         found += [entry for entry in named if entry not in found]
     if len(found) > MAX_PANELS:
         wanted = (
-            f"came the names of {len(found)} panels; wanted at most {MAX_PANELS}, as parts of {_join_names(entries)}"
+            f"got the names of {len(found)} panels; expected at most {MAX_PANELS}, as parts of {_join_names(entries)}"
         )
         raise InputError(InputMistake(wanted, key="--panels"))
     return found

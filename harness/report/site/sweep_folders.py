@@ -68,7 +68,7 @@ def find_folders(results: Path) -> list[SweepFolder]:
         InputError: if there is none.
     """
     if not results.is_dir():
-        raise InputError(InputMistake("is no folder; wanted a folder of results, or that of one sweep", results))
+        raise InputError(InputMistake("is no folder; expected a folder of results, or that of one sweep", results))
     found = {
         folder.parent
         for kind in ROW_FOLDERS

@@ -37,7 +37,7 @@ class AttachmentsEffect(VertexSelection):
         vertices = self.select_vertices(mesh, self.kind)
         if self.anchors and len(self.anchors) not in (1, len(vertices)):
             raise InputError(
-                f"attachments: anchors: came {len(self.anchors)} points for {len(vertices)} vertices; give one or all"
+                f"attachments: anchors: got {len(self.anchors)} points for {len(vertices)} vertices; give one or all"
             )
         if not self.stiffness:
             return EffectContribution()

@@ -75,7 +75,7 @@ class ContactEffect(ConfigModel):
         lengths = mesh.rest_lengths
         if len(lengths) and not self.min_distance < lengths.min():
             raise InputError(
-                f"contact: came a min_distance of {self.min_distance:g} m, which is not below the shortest of the "
+                f"contact: got a min_distance of {self.min_distance:g} m, which is not below the shortest of the "
                 f"springs at rest, {lengths.min():.3g} m; take a smaller one, or a coarser mesh"
             )
         obstacles = tuple(one.build_obstacle() for one in self.obstacles)

@@ -33,7 +33,7 @@ class GasEffect(ConfigModel):
         _require_closed_surface(sides, mesh)
         volume = gas_energy.Gas(triangles, self.pressure, 1.0).volume_at(mesh.rest_positions)
         if not abs(volume) > 1e-9 * mesh.bounding_box_diagonal**3:
-            raise InputError(f"gas: the mesh encloses no volume (came {volume:.3g} m^3)")
+            raise InputError(f"gas: the mesh encloses no volume (it is {volume:.3g} m^3)")
         outwards = triangles if volume > 0.0 else triangles[:, ::-1]
         return EffectContribution(energies=(gas_energy.Gas(outwards, self.pressure, abs(volume)),))
 

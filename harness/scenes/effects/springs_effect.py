@@ -114,7 +114,7 @@ class SpringsEffect(ConfigModel):
                 raise InputError(InputMistake("`thickness` has no meaning for a solid; leave it out", key="thickness"))
             return E
         if t is None:
-            raise InputError(InputMistake("`thickness` [m] is missing beside `youngs_modulus`", key="thickness"))
+            raise InputError(InputMistake("`thickness` [m] is missing, which `youngs_modulus` needs", key="thickness"))
         return E * t
 
     def list_material_values(self, mesh: Mesh, mass: NDArray[np.float64]) -> list[tuple[PlausibleRange, float]]:

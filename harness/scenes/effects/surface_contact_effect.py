@@ -109,13 +109,13 @@ class SurfaceContactEffect(ConfigModel):
 
         def carry(begin: float, end: float, p: Positions) -> list[Positions]:
             rigid = [one.motion for one in self.obstacles if one.motion is not None and not is_deforming(one)]
-            ways = [motion.transform_points(motion.invert_points(p, begin), end) for motion in rigid]
+            carried = [motion.transform_points(motion.invert_points(p, begin), end) for motion in rigid]
             for (x, _), one in zip(shapes, self.obstacles, strict=True):
                 if is_deforming(one):  # as it does on the whole
-                    ways.append(
+                    carried.append(
                         p + (place_obstacle_points(one, x, end) - place_obstacle_points(one, x, begin)).mean(axis=0)
                     )
-            return ways
+            return carried
 
         def energy(stiffness: NDArray[np.float64]) -> ObstacleContact:
             own, others = (

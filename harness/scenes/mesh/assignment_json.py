@@ -43,7 +43,7 @@ def read_assignment_json(path: Path) -> AssignmentJson:
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(InputMistake(f"cannot be read as JSON: {error}", path)) from None
     if not isinstance(data, dict):
-        problem = f"a scene is a JSON object with the keys obj, k and b, came a {type(data).__name__}"
+        problem = f"a scene is a JSON object with the keys obj, k and b, got a {type(data).__name__}"
         raise InputError(InputMistake(problem, path))
     try:
         return AssignmentJson.model_validate(data, strict=True)
@@ -70,9 +70,9 @@ def _reject_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _convert_error(path: Path, detail: Any) -> InputMistake:
     """Convert a pydantic error to a mistake."""
     key = str(detail["loc"][0])[:80]
-    problem = f"{detail['msg']}, came {str(detail['input'])[:80]!r}"
+    problem = f"{detail['msg']}, got {str(detail['input'])[:80]!r}"
     if detail["type"] == "extra_forbidden":
-        problem = f"unknown key; wanted {suggest_name(key, AssignmentJson.model_fields)}"
+        problem = f"unknown key; expected {suggest_name(key, AssignmentJson.model_fields)}"
     elif detail["type"] == "missing":
         problem = f"is missing: {read_field_descriptions(AssignmentJson)[key]}"
     return InputMistake(problem, path, find_key_line(path, key), ".".join(map(str, detail["loc"]))[:80])

@@ -178,25 +178,25 @@ def _find_group_problem(found: MeshFileContent) -> str:
     """Describe what is wrong with the groups; empty if they are valid."""
     for name, group in found.vertex_groups.items():
         if group[0] < 0 or group[-1] >= len(found.points):
-            return f"its group {name[:40]!r} names the point {group[-1]}; wanted 0 to {len(found.points) - 1}"
+            return f"its group {name[:40]!r} names the point {group[-1]}; expected 0 to {len(found.points) - 1}"
     return ""
 
 
 def _find_cell_problem(points: np.ndarray, blocks: list[tuple[str, IndexArray]]) -> str:
     """Describe what is wrong with meshio's points and cells; empty if they are valid."""
     if points.ndim != 2 or not 1 <= points.shape[1] <= 3:
-        return f"has points of shape {points.shape}; wanted 1 to 3 coordinates each"
+        return f"has points of shape {points.shape}; expected 1 to 3 coordinates each"
     if not np.all(np.abs(points) <= MAX_COORDINATE):
         row = int(np.flatnonzero(~np.all(np.abs(points) <= MAX_COORDINATE, axis=1))[0])
-        return f"point {row} (from 0) is {points[row]}; wanted finite numbers up to {MAX_COORDINATE:g} m"
+        return f"point {row} (from 0) is {points[row]}; expected finite numbers up to {MAX_COORDINATE:g} m"
     for kind, data in blocks:
         if kind not in _CELL_KINDS:
-            return f"has cells of type {kind}; wanted {', '.join(_CELL_KINDS)}"
+            return f"has cells of type {kind}; expected {', '.join(_CELL_KINDS)}"
         if data.ndim != 2 or data.shape[1] < 2:
             return f"has a {kind} of fewer than 2 points"
         ordered = np.sort(data, axis=1)
         wrong = (ordered[:, 0] < 0) | (ordered[:, -1] >= len(points))
         if wrong.any():
             cell = data[np.flatnonzero(wrong)[0]].tolist()
-            return f"a {kind} names the points {cell}; wanted numbers from 0 to {len(points) - 1}"
+            return f"a {kind} names the points {cell}; expected numbers from 0 to {len(points) - 1}"
     return ""

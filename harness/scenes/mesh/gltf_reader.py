@@ -54,7 +54,7 @@ def read_gltf(path: Path) -> GltfContent:
     document, binary = _split_container(path.read_bytes())
     version = str(document.get("asset", {}).get("version", "2.0"))
     if not version.startswith("2"):
-        raise ValueError(f"it is glTF {version}; wanted version 2")
+        raise ValueError(f"it is glTF {version}; expected version 2")
     return _GltfScene(document, _read_buffers(document, binary, path.parent)).collect_geometry()
 
 

@@ -119,7 +119,7 @@ def _transform_points(cells: MeshCells, options: CleaningOptions, path: Path) ->
     if options.up != "y":
         points = np.ascontiguousarray(points[:, columns] * signs) + 0.0  # no negative zeros
     if points is not cells.points and not (np.abs(points) <= MAX_COORDINATE).all():
-        problem = f"gives coordinates above {MAX_COORDINATE:g} m; wanted the metres in a unit of the file"
+        problem = f"gives coordinates above {MAX_COORDINATE:g} m; expected the metres in a unit of the file"
         raise InputError(InputMistake(problem, path, key="scale"))
     return replace(cells, points=points)
 
@@ -141,7 +141,7 @@ def find_weld_targets(points: PointArray, distance: float) -> IndexArray:
         return np.asarray(first[label.ravel()], np.int64)
     tree: Any = cKDTree(points)
     if (tree.count_neighbors(tree, distance) - n) // 2 > _MAX_WELD_PAIRS:
-        raise ValueError(f"{distance:g} m joins too many vertices; wanted a distance below the edge lengths")
+        raise ValueError(f"{distance:g} m joins too many vertices; expected a distance below the edge lengths")
     pairs = np.asarray(tree.query_pairs(distance, output_type="ndarray"), np.int64).reshape(-1, 2)
     label = find_connected_parts(n, pairs)
     first = np.full(n, n, np.int64)

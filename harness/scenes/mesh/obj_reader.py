@@ -136,7 +136,7 @@ class _ObjReader:
                 self.segment_lines += [number] * len(segments)
                 self._add_to_groups(corners)
             elif keyword and keyword not in _IGNORED_KEYWORDS:
-                raise ValueError(f"unknown keyword {keyword[:40]!r}; wanted v, f, l or what OBJ files may carry")
+                raise ValueError(f"unknown keyword {keyword[:40]!r}; expected v, f, l or what OBJ files may carry")
         except ValueError as error:
             self.mistakes.append(InputMistake(str(error), self.path, number))
 
@@ -147,13 +147,13 @@ class _ObjReader:
     def _parse_corners(self, words: list[str]) -> list[int]:
         """Parse zero-based vertices; their existence is checked at the end of the file."""
         if len(words) < 2:
-            raise ValueError(f"a face or line needs at least 2 vertices, came {len(words)}")
+            raise ValueError(f"a face or line needs at least 2 vertices, got {len(words)}")
         corners: list[int] = []
         for word in words:
             match = _CORNER_TOKEN.fullmatch(word)
             index = int(match[1][:20]) if match else 0
             if not index:
-                raise ValueError(f"{word[:40]!r} is no vertex; wanted v, v/vt, v//vn or v/vt/vn, counted from 1")
+                raise ValueError(f"{word[:40]!r} is no vertex; expected v, v/vt, v//vn or v/vt/vn, counted from 1")
             corners.append(index - 1 if index > 0 else len(self.points) + index)
             if corners[-1] < 0:
                 raise ValueError(f"vertex {index} lies before the first; only {len(self.points)} came so far")
@@ -193,7 +193,7 @@ class _ObjReader:
 def _parse_point(words: list[str]) -> tuple[float, float, float]:
     """Parse the position of a `v` line, optionally followed by a weight or a colour."""
     if not 3 <= len(words) <= 7:
-        raise ValueError(f"a vertex needs 3 coordinates (and at most a weight and a colour), came {len(words)}")
+        raise ValueError(f"a vertex needs 3 coordinates (and at most a weight and a colour), got {len(words)}")
     x, y, z = map(_parse_coordinate, words[:3])
     return x, y, z
 
@@ -207,7 +207,7 @@ def _parse_coordinate(word: str) -> float:
     try:
         value = float(word.replace("_", "?"))  # Python would read 1_0 as ten
     except ValueError:
-        raise ValueError(f"{word[:40]!r} is no number; wanted a coordinate in metres") from None
+        raise ValueError(f"{word[:40]!r} is no number; expected a coordinate in metres") from None
     if not abs(value) <= MAX_COORDINATE:
-        raise ValueError(f"{word[:40]!r} is no position; wanted a finite number up to {MAX_COORDINATE:g} m")
+        raise ValueError(f"{word[:40]!r} is no position; expected a finite number up to {MAX_COORDINATE:g} m")
     return value

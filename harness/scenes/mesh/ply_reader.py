@@ -108,7 +108,9 @@ def _parse_header(content: bytes) -> tuple[str, list[PlyElement], int]:
             case ["property", kind, name] if elements and kind in _NUMPY_TYPES:
                 elements[-1].properties.append(PlyProperty(name, _NUMPY_TYPES[kind]))
             case _:
-                raise ValueError(f"its head has the line {line[:60]!r}; wanted format, element or property of PLY 1.0")
+                raise ValueError(
+                    f"its head has the line {line[:60]!r}; expected format, element or property of PLY 1.0"
+                )
     if not form:
         raise ValueError("its head names no format")
     return form, elements, end.end()
@@ -137,7 +139,7 @@ def _to_integers(values: NDArray[np.generic]) -> IndexArray:
     numbers = np.asarray(values, np.float64)
     wrong = ~(np.abs(numbers) < 2.0**53) | (numbers != np.trunc(numbers))
     if wrong.any():
-        raise ValueError(f"a face names the vertex {numbers[wrong][0]:g}; wanted a whole number")
+        raise ValueError(f"a face names the vertex {numbers[wrong][0]:g}; expected a whole number")
     return numbers.astype(np.int64)
 
 
@@ -214,7 +216,7 @@ class _TextBody:
             raise _make_truncation_error(element)
         value = float(self._values[at])
         if not 0 <= value < 2**32 or value != int(value):
-            raise ValueError(f"a list of its {element.name} has the length {value:g}; wanted a whole number")
+            raise ValueError(f"a list of its {element.name} has the length {value:g}; expected a whole number")
         return int(value)
 
     def _read_unequal_rows(self, element: PlyElement, wanted: str, begun: int) -> _ElementRows:
@@ -275,7 +277,7 @@ class _BinaryBody:
         """Read the length of the list that starts here, and advance past it."""
         (value,) = self._read_values(element, one.length_type, 1).tolist()
         if not 0 <= value < 2**32 or value != int(value):
-            raise ValueError(f"a list of its {element.name} has the length {value:g}; wanted a whole number")
+            raise ValueError(f"a list of its {element.name} has the length {value:g}; expected a whole number")
         if len(self._content) - self._position < int(value) * np.dtype(one.type).itemsize:
             raise _make_truncation_error(element)
         return int(value)

@@ -29,7 +29,7 @@ def read_stl(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     if _is_text(content):
         words = _VERTEX.findall(content)
         if len(words) % 3:
-            raise ValueError(f"it has {len(words)} vertices; wanted three for each triangle")
+            raise ValueError(f"it has {len(words)} vertices; expected three for each triangle")
         corners = np.array([[float(word) for word in row] for row in words], np.float64).reshape(-1, 3)
     else:
         count = _count_promised(content)

@@ -66,7 +66,7 @@ def read_vtp(content: bytes) -> VtpContent:
         root = ElementTree.fromstring(content)
         arrays = _DataArrays(root, b"", raw=False)
     if root.get("type") != "PolyData":
-        raise ValueError(f"holds {root.get('type')}; wanted PolyData")
+        raise ValueError(f"holds {root.get('type')}; expected PolyData")
     pieces = [_read_piece(piece, arrays) for piece in root.iter("Piece")]
     first = np.cumsum([0, *(len(piece.points) for piece in pieces)]).tolist()
     moved = list(zip(first, pieces, strict=False))
@@ -126,13 +126,13 @@ class _DataArrays:
         self._appended, self._raw = appended, raw
         name = root.get("compressor")
         if name and name not in _DECOMPRESSORS:
-            raise ValueError(f"is compressed by {name}; wanted one of {', '.join(_DECOMPRESSORS)}, or none")
+            raise ValueError(f"is compressed by {name}; expected one of {', '.join(_DECOMPRESSORS)}, or none")
         self._decompress = _DECOMPRESSORS[name] if name else None
 
     def decode_array(self, array: Element) -> NDArray[np.generic]:
         """Decode one data array as one row of numbers."""
         if (kind := array.get("type", "")) not in _NUMPY_TYPES:
-            raise ValueError(f"has numbers of type {kind!r}; wanted one of {', '.join(_NUMPY_TYPES)}")
+            raise ValueError(f"has numbers of type {kind!r}; expected one of {', '.join(_NUMPY_TYPES)}")
         dtype, form = np.dtype(self._order + _NUMPY_TYPES[kind]), array.get("format", "ascii")
         text = "".join([array.text or "", *(child.tail or "" for child in array)])  # children tell of its range
         if form == "ascii":

@@ -96,9 +96,8 @@ class _FixedPointState(SolverState):
         if isinstance(found, np.ndarray) and found.shape == wanted and found.dtype == np.float64:
             return found
         came = f"{found.dtype} of shape {found.shape}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
-        raise PluginContractError(
-            f"{source_line_of(self._ready.next_iterate)}: `next_iterate` gave {came}; wanted float64 of shape {wanted}"
-        )
+        line = source_line_of(self._ready.next_iterate)
+        raise PluginContractError(f"{line}: `next_iterate` gave {came}; expected float64 of shape {wanted}")
 
     def residual(self) -> float:
         """Return |Q^-1 grad g|_Q of the previous iterate."""

@@ -126,9 +126,7 @@ class _FixedStepSolver(ExplicitSolver):
                 other than `substepping` and implicit Euler; for unpinned vertices without mass; for too many substeps.
         """
         if not self.refinement_factor >= 1:
-            raise Unsupported(
-                f"{self.solver_name}: refinement_factor came as {self.refinement_factor}; wanted 1 or more"
-            )
+            raise Unsupported(f"{self.solver_name}: refinement_factor is {self.refinement_factor}; expected 1 or more")
         return self._prepare_explicit(system, self.refinement_factor, 0.0)
 
 
@@ -151,7 +149,7 @@ class _AdaptiveStepSolver(ExplicitSolver):
         """
         if not 1e-14 <= self.error_tolerance <= 1.0:
             raise Unsupported(
-                f"{self.solver_name}: error_tolerance came as {self.error_tolerance}; wanted a number from 1e-14 to 1"
+                f"{self.solver_name}: error_tolerance is {self.error_tolerance}; expected a number from 1e-14 to 1"
             )
         return self._prepare_explicit(system, 1, self.error_tolerance)
 

@@ -82,8 +82,8 @@ class _RosenbrockSolver:
         """
         if self.refinement_factor < 1 or not 0.0 <= self.error_tolerance <= 1.0:
             raise Unsupported(
-                f"{self.solver_name}: refinement_factor came as {self.refinement_factor} and error_tolerance as "
-                f"{self.error_tolerance}; wanted 1 or more, and a number "
+                f"{self.solver_name}: refinement_factor is {self.refinement_factor} and error_tolerance as "
+                f"{self.error_tolerance}; expected 1 or more, and a number "
                 "from 0 to 1"
             )
         vertex_terms.require_implicit_euler(system, self.solver_name)

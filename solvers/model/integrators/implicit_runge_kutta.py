@@ -55,7 +55,9 @@ class RungeKutta:
         """Raise ValueError if the stages do not share one system matrix."""
         diagonal = {row[-1] for row in self.a[self.needs_start_acceleration :]}
         if len(diagonal) != 1 or [len(row) for row in self.a] != list(range(1, len(self.a) + 1)):
-            raise ValueError("wanted a lower triangular tableau with one diagonal element, explicit first stages apart")
+            raise ValueError(
+                "expected a lower triangular tableau with one diagonal element, explicit first stages apart"
+            )
 
     @cached_property
     def needs_start_acceleration(self) -> bool:
