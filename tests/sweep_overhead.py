@@ -90,7 +90,7 @@ def _run_in_child(answer: Any, runs: list[RunSpec], folder: Path, workers: int |
     from springbench.harness.experiments import run_pipeline as runs_of
     from springbench.harness.experiments.sweep_runner import run_sweep
 
-    timed, note = runs_of._hold_timing_lock, folder / "timed"
+    timed, note = runs_of._acquire_timing_lock, folder / "timed"
 
     @contextmanager
     def noting(*given: Any) -> Generator[dict[str, Any]]:
@@ -101,7 +101,7 @@ def _run_in_child(answer: Any, runs: list[RunSpec], folder: Path, workers: int |
         with note.open("a") as file:  # a short line is written at once
             file.write("{} {}\n".format(*took))
 
-    runs_of._hold_timing_lock = noting
+    runs_of._acquire_timing_lock = noting
     weighed = MemoryDisplay()
     run_sweep("costs", runs, folder, weighed, lambda said: None, num_workers=workers, isolated=workers != 0)
     wall = monotonic() - began

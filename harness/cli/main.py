@@ -48,8 +48,13 @@ from springbench.harness.cli.shared_options import (
     describe_config,
     require_output_file,
 )
-from springbench.harness.console import get_error_console, get_output_console, show_activity, split_wide_table
-from springbench.harness.console import print_message as _say
+from springbench.harness.console import (
+    get_error_console,
+    get_output_console,
+    print_message,
+    show_activity,
+    split_wide_table,
+)
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.solvers.platform_calls import can_isolate_processes
@@ -132,7 +137,7 @@ def run(
             config,
             max_error,
             results,
-            _say,
+            print_message,
             t_end=t_end,
             sizes=size or (),
             verify=verify,
@@ -147,16 +152,16 @@ def run(
         raise InputError(InputMistake("is of a run with --error; leave it out", key=key))
     sweep = load_config(config, solvers=solver or (), sizes=size or (), **context.obj)
     if not in_process and not can_isolate_processes():
-        _say("runs share this process, without limits of time and memory: worker processes need Linux")
+        print_message("runs share this process, without limits of time and memory: worker processes need Linux")
     if sweep.options.record and not RECORDINGS.is_installed():
-        _say(f"nothing is recorded, and no pictures are drawn: {RECORDINGS.describe_absence()}")
+        print_message(f"nothing is recorded, and no pictures are drawn: {RECORDINGS.describe_absence()}")
     folder = claim_folder(results / sweep.name, config)
     swept = run_sweep(
         sweep.name,
         sweep.list_runs(),
         folder,
         create_display(get_error_console()),
-        _say,
+        print_message,
         rerun=rerun,
         rerun_stale=rerun_stale,
         positions=positions,
@@ -190,13 +195,13 @@ def _report_sweep(sweep: SweepPlan, swept: SweepResults, config: Path, results: 
 
     table = swept.table
     get_output_console().print(build_summary_table(table, swept.stale_ids))
-    _say(f"rows, recordings and pictures are in {folder}")
+    print_message(f"rows, recordings and pictures are in {folder}")
     for path in run_reports(sweep.reports, table, folder, sweep.options.time_limit):
-        _say(f"reported in {path}")
-    refresh_results_page(results, folder, _say, is_quiet=True)
+        print_message(f"reported in {path}")
+    refresh_results_page(results, folder, print_message, is_quiet=True)
     failed = list_failed_runs(table)
     for line in (*failed, *build_closing_lines(table, config, results, folder)):
-        _say(line)
+        print_message(line)
     return failed
 
 
@@ -222,17 +227,17 @@ def accuracy(
         plan,
         folder,
         create_display(get_error_console()),
-        _say,
+        print_message,
         rerun=rerun,
         rerun_stale=rerun_stale,
         isolated=not in_process,
     )
     drawn = draw_accuracy_report(folder, files)
-    _say(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and tables show them")
-    refresh_results_page(results, folder, _say)
+    print_message(f"rows are in {folder / 'accuracy'}; {len(drawn)} pictures and tables show them")
+    refresh_results_page(results, folder, print_message)
     failed = list_failed_units(files)
     for line in failed:
-        _say(line)
+        print_message(line)
     raise typer.Exit(1 if failed else 0)
 
 
@@ -255,15 +260,15 @@ def report(
     show_activity("reading the rows")
     for picture, words in draw_device_sheets(results):
         for line in words:
-            _say(line)
+            print_message(line)
         if picture:
-            _say(f"what a device saves is drawn in {picture}")
+            print_message(f"what a device saves is drawn in {picture}")
     show_activity("writing the page")
-    page = update_page(results, with_recordings=True, with_viewer=viewer, print_message=_say)
+    page = update_page(results, with_recordings=True, with_viewer=viewer, print_message=print_message)
     for picture, cells in draw_hard_case_sheets(results, find_stale_runs_in_folder):
         get_output_console().print(split_wide_table(build_score_table(cells)))
-        _say(f"the map is {picture}")
-    _say(f"the page is {page}; a browser opens it, and needs no network for it")
+        print_message(f"the map is {picture}")
+    print_message(f"the page is {page}; a browser opens it, and needs no network for it")
 
 
 app.command(cls=build_command_class("frames", "max_iterations", "rtol", "rounds"))(ablate)
@@ -305,7 +310,7 @@ def query(
     found = run_query(sql, results, max_rows=MAX_CSV_ROWS if csv else MAX_SHOWN_ROWS, cpu_seconds=cpu_limit)
     if found.is_truncated:
         more = "" if csv else "; --csv prints more"
-        _say(f"only the first {len(found.values):,} rows of the answer are shown{more}")
+        print_message(f"only the first {len(found.values):,} rows of the answer are shown{more}")
     if csv:
         found.write_csv(sys.stdout)
     else:
@@ -338,7 +343,7 @@ def reference(
     pages = build_reference_pages(typer.main.get_command(app))
     paths = find_stale_pages(pages, folder) if check else write_stale_pages(pages, folder)
     for path in paths:
-        _say(f"{path}: stale" if check else f"{path}: written")
+        print_message(f"{path}: stale" if check else f"{path}: written")
     raise typer.Exit(1 if check and paths else 0)
 
 

@@ -55,13 +55,13 @@ class ThrottledMessages:
     def __init__(
         self, print_message: Callable[[str], None], show_activity: Callable[[str], None] = lambda words: None
     ) -> None:
-        self._say, self._show, self._last_print_time = print_message, show_activity, monotonic()
+        self._print_message, self._show_activity, self._last_print_time = print_message, show_activity, monotonic()
 
     def __call__(self, words: str) -> None:
         """Show the message, and print it if the last one is old enough."""
-        self._show(words)
+        self._show_activity(words)
         if monotonic() - self._last_print_time > _MAX_SILENT_SECONDS:
-            self._say(words)
+            self._print_message(words)
             self._last_print_time = monotonic()
 
 

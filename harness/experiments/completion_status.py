@@ -71,11 +71,11 @@ def read_completion_statuses(
         machine_info.hash_sources(),
     )
     found: dict[Path, CompletionStatus] = {}
-    for path, as_asked in matches_request.items():
+    for path, is_match in matches_request.items():
         there = heads.get(path)
         if isinstance(there, str):
             found[path] = CompletionStatus(NOT_STARTED, damage_reason=f"{path} {there}")
-        elif there is None or not as_asked(there):
+        elif there is None or not is_match(there):
             found[path] = CompletionStatus(NOT_STARTED)
         else:
             found[path] = CompletionStatus(COMPLETED, is_stale=there["source_fingerprint"] != today)

@@ -219,7 +219,7 @@ def _run_passes(job: RunJob, session: TimingSession) -> list[dict[str, Any]]:
 
 def _time_rounds(job: RunJob, setup: RunSetup) -> TimedRounds:
     """Prepare the solver and time the rounds, under the timing lock of the run."""
-    with _hold_timing_lock(job.run, job.tick) as lock_columns:
+    with _acquire_timing_lock(job.run, job.tick) as lock_columns:
         if job.run.timing == "none":
             measured, rows = prepare_untimed(setup.scene, setup.build_solver()), None
         else:
@@ -274,7 +274,7 @@ def _build_formula_check_columns(scene: Scene, frames: int) -> dict[str, str]:
 def _run_error_controlled(job: RunJob, max_error: float, session: TimingSession) -> list[dict[str, Any]]:
     """Return the rows of an error-controlled run, whose integrator and step size are chosen first."""
     run = job.run
-    with _hold_timing_lock(run, job.tick) as lock_columns:
+    with _acquire_timing_lock(run, job.tick) as lock_columns:
         found = load_target(ERROR_CONTROL_TARGET)(run, max_error, job.tick)
     rows, seen, last = found.rows(), found.positions, dict[str, Any]()
     session.finish_timing()
@@ -302,7 +302,7 @@ def _run_error_controlled(job: RunJob, max_error: float, session: TimingSession)
 
 
 @contextmanager
-def _hold_timing_lock(run: RunSpec, tick: ProgressCallback) -> Generator[dict[str, Any]]:
+def _acquire_timing_lock(run: RunSpec, tick: ProgressCallback) -> Generator[dict[str, Any]]:
     """Hold the run's timing lock (exclusive, shared, own cores), and yield its columns."""
     if run.timing != "shared":
         with (lock_timing_exclusive if run.timing == "exclusive" else lock_timing_shared)(tick):

@@ -52,7 +52,7 @@ def find_first_violation(
     def place(time: float) -> Positions:
         return point_motion.transform_points(points, time) if point_motion else points
 
-    def look(time: float) -> NDArray[np.float64]:
+    def measure_distance(time: float) -> NDArray[np.float64]:
         return obstacle.signed_distance(place(time), time)
 
     for begin, end in pairwise(times):
@@ -61,7 +61,7 @@ def find_first_violation(
             speed += obstacle_motion.bound_speed(begin, end, place(begin), slack=speed * (end - begin))
         time = begin
         while time < end:
-            distance = look(time)
+            distance = measure_distance(time)
             least = float(distance.min(initial=np.inf))
             if least < min_distance:
                 return time, distance
@@ -70,7 +70,7 @@ def find_first_violation(
                 (end - begin) / _MIN_STEP_FRACTION_PER_KEY,
                 shortest,
             )
-    distance = look(times[-1])
+    distance = measure_distance(times[-1])
     return (times[-1], distance) if distance.min(initial=np.inf) < min_distance else None
 
 

@@ -131,7 +131,7 @@ def observe_run(
     energy = EnergyBalance(scene)
     budget = DissipationBudget(scene, has_inner_solves=getattr(prepared, "has_inner_solves", False))
 
-    def look(step: SimulationStep, residual: float, balance: EnergyGain, dissipation: StepDissipation) -> None:
+    def observe_step(step: SimulationStep, residual: float, balance: EnergyGain, dissipation: StepDissipation) -> None:
         terms = step.problem.evaluate_terms(step.solution.positions)
         found[step.index] = columns = build_solution_columns(scene, step, terms, residual) | (
             verify_step(step) if verify_step else {}
@@ -146,31 +146,33 @@ def observe_run(
             recorder.record_frame(RecordedFrame(step.index, scene.compute_time(step.index), step.positions, *drawn))
 
     with ThreadPoolExecutor(1) as executor:
-        looked: Future[None] | None = None
+        observed: Future[None] | None = None
         if recorder:
-            looked = executor.submit(
+            observed = executor.submit(
                 recorder.record_frame,
                 RecordedFrame(0, 0.0, build_initial_state(scene).motion.positions, {}, float("nan"), 0),
             )
         for step in iterate_steps(scene, prepared, settings, clock):
-            if looked:
-                looked.result()  # raises here what went wrong there
+            if observed:
+                observed.result()  # raises here what went wrong there
             # A solver's memory may be reused by the next solve, so it is not read concurrently with the next step.
             balance = energy.add_step(step)
             if balance.is_above(BLOW_UP_FACTOR):
                 raise StepError(step.index) from DivergenceError(f"from frame {step.index} on the motion has {balance}")
             dissipation = budget.add_step(step)
-            looked = executor.submit(look, step, compute_returned_residual(prepared, step), balance, dissipation)
+            observed = executor.submit(
+                observe_step, step, compute_returned_residual(prepared, step), balance, dissipation
+            )
             if recorder and step.index in convergence_frames:
                 norm = EnergyNorm(step.problem.system)
                 # A further round of friction starts where the previous one ended; only the first one is drawn.
                 shown = step.iteration_counts[0] if step.friction_rounds else step.solution.num_iterations
                 curve = trace_convergence(prepared, step.problem, norm, shown)
-                looked.result()
+                observed.result()
                 recorder.record_convergence(step.index, curve.residuals, curve.objective)
             tick("second pass")
-        if looked:
-            looked.result()
+        if observed:
+            observed.result()
     return found
 
 

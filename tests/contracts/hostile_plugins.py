@@ -237,7 +237,9 @@ SOLVING = {
     "a fault in its residual": Hostile("measuring", "return 'small'", "solver", FAILED, ""),
 }
 BINDING = {
-    "binds nothing": Hostile("binding", "return None", "effect", MISTAKE, "`build_contribution` returned None; expected"),
+    "binds nothing": Hostile(
+        "binding", "return None", "effect", MISTAKE, "`build_contribution` returned None; expected"
+    ),
     "binds a text": Hostile("binding", "return 'x'", "effect", MISTAKE, "`build_contribution` returned a str"),
     "writes to the mesh": Hostile("binding", "mesh.rest_positions[0] = 1", "effect", MISTAKE, "read-only"),
     "writes to the mesh by force": Hostile(
