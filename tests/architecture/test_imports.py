@@ -47,7 +47,7 @@ def loads(arguments: list[str], cache: Path) -> list[str]:
     ],
     ids=["--help", "list-config", "list", "query"],
 )
-def test_a_command_that_tells_imports_neither_pictures_nor_recordings(
+def test_a_command_without_pictures_imports_neither_plotting_nor_recording(
     arguments: list[str], without: set[str], fewer: int, tmp_path: Path
 ) -> None:
     if "--help" not in arguments:

@@ -151,7 +151,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
     return calls
 
 
-def test_calls_lead_down_the_rows_and_up_to_what_was_given_on_the_way(walk: list[Call]):
+def test_calls_lead_down_the_rows_and_up_to_what_was_passed_down(walk: list[Call]):
     assert {(call.by, call.of) for call in walk if row(call.of) < row(call.by)} == set(GIVEN)
 
 

@@ -322,7 +322,7 @@ def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_
     assert all(what in line for line in messages)
 
 
-def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_error_asks_for():
+def test_fixed_steps_are_no_longer_than_is_stable_and_as_short_as_the_error_requires():
     """Of order 2: the step that a hundredth of the error asks for is a tenth."""
     even, truth = (
         FixedSubstepper(
@@ -343,7 +343,7 @@ def test_steps_of_one_length_are_no_longer_than_is_stable_and_as_short_as_the_er
     assert errors[1] == pytest.approx(0.01 * errors[0], rel=0.2)
 
 
-def test_forces_of_the_speed_are_even_within_pieces_of_a_frame_as_short_as_the_error_asks_for():
+def test_forces_of_the_speed_are_constant_within_parts_of_a_frame_as_short_as_the_error_requires():
     spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(drag_law="quadratic", coefficient=0.5), HELD)
     even = FixedSubstepper(
         build_scene(spec, 5, "substepping"),

@@ -95,7 +95,7 @@ def test_ways_are_sorted_chosen_and_printed_by_one_statistic(monkeypatch):
     assert printed == [f"{promise:.3g}" for promise in promises]
 
 
-def test_a_way_that_comes_no_nearer_is_followed_by_the_next(monkeypatch):
+def test_a_method_that_does_not_improve_is_followed_by_the_next(monkeypatch):
     messages = list[str]()
     stuck = Formula(lambda steps: 0.03 + 1.0 / steps**2, 1e-4)
     answer = found(monkeypatch, 1e-2, messages, stuck=stuck, slower=Formula(lambda steps: 1.0 / steps, 1e-2))
@@ -104,7 +104,7 @@ def test_a_way_that_comes_no_nearer_is_followed_by_the_next(monkeypatch):
     assert any(line.startswith("  stuck: reaches 3.") and "come no nearer" in line for line in messages)
 
 
-def test_a_way_that_takes_longer_than_the_next_promises_is_tried_after_it(monkeypatch):
+def test_a_method_that_takes_longer_than_predicted_for_the_next_is_tried_after_it(monkeypatch):
     """Its error falls as promised at first, and then by order a half alone."""
     messages = list[str]()
     late = Formula(lambda steps: 20.0 / steps**2 if steps < 40 else 0.0125 * (40 / steps) ** 0.5, 1e-4)
@@ -114,7 +114,7 @@ def test_a_way_that_takes_longer_than_the_next_promises_is_tried_after_it(monkey
     assert any(line.startswith("  late: takes more than") for line in messages)
 
 
-def test_an_error_that_no_way_comes_near_is_refused_with_the_nearest(monkeypatch):
+def test_an_error_that_no_method_reaches_is_refused_with_the_nearest(monkeypatch):
     lows = {"a": 0.3, "b": 0.2}
     named = [
         Method("substepping", k, Formula(lambda steps, low=low: low + 1.0 / steps**2, 1e-3)) for k, low in lows.items()

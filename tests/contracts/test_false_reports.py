@@ -103,7 +103,7 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[l
     return lambda: (execute_run(spec, files, lambda phase: None), files)
 
 
-def test_a_run_that_tells_the_truth_is_done(ran):
+def test_a_run_with_a_correct_report_is_accepted(ran):
     found, files = ran()
     assert {row["status"] for row in found} == {"ok"}
     assert files.recording_path.exists()
@@ -176,7 +176,7 @@ def test_a_run_whose_recording_does_not_end_as_it_did_fails(ran, monkeypatch: py
     assert not files.recording_path.exists()
 
 
-def test_a_run_whose_second_pass_goes_another_way_than_the_timed_one_fails(ran, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_whose_second_pass_differs_from_the_timed_one_fails(ran, monkeypatch: pytest.MonkeyPatch):
     steps = count()
     advance = SingleStageIntegrator.complete_step
 

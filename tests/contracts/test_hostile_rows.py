@@ -110,7 +110,7 @@ def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
 @pytest.mark.parametrize(
     "recording", ["/etc/hostname", "../../secret.rrd", "a/../../secret.rrd", "a\0b", "recordings/" + "x" * 300]
 )
-def test_a_recording_is_looked_for_below_its_folder(tmp_path: Path, recording: str):
+def test_a_recording_is_searched_below_its_folder(tmp_path: Path, recording: str):
     given_rows = synthetic_accuracy_rows.build_snapshot_rows("net", 6, "early") + list(
         synthetic_accuracy_rows.build_curve_rows("net", 6, "early", "numba")
     )

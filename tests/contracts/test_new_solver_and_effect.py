@@ -108,14 +108,14 @@ def constants(folder: str) -> set[str]:
     }
 
 
-def test_no_report_and_little_else_knows_a_solver_by_name():
+def test_no_report_and_little_else_refers_to_a_solver_by_name():
     assert not constants("harness/report") & set(SOLVERS)
     # `sparse` is an option of a peer's, for its own linear solver.
     assert constants("harness") & set(SOLVERS) - {"sparse"} == DEFAULTS
 
 
 @pytest.mark.parametrize("folder", ["report", "experiments"])
-def test_no_report_and_no_experiment_knows_an_effect_by_name(folder: str):
+def test_no_report_and_no_experiment_refers_to_an_effect_by_name(folder: str):
     # `springs` is a column of rows: how many a mesh has.
     assert constants(f"harness/{folder}") & set(EFFECT_CLASSES) <= {"springs"}
 

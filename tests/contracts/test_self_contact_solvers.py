@@ -93,7 +93,7 @@ def begun() -> tuple[Scene, MotionState]:
 
 
 @pytest.mark.parametrize("name", TAKE)
-def test_every_iterate_is_free_and_the_way_to_it(name):
+def test_every_iterate_and_the_path_to_it_are_free(name):
     made, state = begun()
     stated = build_problem(made, state, "inertial")
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))

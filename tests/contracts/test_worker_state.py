@@ -58,7 +58,7 @@ def answer(tick: ProgressCallback) -> bytes:
 
 
 @pytest.mark.long
-def test_the_memory_of_the_process_that_asks_stays_flat():
+def test_the_memory_of_the_parent_process_stays_constant():
     """64 KiB an answer: kept, the second thousand would be 64 MiB."""
     sizes = list[int]()
     for _ in range(2):

@@ -101,7 +101,7 @@ def test_in_single_precision_it_ends_at_the_minimum_in_double() -> None:
     np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-10)
 
 
-def test_bits_do_not_depend_on_who_looks() -> None:
+def test_bits_do_not_depend_on_observers() -> None:
     problem = build_first_problem(SCENE_BUILDERS["chain"](1e10))
     prepared = on_device(problem)
     looked_at = [p.copy() for p in islice(prepared.iterates(problem), 7)][-1]

@@ -49,7 +49,7 @@ def test_iterates_are_those_of_the_processor(make: Callable[[], StepProblem], me
 
 
 @methods
-def test_bits_and_velocities_do_not_depend_on_who_looks(method: Callable[..., Any]) -> None:
+def test_bits_and_velocities_do_not_depend_on_observers(method: Callable[..., Any]) -> None:
     problem, rule = build_first_problem(SCENE_BUILDERS["chain"](1e10)), StopRule(4)
     prepared = method(device="cuda").prepare(problem.system)
     assert isinstance(prepared, DeviceSolver)

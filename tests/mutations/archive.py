@@ -71,6 +71,6 @@ ARCHIVE = (
         "harness/atomic_files.py",
         '("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC")',
         '("O_NONBLOCK", "O_CLOEXEC")',
-        (f"{_LOCKS}::test_what_is_in_the_way_of_a_lock_is_named_at_once",),
+        (f"{_LOCKS}::test_what_prevents_a_lock_is_named_at_once",),
     ),
 )

@@ -72,7 +72,7 @@ _TABLE = (
         f"{_FOLDER}/fingerprints.py",
         "k = int(np.argmax(by_count <= max(1.5 * lowest, noise))) + 1",
         "k = int(np.argmax(by_count <= max(1.5 * lowest, noise)))",
-        f"{_GRADE}::test_a_scene_without_required_iterations_asks_for_convergence",
+        f"{_GRADE}::test_a_scene_without_required_iterations_requires_convergence",
     ),
     (
         "grade-anything-is-a-minimum",

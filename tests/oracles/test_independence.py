@@ -36,7 +36,7 @@ def test_no_module_imports_a_formula_of_the_solvers():
     assert {path.name: found for path in files if (found := find_forbidden_imports(path.read_text()))} == {}
 
 
-def test_each_way_to_import_a_formula_is_found():
+def test_each_form_of_importing_a_formula_is_found():
     assert find_forbidden_imports("import springbench.solvers.contact.ccd as ccd") == {"springbench.solvers.contact"}
     found = find_forbidden_imports("from springbench.solvers.model import energies, step_problem")
     assert found == {"springbench.solvers.model.energies"}

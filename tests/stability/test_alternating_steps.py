@@ -121,7 +121,7 @@ def test_what_measures_at_one_time_step_refuses_two_by_the_key(command: str, tmp
     assert f"{FILE}:7: alternate_time_step: " in answer.output.replace("\n", "")
 
 
-def test_symplectic_euler_takes_the_substeps_that_each_length_asks_for():
+def test_symplectic_euler_takes_the_substeps_that_each_length_requires():
     scene = made()
     assert scene.alternate_scene is not None
     prepared = [SymplecticEuler().prepare(part.system) for part in (scene, scene.alternate_scene)]

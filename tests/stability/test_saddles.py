@@ -98,7 +98,7 @@ def test_a_step_that_starts_at_a_saddle_ends_at_a_minimum_below_it(solver: Solve
 
 @saddles
 @solvers
-def test_a_saddle_is_left_the_same_way_twice_and_downwards(solver: Solver, saddle: str):
+def test_a_saddle_is_left_in_the_same_direction_twice_and_downwards(solver: Solver, saddle: str):
     _, given = at_a_saddle(saddle, "implicit-euler")
     one, two = (
         [given.initial_guess, *(p.copy() for p in islice(solver.prepare(given.system).iterates(given), 60))]
@@ -139,7 +139,7 @@ def test_a_solve_that_may_not_leave_a_saddle_says_so(saddle: str, monkeypatch):
         np.testing.assert_allclose(solution.positions, given.initial_guess, rtol=0.0, atol=1e-9)  # round-off moves it
 
 
-def test_only_a_close_tolerance_asks_for_a_minimum():
+def test_only_a_close_tolerance_requires_a_minimum():
     """Far from stationary points the Hessian tells nothing."""
     _, given = at_a_saddle("a chain pressed along its line", "implicit-euler")
     guess = given.initial_guess.copy()

@@ -56,7 +56,7 @@ def test_the_rope_is_tied_in_an_overhand_knot():
     assert knot_determinant(free("knot", SOLVE["hybrid"], None, 240)) == 3
 
 
-def test_the_determinant_tells_knots():
+def test_the_determinant_distinguishes_knots():
     t = np.linspace(-2.2, 2.2, 60)
     trefoil = np.stack([t**3 - 3 * t, t**4 - 4 * t**2, 0.12 * (t**5 - 10 * t)], axis=1)
     turned = trefoil @ np.array([[1.0, 0.0, 0.0], [0.0, np.cos(1.0), -np.sin(1.0)], [0.0, np.sin(1.0), np.cos(1.0)]])

@@ -34,7 +34,7 @@ def clock(seconds: float) -> Callable[[], float]:
     ("ratio", "answer"),
     [(1.0, RegressionVerdict.PASS), (1.05, RegressionVerdict.FAIL), (1.03, RegressionVerdict.INCONCLUSIVE)],
 )
-def test_a_race_ends_when_it_knows(ratio: float, answer: RegressionVerdict):
+def test_a_benchmark_ends_with_its_verdict(ratio: float, answer: RegressionVerdict):
     # The third ratio is the limit itself: neither above nor below, so that only the budget ends it.
     found = run_paired_benchmark(
         ProgramPair(clock(ratio), clock(1.0)),

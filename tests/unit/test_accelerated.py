@@ -89,7 +89,7 @@ def test_a_step_compiled_as_a_whole_is_the_step_with_calls_in_between(method, na
 @methods
 @problems
 @pytest.mark.parametrize("linear", ["supernodal", "cholespy"])
-def test_a_run_tells_its_gradient_and_by_how_much_the_objective_fell(method, name, linear):
+def test_a_run_returns_its_gradient_and_the_decrease_of_the_objective(method, name, linear):
     problem = PROBLEMS[name]()
     prepared = method(linear_solver=linear).prepare(problem.system)
     run = prepared.init_state(problem, problem.initial_guess)

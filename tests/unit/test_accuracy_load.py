@@ -47,7 +47,7 @@ def loaded(folder: Path, text: str) -> AccuracyPlan:
     return load_accuracy(folder / "config.yaml")
 
 
-def test_a_study_of_curves_asks_for_each_moment_and_solver_that_minimises(folder: Path) -> None:
+def test_a_study_of_curves_has_each_snapshot_and_solver_that_minimises(folder: Path) -> None:
     units = loaded(folder, CONFIG).curves
     assert [(u.snapshot, u.solver.name) for u in units] == [
         ("early", "numba"),
@@ -68,7 +68,7 @@ def test_studies_take_every_first_guess_that_is_no_solve_and_reports_have_words_
     assert set(INITIAL_GUESS_LABELS) == set(INITIAL_GUESSES) == set(guesses)
 
 
-def test_a_study_of_work_asks_for_all_combinations(folder: Path) -> None:
+def test_a_study_of_work_has_all_combinations(folder: Path) -> None:
     units = loaded(folder, CONFIG).work
     found = {(u.case.scene_name, u.case.size, u.case.scene.time_step, u.options["rtol"], u.solver.name) for u in units}
     assert found == {
@@ -136,7 +136,7 @@ def test_a_sweep_and_an_accuracy_config_are_not_taken_for_each_other(folder: Pat
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_every_shipped_config_asks_for_curves_and_names_its_schema(path: Path) -> None:
+def test_every_shipped_config_has_curves_and_names_its_schema(path: Path) -> None:
     requested = load_accuracy(path)
     assert requested.curves or requested.work
     assert path.read_text().splitlines()[0] == "# yaml-language-server: $schema=schema.json"

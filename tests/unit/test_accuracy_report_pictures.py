@@ -67,7 +67,7 @@ def luminance(color: Sequence[float]) -> float:
 
 
 @pytest.mark.parametrize("name", [*SOLVER_TABLE, *(f"a stranger {k}" for k in range(12))])
-def test_one_look_is_seen_on_the_light_page_and_on_the_dark_ground_of_the_viewer(name: str) -> None:
+def test_one_style_is_visible_on_the_light_page_and_on_the_dark_ground_of_the_viewer(name: str) -> None:
     color = luminance(to_rgb(assign_solver_styles([name])[name].color))
     page, ground = luminance(to_rgb(BACKGROUND_COLOUR)), luminance([part / 255 for part in BACKGROUND])
     # Contrast as the W3C defines it; 1.5 is that of a hairline, and lines are thick.
@@ -75,7 +75,7 @@ def test_one_look_is_seen_on_the_light_page_and_on_the_dark_ground_of_the_viewer
     assert (color + 0.05) / (ground + 0.05) > 1.5
 
 
-def test_every_solver_has_a_look_and_a_marker_of_its_own() -> None:
+def test_every_solver_has_a_style_and_a_marker_of_its_own() -> None:
     looks = assign_solver_styles([])
     assert set(looks) == set(SOLVER_TABLE)
     assert len({look.marker for look in looks.values()}) == len(looks)

@@ -123,7 +123,7 @@ def squared(x: Sequence[Exact], edges: bool) -> Fraction:
 
 
 @pytest.mark.parametrize("edges", [False, True], ids=["point-triangle", "edge-edge"])
-def test_no_random_pair_comes_nearer_than_it_may_on_the_way(edges):
+def test_no_random_pair_comes_nearer_than_allowed_on_its_path(edges):
     rng, ended = np.random.default_rng(0), 0
     for _ in range(24):
         p, d = (np.round(64 * rng.normal(size=(4, 3))) / 64 for _ in range(2))

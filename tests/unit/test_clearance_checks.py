@@ -36,14 +36,14 @@ FAR = SphereObstacle(center=(4.0, 0.0, 0.0), radius=0.05)
     [(BALL, ACROSS, 0.4725), (FAR, ROUND, 0.4952), (BALL, SMOOTH, 0.4725)],
     ids=["along a line", "along a circle", "along a cubic"],
 )
-def test_a_way_through_a_ball_is_found_where_it_begins(ball: SphereObstacle, motion: KeyFrameMotion, when: float):
+def test_a_path_through_a_ball_is_found_where_it_begins(ball: SphereObstacle, motion: KeyFrameMotion, when: float):
     found = find_first_violation(ball.build_obstacle(), None, POINT, motion, LIMIT)
     assert found is not None
     assert found[0] == pytest.approx(when, abs=0.01)
     assert found[1].min() < LIMIT
 
 
-def test_a_ball_that_comes_is_found_like_a_way_to_it():
+def test_a_ball_that_approaches_is_found_like_a_path_to_it():
     back = moving({"time": 0.0}, {"time": 1.0, "offset": (-4.0, 0.0, 0.0)})
     ball = SphereObstacle(center=(2.0, 0.0, 0.0), radius=0.1, motion=back)
     found = find_first_violation(ball.build_obstacle(), back, POINT, None, LIMIT)
@@ -80,7 +80,7 @@ def test_four_planes_may_leave_no_room_where_any_three_do():
     assert all(largest_gap_radius(planes[:k] + planes[k + 1 :], 0.0) > 0.0 for k in range(4))
 
 
-def test_planes_that_turn_are_looked_at_between_their_keys():
+def test_planes_that_turn_are_checked_between_their_keys():
     assert list(sample_times([ACROSS])) == [0.0, 1.0]
     assert len(list(sample_times([ROUND]))) > 32
     assert merge_key_times(ACROSS, None, KeyFrameMotion(key_frames=(KeyFrame(time=0.5),))) == [0.0, 0.5, 1.0]

@@ -96,7 +96,7 @@ def test_noise_too_large_for_the_limit_is_undecided_and_not_passed():
     assert RegressionVerdict.PASS not in found
 
 
-def test_the_first_answer_is_that_of_looking_turn_by_turn():
+def test_the_first_verdict_is_that_of_a_test_after_each_block():
     rule = SequentialTest(1.03)
     for seed in range(20):
         x = sample(seed, 1.0 + 0.01 * seed)

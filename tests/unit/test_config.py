@@ -58,7 +58,7 @@ def test_a_number_that_is_not_finite_is_read_and_left_to_the_model_to_refuse(tmp
     assert value - value != 0  # inf - inf and nan - nan are nan
 
 
-def test_every_key_and_item_knows_its_line(tmp_path: Path) -> None:
+def test_every_key_and_item_has_its_line(tmp_path: Path) -> None:
     lines = read(tmp_path, "a: 1\n\nb:\n  - c: 2\n    d: 3\n  -\n    5\n").lines
     assert {format_key(key): line for key, line in lines.items() if key} == {
         "a": 1,

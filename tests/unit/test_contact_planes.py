@@ -73,7 +73,7 @@ def test_what_passes_by_is_let_pass_and_what_hits_is_stopped(name):
 
 
 @pytest.mark.parametrize("name", ["plane", "sphere", "capsule", "plate"])
-def test_a_half_space_touches_the_first_contact_of_a_way(name):
+def test_a_half_space_touches_the_first_contact_of_a_path(name):
     energy = bound(build_contact(OBSTACLE_SPECS[name]), 400)
     (obstacle,) = energy.obstacles
     p, v = ways(obstacle)

@@ -84,7 +84,7 @@ def test_runs_on_the_processor_are_named_as_before_there_were_devices(sweep: Pat
         ("{name: lbfgs, device: cuda}", "device"),
     ],
 )
-def test_what_no_device_knows_is_refused(entry: str, said: str, sweep: Path) -> None:
+def test_what_no_device_supports_is_refused(entry: str, said: str, sweep: Path) -> None:
     sweep.write_text(SWEEP.replace("{name: vbd, device: cuda}", entry))
     result = CliRunner().invoke(app, ["run", str(sweep), "--results", str(sweep.parent / "r")])
     assert result.exit_code == 2
@@ -137,7 +137,7 @@ def nvml(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return made
 
 
-def test_a_row_has_what_the_device_tells_of_its_state_and_null_for_what_it_does_not(nvml: SimpleNamespace) -> None:
+def test_a_row_has_the_reported_state_of_the_device_and_null_for_the_rest(nvml: SimpleNamespace) -> None:
     values = {"sm_clock_mhz": 1980.0, "memory_clock_mhz": 2619.0, "power_w": None, "power_limit_w": 700.0}
     assert cuda_device.read_device_state() == values | {"performance_state": 0.0, "temperature_c": 41.0}
 

@@ -58,7 +58,7 @@ def test_a_cantilever_clamped_half_way_between_its_pins_is_a_beam_to_a_thousandt
 
 
 @pytest.mark.parametrize("angle", [0, 30, 45, 60, 90, 135])
-def test_a_cylinder_stores_what_its_curvature_asks_along_the_lines_and_twice_that_along_the_diagonals(angle):
+def test_a_cylinder_has_the_energy_of_its_curvature_along_the_lines_and_twice_that_along_the_diagonals(angle):
     mesh = GridMesh().build_mesh(41)
     e = np.array([np.cos(np.deg2rad(angle)), 0.0, np.sin(np.deg2rad(angle))])
     p, curvature = mesh.rest_positions.copy(), 1e-2

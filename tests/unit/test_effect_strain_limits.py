@@ -40,7 +40,7 @@ def test_no_spring_is_beyond_the_limit_when_converged():
     assert 1.1 < stretched.max() <= 1.1 + 1e-3
 
 
-def test_a_chain_at_its_limit_gives_way_by_what_the_stiffness_says():
+def test_a_chain_at_its_limit_yields_by_the_force_over_the_stiffness():
     """The springs hold EA (l - 1), the limits EA' (l - 1.1), and both together the weight that hangs below."""
     ea, stiff, mass, size = 50.0, 5e4, 2.0, 6
     made = build_test_scene(

@@ -56,7 +56,7 @@ def test_only_the_velocity_of_the_air_relative_to_the_triangle_counts():
     assert not force(velocity=(1.0, -2.0, 3.0), v=v).any()
 
 
-def test_the_force_does_not_depend_on_which_way_triangles_face():
+def test_the_force_does_not_depend_on_the_orientation_of_triangles():
     mirrored = PLATE.rest_positions * [-1.0, 1.0, 1.0]  # their normals now point the other way
     found, wanted = (force(p, velocity=(0.0, 0.0, 5.0), lift_coefficient=0.4) for p in (mirrored, PLATE.rest_positions))
     np.testing.assert_allclose(found, wanted, rtol=1e-13)

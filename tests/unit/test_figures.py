@@ -75,7 +75,7 @@ def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tm
     assert least_similarity(now, then) > MIN_SIMILARITY, hint
 
 
-def test_a_curve_of_another_look_is_found_out(figures: dict[str, Figure]) -> None:
+def test_a_curve_of_another_style_is_detected(figures: dict[str, Figure]) -> None:
     line = figures["timing"].axes[0].lines[0]
     look, now = (line.get_linestyle(), line.get_color()), render_figure(figures["timing"])
     line.set(linestyle=":", color="#d55e00")

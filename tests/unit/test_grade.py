@@ -312,7 +312,7 @@ def test_a_saddle_is_no_minimum(tmp_path):
     assert not step.is_minimum
 
 
-def test_a_scene_without_required_iterations_asks_for_convergence(tmp_path):
+def test_a_scene_without_required_iterations_requires_convergence(tmp_path):
     path, scene = load_case(tmp_path)
     found = grade_array(make_grader(path, required=None), simulate(scene, 6, iterations=12))
     assert found.kind == UNCONVERGED

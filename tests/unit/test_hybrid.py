@@ -82,7 +82,7 @@ def test_a_graph_is_ordered_once(monkeypatch):
 
 
 @pytest.mark.parametrize("size", [0.9, 1.1])
-def test_a_way_to_a_saddle_is_left_aside_where_curvature_is_negative_alone(size):
+def test_a_path_to_a_saddle_is_left_where_curvature_is_negative(size):
     """A net in its plane, which nothing tells up from down: pressed it bends out of it, stretched it stays."""
     given = stiff(1e4)
     flat = given.current_positions * [size, 1.0, size]

@@ -83,7 +83,7 @@ def test_what_is_not_timed_is_done_side_by_side():
         other.leave.set()
 
 
-def test_who_would_be_timed_goes_before_who_would_not():
+def test_timed_runs_have_priority_over_untimed_ones():
     with lock_timing_shared(quiet):
         timed = Other(lock_timing_exclusive)
         assert timed.waits.wait(PATIENCE)
@@ -130,7 +130,7 @@ IN_THE_WAY: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("what", IN_THE_WAY)
-def test_what_is_in_the_way_of_a_lock_is_named_at_once(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_what_prevents_a_lock_is_named_at_once(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)  # the name of a socket may not be long
     monkeypatch.setenv("SPRINGBENCH_LOCKS", "locks")
     Path("locks").mkdir()

@@ -168,7 +168,7 @@ effects: [{kind: springs, stretch: 100}, {kind: gravity}, {kind: pins, indices: 
 """
 
 
-def test_a_scene_tells_which_parts_nothing_holds(tmp_path, caplog):
+def test_a_scene_lists_parts_without_pins_or_attachments(tmp_path, caplog):
     write(tmp_path, FAULTS["coincident-vertices"][0])
     (tmp_path / "scene.yaml").write_text(SCENE)
     code, output = run_command(tmp_path / "scene.yaml", "--strict")

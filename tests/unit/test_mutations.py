@@ -37,7 +37,7 @@ def test_each_can_be_planted_and_names_tests_that_exist(mutation: Mutation):
         assert f"def {name or 'test_'}" in (ROOT / path).read_text()
 
 
-def test_the_command_that_runs_them_is_one_that_pytest_knows():
+def test_pytest_accepts_the_command_that_runs_the_tests():
     command = [sys.executable, *PYTEST, "--collect-only", "tests/unit/test_round_off.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

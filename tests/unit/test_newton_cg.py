@@ -27,7 +27,7 @@ from tests.unit.test_objective import with_links
 OTHERS = pytest.mark.parametrize("solver", [NewtonSolver(), NewtonCG(), HybridNewton()], ids=lambda s: type(s).__name__)
 
 
-def test_it_never_looks_for_the_structure_of_a_hessians_factor():
+def test_it_never_analyses_the_factor_of_a_hessian():
     given = build_first_problem(build_cloth(8, "exact"))
     prepared = NewtonCG().prepare(given.system)
     assert isinstance(prepared, PreparedDescent)

@@ -108,7 +108,7 @@ def test_nothing_is_near_where_patches_say_so_however_fast_it_moves(made, share)
     assert 0 < said < 24
 
 
-def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
+def test_stored_bounds_of_earlier_displacements_are_valid(made):
     # From each way's end, or from its begin, go on by steps long and short; far things were looked at long before.
     said, skipped, limits, near = 0, 0, CollisionQuery(REACH, 0.3 * REACH, MIN_GAP_FRACTION), made.near_at_rest
     for seed in range(2):
@@ -132,7 +132,7 @@ def test_what_patches_remember_of_ways_before_says_nothing_that_is_not_so(made):
     assert skipped > 0 or made.rest_positions[:, 1].any()  # a balloon of few patches has nothing that is far
 
 
-def test_a_way_that_begins_where_one_before_began_is_looked_at_from_there(made):
+def test_a_displacement_from_the_same_start_reuses_its_query(made):
     limits, patches = CollisionQuery(REACH, 0.0, MIN_GAP_FRACTION), made.patches
     p = 2.0 * made.rest_positions
     q, r = 1.02 * p, 1.04 * p @ np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
@@ -229,7 +229,7 @@ def test_a_sheet_that_swings_as_one_piece_is_clear_however_far():
 
 
 @pytest.mark.parametrize("n", [1, 7, 8, 30])
-def test_unevenness_is_the_diagonal_of_the_box_of_all_ways(n):
+def test_relative_displacement_is_the_diagonal_of_the_box_of_all_displacements(n):
     rng = np.random.default_rng(n)
     p, q = rng.normal(size=(2, n, 3))
     assert max_relative_displacement(p, q) == pytest.approx(float(np.linalg.norm(np.ptp(q - p, axis=0))), rel=1e-15)
@@ -250,7 +250,7 @@ def test_patches_of_a_stack_tell_nothing():
     assert not patches.compute_clearance_bounds(rest, rest + 5.0, CollisionQuery(REACH, 0.0, MIN_GAP_FRACTION))
 
 
-def test_contact_that_is_idle_goes_only_ways_that_are_free_and_mostly_without_a_look(monkeypatch):
+def test_idle_contact_allows_only_free_displacements_and_mostly_without_a_query(monkeypatch):
     mesh, arguments, ways = GridMesh().build_mesh(17), [], 0
     surface = CollisionMesh.from_rest_shape(
         mesh.rest_positions,

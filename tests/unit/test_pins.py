@@ -26,7 +26,7 @@ def pinned(problem: StepProblem, vertices: list[int], weight: float, seed: int =
 
 @backends
 @pytest.mark.parametrize("weight", [1e4, 1e7, 1e10])
-def test_a_penalty_pin_gives_way_by_the_force_on_it_over_its_weight(backend, weight):
+def test_a_penalty_pin_yields_by_the_force_on_it_over_its_weight(backend, weight):
     problem = pinned(build_random_problem(0), [0, 3], weight)
     p = backend.prepare(problem.system).solve(problem, CONVERGED).positions
     free = replace(problem, system=replace(problem.system, pins=DirichletPins()), pin_targets=np.empty((0, 3)))

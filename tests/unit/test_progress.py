@@ -86,7 +86,7 @@ def test_a_run_that_is_done_elsewhere_is_left_out(clock: list[float]):
     assert pace.estimate_seconds() == 2 * 3.0
 
 
-def test_a_run_that_goes_on_tells_its_own_pace(clock: list[float]):
+def test_a_started_run_is_estimated_by_its_own_pace(clock: list[float]):
     def does(display: ProgressDisplay) -> None:
         display.start_sweep([RunCost(), RunCost()])
         display.start_run("one", 10, RunCost()).finish_run("ok")

@@ -125,7 +125,7 @@ def test_a_plot_ends_at_the_last_frame_and_its_legend_has_room_above_the_data():
     assert (low, high) == (-1.0, pytest.approx(3.0 + 1.2 * 4.0))
 
 
-def test_a_single_point_can_be_looked_at():
+def test_a_camera_can_be_fitted_to_a_single_point():
     assert np.isfinite(numbers(ViewExtent(np.zeros((1, 3))).build_eye_controls().position)).all()
 
 

@@ -31,7 +31,7 @@ def recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return path
 
 
-def test_what_one_process_wrote_or_read_is_not_read_in_every_way_by_another(recording: Path):
+def test_a_recording_checked_by_one_process_is_not_checked_again_by_another(recording: Path):
     require_intact(recording, refuse)
     other = recording.with_name("b.rrd")
     other.write_bytes(recording.read_bytes())  # another file, of the same bytes

@@ -37,7 +37,7 @@ def config(tmp_path: Path) -> Path:
     return tmp_path / "sweep.yaml"
 
 
-def test_files_travel_both_ways_and_what_is_there_already_does_not(tmp_path: Path):
+def test_files_are_copied_in_both_directions_and_existing_ones_are_not(tmp_path: Path):
     there = tmp_path / "there"
     units = write_dummy_runs(there / "sweep", 3)
     (there / "sweep" / "recordings").mkdir()

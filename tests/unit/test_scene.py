@@ -62,7 +62,7 @@ def test_pins_of_several_effects_are_joined_in_the_order_of_their_vertices():
     assert made.system.unpinned_mask.tolist() == [True, False, False, True, False]
 
 
-def test_a_vertex_may_be_pinned_twice_in_the_same_way():
+def test_a_vertex_may_be_pinned_twice_by_equal_pins():
     made = build_test_scene(ChainMesh(), PinsEffect(parts=("ends",)), PinsEffect(indices=(0,)), size=4)
     assert made.system.pins.vertices.tolist() == [0, 3]
 

@@ -215,7 +215,7 @@ def test_stored_kernels_change_no_bit():
         assert abs(contact.hessian(q) - fresh.hessian(q)).max() == 0.0
 
 
-def test_candidates_are_looked_up_again_before_what_was_out_of_reach_comes_into_range():
+def test_candidates_are_found_again_before_a_pair_outside_comes_into_range():
     """Of three triangles above each other, two in range, the third comes down from where it is no candidate."""
     layer = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float)
     triangles, limit = np.arange(9).reshape(3, 3), CONTACT_THICKNESS + CONTACT_DHAT

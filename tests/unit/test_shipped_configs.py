@@ -83,7 +83,7 @@ def test_a_sweep_names_shipped_scenes(empty_folder: Path):
         load_config(sweep)
 
 
-def test_a_scene_beside_the_sweep_comes_before_a_shipped_one(empty_folder: Path):
+def test_a_scene_in_the_folder_of_the_sweep_has_priority_over_a_shipped_one(empty_folder: Path):
     (empty_folder / "net").write_text("")
     assert resolve_scene_path("net", empty_folder) == empty_folder / "net"
     assert resolve_scene_path("net", empty_folder / "elsewhere") == SHIPPED_FOLDER / "scenes" / "net.yaml"

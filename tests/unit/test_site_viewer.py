@@ -86,7 +86,7 @@ def colours(picture: bytes) -> int:
     return len(np.unique(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).reshape(-1, 3), axis=0))
 
 
-def test_the_viewer_is_given_a_theme_that_it_knows_and_hidden_until_a_recording_is_open():
+def test_the_viewer_gets_a_theme_that_it_supports_and_is_hidden_until_a_recording_is_open():
     """A page that follows the system has an empty theme, of which the viewer complains; see the long test below too."""
     text = REPLAY.read_text()
     assert 'theme: document.documentElement.dataset.theme || (dark ? "dark" : "light")' in text

@@ -41,9 +41,7 @@ def test_a_sound_solver_is_ok_and_graded_by_the_oracle(tmp_path: Path, monkeypat
     assert all(0.0 < graded[frame] < 1.0 for frame in (1, 2, 3))  # it descends in five iterations
 
 
-def test_a_run_is_judged_whose_solver_says_no_more_than_the_readme_asks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_solver_with_only_what_the_readme_requires_is_verified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     found = rows_of(write_plugin_solver(tmp_path, monkeypatch, options=SWEEP_OPTIONS + ", verify: true"), tmp_path)
     steps = [row for row in found if row["phase"] == "step"]
     assert len(steps) == 3

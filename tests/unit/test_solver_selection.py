@@ -54,7 +54,7 @@ def test_a_graph_that_nothing_separates_gets_conjugate_gradients():
     assert "a factor would cost more" in choice.reason
 
 
-def test_a_factor_that_does_not_fit_gives_way_to_conjugate_gradients():
+def test_conjugate_gradients_replace_a_factor_that_does_not_fit():
     Q = grid_matrix(15, 15, 15)
     direct, iterative = needed(Q, "supernodal"), needed(Q, "cg")
     assert iterative < direct

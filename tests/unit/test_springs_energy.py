@@ -129,7 +129,7 @@ def test_a_spring_at_rest_is_at_rest():
     assert springs.value(rest) <= ROUND_OFF**2 * springs.stiffness.sum()  # its square root is a length
 
 
-def test_rest_lengths_that_round_off_alone_tells_apart_are_equal():
+def test_rest_lengths_that_differ_by_round_off_alone_are_equal():
     x = np.linspace(0.0, 1.0, 1000)  # differences of neighbours have several last bits
     edges = np.stack([np.arange(999), np.arange(1, 1000)], axis=1)
     even = np.stack([x, 0 * x, 0 * x], axis=1)

@@ -72,7 +72,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_a_scene_starts_as_it_says_and_its_digest_tells(tmp_path: Path):
+def test_a_scene_starts_as_stated_and_its_digest_includes_the_start(tmp_path: Path):
     spec = load_scene(written(tmp_path, SCENE.format("{kind: collapsed, angular_velocity: [0, 5, 0]}")))
     begun = build_initial_state(build_scene(spec, 3)).motion
     np.testing.assert_allclose(

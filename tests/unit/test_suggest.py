@@ -39,7 +39,7 @@ def still() -> Scene:
     return made
 
 
-def test_a_motion_that_asks_for_nothing_gets_no_suggestion():
+def test_a_motion_without_special_needs_gets_no_suggestion():
     made = still()
     assert suggest(made, set(), folded(made, np.deg2rad(20.0))) == []
 
@@ -65,7 +65,7 @@ def test_a_suggestion_comes_with_its_evidence_unless_the_effect_is_listed(effect
     assert effect not in {s.effect_kind for s in suggest(made, {listed}, places[effect], speed)}
 
 
-def test_a_corner_alone_asks_for_no_effect():
+def test_a_corner_alone_suggests_no_effect():
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0, shear=60.0), size=20)
     p, h = made.mesh.rest_positions.copy(), made.mesh.spacing
     p[0] += [-h, 2 * h, -h]  # three springs of 1482, and two edges of 1083

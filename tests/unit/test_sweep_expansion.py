@@ -222,7 +222,7 @@ def test_a_label_names_the_run_and_fits_a_file_name(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-def test_every_shipped_config_asks_for_runs_and_names_its_schema(path: Path) -> None:
+def test_every_shipped_config_has_runs_and_names_its_schema(path: Path) -> None:
     assert load_config(path).list_runs()
     relative = "schema.json" if path.parent.name == "configs" else "../schema.json"
     assert path.read_text().splitlines()[0] == f"# yaml-language-server: $schema={relative}"

@@ -40,7 +40,7 @@ def test_the_error_of_a_closed_form_is_that_of_its_discretisation(name: str):
         assert row["observed_order"] == pytest.approx(row["order"], abs=0.15)
 
 
-def test_the_dampings_of_dashpot_and_integrator_are_told_apart():
+def test_the_dampings_of_dashpot_and_integrator_are_separated():
     case = FORMS["damped oscillator"]
     assert case.remark is not None
     assert case.remark(100, NEWTON) == "decay 1.194/s, of which the dashpot 0.996 and implicit Euler 0.1983; exact 1"

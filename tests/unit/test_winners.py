@@ -80,7 +80,7 @@ def test_the_map_has_a_winner_for_each_error_that_is_reached(tmp_path: Path):
     )
 
 
-def test_a_cell_tells_how_far_ahead_its_winner_is(found):
+def test_a_cell_states_the_lead_of_its_winner(found):
     assert found[0.1].lead_ratio == pytest.approx(3.0)
     assert found[1e-4].lead_ratio == inf
     assert not found[1e-8].cheapest_by_family, "what no reference certifies wins nothing"
