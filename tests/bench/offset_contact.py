@@ -13,9 +13,9 @@ iterations, `vbd-ogc` after a fixed number.
 One step: that of `hybrid` at the last frame, solved in 10 to 300 iterations from the same start.
 
     residual        of the barrier objective, relative to the start
-    error           root mean square distance from the minimum that `newton` finds [mm]
+    error           root mean square distance from the solution of `newton`, friction included [mm]
     change          the same from the iterate after the largest number of iterations: it falls if there is a fixed point
-    radius          the error of 300 iterations where contacts act within a fraction of the minimum distance
+    radius          the error without friction, where contacts act within a fraction of the minimum distance
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.simulation.instrumentation_pass import count_intersections
 from springbench.harness.simulation.time_loop import build_problem, prepare, simulate_scene
 from springbench.solvers.contact.contact_potential import BarrierContact
+from springbench.solvers.contact.lagged_friction import solve_with_friction
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.newton.hybrid_newton import HybridNewton
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
@@ -48,8 +49,12 @@ from springbench.solvers.model.step_problem import Positions, Solver, StepProble
 from tests.bench.scripted_study import describe_moment, publish_rows
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-SCENES: dict[str, tuple[int, int]] = {"net-on-block": (5, 30), "touching-curtain": (9, 30), "ten-sheets": (3, 8)}
-"""Size and frames of scenes of `configs/touch`: ropes on a block, a cloth in folds, layers that press each other."""
+SCENES: dict[str, tuple[str, int, int]] = {
+    "net-on-block": ("touch", 5, 30),
+    "gathered-curtain": ("contact-accuracy", 9, 20),
+    "ten-sheets": ("touch", 3, 8),
+}
+"""Folder, size and frames of each scene: ropes on a block, a cloth in folds, layers that press each other."""
 
 
 class Contender(NamedTuple):
@@ -74,7 +79,7 @@ STEP_SOLVERS: dict[str, Solver] = {
     "vbd": VertexBlockDescent(),
 }
 ITERATIONS = (10, 30, 100, 300)
-RADIUS_RATIOS = (1.0, 0.25, 0.0625)
+RADIUS_RATIOS, RADIUS_ITERATIONS = (1.0, 0.5, 0.25), (100, 1000)
 
 
 class Motion(NamedTuple):
@@ -138,30 +143,31 @@ class Reference(NamedTuple):
     minimum: Positions
 
 
-def build_touching_scene(name: str, radius_ratio: float = 1.0) -> Scene:
-    """Build a scene with contact radii relative to its minimum distances."""
-    spec = load_scene(CONFIGS / "touch" / f"{name}.yaml")
+def build_touching_scene(name: str, radius_ratio: float | None = None) -> Scene:
+    """Build a scene; with a ratio, without friction and with contact radii relative to its minimum distances."""
+    folder, size, _ = SCENES[name]
+    spec = load_scene(CONFIGS / folder / f"{name}.yaml")
     effects: list[Any] = list(spec.effects)
     for k, one in enumerate(effects):
-        if "contact" in one.kind:
-            effects[k] = one.model_copy(update={"dhat": radius_ratio * one.min_distance})
-    return build_scene(spec.model_copy(update={"effects": tuple(effects)}), SCENES[name][0], log_warnings=False)
+        if "contact" in one.kind and radius_ratio is not None:
+            effects[k] = one.model_copy(update={"dhat": radius_ratio * one.min_distance, "friction": 0.0})
+    return build_scene(spec.model_copy(update={"effects": tuple(effects)}), size, log_warnings=False)
 
 
-def simulate_reference(name: str, radius_ratio: float = 1.0) -> Reference:
-    """Simulate a scene by `hybrid`, and minimise the step after its frames by `newton`."""
+def simulate_reference(name: str, radius_ratio: float | None = None) -> Reference:
+    """Simulate a scene by `hybrid`, and solve the step after its frames by `newton`, with its friction."""
     scene = build_touching_scene(name, radius_ratio)
     prepared = prepare(scene, REFERENCE.solver)
-    steps = simulate_scene(scene, prepared, REFERENCE.stop, initial_guess="extrapolated", frames=SCENES[name][1])
+    steps = simulate_scene(scene, prepared, REFERENCE.stop, initial_guess="extrapolated", frames=SCENES[name][2])
     last = list(steps)[-1]
     problem = build_problem(scene, last.state, "previous")
-    minimum = prepare(scene, NewtonSolver()).solve(problem, StopRule(300, 1e-9)).positions
-    return Reference(scene, last.positions, problem, minimum)
+    solved = solve_with_friction(prepare(scene, NewtonSolver()), problem, StopRule(300, 1e-9))
+    return Reference(scene, last.positions, solved.problem, solved.solution.positions)
 
 
 def measure_motions(name: str, reference: Reference, rounds: int) -> list[dict[str, Any]]:
     """Measure the motion of a scene by each solver: a row for each."""
-    scene, frames = reference.scene, SCENES[name][1]
+    scene, frames = reference.scene, SCENES[name][2]
     motions = simulate_interleaved(scene, frames, list(CONTENDERS.values()), rounds)
     return [
         {
@@ -205,15 +211,24 @@ def measure_step(name: str, reference: Reference) -> list[dict[str, Any]]:
     return rows
 
 
-def measure_radii(name: str, usual: Reference) -> list[dict[str, Any]]:
-    """Measure the error of one step by contact radius: a row for each."""
+def measure_radii(name: str) -> list[dict[str, Any]]:
+    """Measure the error of one step without friction by contact radius and iterations: a row for each."""
     rows: list[dict[str, Any]] = []
     for ratio in RADIUS_RATIOS:
-        reference = usual if ratio == 1.0 else simulate_reference(name, ratio)
-        prepared = prepare(reference.scene, OffsetContactDescent())
-        p = prepared.solve(reference.problem, StopRule(ITERATIONS[-1])).positions
-        error = measure_distance_mm(p, reference.minimum)
-        rows.append({"kind": "radius", "scene": name, "solver": "vbd-ogc", "radius_ratio": ratio, "error_mm": error})
+        reference = simulate_reference(name, ratio)
+        for count in RADIUS_ITERATIONS:
+            prepared = prepare(reference.scene, OffsetContactDescent())
+            p = prepared.solve(reference.problem, StopRule(count)).positions
+            rows.append(
+                {
+                    "kind": "radius",
+                    "scene": name,
+                    "solver": "vbd-ogc",
+                    "radius_ratio": ratio,
+                    "iterations": float(count),
+                    "error_mm": measure_distance_mm(p, reference.minimum),
+                }
+            )
     return rows
 
 
@@ -260,11 +275,12 @@ def main() -> None:
             Console(width=120).print(tabulate_motions(motions[-len(CONTENDERS) :]))
             steps += measure_step(name, reference)
             Console(width=120).print(tabulate_steps(steps[-len(STEP_SOLVERS) * len(ITERATIONS) :]))
-            radii += measure_radii(name, reference)
-            for row in radii[-len(RADIUS_RATIOS) :]:
-                Console(width=120).print(f"{name}: radius {row['radius_ratio']:g}, error {row['error_mm']:.3g} mm")
-    config = CONFIGS / "touch" / "net-on-block.yaml"
-    publish_rows(options.publish, config, "python -m tests.bench.offset_contact", motions + steps + radii, begin)
+            radii += measure_radii(name)
+            for row in radii[-len(RADIUS_RATIOS) * len(RADIUS_ITERATIONS) :]:
+                words = f"{name}: radius {row['radius_ratio']:g}, {row['iterations']:.0f} iterations"
+                Console(width=120).print(f"{words}: {row['error_mm']:.3g} mm")
+            config, command = CONFIGS / "contact-accuracy.yaml", "python -m tests.bench.offset_contact"
+            publish_rows(options.publish, config, command, motions + steps + radii, begin)
 
 
 if __name__ == "__main__":
