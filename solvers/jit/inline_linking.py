@@ -1,12 +1,14 @@
-"""Inner kernels that are compiled into their callers only, not on their own as well.
+"""Functions that are compiled into their callers only, not on their own as well.
 
-Numba optimises an inner kernel and generates its machine code, then repeats this in each caller, level by level. A
-kernel that only other kernels call needs neither. Here it stays as lowered, and the kernel that Python calls is
-optimised once as a whole.
+Numba optimises a called function and generates its machine code, then repeats this in each caller, level by level. A
+function that only kernels call needs neither: an inner kernel, and what Numba implements in Python, such as `np.empty`.
+Here it stays as lowered, and the kernel that Python calls is optimised once as a whole.
 """
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import Any
 
 from llvmlite import binding
@@ -51,6 +53,38 @@ class _NullCodegen:
         """Do nothing."""
 
 
+@contextmanager
+def _use_library_class(codegen: Any, library_class: type) -> Generator[None]:
+    """Create libraries of a class inside the block. Numba compiles under a lock of its own, in one thread at a time."""
+    before = codegen._library_class
+    codegen._library_class = library_class
+    try:
+        yield
+    finally:
+        codegen._library_class = before
+
+
+class KernelCompiler(_COMPILER_CLASS):
+    """Numba's compiler for kernels that Python calls: what they call is only linked."""
+
+    def compile_extra(self, function: Any) -> Any:
+        """Compile a function, and all that it calls into `LinkedLibrary`."""
+        codegen = self.state.targetctx.codegen()
+        self.state.library = _LIBRARY_CLASS(codegen, function.__qualname__)
+        self.state.library.enable_object_caching()
+        with _use_library_class(codegen, LinkedLibrary):
+            return super().compile_extra(function)
+
+
+class ParallelCompiler(_COMPILER_CLASS):
+    """Numba's compiler for kernels with parallel loops, whose parts are called by address."""
+
+    def compile_extra(self, function: Any) -> Any:
+        """Compile a function, and all that it calls, to machine code."""
+        with _use_library_class(self.state.targetctx.codegen(), _LIBRARY_CLASS):
+            return super().compile_extra(function)
+
+
 class LinkedCompiler(_COMPILER_CLASS):
     """Numba's compiler for kernels that are only linked."""
 
@@ -64,7 +98,8 @@ def rebuild_result(context: Any, reduced: Any) -> CompileResult:
     """Rebuild a compile result from the output of its `_reduce`."""
     (name, kind, content), fndesc, env, signature, objectmode, lifted, annotation, reload_init, envs = reduced
     if kind != LINKED_KIND:
-        return CompileResult._rebuild(context, *reduced)
+        with _use_library_class(context.codegen(), _LIBRARY_CLASS):
+            return CompileResult._rebuild(context, *reduced)
     for function in reload_init:
         function()
     library = LinkedLibrary(context.codegen(), name)

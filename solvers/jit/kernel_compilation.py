@@ -2,7 +2,7 @@
 
 Kernels neither create nor store arrays, so there is nothing to count. Counting took half of a step of a hundred
 vertices. Kernels release the GIL. Inner functions are called by kernels only: they need no Python wrapper and no
-machine code of their own (`springbench.solvers.jit.inline_linking`).
+machine code of their own (`springbench.solvers.jit.inline_linking`). Neither does a kernel where another one calls it.
 """
 
 from __future__ import annotations
@@ -10,38 +10,69 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from numba import njit  # noqa: TID251
+from numba import njit, types  # noqa: TID251
+from numba.core.registry import CPUDispatcher
 from numba.core.typing.templates import signature
-from springbench.solvers.jit.inline_linking import LinkedCompiler
+from springbench.solvers.jit.inline_linking import KernelCompiler, LinkedCompiler, ParallelCompiler
 from springbench.solvers.jit.kernel_cache import KernelCache
+
+
+_no_wrapper_options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+_linked_options: Any = {**_no_wrapper_options, "pipeline_class": LinkedCompiler}
+
+_DISPATCHER_CLASS: Any = CPUDispatcher
+"""Untyped, because the declared signatures differ from those of its subclasses."""
+
+
+class KernelDispatcher(_DISPATCHER_CLASS):
+    """The kernel that Python calls. Other kernels call `inner_kernel`, which is only linked into them."""
+
+    inner_kernel: Any
+
+    @property
+    def _numba_type_(self) -> types.Dispatcher:
+        """The type of the kernel where another kernel refers to it."""
+        return types.Dispatcher(self.inner_kernel)
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator like Numba's `njit` whose disk cache depends on all that the function depends on."""
 
     def compiling(function: Callable[..., Any]) -> Any:
-        dispatcher: Any = njit(**options)(function)
-        dispatcher._cache = kernel_cache = KernelCache(function, options)
-        compile_code = dispatcher._compiler.compile
-
-        def compile_once(args: Any, return_type: Any) -> Any:
-            sig = args if return_type is None else signature(return_type, *args)
-            return kernel_cache.compile_once(sig, dispatcher.targetctx, lambda: compile_code(args, return_type))
-
-        dispatcher._compiler.compile = compile_once
-        return dispatcher
+        if "pipeline_class" in options:
+            return _cache_kernel(function, options)
+        if options.get("parallel"):
+            return _cache_kernel(function, {**options, "pipeline_class": ParallelCompiler})
+        kernel = _cache_kernel(function, {**options, "no_cfunc_wrapper": True, "pipeline_class": KernelCompiler})
+        kernel.__class__ = KernelDispatcher
+        kernel.inner_kernel = _cache_kernel(function, {**options, **_linked_options})
+        return kernel
 
     return compiling
 
 
+def _cache_kernel(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """Return Numba's dispatcher of a function, with our cache."""
+    dispatcher: Any = njit(**options)(function)
+    dispatcher._cache = kernel_cache = KernelCache(function, options)
+    compile_code = dispatcher._compiler.compile
+
+    def compile_once(args: Any, return_type: Any) -> Any:
+        sig = args if return_type is None else signature(return_type, *args)
+        return kernel_cache.compile_once(sig, dispatcher.targetctx, lambda: compile_code(args, return_type))
+
+    dispatcher._compiler.compile = compile_once
+    return dispatcher
+
+
 _bare_options: Any = {"_nrt": False, "nogil": True}
-_no_wrapper_options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-_linked_options: Any = {**_no_wrapper_options, "pipeline_class": LinkedCompiler}
 jit_inner_options: Any = {**_bare_options, **_linked_options}
 
-jit_kernel: Any = cached_njit(**_bare_options, no_cfunc_wrapper=True)
+jit_kernel: Any = cached_njit(**_bare_options)
 jit_inner: Any = cached_njit(**jit_inner_options)
 jit_inner_allocating: Any = cached_njit(**_linked_options)  # an inner one that makes arrays
 jit_closure: Any = njit(**jit_inner_options)  # not cached by itself, but within its caller
 jit_inlined_closure: Any = njit(**jit_inner_options, forceinline=True)  # for what takes more arrays than it has work
-jit_inner_parallel: Any = cached_njit(**_bare_options, **_no_wrapper_options, parallel=True)
+jit_inner_parallel: Any = cached_njit(
+    **_bare_options, **_no_wrapper_options, parallel=True, pipeline_class=ParallelCompiler
+)
