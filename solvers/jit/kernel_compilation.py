@@ -7,7 +7,9 @@ machine code of their own (`springbench.solvers.jit.inline_linking`). Neither do
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from typing import Any
 
 from numba import njit, types  # noqa: TID251
@@ -15,7 +17,6 @@ from numba.core.registry import CPUDispatcher
 from numba.core.typing.templates import signature
 from springbench.solvers.jit.inline_linking import KernelCompiler, LinkedCompiler, ParallelCompiler
 from springbench.solvers.jit.kernel_cache import KernelCache
-
 
 _no_wrapper_options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _linked_options: Any = {**_no_wrapper_options, "pipeline_class": LinkedCompiler}
@@ -59,10 +60,23 @@ def _cache_kernel(function: Callable[..., Any], options: dict[str, Any]) -> Any:
 
     def compile_once(args: Any, return_type: Any) -> Any:
         sig = args if return_type is None else signature(return_type, *args)
-        return kernel_cache.compile_once(sig, dispatcher.targetctx, lambda: compile_code(args, return_type))
+        with _pause_garbage_collection():
+            return kernel_cache.compile_once(sig, dispatcher.targetctx, lambda: compile_code(args, return_type))
 
     dispatcher._compiler.compile = compile_once
     return dispatcher
+
+
+@contextmanager
+def _pause_garbage_collection() -> Generator[None]:
+    """Collect no garbage inside the block: a compilation creates millions of objects that live until its end."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 _bare_options: Any = {"_nrt": False, "nogil": True}
