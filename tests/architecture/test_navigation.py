@@ -17,7 +17,7 @@ ANSWERS = {
     "where is the time of impact computed?": "solvers/contact/ccd.py:pair_time_of_impact",
     "which file adds friction's Hessian?": "solvers/contact/potentials/friction.py:write_friction_hessian",
     "where does a row get its residual?": "harness/simulation/instrumentation_pass.py:compute_returned_residual",
-    "where is the numeric phase of Cholesky?": ("solvers/linalg/cholesky/block_multifrontal.py:factorise_blocks"),
+    "where is the numeric phase of Cholesky?": ("solvers/linalg/cholesky/block_multifrontal.py:run_stages"),
     "what do I change to add a stop criterion?": "solvers/model/step_problem.py:StopRule",
     "where is the barrier function?": "solvers/contact/potentials/barrier.py:barrier_derivatives",
     "where are candidate pairs found?": "solvers/contact/broad_phase/bvh.py:find_candidate_pairs",

@@ -34,6 +34,7 @@ from springbench.solvers.kernels import accelerated_descent, spring_local_step, 
 from springbench.solvers.linalg.cholesky import (
     block_cholesky,
     block_multifrontal,
+    factorisation_schedule,
     supernodal_cholesky,
     triangular_solve,
 )
@@ -108,8 +109,10 @@ def _reaches(kernel: Any, names: set[str], seen: frozenset[Any] = frozenset()) -
     )
 
 
-def given(module: Any, name: str, work: Callable[[], object]) -> tuple[Any, ...]:
-    """The arguments of the last call of a kernel in a module while something is done."""
+def given(
+    module: Any, name: str, work: Callable[[], object], accepts: Callable[[tuple[Any, ...]], object] = bool
+) -> tuple[Any, ...]:
+    """The arguments of the last call of a kernel in a module while something is done, of those that are accepted."""
     kernel, calls = getattr(module, name), list[tuple[Any, ...]]()
 
     def noted(*arguments: Any) -> Any:
@@ -121,7 +124,7 @@ def given(module: Any, name: str, work: Callable[[], object]) -> tuple[Any, ...]
         work()
     finally:
         setattr(module, name, kernel)
-    return calls[-1]
+    return next(arguments for arguments in reversed(calls) if accepts(arguments))
 
 
 def solving(solver: str) -> Callable[[], object]:
@@ -208,15 +211,11 @@ def of_block() -> Iterator[Case]:
         "backward_solve_tile": plain.solve_rows,
         "add_vector": plain.add,
     }
-    newton = solving("newton")
-    yield Case(
-        "factorisation",
-        block_multifrontal.factorise_blocks,
-        given(block_cholesky, "factorise_blocks", newton),
-        tiles,
-        (3,),
-    )
-    yield Case("solve", block_multifrontal.solve_blocks, given(block_cholesky, "solve_blocks", newton), tiles, (3,))
+    arguments = given(block_cholesky, "run_stages", solving("newton"), lambda call: len(call[2]))  # a factorisation
+    fronts, schedule, values, panels, x, *team = arguments
+    yield Case("factorisation", block_multifrontal.run_stages, arguments, tiles, (3,))
+    solve = fronts, factorisation_schedule.select_solve(schedule), values, panels, x, *team
+    yield Case("solve", block_multifrontal.run_stages, solve, tiles, (4,))
 
 
 def of_rows() -> Iterator[Case]:

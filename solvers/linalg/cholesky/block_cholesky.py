@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.solvers.linalg import memory
 from springbench.solvers.linalg.cholesky.block_front import PANEL_DEPTH, round_up_columns, round_up_rows
-from springbench.solvers.linalg.cholesky.block_multifrontal import (
-    FactorisationScratch,
-    factorise_blocks,
-    solve_blocks,
+from springbench.solvers.linalg.cholesky.block_multifrontal import FactorisationScratch, run_stages
+from springbench.solvers.linalg.cholesky.factorisation_schedule import (
+    FactorisationSchedule,
+    plan_schedule,
+    select_solve,
 )
-from springbench.solvers.linalg.cholesky.factorisation_schedule import FactorisationSchedule, plan_schedule
 from springbench.solvers.linalg.cholesky.frontal_structure import FrontalStructure
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import SymbolicFactor, analyse_graph
 from springbench.solvers.linalg.cholesky.thread_team import ThreadTeam
@@ -36,9 +36,10 @@ _MIN_FACTORISATION = 0.2
 
 
 class _Workspace(NamedTuple):
-    """What a number of threads needs: its schedule, scratch memory and shared state, and their number or None."""
+    """What a number of threads needs: schedules, scratch memory and shared state, and their number or None."""
 
     schedule: FactorisationSchedule
+    solve_schedule: FactorisationSchedule
     scratch: FactorisationScratch
     team: ThreadTeam
     threads: int | None
@@ -110,7 +111,8 @@ class BlockCholesky:
             np.zeros((threads, PANEL_DEPTH // TILE_COLUMNS, TILE_COLUMNS, TILE_COLUMNS)),
             np.zeros((threads, 2, int(members.max(initial=0)) + 1), np.int64),
         )
-        return _Workspace(schedule, scratch, ThreadTeam.from_task_count(groups), threads if threads > 1 else None)
+        team = ThreadTeam.from_task_count(groups)
+        return _Workspace(schedule, select_solve(schedule), scratch, team, threads if threads > 1 else None)
 
     def _current_workspace(self) -> _Workspace:
         """Return the workspace for Numba's number of threads, one if a second does not pay off."""
@@ -128,8 +130,8 @@ class BlockCholesky:
         return self._factorise(values, np.empty((0, self.fronts.block_size)))
 
     def _factorise(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> bool:
-        schedule, scratch, team, threads = self._current_workspace()
-        failed = factorise_blocks(self.fronts, schedule, values, self.panels, x, scratch, team, threads)
+        schedule, _, scratch, team, threads = self._current_workspace()
+        failed = run_stages(self.fronts, schedule, values, self.panels, x, scratch, team, threads)
         self.failed_vertex = -1
         if failed >= 0:
             self.failed_vertex = int(scratch.failed_vertices[np.argmin(scratch.failures)])
@@ -140,8 +142,9 @@ class BlockCholesky:
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return H^-1 b, both (n, d), with the last factorisation."""
         x = np.array(b, order="C")
-        schedule, scratch, team, threads = self._current_workspace()
-        solve_blocks(self.fronts, schedule, self.panels, x, scratch, team, threads)
+        _, schedule, scratch, team, threads = self._current_workspace()
+        size = self.fronts.block_size
+        run_stages(self.fronts, schedule, np.empty((0, size, size)), self.panels, x, scratch, team, threads)
         return x
 
     def factorise_and_solve(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:

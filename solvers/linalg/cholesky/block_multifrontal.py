@@ -38,6 +38,7 @@ from springbench.solvers.linalg.cholesky.factorisation_schedule import (
     ASSEMBLY,
     BACKWARD,
     ELIMINATION,
+    FORWARD,
     PRODUCT,
     SUBTREES,
 )
@@ -87,69 +88,43 @@ class FactorisationScratch(NamedTuple):
 
 
 @jit_kernel
-def factorise_blocks(fronts, schedule, values, panels, x, scratch, team, threads):
-    """Factorise a matrix of blocks, and write L to the panels.
+def run_stages(fronts, schedule, values, panels, x, scratch, team, threads):
+    """Run the stages of a schedule: factorise a matrix of blocks, solve with its factor, or both.
+
+    One kernel does all three, because each takes seconds to compile.
 
     Args:
         fronts: structure of the factor.
-        schedule: division among threads.
-        values: blocks (b, d, d).
-        panels: output.
+        schedule: stages and their division among threads.
+        values: blocks (b, d, d); only a factorisation reads them.
+        panels: factor L; a factorisation writes it.
         x: right-hand sides (n, d), or empty; overwritten with the solution.
         scratch: scratch memory.
         team: thread team.
         threads: number of threads, None for one.
 
     Returns:
-        First supernode with a pivot that is not positive; -1 if the matrix is positive definite.
+        First supernode with a pivot that is not positive; -1 if there is none.
     """
     scratch.failures[:] = _NO_FAILURE
     reset_team(team)
     if threads is None:
-        _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, ZERO, ONE)
+        _run_in_thread(fronts, schedule, values, panels, x, scratch, team, ZERO, ONE)
     else:
-        _factorise_in_threads(fronts, schedule, values, panels, x, scratch, team, threads)
+        _run_in_threads(fronts, schedule, values, panels, x, scratch, team, threads)
         raise_thread_error(team)
     failure = _first_failure(scratch)
     return failure if failure < _NO_FAILURE else -1
 
 
-@jit_kernel
-def solve_blocks(fronts, schedule, panels, x, scratch, team, threads):
-    """Overwrite x with H^-1 x.
-
-    Args:
-        fronts: structure of the factor.
-        schedule: division among threads.
-        panels: factor L.
-        x: right-hand sides (n, d), overwritten.
-        scratch: scratch memory.
-        team: thread team.
-        threads: number of threads, None for one.
-    """
-    reset_team(team)
-    if threads is None:
-        _solve_in_thread(fronts, schedule, panels, x, scratch, team, ZERO, ONE)
-    else:
-        _solve_in_threads(fronts, schedule, panels, x, scratch, team, threads)
-        raise_thread_error(team)
-
-
 @jit_inner_parallel
-def _factorise_in_threads(fronts, schedule, values, panels, x, scratch, team, threads):
+def _run_in_threads(fronts, schedule, values, panels, x, scratch, team, threads):
     for thread in prange(threads):
-        arguments = fronts, schedule, values, panels, x, scratch, team, thread, threads
-        call_in_thread(team, _factorise_in_thread, arguments)
-
-
-@jit_inner_parallel
-def _solve_in_threads(fronts, schedule, panels, x, scratch, team, threads):
-    for thread in prange(threads):
-        call_in_thread(team, _solve_in_thread, (fronts, schedule, panels, x, scratch, team, thread, threads))
+        call_in_thread(team, _run_in_thread, (fronts, schedule, values, panels, x, scratch, team, thread, threads))
 
 
 @jit_inner
-def _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, thread, threads):
+def _run_in_thread(fronts, schedule, values, panels, x, scratch, team, thread, threads):
     """Process tasks of all stages that no other thread has claimed."""
     tasks = len(team.task_sums)
     stage = ZERO
@@ -160,6 +135,8 @@ def _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, thr
                 kind = schedule.stage_kind[stage]
                 if kind == SUBTREES:
                     _factorise_group(fronts, schedule, task, values, panels, x, scratch, thread)
+                elif kind == FORWARD:
+                    _solve_forward(fronts, schedule, task, panels, x, scratch, thread)
                 elif kind == BACKWARD:
                     _solve_backward(fronts, schedule, task, panels, x, scratch, thread)
                 else:
@@ -170,29 +147,6 @@ def _factorise_in_thread(fronts, schedule, values, panels, x, scratch, team, thr
                     else:
                         finish_phases(team)
         stage = wait_for_phase(team, stage)
-
-
-@jit_inner
-def _solve_in_thread(fronts, schedule, panels, x, scratch, team, thread, threads):
-    """Process groups that no other thread has claimed, forward and then backward."""
-    tasks = len(team.task_sums)
-    phase = ZERO
-    while phase >= 0:
-        for i in range(tasks):
-            task = (thread * tasks // threads + i) % tasks
-            if try_claim(team, task, phase):
-                if phase == 0:
-                    _solve_forward(fronts, schedule, task, panels, x, scratch, thread)
-                else:
-                    _solve_backward(fronts, schedule, task, panels, x, scratch, thread)
-                if complete_task(team):
-                    if phase == 0:
-                        _solve_forward(fronts, schedule, tasks, panels, x, scratch, thread)
-                        _solve_backward(fronts, schedule, tasks, panels, x, scratch, thread)
-                        release_phase(team, 1)
-                    else:
-                        finish_phases(team)
-        phase = wait_for_phase(team, phase)
 
 
 @jit_inner
@@ -247,7 +201,10 @@ def _begin_stage(fronts, schedule, stage, values, panels, x, scratch, thread):
     if kind == BACKWARD:
         if len(x) == 0 or failure < _NO_FAILURE:
             return False
-        _solve_backward(fronts, schedule, len(schedule.group_start) - 2, panels, x, scratch, thread)
+        top = len(schedule.group_start) - 2
+        if schedule.stage_kind[stage - 1] == FORWARD:
+            _solve_forward(fronts, schedule, top, panels, x, scratch, thread)
+        _solve_backward(fronts, schedule, top, panels, x, scratch, thread)
         return True
     if failure < s:
         return False

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import cached_njit
 from springbench.solvers.linalg.cholesky.supernode_amalgamation import group_subtrees
 
-SUBTREES, ASSEMBLY, ELIMINATION, PRODUCT, UPDATE, BACKWARD = range(6)
+SUBTREES, ASSEMBLY, ELIMINATION, PRODUCT, UPDATE, FORWARD, BACKWARD = range(7)
 """Kinds of stages: all groups; of one front its assembly, of a panel block the rows below and the columns to the right,
-and the update; at the end the backward substitution of all groups."""
+and the update; of a solve alone the forward substitution of all groups; at the end their backward substitution."""
 
 _TASKS_PER_THREAD = 4
 """Groups, and parts of a front, for each thread: threads that are interrupted leave theirs to others."""
@@ -24,7 +24,7 @@ _UPDATE_COST = 16.0
 
 
 class FactorisationSchedule(NamedTuple):
-    """Division of a factorisation among threads.
+    """Division of a factorisation, or of a solve, among threads.
 
     Attributes:
         sequence: supernodes group by group, followed by those above all groups, the top; (s,).
@@ -88,6 +88,14 @@ def plan_schedule(
         sequence, starts, update_start, is_shared, *columns, thread_stack_size=np.array([2 * stack])
     )
     return schedule, 2 * stack * threads + shared
+
+
+def select_solve(schedule: FactorisationSchedule) -> FactorisationSchedule:
+    """Return the schedule of a solve with the factor of a schedule."""
+    none = np.zeros(2, np.int64)
+    return schedule._replace(
+        stage_kind=np.array([FORWARD, BACKWARD], np.int64), stage_supernode=none, stage_column=none
+    )
 
 
 @cached_njit()
