@@ -18,6 +18,7 @@ from springbench.harness.report.device_speedup import (
 from springbench.solvers.iteration.device_interface import SIMULATOR_NAME
 from typer.testing import CliRunner
 
+from tests.bench.device import compare_sides
 from tests.synthetic_device_rows import MEASURED, build_device_rows, write_device_results
 from tests.unit.test_machine_comparison import table_of
 
@@ -99,3 +100,19 @@ def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -
     if there:
         with Image.open(picture) as image:
             assert np.asarray(image.convert("L")).min() < 100, "something is drawn"
+
+
+def test_sides_are_compared_by_the_fastest_method_that_reached_the_tolerance() -> None:
+    def time_row(method: str, device: str | None, seconds: float, reason: str = "converged") -> dict[str, Any]:
+        shared = {"kind": "time", "scene": "cloth", "size": 8, "rtol": 0.1}
+        return shared | {"method": method, "device": device, "seconds": seconds, "reason": reason}
+
+    rows = [
+        time_row("vbd, float32", "H", 4.0),
+        time_row("vbd, float64", "H", 8.0),
+        time_row("newton-cg, float32", "H", 1.0, "max-iter"),
+        time_row("hybrid", None, 2.0),
+    ]
+    (found,) = compare_sides(rows)
+    assert (found["device_method"], found["processor_method"], found["time_ratio"]) == ("vbd, float32", "hybrid", 2.0)
+    assert compare_sides(rows[:3]) == []
