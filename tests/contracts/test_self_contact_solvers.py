@@ -35,6 +35,7 @@ from springbench.solvers.contact.contact_potential import SelfContact as Energy
 from springbench.solvers.iteration.idle_contact import _Certificate
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model import integrators
+from springbench.solvers.model.barrier_energy import max_step_size
 from springbench.solvers.model.step_problem import StepProblem, StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
@@ -186,6 +187,10 @@ def test_an_iterate_without_contact_counts_only_where_its_path_is_free():
     assert certificate.is_idle_at(p + 1e-6)
     assert energy.value(beyond) == 0.0
     assert not certificate.is_idle_at(beyond)
+    touching = prepare(made, NewtonSolver()).solve(stated, StopRule(60, 1e-3)).positions
+    assert energy.value(touching) > 0.0
+    assert max_step_size([energy], p, touching - p) == 1.0
+    assert not certificate.is_idle_at(touching)
     assert not certificate.is_idle_at(np.full_like(p, np.nan))
 
 

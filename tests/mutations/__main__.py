@@ -35,7 +35,7 @@ def parse_arguments() -> argparse.Namespace:
 
 def main() -> int:
     """Plant the errors. Exit code 0 if all are caught, 1 if one is not, 2 if the table does not fit the sources, 3 if a
-    time-out leaves one undecided."""
+    time-out or skipped tests leave one undecided."""
     options = parse_arguments()
     chosen = [mutation for mutation in TABLE if not options.names or mutation.name in options.names]
     if options.whole:

@@ -34,7 +34,7 @@ IGNORED_TESTS = "--ignore=tests/unit/test_mutations.py"
 """Tests of the table fail for any planted error, because its entry no longer fits: they catch nothing."""
 MAX_FAILURES = 5
 """Failures after which the whole suite ends: some are by chance, and each restart costs minutes."""
-CAUGHT, SURVIVED, BROKEN, TIMED_OUT = "caught", "survived", "broken", "timed out"
+CAUGHT, SURVIVED, BROKEN, TIMED_OUT, SKIPPED = "caught", "survived", "broken", "timed out", "skipped"
 _TIME_OUT_CODE = -1
 
 
@@ -61,8 +61,8 @@ class Outcome:
 
     @property
     def decided(self) -> bool:
-        """Whether nothing timed out."""
-        return TIMED_OUT not in (self.tests, self.product)
+        """Whether nothing timed out, and the tests were not all skipped, as without a browser."""
+        return self.tests != SKIPPED and TIMED_OUT not in (self.tests, self.product)
 
 
 def digest_sources(mutation: Mutation, *, whole: bool = False) -> str:
@@ -209,6 +209,8 @@ def examine(
     else:
         code, failed = _run_own_tests(copy, mutation, failed_before)
     tests = {0: SURVIVED, 1: CAUGHT, _TIME_OUT_CODE: TIMED_OUT}.get(code, BROKEN)
+    if tests == SURVIVED and " passed" not in failed:
+        tests = SKIPPED
     product = "" if whole else _examine_product(copy, mutation)
     return Outcome(mutation.name, tests, product, round(monotonic() - began, 1), mutation.digest, sources, failed)
 

@@ -89,7 +89,7 @@ def test_what_is_not_finite_is_not_positive_definite(value):
     assert not factor.factorise(values)
 
 
-def test_a_matrix_as_singular_as_round_off_tells_is_not_positive_definite():
+def test_a_matrix_that_is_singular_within_round_off_is_not_positive_definite():
     """Springs that nothing holds: the sum of each row is zero."""
     n, pairs = 20, np.stack([np.arange(19), np.arange(1, 20)], axis=1)
     laplace = np.diag(np.r_[1.0, 2.0 * np.ones(18), 1.0]) - np.eye(n, k=1) - np.eye(n, k=-1)
@@ -172,3 +172,16 @@ def test_what_a_failure_counts_does_not_depend_on_threads(part):
     (x, count, _), *others = by_threads(A, values)
     assert x is None
     assert {count} == {count for _, count, _ in others}
+
+
+@pytest.mark.usefixtures("always_by_threads")
+@pytest.mark.parametrize("vertex", [0, 133, 399])
+def test_a_failure_names_the_vertex_of_its_pivot(vertex: int):
+    A = MATRICES["a sheet"]
+    values, rows = entries(A), np.repeat(np.arange(400), np.diff(A.indptr))
+    values[(A.indices == rows) & (rows == vertex), 0, 0] *= -1.0
+    for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):  # type: ignore[attr-defined]
+        with limit_threads(threads):
+            factor = BlockCholesky(graph_of(A))
+            assert not factor.factorise(values)
+            assert factor.failed_vertex == vertex

@@ -29,6 +29,7 @@ from springbench.harness.simulation.time_loop import (
     simulate_scene,
 )
 from springbench.solvers.contact.lagged_friction import solve_with_friction
+from springbench.solvers.contact.potentials.friction_law import evaluate_friction
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, Solver, StepProblem, StopRule
@@ -295,3 +296,11 @@ def test_a_sheet_on_a_slope_with_very_large_friction_takes_few_rounds():
     assert last.friction_rounds is not None
     assert 2 < last.friction_rounds.num_iterations <= 8
     assert last.friction_rounds.relative_change > 0.5
+
+
+def test_the_force_is_the_slope_of_the_potential_across_the_smoothing_length():
+    smoothing_length, limit, lengths = 0.3, 2.0, np.linspace(0.0, 1.0, 2001)
+    smoothed, stiffness = np.empty((2, len(lengths)))
+    evaluate_friction(np.full(len(lengths), limit), lengths, smoothing_length, smoothed, stiffness)
+    forces, slopes = stiffness * lengths, limit * np.diff(smoothed) / np.diff(lengths)
+    np.testing.assert_allclose(slopes, 0.5 * (forces[1:] + forces[:-1]), rtol=0, atol=1e-2 * limit)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
-from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, PreparedHybrid
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, PreparedHybrid, _MeasuredRule
 from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
@@ -226,3 +227,29 @@ def test_no_newton_step_is_taken_where_lbfgs_is_sooner_at_the_limit():
     assert limited is not None
     assert "newton" in endless
     assert set(limited) == {"lbfgs"}
+
+
+class ShiftedHessian:
+    """A Hessian that has a factor with a shift, and without one where it is definite."""
+
+    def __init__(self, is_definite: bool) -> None:
+        self.is_definite = is_definite
+
+    def factorise(self, scale: float = 1.0, shift: Any = 0.0) -> bool:
+        return self.is_definite or bool(np.any(shift))
+
+
+@pytest.mark.parametrize("is_definite", [True, False])
+def test_only_a_step_by_the_unmodified_hessian_agrees_with_its_model(is_definite: bool):
+    """A step that decreases the objective by half of its slope; by a shifted Hessian it may end at a saddle."""
+    given = stiff(10.0)
+    step, p, inertia = StepObjective(FixedObjective(given.system), given), given.initial_guess, np.ones(3)
+    at, length = DescentPoint(p, step.gradient(p)), 1e-12
+    slope = np.vdot(at.gradient, at.gradient)
+    while -step.objective_change(p, p - length * at.gradient)[0] > 0.6 * length * slope:
+        length *= 1.1
+    rule = _MeasuredRule(inertia)
+    hessian: Any = ShiftedHessian(is_definite)
+    assert rule.factorise_hessian(hessian, at, inertia) == (0 if is_definite else 1)
+    rule.record_step(step, hessian, at, DescentPoint(p - length * at.gradient, at.gradient))
+    assert rule.is_delivered == is_definite

@@ -142,3 +142,12 @@ def test_a_time_out_catches_nothing_and_is_repeated(tmp_path: Path, capsys: pyte
     missed = replace(found, tests="survived")
     assert [summarise_outcomes(some) for some in ([caught], [found, missed], [caught, found])] == [0, 1, 3]
     assert f"1 of 2 caught; undecided, run again: {found.name}" in capsys.readouterr().out
+
+
+def test_tests_that_are_all_skipped_decide_nothing():
+    class WithoutBrowser(ChanceFailures):
+        def run_command(self, mutation: Mutation, command: list[str], limit: float) -> tuple[int, str]:
+            return 0, "12 skipped in 3.00s"
+
+    found = examine(WithoutBrowser(), replace(TABLE[0], product=None), "")
+    assert (found.tests, found.decided, found.caught) == ("skipped", False, False)

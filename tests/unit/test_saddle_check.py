@@ -76,9 +76,30 @@ def test_the_bound_includes_elements(name: str):
     assert {bounded for _, bounded in held} == {True, False}
 
 
-@pytest.mark.parametrize(("factor", "bounded"), [(1.0 + 1e-9, True), (1.0 - 1e-9, False)])
-def test_the_bound_of_a_single_spring_is_its_buckling_load(factor: float, bounded: bool):
-    """Two vertices of mass m on a spring of length l: the smallest eigenvalue is m/h^2 - 2 k (r/l - 1)."""
+def test_the_bound_of_an_element_counts_its_vertices():
+    """The energy -|x_0 - x_1|^2 / 2 has the eigenvalue -2."""
+    problem, p = next(effect_steps("strain limits"))
+    terms, linear, _, joined, _ = StepObjective(FixedObjective(problem.system), problem).hessian(p).kernel_arguments
+    pair = joined._replace(
+        row_starts=np.array([0, 2], joined.row_starts.dtype),
+        vertices=np.array([0, 1], joined.vertices.dtype),
+        coefficients=np.array([1.0, -1.0]),
+    )
+    curvature = np.array([[-1.0, 0.0, 0.0, -1.0, 0.0, -1.0]])
+    for stiffness, bounded in ((2.0 + 1e-9, True), (2.0 - 1e-9, False)):
+        anchors, scratch = np.full((2, len(p)), stiffness)
+        assert curvature_search.bound_by_elements(terms, linear[:0], pair, curvature, anchors, scratch) == bounded
+
+
+@pytest.mark.parametrize(
+    ("factor", "bounded"),
+    [(1.0 + 1e-9, True), (1.0 - 1e-9, False), ((0.6, 1.5), False), ((1.5, 0.6), False)],
+)
+def test_the_bound_of_a_single_spring_is_its_buckling_load(factor: float | tuple[float, float], bounded: bool):
+    """Two vertices of mass m on a spring of length l: the smallest eigenvalue is m/h^2 - 2 k (r/l - 1).
+
+    The lighter one of two alone may be below the load: each has the whole bound.
+    """
     problem = build_random_problem(0, n=2, m=40, weights=())
     springs = problem.system.energies[0]
     assert isinstance(springs, Springs)
@@ -91,7 +112,7 @@ def test_the_bound_of_a_single_spring_is_its_buckling_load(factor: float, bounde
         rest_direction=springs.rest_direction[one],
     )
     load = 2.0 * spring.stiffness[0] * (1.0 / 0.8 - 1.0)
-    mass = np.full(2, factor * load * problem.system.time_step**2)
+    mass = np.array(factor) * load * problem.system.time_step**2 * np.ones(2)
     problem = replace(problem, system=replace(problem.system, mass=mass, energies=(spring,)))
     p = 0.8 * problem.current_positions
     assert is_bounded(problem, p) == bounded == (eigenvalues(problem, p)[0] > 0.0)
