@@ -143,7 +143,13 @@ def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dic
 
 
 _PROBLEM_FIELDS = ("inertial_target", "external_force", "pin_targets", "current_positions")
-_OPTIONAL_FIELDS = ("lag_override", "predicted_acceleration", "warm_start", "normal_force_positions")
+_OPTIONAL_FIELDS = (
+    "lag_override",
+    "predicted_acceleration",
+    "warm_start",
+    "normal_force_positions",
+    "pattern_positions",
+)
 _START_FIELDS = tuple(field.name for field in fields(StepStart) if field.name not in _OPTIONAL_FIELDS)
 SNAPSHOT_ARRAYS = (
     *_PROBLEM_FIELDS,

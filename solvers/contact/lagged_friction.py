@@ -95,7 +95,10 @@ def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: St
     earlier = deque[_Round](maxlen=PERIOD)
     while True:
         x = solution.positions
-        following = replace(problem, initial_guess=x, step_start=replace(problem.step_start, normal_force_positions=x))
+        # Later solves move little: all have the pattern, and so the analysis, of the first solution's neighbourhood.
+        first = x if len(counts) == 1 else problem.step_start.pattern_positions
+        start = replace(problem.step_start, pattern_positions=first, normal_force_positions=x)
+        following = replace(problem, initial_guess=x, step_start=start)
         change, acting = _relative_friction_change(problem, following, x)
         ended = len(counts) >= rounds or _is_cycle_at_largest(earlier, x, acting)
         if not change > FRICTION_RTOL or ended:  # not a number where the solve diverged

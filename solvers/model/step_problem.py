@@ -182,6 +182,8 @@ class StepStart:
         warm_start: warm start from the previous solve.
         normal_force_positions: an iterate of x (n, 3) [m] at which friction evaluates normal forces; None for the start
             of the step.
+        pattern_positions: an iterate of x (n, 3) [m] near which the Hessian's pattern is determined; None for the start
+            of the solve.
     """
 
     positions: Positions
@@ -195,6 +197,7 @@ class StepStart:
     predicted_acceleration: Positions | None = None
     warm_start: NDArray[np.float64] | None = None
     normal_force_positions: Positions | None = None
+    pattern_positions: Positions | None = None
 
     @property
     def lagged_positions(self) -> Positions:

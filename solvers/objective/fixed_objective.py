@@ -56,6 +56,10 @@ class FixedObjective:
         if others:
             self._classify_energies(others)
         self._extended_matrix: BlockMatrix | None = None
+        self._extended_blocks: tuple[NDArray[np.int64], NDArray[np.int64]] = (
+            np.empty(0, np.int64),
+            np.empty(0, np.int64),
+        )
 
     def _classify_energies(self, energies: dict[int, Energy]) -> None:
         """Classify the energies that are not springs."""
@@ -136,6 +140,8 @@ class FixedObjective:
 
     def matrix_with_blocks(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> BlockMatrix:
         """Return a matrix that also has blocks (i, j) of free vertices."""
+        if self._extended_matrix is not None and all(map(np.array_equal, self._extended_blocks, (i, j))):
+            return self._extended_matrix
         for known in (self.hessian_matrix, self._extended_matrix):
             if (
                 known is not None
@@ -143,7 +149,7 @@ class FixedObjective:
                 and (known is self.hessian_matrix or known.is_exact_extension(i, j, self.hessian_matrix))
             ):
                 return known
-        self._extended_matrix = self._build_matrix(self.hessian_matrix.graph, i, j)
+        self._extended_matrix, self._extended_blocks = self._build_matrix(self.hessian_matrix.graph, i, j), (i, j)
         return self._extended_matrix
 
 

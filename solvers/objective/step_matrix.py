@@ -18,8 +18,15 @@ class StepMatrix:
     analysed once. The result is valid as long as it suffices, usually to the end of the step.
     """
 
-    def __init__(self, fixed_objective: FixedObjective, barrier_energies: list[BarrierEnergy]) -> None:
+    def __init__(
+        self,
+        fixed_objective: FixedObjective,
+        barrier_energies: list[BarrierEnergy],
+        pattern_positions: Positions | None = None,
+    ) -> None:
+        """Create the matrix; its first blocks are those near `pattern_positions` (n, 3) [m], if given."""
         self._fixed_objective, self._barrier_energies = fixed_objective, barrier_energies
+        self._pattern_positions = pattern_positions
         self._cached_matrix: BlockMatrix | None = None
 
     def matrix_at(self, p: Positions, i: IndexArray, j: IndexArray, block_vertices: list[IndexArray]) -> BlockMatrix:
@@ -28,17 +35,27 @@ class StepMatrix:
         The latter are between the vertices `block_vertices` (a, k).
         """
         known = self._cached_matrix or self._fixed_objective.hessian_matrix
-        if not (
-            known.has_blocks(i, j)
-            and all(known.has_element_blocks(-1 - k, vertices) for k, vertices in enumerate(block_vertices))
-        ):
-            near = (
-                self._fixed_objective.free_vertex_pairs(energy.candidate_vertices(p))
-                for energy in self._barrier_energies
-            )
-            i, j = (np.concatenate(side) for side in zip(known.block_coordinates, (i, j), *near, strict=True))
-            known = self._cached_matrix = self._fixed_objective.matrix_with_blocks(i, j)
+        if not _covers_blocks(known, i, j, block_vertices) and self._pattern_positions is not None:
+            known = self._cached_matrix = self._extend_matrix(known, i, j, self._pattern_positions)
+            self._pattern_positions = None
+        if not _covers_blocks(known, i, j, block_vertices):
+            known = self._cached_matrix = self._extend_matrix(known, i, j, p)
         return known
+
+    def _extend_matrix(self, known: BlockMatrix, i: IndexArray, j: IndexArray, p: Positions) -> BlockMatrix:
+        """Return a matrix with the blocks of another one, those (i, j), and those that may be needed near p."""
+        near = (
+            self._fixed_objective.free_vertex_pairs(energy.candidate_vertices(p)) for energy in self._barrier_energies
+        )
+        i, j = (np.concatenate(side) for side in zip(known.block_coordinates, (i, j), *near, strict=True))
+        return self._fixed_objective.matrix_with_blocks(i, j)
+
+
+def _covers_blocks(matrix: BlockMatrix, i: IndexArray, j: IndexArray, block_vertices: list[IndexArray]) -> bool:
+    """Return whether a matrix has blocks (i, j) and those between the vertices of each barrier energy."""
+    return matrix.has_blocks(i, j) and all(
+        matrix.has_element_blocks(-1 - k, vertices) for k, vertices in enumerate(block_vertices)
+    )
 
 
 class BarrierHessian:

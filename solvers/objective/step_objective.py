@@ -80,7 +80,7 @@ class StepObjective:
     @cached_property
     def step_matrix(self) -> StepMatrix:
         """The matrix of the Hessians."""
-        return StepMatrix(self.fixed_objective, self.barrier_energies)
+        return StepMatrix(self.fixed_objective, self.barrier_energies, self.problem.step_start.pattern_positions)
 
     @property
     def has_contact_elements(self) -> bool:

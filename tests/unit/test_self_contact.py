@@ -17,6 +17,7 @@ from springbench.solvers.contact.potentials.barrier import compute_distances, co
 from springbench.solvers.contact.potentials.hessian_blocks import ReusableBuffer
 from springbench.solvers.model.step_problem import StepProblem, StepStart, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
+from springbench.solvers.objective.hessian_pattern import BlockMatrix
 from springbench.solvers.objective.step_objective import StepObjective
 
 from tests.self_contact_scenes import (
@@ -376,6 +377,22 @@ def test_a_steps_matrix_has_all_blocks_while_contacts_come_and_go(keep):
         met.add(len(contact.hessian_blocks(q).vertices))
     assert len(met) == 4
     assert len(matrices) == 1
+
+
+def test_solves_with_the_same_pattern_positions_share_a_matrix():
+    contact, p, _ = build_touching_sheets(noise=2e-4)
+    system, still = System(np.full(len(p), 10.0), 0.1, (contact,)), np.zeros_like(p)
+    matrices = {True: list[BlockMatrix](), False: list[BlockMatrix]()}
+    for is_shared, found in matrices.items():
+        objective = FixedObjective(system)
+        for seed in range(3):
+            q = p + random_displacement(seed, p, 1.2e-2)
+            near = p if is_shared else None
+            start = StepStart(p, still, 0.0, p, system.velocity_rate, 0.1, pattern_positions=near)
+            step = StepObjective(objective, StepProblem(system, p, still, p[:0], p, q, start))
+            found.append(step.hessian(q).assemble_clamped())
+    assert len({id(matrix) for matrix in matrices[True]}) == 1
+    assert len({id(matrix) for matrix in matrices[False]}) == 3
 
 
 def test_memory_is_handed_out_again_when_no_one_holds_it():
