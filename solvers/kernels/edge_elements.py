@@ -1,142 +1,335 @@
-"""Compiled strain limits and dashpots, evaluated edge by edge in addition to the springs.
+"""Strain limits and dashpots in the packets of springs, each in the entry of the spring between the same vertices.
 
-    E = sum_e k_e/2 |b_e|^2      b = (|v| - t) v/|v| of a limit, with t the nearest length allowed
-                                 b = (n.v - o) n of a dashpot
+    E = sum_e k_e/2 (l_e - clip(l_e, low_e, high_e))^2      strain limits, l = |v|
+      + sum_e (m_e.v_e - q_e)^2 / 2                         dashpots, m = sqrt(k) n, q = sqrt(k) o
 
-Both are projective: the gradient is A'K b, the projection d = v - b. In block-by-block passes each edge is computed at
-both of its ends, as springs are, so that no row adds to the sum of another. In a single pass it is computed once.
+The vector v and the length l of an entry's spring are there already, so that an edge adds its arithmetic, but no memory
+access to vertices. An edge without a spring gets one of zero stiffness. Both energies are projective: the gradient is
+A'K b, the projection d = v - b, with b = (l - clip(l)) v/l of a limit and (n.v - o) n of a dashpot. Dashpots between
+the same vertices have the same n and o in a step, and are added to one.
+
+These are the scalar forms and the arrays; `springbench.solvers.simd.edge_packets` has the vectors.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.solvers.jit.kernel_compilation import jit_inner
-from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
+from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.kernels.packet_data import copy_aligned, deduplicate_packets
+from springbench.solvers.linalg.memory import allocate_aligned
+from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH, vertex_pair_keys
+from springbench.solvers.model.energies.element_energies import axial_hessian
+from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Positions
+from springbench.solvers.simd.spring_packets import EDGE_STRIDE, LANES
+
+if TYPE_CHECKING:
+    from springbench.solvers.model.energies.dashpot_energy import Dashpots
+    from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
+
+_HALF_SHARE, _FULL_SHARE = 0.25, 0.5
+"""Factors of k b^2 at each end of an edge, and at the only end that moves."""
 
 
-class EdgeElements(NamedTuple):
-    """Edges by the rows of their ends, strain limits first.
+class EdgePackets(NamedTuple):
+    """The strain limit and the dashpot of each entry and lane of `SpringPackets`.
 
     Attributes:
-        end_rows: rows of each edge (m, 2).
-        row_starts: first entry of each row (rows + 1,).
-        other_row: of each entry, the row of the other end.
-        edge_index: of each entry, the edge, ~edge at its second end.
-        stiffness: k (m,) [N/m].
-        min_length, max_length: minimum and maximum lengths [m] of the limits.
-        edge_axis: n of a dashpot, and the direction of a limit at zero length (m, 3).
-        offset: o (m,) [m].
+        limit_offset: of each entry, the position in `limit_data` of eight k [N/m], low, high [m], and energy shares.
+        limit_data: these numbers, stored once for equal entries; k = 0 for none.
+        dashpot_data: of each entry, eight m (three times) [(N/m)^(1/2)] and q [J^(1/2)]; zero for none.
+        dashpot_blocks: of each packet, eight sums of m m' over its entries, as upper triangles row by row (48 b,).
+        has_limits, has_dashpots: whether there are any.
+        limit_index: of each entry, eight strain limits, -1 for none.
+        dashpot_index: of each entry, eight dashpots counted from 1, negative at the second end, 0 for none.
+        dashpot_names: one of the concatenated dashpots between the vertices of each (d,).
+        dashpot_stiffness: the sum of their stiffnesses (d,) [N/m].
+        packet_start: first entry of each packet (b + 1,).
     """
 
-    end_rows: NDArray[np.int64]
-    row_starts: NDArray[np.int64]
-    other_row: NDArray[np.int64]
-    edge_index: NDArray[np.int64]
+    limit_offset: NDArray[np.int32]
+    limit_data: NDArray[np.float64]
+    dashpot_data: NDArray[np.float64]
+    dashpot_blocks: NDArray[np.float64]
+    has_limits: bool
+    has_dashpots: bool
+    limit_index: NDArray[np.int32]
+    dashpot_index: NDArray[np.int32]
+    dashpot_names: NDArray[np.int64]
+    dashpot_stiffness: NDArray[np.float64]
+    packet_start: NDArray[np.int64]
+
+    def with_limits(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> EdgePackets:
+        """Return the packets with other limits (m,) [m] of the concatenated strain limits."""
+        number = self.limit_index.reshape(-1, 1, LANES)[:, 0]
+        data = self.limit_data.reshape(-1, 4, LANES)[self.limit_offset // EDGE_STRIDE].copy()
+        data[:, 1], data[:, 2] = (np.where(number >= 0, x[number], y) for x, y in ((low, 0.0), (high, np.inf)))
+        offset = np.arange(0, data.size, EDGE_STRIDE, dtype=np.int32)
+        return self._replace(limit_offset=offset, limit_data=copy_aligned(data))
+
+    def with_directions(self, axis: Positions, offset: NDArray[np.float64]) -> EdgePackets:
+        """Return the packets with directions n (m, 3) and offsets o (m,) [m] of the concatenated dashpots."""
+        data, blocks = allocate_aligned(4 * len(self.dashpot_index)), allocate_aligned(6 * LANES * self._num_packets)
+        scale = np.sqrt(self.dashpot_stiffness)
+        _write_dashpots(
+            self, scale[:, None] * axis[self.dashpot_names], scale * offset[self.dashpot_names], data, blocks
+        )
+        return self._replace(dashpot_data=data, dashpot_blocks=blocks)
+
+    @property
+    def _num_packets(self) -> int:
+        return len(self.packet_start) - 1
+
+
+class AttachedEdges(NamedTuple):
+    """Springs with those of zero stiffness that edges need, and the edge of each.
+
+    Attributes:
+        springs: the springs, and those of zero stiffness behind them.
+        limit_index: of each spring, the strain limit, -1 for none.
+        dashpot_index: of each spring, the dashpot counted from 1, negative if it runs in the opposite direction, 0 for
+            none.
+        dashpot_names, dashpot_stiffness: see `EdgePackets`.
+        stiffness, min_length, max_length: of the concatenated strain limits (m,).
+    """
+
+    springs: Springs
+    limit_index: NDArray[np.int32]
+    dashpot_index: NDArray[np.int32]
+    dashpot_names: NDArray[np.int64]
+    dashpot_stiffness: NDArray[np.float64]
     stiffness: NDArray[np.float64]
     min_length: NDArray[np.float64]
     max_length: NDArray[np.float64]
-    edge_axis: Positions
-    offset: NDArray[np.float64]
 
     @classmethod
-    def from_edges(
-        cls,
-        ends: NDArray[np.int64],
-        stiffness: NDArray[np.float64],
-        low: NDArray[np.float64],
-        high: NDArray[np.float64],
-        row: NDArray[np.int64],
-        rows: int,
-    ) -> EdgeElements:
-        """Build edges between vertices (m, 2) in rows `row` (n,)."""
-        proper = np.flatnonzero(ends[:, 0] != ends[:, 1])
-        here, there = row[ends[proper]].T.ravel(), row[ends[proper, ::-1]].T.ravel()
-        order = np.argsort(here, kind="stable")
-        return cls(
-            row[ends].astype(np.int64),
-            np.concatenate([[0], np.cumsum(np.bincount(here, minlength=rows))]),
-            there[order],
-            np.concatenate([proper, ~proper])[order],
-            stiffness,
-            low,
-            high,
-            np.zeros((len(ends), 3)),
-            np.zeros(len(ends)),
+    def from_energies(
+        cls, springs: Springs, limits: tuple[StrainLimits, ...], dashpots: tuple[Dashpots, ...]
+    ) -> AttachedEdges:
+        """Attach the edges to the springs between the same vertices.
+
+        A vertex pair with several springs has its edges at the first one. A second strain limit of a pair is attached
+        to a spring of its own.
+        """
+        limit_ends = _concatenate_ends(limits)
+        dashpot_ends = _concatenate_ends(dashpots)
+        proper = np.flatnonzero(dashpot_ends[:, 0] != dashpot_ends[:, 1])
+        size = 1 + int(max((ends.max(initial=0) for ends in (springs.edges, limit_ends, dashpot_ends)), default=0))
+        _, first, kind = np.unique(vertex_pair_keys(dashpot_ends[proper], size), return_index=True, return_inverse=True)
+        names = proper[first]
+        damping = np.zeros(len(names))
+        np.add.at(damping, kind, np.concatenate([np.empty(0), *(e.stiffness for e in dashpots)])[proper])
+        # Which spring has each edge: an existing one, the first of its pair, or a new one behind the springs.
+        keys = np.concatenate(
+            [vertex_pair_keys(ends, size) for ends in (springs.edges, limit_ends, dashpot_ends[names])]
+        )
+        rank = np.zeros(len(keys), np.int64)
+        rank[len(springs.edges) : len(springs.edges) + len(limit_ends)] = _rank_repeated(
+            vertex_pair_keys(limit_ends, size)
+        )
+        taken = np.concatenate([springs.edges, limit_ends, dashpot_ends[names]])
+        _, owner, kind = np.unique(keys * (1 + rank.max(initial=0)) + rank, return_index=True, return_inverse=True)
+        owner = owner[kind]
+        added = np.flatnonzero((owner == np.arange(len(keys))) & (np.arange(len(keys)) >= len(springs.edges)))
+        place = np.arange(len(keys))
+        place[added] = len(springs.edges) + np.arange(len(added))
+        place = place[owner]
+        axes = np.tile([1.0, 0.0, 0.0], (len(keys), 1))
+        axes[: len(springs.edges)] = springs.rest_direction
+        behind = slice(len(springs.edges), len(springs.edges) + len(limit_ends))
+        axes[behind] = np.concatenate([np.empty((0, 3)), *(e.rest_direction for e in limits)])
+        flat = np.zeros(len(added))
+        whole = Springs.from_parts([springs, Springs(taken[added], flat, flat, axes[added])])
+        limit_index, dashpot_index = np.full(len(whole.edges), -1, np.int32), np.zeros(len(whole.edges), np.int32)
+        limit_index[place[behind]] = np.arange(len(limit_ends))
+        # A spring of zero rest length needs no direction, so that it may have that of its limit.
+        loose = np.flatnonzero((limit_index >= 0) & (whole.rest_length == 0.0))
+        axis = axes[behind][limit_index[loose]]
+        opposite = whole.edges[loose, 0] != limit_ends[limit_index[loose], 0]
+        whole.rest_direction[loose] = np.where(opposite[:, None], -axis, axis)
+        at = place[behind.stop :]
+        aligned = whole.edges[at, 0] == dashpot_ends[names, 0]
+        dashpot_index[at] = np.where(aligned, 1, -1) * np.arange(1, len(names) + 1)
+        none = np.empty(0)
+        numbers = (np.concatenate([none, *(getattr(e, x) for e in limits)]) for x in _LIMIT_FIELDS)
+        return cls(whole, limit_index, dashpot_index, names, damping, *numbers)
+
+    def build_packets(
+        self,
+        spring_index: NDArray[np.int32],
+        is_filled: NDArray[np.bool_],
+        has_fixed_end: NDArray[np.bool_],
+        packet_start: NDArray[np.int64],
+    ) -> EdgePackets:
+        """Build the edges of packets.
+
+        Args:
+            spring_index: of each entry and lane, the spring, ~spring at its second end.
+            is_filled: whether it is one; the others are padding.
+            has_fixed_end: whether the other end does not move.
+            packet_start: first entry of each packet (b + 1,).
+        """
+        spring = np.maximum(spring_index, ~spring_index)
+        limit = np.where(is_filled, self.limit_index[spring], -1).astype(np.int32)
+        sign = np.where(spring_index < 0, -1, 1)
+        dashpot = np.where(is_filled, sign * self.dashpot_index[spring], 0).astype(np.int32)
+        data = np.empty((4, len(spring_index)))
+        for row, values, none in zip(
+            data, (self.stiffness, self.min_length, self.max_length), (0.0, 0.0, np.inf), strict=False
+        ):
+            row[:] = none
+            row[limit >= 0] = values[limit[limit >= 0]]
+        data[3] = np.where(has_fixed_end, _FULL_SHARE, _HALF_SHARE)
+        offset, numbers = deduplicate_packets(*data)
+        has_dashpots = len(self.dashpot_names) > 0
+        many = len(spring_index) if has_dashpots else 0
+        return EdgePackets(
+            offset,
+            numbers,
+            np.zeros(4 * many),
+            np.zeros(6 * LANES * (len(packet_start) - 1) if has_dashpots else 0),
+            len(self.stiffness) > 0,
+            has_dashpots,
+            limit,
+            dashpot,
+            self.dashpot_names,
+            self.dashpot_stiffness,
+            packet_start,
         )
 
 
-@jit_inner
-def _evaluate_entry(edges, row, entry, x):
-    """Return v and b of an entry, seen from its own end, and its stiffness."""
-    j, e, sign = edges.other_row[entry], edges.edge_index[entry], 1.0
-    if e < 0:
-        e, sign = ~e, -1.0
-    v = x[4 * row] - x[4 * j], x[4 * row + 1] - x[4 * j + 1], x[4 * row + 2] - x[4 * j + 2]
-    n = sign * edges.edge_axis[e, 0], sign * edges.edge_axis[e, 1], sign * edges.edge_axis[e, 2]
-    if e >= len(edges.min_length):
-        scale = n[0] * v[0] + n[1] * v[1] + n[2] * v[2] - edges.offset[e]
-        return v, (scale * n[0], scale * n[1], scale * n[2]), edges.stiffness[e]
-    length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    scale = length - min(max(length, edges.min_length[e]), edges.max_length[e])
-    if length <= ZERO_LENGTH:
-        return v, (scale * n[0], scale * n[1], scale * n[2]), edges.stiffness[e]
-    scale /= length
-    return v, (scale * v[0], scale * v[1], scale * v[2]), edges.stiffness[e]
+_LIMIT_FIELDS = "stiffness", "min_length", "max_length"
+
+
+def _concatenate_ends(energies: tuple[StrainLimits, ...] | tuple[Dashpots, ...]) -> NDArray[np.int64]:
+    return np.concatenate([np.empty((0, 2), np.int64), *(e.edges for e in energies)])
+
+
+def _rank_repeated(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how many equal numbers precede each one."""
+    order = np.argsort(keys, kind="stable")
+    rank = np.empty(len(keys), np.int64)
+    rank[order] = np.arange(len(keys)) - np.searchsorted(keys[order], keys[order])
+    return rank
+
+
+@jit_kernel
+def _write_dashpots(edges, axis, offset, data, blocks):
+    """Write m and q of all entries, and the sums of m m' of the packets; axis: m (d, 3); offset: q (d,)."""
+    for b in range(len(edges.packet_start) - 1):
+        for k in range(6 * LANES):
+            blocks[6 * LANES * b + k] = 0.0
+        for entry in range(edges.packet_start[b], edges.packet_start[b + 1]):
+            for lane in range(LANES):
+                number, at = edges.dashpot_index[LANES * entry + lane], EDGE_STRIDE * entry + lane
+                m0 = m1 = m2 = q = 0.0
+                if number != 0:
+                    e, sign = abs(number) - 1, 1.0 if number > 0 else -1.0
+                    m0, m1, m2, q = sign * axis[e, 0], sign * axis[e, 1], sign * axis[e, 2], offset[e]
+                data[at], data[at + LANES], data[at + 2 * LANES], data[at + 3 * LANES] = m0, m1, m2, q
+                block = 6 * LANES * b + lane
+                blocks[block] += m0 * m0
+                blocks[block + LANES] += m0 * m1
+                blocks[block + 2 * LANES] += m0 * m2
+                blocks[block + 3 * LANES] += m1 * m1
+                blocks[block + 4 * LANES] += m1 * m2
+                blocks[block + 5 * LANES] += m2 * m2
 
 
 @jit_inner
-def add_edges(edges, begin, end, x, out, shift, correct):
-    """Add A'K d, or minus the gradient if `correct`, to rows shifted by `shift`.
+def _limit_excess(edges, at, length):
+    """Return the length beyond the limits at a position in their data, negative below the minimum."""
+    return length - min(max(length, edges.limit_data[at + LANES]), edges.limit_data[at + 2 * LANES])
 
-    It is that of the rows from `begin` to `end`.
+
+@jit_inner
+def _dashpot_at(edges, entry, lane, v0, v1, v2):
+    """Return m and m.v - q of an entry's dashpot."""
+    if not edges.has_dashpots:
+        return 0.0, 0.0, 0.0, 0.0
+    at = EDGE_STRIDE * entry + lane
+    m0, m1, m2 = edges.dashpot_data[at], edges.dashpot_data[at + LANES], edges.dashpot_data[at + 2 * LANES]
+    return m0, m1, m2, m0 * v0 + m1 * v1 + m2 * v2 - edges.dashpot_data[at + 3 * LANES]
+
+
+@jit_inner
+def add_edge_forces(edges, entry, lane, v, n, correct, force):
+    """Add minus the gradient of an entry's edges to a force, or A'K d if not `correct`; do nothing without edges.
+
+    v: vector to the vertex; n: its direction, at zero length that of the rest shape.
     """
     if edges is None:
-        return
-    for row in range(begin, end):
-        s0 = s1 = s2 = 0.0
-        for entry in range(edges.row_starts[row], edges.row_starts[row + 1]):
-            v, b, k = _evaluate_entry(edges, row, entry, x)
-            if correct:
-                s0, s1, s2 = s0 - k * b[0], s1 - k * b[1], s2 - k * b[2]
-            else:
-                s0, s1, s2 = s0 + k * (v[0] - b[0]), s1 + k * (v[1] - b[1]), s2 + k * (v[2] - b[2])
-        at = 4 * (row + shift)
-        out[at], out[at + 1], out[at + 2] = out[at] + s0, out[at + 1] + s1, out[at + 2] + s2
+        return force
+    at = edges.limit_offset[entry] + lane
+    k, beyond = (
+        edges.limit_data[at],
+        _limit_excess(edges, at, np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])),
+    )
+    m0, m1, m2, stretch = _dashpot_at(edges, entry, lane, v[0], v[1], v[2])
+    pull = k * beyond
+    s0, s1, s2 = (
+        force[0] - pull * n[0] - stretch * m0,
+        force[1] - pull * n[1] - stretch * m1,
+        force[2] - pull * n[2] - stretch * m2,
+    )
+    if not correct:
+        k += m0 * m0 + m1 * m1 + m2 * m2
+        s0, s1, s2 = s0 + k * v[0], s1 + k * v[1], s2 + k * v[2]
+    return s0, s1, s2
 
 
 @jit_inner
-def add_edge_descent(edges, rows, x, out):
-    """Add minus the gradient of all edges to the first `rows` rows of `out`, which move; return the energy [J].
-
-    Each edge is computed once and added at both of its ends.
-    """
+def edge_energy(edges, entry, lane, v0, v1, v2):
+    """Return an end's share of the energy [J] of an entry's edges; 0 without edges."""
     if edges is None:
         return 0.0
-    total, limits = 0.0, len(edges.min_length)
-    for e in range(len(edges.stiffness)):
-        i, j, k = edges.end_rows[e, 0], edges.end_rows[e, 1], edges.stiffness[e]
-        if i == j or (i >= rows and j >= rows):
-            continue
-        v0, v1, v2 = x[4 * i] - x[4 * j], x[4 * i + 1] - x[4 * j + 1], x[4 * i + 2] - x[4 * j + 2]
-        n0, n1, n2 = edges.edge_axis[e, 0], edges.edge_axis[e, 1], edges.edge_axis[e, 2]
-        if e >= limits:
-            scale = n0 * v0 + n1 * v1 + n2 * v2 - edges.offset[e]
-        else:
-            squared = v0 * v0 + v1 * v1 + v2 * v2
-            if edges.min_length[e] * edges.min_length[e] <= squared <= edges.max_length[e] * edges.max_length[e]:
-                continue
-            length = np.sqrt(squared)
-            scale = length - min(max(length, edges.min_length[e]), edges.max_length[e])
-            if length > ZERO_LENGTH:
-                n0, n1, n2 = v0 / length, v1 / length, v2 / length
-        total += 0.5 * k * scale * scale
-        f0, f1, f2 = k * scale * n0, k * scale * n1, k * scale * n2
-        if i < rows:
-            out[4 * i], out[4 * i + 1], out[4 * i + 2] = out[4 * i] - f0, out[4 * i + 1] - f1, out[4 * i + 2] - f2
-        if j < rows:
-            out[4 * j], out[4 * j + 1], out[4 * j + 2] = out[4 * j] + f0, out[4 * j + 1] + f1, out[4 * j + 2] + f2
-    return total
+    at = edges.limit_offset[entry] + lane
+    beyond = _limit_excess(edges, at, np.sqrt(v0 * v0 + v1 * v1 + v2 * v2))
+    _, _, _, stretch = _dashpot_at(edges, entry, lane, v0, v1, v2)
+    return edges.limit_data[at + 3 * LANES] * (edges.limit_data[at] * beyond * beyond + stretch * stretch)
+
+
+@jit_inner
+def add_edge_derivatives(edges, entry, lane, v, n, length, gradient, block):
+    """Add an entry's edges to gradient and block of its vertex; do nothing without edges."""
+    if edges is None:
+        return gradient, block
+    at = edges.limit_offset[entry] + lane
+    k, beyond = edges.limit_data[at], _limit_excess(edges, at, length)
+    m0, m1, m2, stretch = _dashpot_at(edges, entry, lane, v[0], v[1], v[2])
+    gradient = (
+        gradient[0] + k * beyond * n[0] + stretch * m0,
+        gradient[1] + k * beyond * n[1] + stretch * m1,
+        gradient[2] + k * beyond * n[2] + stretch * m2,
+    )
+    h0, h1, h2, h3, h4, h5 = axial_hessian(
+        k if beyond != 0.0 else 0.0, k * beyond / length if length > ZERO_LENGTH else 0.0, n[0], n[1], n[2]
+    )
+    return gradient, (
+        block[0] + h0 + m0 * m0,
+        block[1] + h1 + m0 * m1,
+        block[2] + h2 + m0 * m2,
+        block[3] + h3 + m1 * m1,
+        block[4] + h4 + m1 * m2,
+        block[5] + h5 + m2 * m2,
+    )
+
+
+@jit_inner
+def edge_energy_change(edges, entry, lane, v, d):
+    """Return the change of the energy [J] of an entry's edges by a step d of its vertex, without cancellation."""
+    if edges is None:
+        return 0.0
+    at = edges.limit_offset[entry] + lane
+    t0, t1, t2 = v[0] + d[0], v[1] + d[1], v[2] + d[2]
+    before, after = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), np.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    one, other = _limit_excess(edges, at, before), _limit_excess(edges, at, after)
+    longer = other - one
+    if one * other > 0.0:  # the same limit: the difference of the lengths, which keeps its digits
+        longer = (d[0] * (v[0] + t0) + d[1] * (v[1] + t1) + d[2] * (v[2] + t2)) / (before + after)
+    m0, m1, m2, stretch = _dashpot_at(edges, entry, lane, v[0], v[1], v[2])
+    closer = m0 * d[0] + m1 * d[1] + m2 * d[2]
+    return 0.5 * edges.limit_data[at] * longer * (one + other) + closer * (stretch + 0.5 * closer)

@@ -25,7 +25,6 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_inner_parallel, jit_kernel
-from springbench.solvers.kernels.edge_elements import add_edges
 from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, RESIDUAL_EACH, RESIDUAL_LAST, check_residual
 from springbench.solvers.kernels.spring_local_step import add_descent, add_projection, squared_norm
 from springbench.solvers.linalg.cholesky.thread_team import (
@@ -96,15 +95,13 @@ def _add_slice(a, b):
 
 
 @jit_inner
-def _forward_block(plan, bundles, edges, block, x, right, p, out):
+def _forward_block(plan, bundles, block, x, right, p, out):
     """Do the local step of a block at x (at p, if that is given) and its forward substitution."""
-    slot, slot_end, bundle, bundle_end, chunk, chunk_end, _ = plan.block_table[block]
+    _, _, bundle, bundle_end, chunk, chunk_end, _ = plan.block_table[block]
     if p is None:
         add_projection(bundles, bundle, bundle_end, x, right, out, plan.row_shift)
-        add_edges(edges, slot, slot_end, x, out, plan.row_shift, False)
     else:
         add_descent(bundles, bundle, bundle_end, p, right, out, plan.row_shift)
-        add_edges(edges, slot, slot_end, p, out, plan.row_shift, True)
     forward_substitution(plan.panels, plan.row_slots, plan.chunks, chunk, chunk_end, out)
 
 
@@ -124,7 +121,7 @@ def _clear_block(plan, block, out):
 
 
 @jit_inner
-def _process_group(plan, bundles, edges, group, x, right, p, out, down, up):
+def _process_group(plan, bundles, group, x, right, p, out, down, up):
     """Process a group in the order of its visits: down with the vector x, and up with `out`."""
     top = 4 * plan.top_range[0]
     size = 4 * plan.top_range[1] - top
@@ -141,11 +138,11 @@ def _process_group(plan, bundles, edges, group, x, right, p, out, down, up):
             if up:
                 _clear_block(plan, block, out)
         elif up:
-            _forward_block(plan, bundles, edges, block, x, right, p, out)
+            _forward_block(plan, bundles, block, x, right, p, out)
 
 
 @jit_inner
-def _process_top(plan, bundles, edges, x, right, p, out):
+def _process_top(plan, bundles, x, right, p, out):
     """Process the top: up at the positions x, and down again."""
     top, top_end, groups = plan.top_range
     size = 4 * (top_end - top)
@@ -156,7 +153,7 @@ def _process_top(plan, bundles, edges, x, right, p, out):
         else:
             _add_slice(out[begin : begin + size], out[4 * top : 4 * top_end])
     for block in range(plan.group_blocks[-2], plan.group_blocks[-1]):
-        _forward_block(plan, bundles, edges, block, x, right, p, out)
+        _forward_block(plan, bundles, block, x, right, p, out)
         _backward_block(plan, block, out, p)
 
 
@@ -192,7 +189,7 @@ def compute_residual(plan, form, x, before, p, e):
 
 
 @jit_kernel
-def run_blocked_local_step(plan, bundles, edges, x, right, p, out):
+def run_blocked_local_step(plan, bundles, x, right, p, out):
     """Do the local step of all blocks without a solve."""
     for k in range(len(out)):
         out[k] = 0.0
@@ -200,16 +197,10 @@ def run_blocked_local_step(plan, bundles, edges, x, right, p, out):
         add_projection(bundles, 0, len(bundles.packet_start) - 1, x, right, out, plan.row_shift)
     else:
         add_descent(bundles, 0, len(bundles.packet_start) - 1, p, right, out, plan.row_shift)
-    for block in range(len(plan.block_table)):
-        begin, end = plan.block_table[block, 0], plan.block_table[block, 1]
-        if p is None:
-            add_edges(edges, begin, end, x, out, plan.row_shift, False)
-        else:  # of another precision than x
-            add_edges(edges, begin, end, p, out, plan.row_shift, True)
 
 
 @jit_inner
-def _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, first):
+def _run_thread(plan, bundles, form, vectors, right, p, limits, team, first):
     """Do a thread's part of the iterations: the groups from `first` on that no other thread has claimed.
 
     Phase 2 k is iteration k, phase 2 k + 1 computes its residual if it is requested.
@@ -230,7 +221,7 @@ def _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, fir
                     _compute_displacement(plan, group, a, c, p, e)
                     team.task_sums[group] = _squared_norm(plan, form, group, e)
                 else:
-                    _process_group(plan, bundles, edges, group, a, right, p, b, k > 0, k < limits.max_iterations)
+                    _process_group(plan, bundles, group, a, right, p, b, k > 0, k < limits.max_iterations)
                 if complete_task(team):
                     enough = k == limits.max_iterations
                     if measures:
@@ -249,26 +240,25 @@ def _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, fir
                         team.results[0] = k
                         finish_phases(team)
                     else:
-                        _process_top(plan, bundles, edges, a, right, p, b)
+                        _process_top(plan, bundles, a, right, p, b)
                         release_phase(team, 2 * k + 2)
         phase = wait_for_phase(team, phase)
 
 
 @jit_inner_parallel
-def _run_threads(plan, bundles, edges, form, vectors, right, p, limits, team, threads):
+def _run_threads(plan, bundles, form, vectors, right, p, limits, team, threads):
     for thread in prange(threads):
         first = thread * plan.top_range[2] // threads
-        call_in_thread(team, _run_thread, (plan, bundles, edges, form, vectors, right, p, limits, team, first))
+        call_in_thread(team, _run_thread, (plan, bundles, form, vectors, right, p, limits, team, first))
 
 
 @jit_kernel
-def run_iterations(plan, bundles, edges, form, vectors, right, p, limits, threads, team):
+def run_iterations(plan, bundles, form, vectors, right, p, limits, threads, team):
     """Iterate from the positions in the first vector, or from p if that is given, which is then overwritten.
 
     Args:
         plan: the plan.
-        bundles: packets of the springs.
-        edges: strain limits and dashpots, or None.
+        bundles: packets of the springs and edges.
         form: packets of |e|_Q^2, with pairs for all energies that are not springs.
         vectors: three vectors that rotate, and one for scratch, of float64.
         right: constant right-hand side (see `SpringPackets.build_right_hand_side`).
@@ -284,9 +274,9 @@ def run_iterations(plan, bundles, edges, form, vectors, right, p, limits, thread
     reset_team(team)
     team.results[1] = np.nan
     if threads is None:
-        _run_thread(plan, bundles, edges, form, vectors, right, p, limits, team, 0)
+        _run_thread(plan, bundles, form, vectors, right, p, limits, team, 0)
     else:
-        _run_threads(plan, bundles, edges, form, vectors, right, p, limits, team, threads)
+        _run_threads(plan, bundles, form, vectors, right, p, limits, team, threads)
         raise_thread_error(team)
     x0, x1, x2, _ = vectors
     done = int(team.results[0])

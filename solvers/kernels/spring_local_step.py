@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.kernels.edge_elements import AttachedEdges, EdgePackets, add_edge_forces
+from springbench.solvers.kernels.packet_data import deduplicate_packets
+from springbench.solvers.kernels.spring_law import unit_direction
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.model.energies.spring_energy import ZERO_LENGTH, Springs
 from springbench.solvers.simd import spring_forces as vectors
@@ -38,6 +41,7 @@ class SpringPackets(NamedTuple):
         weights: these numbers, stored once for equal entries, which are nearly all in a regular mesh.
         spring_index: of each entry, eight springs, ~spring at the second end.
         rest_direction: unit directions at zero length (m, 3).
+        edges: strain limits and dashpots, or None.
     """
 
     row_offset: NDArray[np.int32]
@@ -47,10 +51,18 @@ class SpringPackets(NamedTuple):
     weights: NDArray[np.float64]
     spring_index: NDArray[np.int32]
     rest_direction: NDArray[np.float64]
+    edges: EdgePackets | None
 
     @classmethod
     def from_springs(
-        cls, springs: Springs, row: NDArray[np.int64], part: NDArray[np.int64], parts: int, padding_row: int, far: int
+        cls,
+        springs: Springs,
+        row: NDArray[np.int64],
+        part: NDArray[np.int64],
+        parts: int,
+        padding_row: int,
+        far: int,
+        attached: AttachedEdges | None = None,
     ) -> tuple[SpringPackets, NDArray[np.int64]]:
         """Build the packets of springs, and the first packet of each part of the rows (parts + 1,).
 
@@ -63,7 +75,9 @@ class SpringPackets(NamedTuple):
             parts: number of parts.
             padding_row: row of padding lanes.
             far: row of the ends of padding springs.
+            attached: strain limits and dashpots attached to the springs, or None.
         """
+        springs = attached.springs if attached else springs
         keep = np.flatnonzero(springs.edges[:, 0] != springs.edges[:, 1])
         ends = springs.edges[keep]
         degree = np.bincount(ends.ravel(), minlength=len(row))
@@ -87,6 +101,7 @@ class SpringPackets(NamedTuple):
         pull = k * springs.rest_length[np.maximum(spring, ~spring)]
         order = np.lexsort((pull, k, place[here]))  # so that lanes have equal springs side by side
         order = order[np.searchsorted(place[here[order]], 0) :]
+        is_fixed = part[there[order]] < 0
         here, there, spring, k, pull = place[here[order]], row[there[order]], spring[order], k[order], pull[order]
         nth = np.arange(len(here)) - np.searchsorted(here, here)
         entry = LANES * (start[here // LANES] + nth) + here % LANES
@@ -97,13 +112,18 @@ class SpringPackets(NamedTuple):
             out[entry] = values
             return out
 
+        named = filled(spring.astype(np.int32), 0)
+        edges = None
+        if attached:
+            edges = attached.build_packets(named, filled(np.ones(len(entry), bool), 0), filled(is_fixed, 0), start)
         return cls(
             4 * own,
             start,
             filled(4 * there.astype(np.int32), 4 * far),
             *deduplicate_packets(filled(pull, 0.0), filled(k, 0.0)),
-            filled(spring.astype(np.int32), 0),
+            named,
             np.array(springs.rest_direction, order="C"),
+            edges,
         ), first
 
     def entry_weights(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -141,18 +161,6 @@ class SpringPackets(NamedTuple):
         at = np.full(rows, 4 * len(lane))
         at[self.row_offset // 4] = RHS_STRIDE * (lane // LANES) + lane % LANES
         return at
-
-
-def deduplicate_packets(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Return the offsets of each entry's numbers, eight per array, and the numbers without duplicates."""
-    rows = np.concatenate([array.reshape(-1, LANES) for array in numbers], axis=1)
-    mixing = np.random.default_rng(0).integers(2**63, size=rows.shape[1], dtype=np.uint64)
-    _, first, kind = np.unique(rows.view(np.uint64) @ mixing, return_index=True, return_inverse=True)
-    if not np.array_equal(rows[first[kind]], rows):  # two kinds were mixed to one number
-        first = kind = np.arange(len(rows))
-    unique_weights = allocate_aligned(rows[first].size)
-    unique_weights[:] = rows[first].ravel()
-    return (rows.shape[1] * kind).astype(np.int32), unique_weights
 
 
 @jit_inner
@@ -216,7 +224,20 @@ def add_scalar_springs(bundles, b, p, out, correct):
             else:
                 scale /= np.sqrt(squared)
             s0, s1, s2 = s0 + scale * v0, s1 + scale * v1, s2 + scale * v2
+            s0, s1, s2 = _add_edges(bundles, bundles.edges, i, entry, lane, p, correct, (s0, s1, s2))
         out[i], out[i + 1], out[i + 2] = out[i] + s0, out[i + 1] + s1, out[i + 2] + s2
+
+
+@jit_inner
+def _add_edges(bundles, edges, i, entry, lane, p, correct, force):
+    """Add the edges of an entry to the force on the vertex at offset i; do nothing without edges."""
+    if edges is None:
+        return force
+    e = LANES * entry + lane
+    j = bundles.neighbour_offset[e]
+    v = p[i] - p[j], p[i + 1] - p[j + 1], p[i + 2] - p[j + 2]
+    n0, n1, n2, _ = unit_direction(v[0], v[1], v[2], bundles.rest_direction, bundles.spring_index[e])
+    return add_edge_forces(edges, entry, lane, v, (n0, n1, n2), correct, force)
 
 
 @jit_inner

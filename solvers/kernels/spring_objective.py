@@ -14,11 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner
+from springbench.solvers.kernels.edge_elements import edge_energy
+from springbench.solvers.kernels.packet_data import deduplicate_packets
 from springbench.solvers.kernels.spring_local_step import (
     ZERO_LENGTH_SQUARED,
     SpringPackets,
     add_degenerate_packet,
-    deduplicate_packets,
 )
 from springbench.solvers.simd import spring_descent
 from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
@@ -67,7 +68,7 @@ def value_and_descent(bundles, shares, p, right, out):
     total = 0.0
     for b in range(len(bundles.packet_start) - 1):
         energy = spring_descent.spring_energy_and_descent(bundles, shares, b, p, right, out)
-        if energy < 0.0:
+        if energy == spring_descent.SHORT_SPRING:
             for lane in range(LANES):
                 for c in range(4):
                     out[bundles.row_offset[LANES * b + lane] + c] = 0.0
@@ -100,4 +101,5 @@ def _degenerate_packet_energy(bundles, shares, b, p, right):
             shares.energy_weights[shares.weight_offset[entry] + lane]
             * (bundles.weights[w] - bundles.weights[w + LANES] * length) ** 2
         )
+        total += edge_energy(bundles.edges, entry, lane, p[i] - p[j], p[i + 1] - p[j + 1], p[i + 2] - p[j + 2])
     return total

@@ -4,7 +4,7 @@ A constant quadratic form (bending, attachments, linear drag) is equivalent to s
 vertices that it couples, and a weight of each single vertex (see
 `springbench.solvers.kernels.quadratic_form_kernels`). So the
 kernels of springs compute its forces and its value. Its force at the origin, A'W d, is constant in a step and is added
-to the external force. Strain limits and dashpots are edges with their own kernel (see
+to the external force. Strain limits and dashpots are evaluated with the spring between the same vertices (see
 `springbench.solvers.kernels.edge_elements`); in Q they too are springs of zero rest length.
 """
 
@@ -19,11 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.solvers.model import system_matrix_assembly
+from springbench.solvers.model.energies.edge_energy import vertex_pair_keys
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Energy, Positions, StepProblem, StepStart, System, is_lagged
 
 if TYPE_CHECKING:
-    from springbench.solvers.kernels.edge_elements import EdgeElements
+    from springbench.solvers.kernels.edge_elements import AttachedEdges
+    from springbench.solvers.kernels.spring_local_step import SpringPackets
     from springbench.solvers.model.energies.dashpot_energy import Dashpots
     from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
 
@@ -35,7 +37,9 @@ class SpringForm:
     Attributes:
         springs: springs of the system.
         springs_and_forms: these and the pairs of the forms.
-        system_pairs: all pairs in Q: these and the edges.
+        joined_pairs: these, with a spring and a pair between the same vertices as one; their value differs by a
+            constant.
+        system_pairs: all pairs in Q: the joined ones and the edges, without rest lengths if there are edges.
         vertex_weight: weight h of all forms at each vertex (n,) [N/m].
         form_builders: builders of each form for a step.
         strain_limits, dashpots: edge energies, with k [N/m] of both.
@@ -46,6 +50,7 @@ class SpringForm:
 
     springs: Springs
     springs_and_forms: Springs
+    joined_pairs: Springs
     system_pairs: Springs
     vertex_weight: NDArray[np.float64]
     form_builders: tuple[Callable[[StepStart], Any], ...] = field(default=())
@@ -74,50 +79,52 @@ class SpringForm:
             self.springs_and_forms.edges[below], -self.springs_and_forms.stiffness[below]
         ).stiffness_matrix(len(self.vertex_weight))
 
-    def build_edges(self, row: NDArray[np.int64], rows: int) -> EdgeElements | None:
-        """Build the strain limits and dashpots as they are before a step; None if there are none.
-
-        Args:
-            row: row of each vertex (n,).
-            rows: number of rows.
-        """
+    def attach_edges(self, springs: Springs) -> AttachedEdges | None:
+        """Attach the strain limits and dashpots to springs between the same vertices; None if there are none."""
         if not (self.strain_limits or self.dashpots):
             return None
-        from springbench.solvers.kernels.edge_elements import EdgeElements
+        from springbench.solvers.kernels.edge_elements import AttachedEdges
 
-        both = (*self.strain_limits, *self.dashpots)
-        ends, k = np.concatenate([e.edges for e in both]), np.concatenate([e.stiffness for e in both])
-        none = np.empty(0)
-        low, high = (
-            np.concatenate([none, *(getattr(e, at) for e in self.strain_limits)]) for at in ("min_length", "max_length")
-        )
-        edges = EdgeElements.from_edges(ends, k, low, high, row, rows)
-        edges.edge_axis[: len(low)] = np.concatenate(
-            [none.reshape(0, 3), *(e.rest_direction for e in self.strain_limits)]
-        )
-        return edges
+        return AttachedEdges.from_energies(springs, self.strain_limits, self.dashpots)
 
-    def update_edges(self, edges: EdgeElements | None, problem: StepProblem) -> EdgeElements | None:
-        """Return the edges updated to a step."""
-        if edges is not None and any(map(is_lagged, self.strain_limits)):
-            from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
+    def select_packed_edges(self) -> SpringForm:
+        """Return the form without edges of another law, such as those of an augmented Lagrangian."""
+        limits = tuple(e for e in self.strain_limits if is_packed_edge(e))
+        return self if len(limits) == len(self.strain_limits) else replace(self, strain_limits=limits)
 
-            limits = [e for e in problem.energies if isinstance(e, StrainLimits)]
-            low, high = (np.concatenate([getattr(e, at) for e in limits]) for at in ("min_length", "max_length"))
-            edges = edges._replace(min_length=low, max_length=high)
-        if edges is None or not self.dashpots:
-            return edges
+    def update_edges(self, packets: SpringPackets, problem: StepProblem) -> SpringPackets:
+        """Return packets whose strain limits and dashpots are those of a step."""
+        edges = packets.edges
+        if edges is None:
+            return packets
         from springbench.solvers.model.energies.dashpot_energy import Dashpots
 
-        steps, first = [e for e in problem.energies if isinstance(e, Dashpots)], len(edges.min_length)
-        axis, offset = edges.edge_axis.copy(), edges.offset.copy()
-        axis[first:] = np.concatenate([e.direction for e in steps])
-        offset[first:] = np.concatenate([e.offset for e in steps])
-        return edges._replace(edge_axis=axis, offset=offset)
+        if any(map(is_lagged, self.strain_limits)):
+            kinds = tuple({type(e) for e in self.strain_limits})
+            limits = [e for e in problem.energies if isinstance(e, kinds)]
+            low, high = (np.concatenate([getattr(e, at) for e in limits]) for at in ("min_length", "max_length"))
+            edges = edges.with_limits(low, high)
+        if self.dashpots:
+            steps = [e for e in problem.energies if isinstance(e, Dashpots)]
+            edges = edges.with_directions(
+                np.concatenate([e.direction for e in steps]), np.concatenate([e.offset for e in steps])
+            )
+        return packets._replace(edges=edges)
 
     def edge_energy_scale(self, p: Positions) -> float:
         """Return the sum of k |v|^2 [J] over strain limits and dashpots at p (n, 3), the scale of cancellation."""
         return sum(float(e.stiffness @ e.edge_lengths(p) ** 2) for e in (*self.strain_limits, *self.dashpots))
+
+
+def is_packed_edge(energy: Any) -> bool:
+    """Return whether an energy has the law of strain limits or dashpots, which packets of springs evaluate."""
+    from springbench.solvers.model.energies.dashpot_energy import Dashpots  # for those who need one of them
+    from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
+
+    return isinstance(energy, (StrainLimits, Dashpots)) and energy.element_law in (
+        StrainLimits.element_law,
+        Dashpots.element_law,
+    )
 
 
 def decompose_energies(system: System) -> SpringForm:
@@ -126,7 +133,7 @@ def decompose_energies(system: System) -> SpringForm:
     springs = Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
     others = [energy for energy in system.energies if not isinstance(energy, Springs)]
     if not others:
-        return SpringForm(springs, springs, springs, np.zeros(n))
+        return SpringForm(springs, springs, springs, springs, np.zeros(n))
     from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
     from springbench.solvers.model.energies.dashpot_energy import Dashpots  # for those who need one of them
     from springbench.solvers.model.energies.quadratic_energy import Quadratic
@@ -146,12 +153,14 @@ def decompose_energies(system: System) -> SpringForm:
     )
     form = QuadraticForm.from_matrix(L)
     whole = Springs.from_parts([springs, _zero_length_springs(form.pairs, form.pair_weight)])
+    joined = _join_pairs(springs, form.pairs, form.pair_weight) if len(form.pairs) else whole
     edges = [_zero_length_springs(energy.edges, energy.stiffness) for energy in (*limits, *dashpots)]
-    pairs = Springs.from_parts([whole, *edges])
+    pairs = _merge_parallel_pairs(Springs.from_parts([joined, *edges])) if edges else joined
     K = Springs.from_parts([springs, *edges]).stiffness_matrix(n)
     return SpringForm(
         springs,
         whole,
+        joined,
         pairs,
         form.vertex_weight,
         tuple(form.begin_step if is_lagged(form) else _constant_form(form) for form in forms),
@@ -160,6 +169,40 @@ def decompose_energies(system: System) -> SpringForm:
         unknown,
         system_matrix_assembly.drop_zeros(K + L).nnz < system_matrix_assembly.drop_zeros(abs(K) + abs(L)).nnz,
     )
+
+
+def _join_pairs(springs: Springs, pairs: NDArray[np.int64], weight: NDArray[np.float64]) -> Springs:
+    """Return springs and pairs of zero rest length, those between the same vertices as one spring.
+
+    k/2 (l - r)^2 + w/2 l^2 = (k + w)/2 (l - k r/(k + w))^2 up to a constant. A pair that would leave no positive
+    stiffness stays apart. Vertex blocks need both apart, because a compressed spring loses its transverse stiffness
+    there and a pair does not.
+
+    Args:
+        springs: the springs.
+        pairs: vertex pairs (m, 2), none of them twice.
+        weight: their stiffnesses w [N/m], of either sign.
+    """
+    size = 1 + int(max(springs.edges.max(initial=0), pairs.max(initial=0)))
+    known, first = np.unique(vertex_pair_keys(springs.edges, size), return_index=True)
+    wanted = vertex_pair_keys(pairs, size)
+    is_joined = np.isin(wanted, known)
+    at = first[np.searchsorted(known, wanted[is_joined])]
+    is_joined[is_joined] = (springs.stiffness[at] > 0.0) & (springs.stiffness[at] + weight[is_joined] > 0.0)
+    at = first[np.searchsorted(known, wanted[is_joined])]
+    k, rest = springs.stiffness.copy(), springs.rest_length.copy()
+    k[at] += weight[is_joined]
+    rest[at] *= springs.stiffness[at] / k[at]
+    others = _zero_length_springs(pairs[~is_joined], weight[~is_joined])
+    return Springs.from_parts([replace(springs, stiffness=k, rest_length=rest), others])
+
+
+def _merge_parallel_pairs(springs: Springs) -> Springs:
+    """Return springs of zero rest length with the stiffness of all springs between each two vertices."""
+    ends, pair = np.unique(np.sort(springs.edges, axis=1), axis=0, return_inverse=True)
+    stiffness = np.zeros(len(ends))
+    np.add.at(stiffness, pair.ravel(), springs.stiffness)
+    return _zero_length_springs(ends, stiffness)
 
 
 def _zero_length_springs(edges: NDArray[np.int64], stiffness: NDArray[np.float64]) -> Springs:

@@ -28,7 +28,8 @@ def literal_signature(*kinds: Any, compiled_in: int = 1) -> Any:
 def unpack_arguments(context: Any, builder: Any, signature: Any, args: Any) -> list[Any]:
     """Return a kernel's arguments as LLVM values.
 
-    Arrays become pointers to their data, numbers int64, literals Python integers, and named tuples are unpacked alike.
+    Arrays become pointers to their data, numbers int64, literals Python integers, None stays None, and named tuples are
+    unpacked alike.
     """
     return [_unpack_argument(context, builder, *both) for both in zip(signature.args, args, strict=True)]
 
@@ -38,6 +39,8 @@ def _unpack_argument(context: Any, builder: Any, kind: Any, value: Any) -> Any:
         return context.make_array(kind)(context, builder, value).data
     if isinstance(kind, types.IntegerLiteral):
         return kind.literal_value
+    if isinstance(kind, types.NoneType):
+        return None
     if hasattr(kind, "instance_class"):
         fields = [builder.extract_value(value, k) for k in range(len(kind))]
         return kind.instance_class(

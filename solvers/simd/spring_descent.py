@@ -11,6 +11,7 @@ from typing import Any
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from springbench.solvers.simd.edge_packets import EdgeBuilder
 from springbench.solvers.simd.llvm_vectors import F64, I64, unpack_arguments
 from springbench.solvers.simd.spring_packets import (
     LANES,
@@ -21,19 +22,24 @@ from springbench.solvers.simd.spring_packets import (
     constant_packet,
 )
 
+SHORT_SPRING = float("-inf")
+"""Result in place of an energy. An energy itself may be negative, because forms have pairs of negative stiffness."""
+
 
 def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
-    """Write a packet's rows of `out` and return its energy; return -1 without writing if a spring is too short."""
+    """Write a packet's rows of `out` and return its energy; only return SHORT_SPRING if a spring is too short."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, shares, number, x, right, out = unpack_arguments(context, builder, signature, args)
         v, springs = PacketBuilder(context, builder), SpringPacket.from_bundles(builder, bundles, number)
         centre = v.gather_rows(x, v.load_row_offsets(springs.row_offset, number))
+        edges = None if springs.edges is None else EdgeBuilder(v, springs.edges, number)
         sums, shortest = v.allocate_sums(4), cgutils.alloca_once_value(builder, constant_packet(MAX_SQUARED_LENGTH))
 
         def read(entry: Any) -> list[Any]:
-            """Load the data of an entry's springs: k r, k, 1/(4 k), and the vector from their other ends."""
+            """Load the data of an entry's springs: the entry, k r, k, 1/(4 k), the vector from their other ends."""
             numbers = [
+                entry,
                 *v.load_packets(springs.weights, springs.weight_offset, entry),
                 *v.load_packets(shares.energy_weights, shares.weight_offset, entry, 1),
             ]
@@ -41,11 +47,17 @@ def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any
 
         def add(values: list[Any]) -> None:
             """Add an entry's springs to the sums."""
-            pull, k, share, *arrow = values
+            entry, pull, k, share, *arrow = values
             squared = v.squared_norm(arrow)
             v.update_minimum(squared, shortest)
-            scale = builder.fsub(builder.fmul(pull, v.inverse_sqrt(squared)), k)
+            root = v.inverse_sqrt(squared)
+            scale = builder.fsub(builder.fmul(pull, root), k)
             energy = builder.fmul(builder.fmul(share, scale), scale)
+            if edges is not None:
+                v.add_products([energy], [squared], sums[3:])
+                scale = edges.subtract_forces(entry, arrow, squared, root, scale, sums)
+                v.add_products([scale] * 3, arrow, sums[:3])
+                return
             v.add_products([scale] * 3 + [energy], [*arrow, squared], sums)
 
         v.pipeline_entries(springs.first_entry, springs.end_entry, read, add)
@@ -61,7 +73,7 @@ def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any
                 v.load_row_offsets(springs.row_offset, number), v.transpose_to_rows(total), strict=True
             ):
                 v.store(row, builder.gep(out, [place]))
-        return builder.select(short, F64(-1.0), v.sum_lanes(builder.load(sums[3])))
+        return builder.select(short, F64(SHORT_SPRING), v.sum_lanes(builder.load(sums[3])))
 
     return types.float64(bundles, shares, number, x, right, out), generate
 

@@ -9,6 +9,7 @@ from typing import Any
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from springbench.solvers.simd.edge_packets import EdgeBuilder
 from springbench.solvers.simd.llvm_vectors import I64, unpack_arguments
 from springbench.solvers.simd.spring_packets import (
     LANES,
@@ -56,6 +57,9 @@ def _sum_spring_forces(
     """Return the sums of a packet's springs, (k r/|v| - k) v or k r/|v| v, and whether a spring is too short."""
     builder: Any = v.builder
     sums, shortest = v.allocate_sums(3), cgutils.alloca_once_value(builder, constant_packet(MAX_SQUARED_LENGTH))
+    if springs.edges is not None:
+        _add_springs_with_edges(v, springs, x, centre, correct, sums, shortest)
+        return [builder.load(total) for total in sums], v.has_short_spring(shortest)
 
     def read(entry: Any) -> list[Any]:
         """Load the data of an entry's springs: k r, k, and the vector from their other ends with its square."""
@@ -78,6 +82,35 @@ def _sum_spring_forces(
 
     v.pipeline_entries(springs.first_entry, springs.end_entry, read, scale, add)
     return [builder.load(total) for total in sums], v.has_short_spring(shortest)
+
+
+def _add_springs_with_edges(
+    v: PacketBuilder,
+    springs: SpringPacket,
+    x: Any,
+    centre: list[Any],
+    correct: bool,
+    sums: list[Any],
+    shortest: Any,
+) -> None:
+    """Add a packet's springs and edges to the sums, in a pipeline of two stages."""
+    builder, edges = v.builder, EdgeBuilder(v, springs.edges, springs.packet_index)
+
+    def read(entry: Any) -> list[Any]:
+        arrow = v.compute_spring_vectors(x, centre, springs.neighbour_offset, entry)
+        return [*v.load_packets(springs.weights, springs.weight_offset, entry), entry, v.squared_norm(arrow), *arrow]
+
+    def add(values: list[Any]) -> None:
+        pull, stiffness, entry, squared, *arrow = values
+        v.update_minimum(squared, shortest)
+        root = v.inverse_sqrt(squared)
+        scale = builder.fmul(pull, root)
+        if correct:
+            scale = builder.fsub(scale, stiffness)
+        scale = edges.subtract_forces(entry, arrow, squared, root, scale, sums, correct=correct)
+        v.add_products([scale] * 3, arrow, sums)
+
+    v.pipeline_entries(springs.first_entry, springs.end_entry, read, add)
 
 
 def _spring_norm_code(typingctx: Any, bundles: Any, number: Any, x: Any, measure: Any) -> Any:

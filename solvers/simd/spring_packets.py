@@ -23,6 +23,10 @@ from springbench.solvers.simd.llvm_vectors import F64, I8, I64, VectorBuilder, p
 LANES = 8
 RHS_STRIDE = 4 * LANES
 """Numbers in a packet's constant right-hand side: x, y and z of eight vertices, and their stiffnesses [N/m]."""
+EDGE_STRIDE = 4 * LANES
+"""Numbers of a strain limit and of a dashpot in each entry: four of eight lanes."""
+BLOCK_ENTRIES = 6
+"""Entries of the upper triangle of a vertex's block."""
 ROW_TYPE, PACKET_TYPE, MASK_TYPE = ir.VectorType(F64, 4), ir.VectorType(F64, LANES), ir.VectorType(ir.IntType(1), LANES)
 BITS_TYPE = ir.VectorType(I64, LANES)
 _RSQRT_MAGIC, _RSQRT14_INTRINSIC = 0x5FE6EB50C7B537A9, "llvm.x86.avx512.rsqrt14.pd.512"
@@ -42,7 +46,7 @@ class SpringPacket(NamedTuple):
     """Springs of eight vertices in memory.
 
     Offsets of the arrays of `springbench.solvers.kernels.spring_local_step.SpringPackets`, the packet's index, and its
-    first and end entry.
+    first and end entry; its edges (see `springbench.solvers.kernels.edge_elements.EdgePackets`) or None.
     """
 
     row_offset: Any
@@ -52,14 +56,14 @@ class SpringPacket(NamedTuple):
     packet_index: Any
     first_entry: Any
     end_entry: Any
+    edges: Any
 
     @classmethod
     def from_bundles(cls, builder: Any, bundles: Any, number: Any) -> SpringPacket:
         """Load the packet with a given index."""
         begin, end = (builder.load(builder.gep(bundles.packet_start, [builder.add(number, I64(k))])) for k in (0, 1))
-        return cls(
-            bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights, number, begin, end
-        )
+        arrays = bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights
+        return cls(*arrays, number, begin, end, bundles.edges)
 
 
 class PacketBuilder(VectorBuilder):

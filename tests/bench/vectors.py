@@ -136,7 +136,7 @@ def solving(solver: str) -> Callable[[], object]:
 
 def of_springs() -> Iterator[Case]:
     """Over bundles of eight vertices with their springs."""
-    state, _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
+    state, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
     parts, p, out = state.spring_packets, window.trial_position, window.trial_descent.copy()
     whole = 0, len(parts.packet_start) - 1
     short = {"add_spring_projection": plain.refuse, "add_spring_forces": plain.refuse}
@@ -160,7 +160,7 @@ def of_springs() -> Iterator[Case]:
 
 def of_descent() -> Iterator[Case]:
     """Over the same bundles, with the objective."""
-    state, _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
+    state, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
     descent = (
         state.spring_packets,
         state.objective_weights,

@@ -13,6 +13,10 @@ from springbench.harness.scenes.effects.pins_effect import PinsEffect
 from springbench.harness.scenes.effects.springs_effect import SpringsEffect as SpringsEffect
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.solvers.jit.kernel_compilation import jit_kernel
+from springbench.solvers.kernels.spring_local_step import SpringPackets
+from springbench.solvers.kernels.spring_objective import ObjectiveWeights
+from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.local_global.fused_local_global import PreparedCompiledLocalGlobal
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
@@ -21,6 +25,7 @@ from springbench.solvers.model.energies.quadratic_energy import Quadratic
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule
 from springbench.solvers.objective.spring_form import decompose_energies
+from springbench.solvers.simd.spring_descent import spring_energy_and_descent
 
 from tests.effect_scenes import (
     AIR_DRAG_EFFECT,
@@ -64,17 +69,18 @@ def iterates(solver: Solver, problem: StepProblem, count: int) -> list[Positions
         and not decompose_energies(SCENES[name]().system).dashpots
     ],
 )
-def test_forces_and_differences_of_value_are_those_of_the_energies(name):
+@pytest.mark.parametrize("field", ["springs_and_forms", "joined_pairs"])
+def test_forces_and_differences_of_value_are_those_of_the_energies(name, field):
     problem = build_moving_problem(SCENES[name]())
     s, rng = problem.system, np.random.default_rng(0)
     parts = decompose_energies(s)
     forms = [energy for energy in problem.energies if isinstance(energy, Quadratic)]
     assert (len(forms), parts.unsupported_energies, parts.has_cancellation) == (len(parts.form_builders), (), False)
-    force = parts.compute_force(problem) - problem.external_force
+    force, whole = parts.compute_force(problem) - problem.external_force, getattr(parts, field)
     p, q = problem.current_positions + 0.1 * rng.normal(size=(2, *problem.current_positions.shape))
 
     def value(x: Positions) -> float:
-        pairs = parts.springs_and_forms.value(x) - parts.springs.value(x)
+        pairs = whole.value(x) - parts.springs.value(x)
         return pairs + 0.5 * float(parts.vertex_weight @ np.sum(x**2, axis=1)) - float(np.sum(force * x))
 
     def gradient(energies, x: Positions) -> Positions:
@@ -86,11 +92,44 @@ def test_forces_and_differences_of_value_are_those_of_the_energies(name):
     wanted = sum(energy.value(q) - energy.value(p) for energy in forms)
     size = sum(abs(energy.value(x)) for energy in forms for x in (p, q)) + np.abs(force).sum()
     assert abs(value(q) - value(p) - wanted) <= 1e-12 * size  # sums of some hundred terms
-    found = (
-        gradient([parts.springs_and_forms], p) - gradient([parts.springs], p) + parts.vertex_weight[:, None] * p - force
-    )
+    found = gradient([whole], p) - gradient([parts.springs], p) + parts.vertex_weight[:, None] * p - force
     wanted = gradient(forms, p)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * (np.abs(wanted).max() + np.abs(force).max()))
+
+
+def test_a_spring_and_a_pair_between_the_same_vertices_are_one():
+    parts = decompose_energies(build_effect_cloth(BENDING_EFFECT).system)
+    pairs = [
+        {frozenset(map(int, edge)) for edge in part.edges} for part in (parts.springs_and_forms, parts.joined_pairs)
+    ]
+    assert pairs[0] == pairs[1]
+    assert len(pairs[1]) == len(parts.joined_pairs.edges) < len(parts.springs_and_forms.edges)
+
+
+def test_edges_in_the_norm_of_q_are_one_with_the_springs_between_the_same_vertices():
+    system = build_effect_cloth(STRAIN_LIMIT_EFFECT, DASHPOT_EFFECT, RAYLEIGH_EFFECT).system
+    parts, n = decompose_energies(system), system.num_vertices
+    assert len(parts.system_pairs.edges) == len(parts.springs.edges)
+    wanted = csr_array((n, n))
+    for energy in (parts.springs, *parts.strain_limits, *parts.dashpots):
+        wanted = wanted + energy.stiffness_matrix(n)
+    assert abs(parts.system_pairs.stiffness_matrix(n) - wanted).max() <= 1e-12 * wanted.max()
+
+
+def test_a_negative_energy_of_a_packet_is_no_short_spring():
+    """A pair of negative stiffness leaves the packet's energy negative; its vectors give it nevertheless."""
+    pair = Springs(np.array([[0, 1]]), np.array([-2.0]), np.zeros(1), np.eye(3)[:1])
+    packets, _ = SpringPackets.from_springs(pair, np.arange(2), np.zeros(2, np.int64), 1, 2, 3)
+    weights = ObjectiveWeights.from_packets(packets, np.zeros(4), np.empty(0, np.int64))
+    x, right = allocate_aligned(16), packets.build_right_hand_side(np.zeros(4), np.zeros(16))
+    x[:8], x[12] = [3.0, 0.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0], 1e100
+    value = np.empty(1)
+
+    def evaluate(packets, weights, x, right, out, value):
+        value[0] = spring_energy_and_descent(packets, weights, 0, x, right, out)
+
+    jit_kernel(evaluate)(packets, weights, x, right, np.empty(16), value)
+    assert value[0] == pytest.approx(pair.value(x.reshape(-1, 4)[:2, :3])) == -25.0
 
 
 @scenes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice, pairwise
 from typing import Any
@@ -13,6 +14,8 @@ from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.methods.vertex_block.incident_elements import ElementKind, VertexFunctions
 from springbench.solvers.methods.vertex_block.vbd import PreparedVertexBlockDescent, VertexBlockDescent
 from springbench.solvers.methods.vertex_block.vertex_elements import VertexElements
+from springbench.solvers.model.energies.dashpot_energy import Dashpots
+from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
 from springbench.solvers.model.step_problem import StopRule, Unsupported
 
 from tests.effect_scenes import (
@@ -36,13 +39,18 @@ EFFECTS = {
 NOISE = np.random.default_rng(0)
 
 
+def energy_index(energies: Sequence[Any]) -> int:
+    """The index of strain limits or dashpots, which the packets of springs take as well as elements by vertex."""
+    return next(k for k, energy in enumerate(energies) if isinstance(energy, (StrainLimits, Dashpots)))
+
+
 @pytest.mark.parametrize("effect", ["strain limits", "dashpots"])
 def test_a_vertex_feels_what_the_oracle_says(effect):
     """Value, gradient, diagonal blocks of the Hessian, and the rise by a step of one vertex."""
     problem = build_moving_problem(build_effect_cloth(*EFFECTS[effect]))
     n = problem.system.num_vertices
     p, d = problem.current_positions, 0.01 * NOISE.normal(size=(n, 3))
-    other = VertexElements.from_system(problem.system)
+    other = VertexElements(problem.system, (energy_index(problem.system.energies),))
     around = other.with_rows(np.arange(n), n).update_elements(problem)
     energy: Any = problem.energies[other.energy_indices[0]]
     total, felt, risen = VertexFunctions.from_kinds([ElementKind(energy.element_law, 2)])
@@ -90,13 +98,13 @@ def test_vertices_of_one_element_have_different_colours():
     """Elements that join vertices which no spring joins."""
     problem = build_moving_problem(build_effect_cloth(DASHPOT_EFFECT))
     system = problem.system
-    other = VertexElements.from_system(system)
+    damped = [energy for energy in system.energies if isinstance(energy, Dashpots)]
     far = [
         replace(energy, edges=np.array([[0, 35], [5, 30]]), stiffness=energy.stiffness[:2], offset=energy.offset[:2],
                 direction=energy.direction[:2])
-        for energy in other.energies
+        for energy in damped
     ]  # fmt: skip
-    apart = replace(system, energies=(*(e for e in system.energies if e not in other.energies), *far))
+    apart = replace(system, energies=(*(e for e in system.energies if e not in damped), *far))
     made = VertexBlockDescent().prepare(apart)
     assert isinstance(made, PreparedVertexBlockDescent)
     bundle = {int(place) // 4: k // 8 for k, place in enumerate(made.colour_packets.spring_packets.row_offset)}

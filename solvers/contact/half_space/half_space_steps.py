@@ -21,6 +21,7 @@ from springbench.solvers.contact.potentials.friction_law import (
     smoothed_length,
 )
 from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inner
+from springbench.solvers.kernels.edge_elements import add_edge_derivatives, edge_energy_change
 from springbench.solvers.kernels.spring_law import unit_direction
 from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
 
@@ -100,7 +101,7 @@ def _spring_gradient_and_block(bundles, b, lane, p, x, anchor_stiffness, load):
     for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
         e, w = LANES * entry + lane, bundles.weight_offset[entry] + lane
         j, k, pull = bundles.neighbour_offset[e], bundles.weights[w + LANES], bundles.weights[w]
-        if k == 0.0:
+        if k == 0.0 and bundles.edges is None:
             continue
         v0, v1, v2 = x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]
         n0, n1, n2, length = unit_direction(v0, v1, v2, bundles.rest_direction, bundles.spring_index[e])
@@ -109,6 +110,10 @@ def _spring_gradient_and_block(bundles, b, lane, p, x, anchor_stiffness, load):
         g0, g1, g2 = g0 + tension * n0, g1 + tension * n1, g2 + tension * n2
         a00, a01, a02 = a00 + axial * n0 * n0 + lateral, a01 + axial * n0 * n1, a02 + axial * n0 * n2
         a11, a12, a22 = a11 + axial * n1 * n1 + lateral, a12 + axial * n1 * n2, a22 + axial * n2 * n2 + lateral
+        (g0, g1, g2), (a00, a01, a02, a11, a12, a22) = add_edge_derivatives(
+            bundles.edges, entry, lane, (v0, v1, v2), (n0, n1, n2), length,
+            (g0, g1, g2), (a00, a01, a02, a11, a12, a22),
+        )  # fmt: skip
     return (g0, g1, g2), (a00, a01, a02, a11, a12, a22)
 
 
@@ -177,6 +182,7 @@ def _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load):
     for entry in range(bundles.packet_start[b], bundles.packet_start[b + 1]):
         j, w = bundles.neighbour_offset[LANES * entry + lane], bundles.weight_offset[entry] + lane
         stiffness, before, after, change = bundles.weights[w + LANES], 0.0, 0.0, 0.0
+        total += edge_energy_change(bundles.edges, entry, lane, (x[0] - p[j], x[1] - p[j + 1], x[2] - p[j + 2]), d)
         if stiffness == 0.0:
             continue
         for c in range(3):

@@ -21,7 +21,6 @@ from scipy.sparse import csr_array
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.kernels import local_global_iteration, step_setup
 from springbench.solvers.kernels import spring_local_step as kernels
-from springbench.solvers.kernels.edge_elements import EdgeElements
 from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, LoopLimits, iteration_limit
 from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
 from springbench.solvers.linalg.cholesky.thread_team import ThreadTeam
@@ -145,8 +144,7 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         base: the uncompiled iteration.
         spring_form: decomposition of the energies.
         iteration_plan: plan of an iteration.
-        spring_packets: packets of the springs in the local step.
-        edges: strain limits and dashpots, or None.
+        spring_packets: packets of the springs, strain limits and dashpots in the local step.
         norm_packets: packets of |e|_Q^2.
         vertex_rows: rows of the vertices.
         padding_row: last row.
@@ -160,7 +158,6 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
     spring_form: SpringForm
     iteration_plan: local_global_iteration.IterationPlan
     spring_packets: kernels.SpringPackets
-    edges: EdgeElements | None
     norm_packets: kernels.SpringPackets
     vertex_rows: step_setup.VertexRows
     padding_row: int
@@ -185,8 +182,10 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         where = row, part, len(order.block_spans), padding_row, padding_row + 1
         form, first = kernels.SpringPackets.from_springs(parts.system_pairs, *where)
         # A solve for positions has the forms in Q; one for corrections also needs their gradient.
-        local = parts.springs_and_forms if corrects else parts.springs
-        bundles = form if local is parts.system_pairs else kernels.SpringPackets.from_springs(local, *where)[0]
+        local = parts.joined_pairs if corrects else parts.springs
+        bundles = form
+        if local is not parts.system_pairs:
+            bundles, _ = kernels.SpringPackets.from_springs(local, *where, parts.attach_edges(local))
         inertia = s.inertia_diagonal
         anchor_stiffness, measure, loose = np.zeros((3, padding_row + 2 + order.row_shift))
         anchor_stiffness[row] = measure[row] = inertia + parts.vertex_weight
@@ -199,7 +198,6 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
             parts,
             _build_plan(order, first, anchor_stiffness, form.gather_lanes(measure), loose),
             bundles,
-            parts.build_edges(row, len(anchor_stiffness)),
             form,
             _build_vertex_rows(base, row, bundles.right_hand_side_offset(len(anchor_stiffness))[row], corrects),
             padding_row + 1,
@@ -259,13 +257,10 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         target, force, pins, guess = self.step_arrays(problem, problem.initial_guess)
         step_setup.write_right_hand_side(self.vertex_rows, target, force, pins, right)
         step_setup.init_vectors(self.vertex_rows, work.vectors, p, guess, pins)
-
-        edges = self.spring_form.update_edges(self.edges, problem)
+        bundles = self.spring_form.update_edges(self.spring_packets, problem)
 
         def local() -> NDArray[Any]:
-            local_global_iteration.run_blocked_local_step(
-                self.iteration_plan, self.spring_packets, edges, a, right, p, b
-            )
+            local_global_iteration.run_blocked_local_step(self.iteration_plan, bundles, a, right, p, b)
             return b
 
         y, out = self.base.system.inertia_diagonal[:, None] * target + force, np.zeros_like(target)
@@ -310,9 +305,9 @@ class _CompiledState(SolverState):
 
     def __init__(self, prepared: PreparedCompiledLocalGlobal, problem: StepProblem, guess: Positions) -> None:
         self._prepared, self._problem, self._guess = prepared, problem, guess
-        self._arrays, self._edges = (
+        self._arrays, self._spring_packets = (
             prepared.step_arrays(problem, guess),
-            prepared.spring_form.update_edges(prepared.edges, problem),
+            prepared.spring_form.update_edges(prepared.spring_packets, problem),
         )
         self.positions = np.empty_like(problem.inertial_target)
 
@@ -321,8 +316,7 @@ class _CompiledState(SolverState):
         made = self._prepared
         fixed = (
             made.iteration_plan,
-            made.spring_packets,
-            self._edges,
+            self._spring_packets,
             made.norm_packets,
             made.vertex_rows,
             *made.shared_scratch,
@@ -341,7 +335,7 @@ class _CompiledState(SolverState):
         """Do one iteration; return False if round-off prevents descent."""
         made = self._prepared
         (a, b, c, e), right, p = self._own_scratch
-        fixed = made.iteration_plan, made.spring_packets, self._edges, made.norm_packets, (a, b, c, e), right, p
+        fixed = made.iteration_plan, self._spring_packets, made.norm_packets, (a, b, c, e), right, p
         local_global_iteration.run_iterations(*fixed, ONE_ITERATION, made.num_threads(), self._thread_team)
         self._own_scratch = StepScratch((b, a, c, e), right, p)
         step_setup.read_positions(made.vertex_rows, b if p is None else p, self.positions)

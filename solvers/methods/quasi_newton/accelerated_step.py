@@ -21,7 +21,6 @@ from springbench.solvers.kernels.accelerated_descent import (
     propose_trial,
 )
 from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
-from springbench.solvers.kernels.edge_elements import add_edge_descent
 from springbench.solvers.kernels.iteration_loop import build_compiled_loop
 from springbench.solvers.kernels.local_global_iteration import IterationPlan
 from springbench.solvers.kernels.spring_local_step import SpringPackets, squared_norm
@@ -57,14 +56,11 @@ class AcceleratedStep(NamedTuple):
 
 
 @jit_kernel
-def start_solve(step: AcceleratedStep, edges, window: AccelerationWindow, target, force, pin_targets, guess):
-    """Start the solve of a step and return the residual [J^(1/2)] at the guess.
-
-    `edges` are strain limits and dashpots, or None.
-    """
+def start_solve(step: AcceleratedStep, window: AccelerationWindow, target, force, pin_targets, guess):
+    """Start the solve of a step and return the residual [J^(1/2)] at the guess."""
     write_right_hand_side(step.vertex_rows, target, force, pin_targets, step.right_hand_side)
     write_positions(step.vertex_rows, guess, pin_targets, window.trial_position)
-    step.objective_values[0] = _evaluate_trial(step, edges, window)
+    step.objective_values[0] = _evaluate_trial(step, window)
     size = step.objective_weights.energy_scale
     for k in range(len(window.direction)):
         size += step.iteration_plan.anchor_stiffness[k // 4] * window.trial_position[k] ** 2
@@ -72,16 +68,16 @@ def start_solve(step: AcceleratedStep, edges, window: AccelerationWindow, target
     _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
     init_window(window, step.solution_rows)
     window.window_state[0].objective_decrease = 0.0
-    return _residual((step, edges, window))
+    return _residual((step, window))
 
 
 @jit_inner
 def _step_state(state):
-    step, edges, window = state
+    step, window = state
     now, there, verdict = window.window_state[0], 0.0, TRIAL_AGAIN
     propose_trial(window)
     while verdict == TRIAL_AGAIN:
-        there = _evaluate_trial(step, edges, window)
+        there = _evaluate_trial(step, window)
         before, size = abs(step.objective_values[0]) + 2.0 * step.objective_values[2], step.objective_values[1]
         now.objective_change, now.roundoff = (
             there - step.objective_values[0],
@@ -97,18 +93,16 @@ def _step_state(state):
 
 
 @jit_inner
-def _evaluate_trial(step, edges, window):
-    rows = len(window.direction) // 4
-    total = value_and_descent(
+def _evaluate_trial(step, window):
+    return value_and_descent(
         step.spring_packets, step.objective_weights, window.trial_position, step.right_hand_side, window.trial_descent
     )
-    return total + add_edge_descent(edges, rows, window.trial_position, window.trial_descent)
 
 
 @jit_inner
 def _residual(state):
     """Return |c|_Q [J^(1/2)] over the unpinned vertices."""
-    step, _, window = state
+    step, window = state
     for i in range(len(window.correction) // 4):
         for k in range(4 * i, 4 * i + 3):
             step.displacement_rows[k] = step.iteration_plan.unpinned_mask[i] * window.correction[k]
@@ -127,27 +121,27 @@ _iterate_loop = build_compiled_loop(_step_state, _residual)
 
 
 @jit_kernel
-def run_solve(step: AcceleratedStep, edges, window: AccelerationWindow, limits, out):
+def run_solve(step: AcceleratedStep, window: AccelerationWindow, limits, out):
     """Run the iteration loop (see `springbench.solvers.kernels.iteration_loop`) and write the positions to `out` (n,
     3)."""
-    answer = _iterate_loop((step, edges, window), limits)
+    answer = _iterate_loop((step, window), limits)
     read_positions(step.vertex_rows, window.position, out)
     return answer
 
 
 @jit_inner
 def _objective_decrease(state):
-    return state[2].window_state[0].objective_decrease
+    return state[1].window_state[0].objective_decrease
 
 
 _iterate_rounds = build_compiled_rounds(_step_state, _residual, _objective_decrease)
 
 
 @jit_kernel
-def run_solve_rounds(step: AcceleratedStep, edges, window: AccelerationWindow, rounds, limits, out):
+def run_solve_rounds(step: AcceleratedStep, window: AccelerationWindow, rounds, limits, out):
     """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions to `out` (n,
     3)."""
-    answer = _iterate_rounds((step, edges, window), rounds, limits)
+    answer = _iterate_rounds((step, window), rounds, limits)
     read_positions(step.vertex_rows, window.position, out)
     return answer
 

@@ -24,7 +24,6 @@ from springbench.solvers.iteration.iterative_solver import IterativeSolver, comp
 from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.acceleration_coefficients import require_history_size
-from springbench.solvers.kernels.edge_elements import EdgeElements
 from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, LoopLimits, iteration_limit
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.linalg.memory import allocate_aligned
@@ -173,7 +172,7 @@ class _CompiledEngine:
 
     def __init__(self, scheme: AccelerationScheme, compiled: PreparedCompiledLocalGlobal) -> None:
         self._acceleration_scheme = scheme
-        self._spring_form, self._edges, self._form = compiled.spring_form, compiled.edges, compiled.norm_packets
+        self._spring_form, self._form = compiled.spring_form, compiled.norm_packets
         plan, bundles, self._rows = compiled.iteration_plan, compiled.spring_packets, compiled.vertex_rows
         pins = compiled.base.system.pins
         self._block_entries = 4 * int(plan.block_table[:, 1].max())
@@ -201,8 +200,7 @@ class _CompiledEngine:
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Start a solve from an initial guess (n, 3) [m]."""
         state = self._free_states.pop() if self._free_states else self._allocate_state()
-        edges, given = self._spring_form.update_edges(self._edges, problem), (problem, initial_guess)
-        return _CompiledAccelerationState(self._free_states, state, self._spring_form, edges, *given)
+        return _CompiledAccelerationState(self._free_states, state, self._spring_form, problem, initial_guess)
 
 
 _AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow]
@@ -217,13 +215,13 @@ class _CompiledAccelerationState(AcceleratedState):
         free_states: list[_AccelerationMemory],
         state: _AccelerationMemory,
         parts: SpringForm,
-        edges: EdgeElements | None,
         problem: StepProblem,
         guess: Positions,
     ) -> None:
         self._free_states, self._memory = free_states, state
         step, window = state
-        self._state = step, edges, window
+        step = step._replace(spring_packets=parts.update_edges(step.spring_packets, problem))
+        self._state = step, window
         # The kernels are compiled for writable arrays.
         given = [
             np.array(x, order="C")
@@ -257,7 +255,7 @@ class _CompiledAccelerationState(AcceleratedState):
 
     def gradient(self) -> Positions:
         """Return the gradient of the objective (n, 3) [N] at the current point."""
-        step, _, window = self._state
+        step, window = self._state
         out = np.empty_like(self.positions)
         step_setup.read_positions(step.vertex_rows, window.descent, out)
         return np.negative(out, out=out)

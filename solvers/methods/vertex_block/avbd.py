@@ -257,7 +257,7 @@ class AugmentedSweepState(SweepState):
             base,
             np.empty_like(base),
         )
-        *others, hard = cast(tuple[Any, ...], self._element_data)
+        *others, hard = cast(tuple[Any, ...], self._element_data)  # one for each law, the edges of L last
         self._constraint_elements = hard._replace(parameters=hard.parameters.copy())
         self._element_data = (*others, self._constraint_elements)
         self._colour_packets = self._colour_packets._replace(majorant=self._colour_packets.majorant.copy())

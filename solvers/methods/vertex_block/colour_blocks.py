@@ -48,7 +48,7 @@ class VertexBlocks(NamedTuple):
         """Build the rows of a system from the decomposition of its energies."""
         n = system.num_vertices
         coloured = colouring.colour_vertices(
-            np.concatenate([parts.springs_and_forms.edges, vertex_elements.vertex_pairs()]), n
+            np.concatenate([parts.system_pairs.edges, vertex_elements.vertex_pairs()]), n
         )
         colour = np.empty(n, np.int64)
         colour[coloured.item_order] = np.repeat(np.arange(coloured.num_colours), np.diff(coloured.colour_starts))
@@ -57,14 +57,23 @@ class VertexBlocks(NamedTuple):
         row = np.empty(n, np.int64)
         row[order], row[pinned] = np.arange(len(order)), np.arange(len(order), n)
         colour[pinned] = -1
+        packed = parts.select_packed_edges()
         bundles, first = SpringPackets.from_springs(
-            parts.springs_and_forms, row, colour, coloured.num_colours, n, n + 1
+            parts.springs_and_forms,
+            row,
+            colour,
+            coloured.num_colours,
+            n,
+            n + 1,
+            packed.attach_edges(parts.springs_and_forms),
         )
         anchor_stiffness, majorant = np.zeros(n + 2), np.ones(n + 2)
         anchor_stiffness[: len(order)] = majorant[: len(order)] = (
             vertex_terms.compute_anchor_stiffness(system) + parts.vertex_weight
         )[order]
         majorant[: len(order)] += vertex_elements.stiffness_diagonal()[order]
+        for energy in (*packed.strain_limits, *packed.dashpots):
+            majorant[: len(order)] += energy.stiffness_matrix(n).diagonal()[order]
         ends = np.repeat(bundles.row_offset.reshape(-1, LANES), np.diff(bundles.packet_start), axis=0)
         np.add.at(majorant, ends.ravel() // 4, bundles.entry_weights()[1])
         return cls(row, len(order), bundles, first, anchor_stiffness, majorant)

@@ -4,10 +4,11 @@
 
 with n the direction and l the length of a spring, and q the anchor stiffness (inertia and penalty pins). Compressed
 springs lose their negative lateral curvature, so B_i is positive definite. A quadratic form adds its diagonal entry.
-Contact adds its exact second derivatives, since it acts on single vertices. A projective energy of elements (strain
-limits, dashpots) adds those of the vertex's elements. The paper has no line search. Here a step that would raise the
-energy is replaced by that of the majorant (q_i + sum of k) I, which cannot raise it; hence no sweep raises the
-objective. Energies without such a majorant, that is, energies that are not projective, are not supported.
+Contact adds its exact second derivatives, since it acts on single vertices. Strain limits and dashpots add theirs in
+the packets of the springs, any other projective energy of elements those of the vertex's elements. The paper has no
+line search. Here a step that would raise the energy is replaced by that of the majorant (q_i + sum of k) I, which
+cannot raise it; hence no sweep raises the objective. Energies without such a majorant, that is, energies that are not
+projective, are not supported.
 `device: cuda` computes the same iterates in `springbench.solvers.methods.vertex_block.device_vbd`. Vertices are
 processed by colour: no spring, form or element joins two of the same colour.
 
@@ -41,7 +42,7 @@ from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.vertex_block import vbd_sweeps as kernels
 from springbench.solvers.methods.vertex_block.colour_blocks import VertexBlocks
-from springbench.solvers.methods.vertex_block.vbd_packets import SPRING_SCRATCH_SIZE
+from springbench.solvers.methods.vertex_block.vbd_packets import PACKET_SCRATCH_SIZE, SPRING_SCRATCH_SIZE
 from springbench.solvers.methods.vertex_block.vertex_elements import VertexElements
 from springbench.solvers.model.barrier_energy import is_barrier_energy, without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
@@ -173,7 +174,7 @@ class PreparedVertexBlockDescent(IterativeSolver):
         gauge = residual_solver.description
         return cls(
             system,
-            parts,
+            parts.select_packed_edges(),
             vertex_elements.with_rows(made.row_of_vertex, system.num_vertices + 2),
             spectral_radius,
             kernels.ColourPackets(
@@ -242,22 +243,25 @@ class SweepState(SolverState):
     """State of a solve: sweeps over all vertices in one step problem."""
 
     def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
-        contacts, blocks = begin_active_contacts(problem), prepared.colour_packets
+        form, blocks = prepared.spring_form, prepared.colour_packets
+        blocks = blocks._replace(spring_packets=form.update_edges(blocks.spring_packets, problem))
+        contacts = begin_active_contacts(problem)
         self._element_data = prepared.vertex_elements.update_elements(problem)
         self._prepared, self._colour_packets, self._compute_residual = (
             prepared,
             blocks,
             prepared.residual_solver.build_residual(problem),
         )
-        pull = vertex_terms.compute_anchor_force(
-            replace(problem, external_force=prepared.spring_form.compute_force(problem))
-        )
+        pull = vertex_terms.compute_anchor_force(replace(problem, external_force=form.compute_force(problem)))
         p, y = (prepared.pack_rows(x) for x in (vertex_terms.apply_exact_pins(guess, problem), pull))
         self._right_hand_side = blocks.spring_packets.build_right_hand_side(prepared.anchor_stiffness, y)
         self._half_spaces = prepared.build_half_spaces(contacts) if contacts else None
         p[-4] = _PADDING_COORDINATE
         entries = int(np.diff(blocks.spring_packets.packet_start).max(initial=0))
-        scratch = allocate_aligned(SPRING_SCRATCH_SIZE * LANES * entries), allocate_aligned(9 * LANES)
+        scratch = (
+            allocate_aligned((PACKET_SCRATCH_SIZE + SPRING_SCRATCH_SIZE * entries) * LANES),
+            allocate_aligned(9 * LANES),
+        )
         self._sweep_scratch = kernels.SweepScratch(
             p.copy(), p.copy(), np.zeros_like(p), *scratch, np.zeros(1), np.full(1, np.nan)
         )

@@ -1,4 +1,4 @@
-"""Compiled vertex block descent with element energies in addition to springs: strain limits, dashpots, custom ones.
+"""Compiled vertex block descent with element energies in addition to springs: augmented Lagrangians, custom ones.
 
 Springs are processed in packets of eight vertices, as they are alone. The contributions of elements to gradients,
 blocks and energy changes are computed vertex by vertex in between.

@@ -249,7 +249,7 @@ class OffsetContactState(SweepState):
                 self._store_positions()
                 self._detect_contacts(self.positions)
             count, truncated = sweep(
-                made.colour_packets,
+                self._colour_packets,
                 self._element_data,
                 self._packed,
                 self._right_hand_side,

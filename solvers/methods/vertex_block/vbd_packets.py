@@ -9,6 +9,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from springbench.solvers.simd.edge_packets import EdgeBuilder
 from springbench.solvers.simd.llvm_vectors import I64, unpack_arguments
 from springbench.solvers.simd.spring_packets import (
     LANES,
@@ -22,6 +23,9 @@ from springbench.solvers.simd.spring_packets import (
 
 SPRING_SCRATCH_SIZE = 4
 """Numbers stored for each spring between the two passes: its vector and its length."""
+
+PACKET_SCRATCH_SIZE = 3
+"""Numbers stored for each vertex in front of them: the gradient of its dashpots."""
 
 _PIVOT_ROUNDOFF = 1e-14
 """Pivots up to this fraction of the trace are round-off, of some ten springs."""
@@ -54,6 +58,7 @@ def _solve_newton_system(v: PacketBuilder, block: list[Any], g: list[Any]) -> tu
 def _scratch_pointers(builder: Any, springs: SpringPacket, near: Any, entry: Any) -> list[Any]:
     """Return pointers to the stored vector and length of an entry's springs."""
     begins = builder.mul(builder.sub(entry, springs.first_entry), I64(LANES * SPRING_SCRATCH_SIZE))
+    begins = builder.add(begins, I64(LANES * PACKET_SCRATCH_SIZE))
     return [builder.gep(near, [builder.add(begins, I64(LANES * k))]) for k in range(SPRING_SCRATCH_SIZE)]
 
 
@@ -65,6 +70,8 @@ def _build_vertex_model(
     load: force of inertia, external forces and pins; weight: their stiffness.
     """
     builder: Any = v.builder
+    edges = None if springs.edges is None else EdgeBuilder(v, springs.edges, springs.packet_index)
+    slopes = v.allocate_sums(3)
     sums = [cgutils.alloca_once_value(builder, one) for one in (*load, weight, _ZERO, _ZERO, weight, _ZERO, weight)]
     short = cgutils.alloca_once_value(builder, ir.Constant(MASK_TYPE, [0] * LANES))
     with cgutils.for_range_slice(builder, springs.first_entry, springs.end_entry, I64(1), I64) as (entry, _):
@@ -83,6 +90,9 @@ def _build_vertex_model(
         compressed = [builder.fcmp_ordered(">", force, _ZERO) for force in (tension, inward)]
         lateral = builder.select(builder.and_(*compressed), _ZERO, builder.fsub(_ZERO, tension))
         axial = builder.fsub(k, lateral)
+        if edges is not None:
+            factors = [tension, lateral, axial]
+            tension, lateral, axial = edges.add_derivatives(entry, arrow, squared, root, factors, slopes)
         n = [builder.fmul(component, root) for component in arrow]
         along = [builder.fmul(axial, component) for component in n]
         added = [(tension, component) for component in arrow]
@@ -90,6 +100,11 @@ def _build_vertex_model(
         for index, ((one, other), accumulator) in enumerate(zip(added, sums, strict=True)):
             total = v.multiply_add(one, other, builder.load(accumulator))
             builder.store(builder.fadd(total, lateral) if index in (3, 6, 8) else total, accumulator)
+    if edges is not None:
+        edges.add_dashpot_blocks(sums[3:])
+        for k, (slope, total) in enumerate(zip(slopes, sums, strict=False)):
+            v.store(builder.load(slope), builder.gep(near, [I64(LANES * k)]))
+            builder.store(builder.fsub(builder.load(total), builder.load(slope)), total)
     found = [builder.load(total) for total in sums]
     return found[:3], found[3:], v.any_lane(builder.load(short))
 
@@ -99,6 +114,7 @@ def _energy_change(
 ) -> Any:
     """Return the energy change of steps d, from differences of lengths, which do not cancel."""
     builder: Any = v.builder
+    edges = None if springs.edges is None else EdgeBuilder(v, springs.edges, springs.packet_index)
     rise = builder.fmul(builder.fmul(_HALF, weight), v.squared_norm(d))
     for component, own_force in zip(d, load, strict=True):
         rise = v.subtract_product(rise, component, own_force)
@@ -107,13 +123,22 @@ def _energy_change(
         *arrow, length = [v.load(pointer, PACKET_TYPE) for pointer in _scratch_pointers(builder, springs, near, entry)]
         moved = [builder.fadd(a, b) for a, b in zip(arrow, d, strict=True)]
         squared = v.squared_norm(moved)
-        both = v.multiply_add(squared, v.inverse_sqrt(v.clamp_squared_length(squared)), length)
+        after = builder.fmul(squared, v.inverse_sqrt(v.clamp_squared_length(squared)), flags=("contract",))
+        both = builder.fadd(after, length, flags=("contract",))
         change = builder.fmul(builder.fadd(arrow[0], moved[0]), d[0])
         for c in (1, 2):
             change = v.multiply_add(builder.fadd(arrow[c], moved[c]), d[c], change)
         pull, k = v.load_packets(springs.weights, springs.weight_offset, entry)
-        factor = builder.fsub(builder.fmul(_HALF, k), builder.fdiv(pull, both))
+        if edges is None:
+            factor = builder.fsub(builder.fmul(_HALF, k), builder.fdiv(pull, both))
+        else:
+            by_both = builder.fdiv(_ONE, both)
+            factor = v.subtract_product(builder.fmul(_HALF, k), pull, by_both)
+            edges.add_limit_change(entry, length, after, change, by_both, rises)
         v.add_products([factor], [change], [rises])
+    if edges is not None:
+        slopes = [v.load(builder.gep(near, [I64(LANES * k)]), PACKET_TYPE) for k in range(PACKET_SCRATCH_SIZE)]
+        edges.add_dashpot_change(slopes, d, rises)
     return builder.load(rises)
 
 

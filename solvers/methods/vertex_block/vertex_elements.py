@@ -1,5 +1,8 @@
 """Element energies for vertex-by-vertex methods: the couplings of vertices and the majorants.
 
+Springs, strain limits and dashpots are in packets of eight vertices (`springbench.solvers.kernels.edge_elements`).
+These are all other projective energies with an element-wise form.
+
 If a single vertex moves, the change of a projective energy, w_e/2 |(A p)_e - d_e|^2, is bounded by its gradient and the
 diagonal of A'WA, which is its contribution to the majorant of the vertex.
 """
@@ -16,6 +19,7 @@ from springbench.solvers.methods.vertex_block import vbd_sweeps as plain
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.energies.element_energies import ElementLaw, Elements
 from springbench.solvers.model.step_problem import ProjectiveEnergy, StepProblem, System, is_lagged
+from springbench.solvers.objective.spring_form import is_packed_edge
 
 if TYPE_CHECKING:
     from springbench.solvers.methods.vertex_block.incident_elements import ElementKind, IncidentElements
@@ -38,7 +42,9 @@ class VertexElements:
     def from_system(cls, system: System) -> VertexElements:
         """Select those of a system."""
         known = (
-            k for k, e in enumerate(system.energies) if hasattr(e, "element_law") and isinstance(e, ProjectiveEnergy)
+            k
+            for k, e in enumerate(system.energies)
+            if hasattr(e, "element_law") and isinstance(e, ProjectiveEnergy) and not is_packed_edge(e)
         )
         return cls(system, tuple(known))
 

@@ -86,6 +86,11 @@ def _row_norms(v: Positions) -> NDArray[np.float64]:
     return np.sqrt(np.einsum("ij,ij->i", v, v))
 
 
+def vertex_pair_keys(edges: NDArray[np.int64], num_vertices: int) -> NDArray[np.int64]:
+    """Return one number for the vertices of each edge (m, 2), the same for both directions."""
+    return num_vertices * edges.min(axis=1, initial=num_vertices) + edges.max(axis=1, initial=0)
+
+
 def unit_directions(v: Positions, fallback: Positions) -> tuple[NDArray[np.float64], Positions]:
     """Return |v| (m,) and v/|v| (m, 3) of each row, with the fallback for a row of zero length."""
     length = _row_norms(v)
