@@ -8,11 +8,11 @@ from springbench.harness.execution.machine_info import limit_threads
 from springbench.harness.experiments.ablation.iteration_overhead import measure_overhead, prepare_scene
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.effects import GATES, KINDS, PRICES, SOLVED, STOP
+from tests.bench.effects import GATES, KINDS, PRICES, SINGLE_EFFECTS, SOLVED, STOP
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("effect", KINDS)
+@pytest.mark.parametrize("effect", [*SINGLE_EFFECTS, "all"])
 @pytest.mark.parametrize("solver", SOLVED)
 def test_an_effect_stays_below_its_limit(solver: str, effect: str):
     """By the lower end of the interval: a price that is beyond the limit for sure fails, noise does not."""
