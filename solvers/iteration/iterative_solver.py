@@ -84,6 +84,10 @@ class SolverState(ABC):
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents descent and the positions do not change."""
 
+    def compute_start_residual(self) -> float | None:
+        """Return the residual at the initial guess [J^(1/2)] before any iteration, None if it costs extra work."""
+        return self.start_residual
+
     def residual(self) -> float:
         """Return |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices, at the iterate of `residual_iterate`.
 
@@ -162,7 +166,7 @@ class IterativeSolver(ABC):
                 stop.atol,
             )
             if stop.rtol is not None:
-                known = run.start_residual if problem.initial_guess is problem.current_positions else None
+                known = run.compute_start_residual() if problem.initial_guess is problem.current_positions else None
                 yardstick = self.residual_at(problem, problem.current_positions) if known is None else known
                 limit, close = max(limit, stop.rtol * yardstick), stop.rtol <= _MINIMUM_CHECK_RTOL
             limits = LoopLimits(stop.max_iterations, limit, near, iteration_loop.RESIDUAL_EACH)

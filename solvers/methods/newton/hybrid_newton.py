@@ -13,8 +13,9 @@ positions at the end of the previous step. If H(t) has no Cholesky factor, the s
 one is added: along unstable directions the step is longer, the closer that multiple is to the minimum (More and
 Sorensen 1983).
 
-L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32: the iterations are then limited by memory
-bandwidth, and directions need no more digits. The start is the better of the initial guess and the inertial prediction.
+L-BFGS runs first. If the factor of Q exceeds the cache, it is in float32, unless Q is so stiff that its directions
+would have no digit: the iterations are then limited by memory bandwidth, and directions need no more digits. The start
+is the better of the initial guess and the inertial prediction.
 
 One rule decides which of the three methods continues: that with the largest decrease of the objective per cost in its
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
@@ -23,10 +24,11 @@ has no Cholesky factor, predicted tensions follow, and the exact method is tried
 each attempt that decreases the objective less than the others did meanwhile. A step of the exact method delivers if the
 Hessian is unmodified and the decrease agrees with the quadratic model; then the next step promises more than any other
 method, and the exact method continues until a step does not deliver. An indefinite Hessian gets the smallest multiple
-of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`). Costs are counted, not measured by a
-clock: in groups of L-BFGS iterations, from the numbers of springs, entries and operations of the factors and from the
-factorisations made. Equal solves so make equal decisions and have bitwise equal results, on any machine and under any
-load. `Solution.solver_phases` explains them.
+of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
+(`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
+in its last steps. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of
+springs, entries and operations of the factors and from the factorisations made. Equal solves so make equal decisions
+and have bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them.
 
 If a point that satisfies the tolerance has an indefinite Hessian, the step leaves along a direction of negative
 curvature: symmetric initial guesses lead to saddles.
@@ -96,6 +98,9 @@ _CACHED_ENTRIES = 2**15
 """Entries of a factor of Q that fit in a core's second-level cache, 256 KiB: there float64 costs as much as float32,
 and the residuals of L-BFGS are exact."""
 
+_FLOAT32_CONDITION = 0.1 / float(np.finfo(np.float32).eps)
+"""Largest condition number of Q, relative to the inertia, at which float32 leaves directions a digit."""
+
 _FIRST_PATIENCE = 10.0
 """Multiple of the cost of an attempt after which the exact method is tried again, at first."""
 
@@ -142,9 +147,9 @@ class HybridNewton:
         """
         with cache_symbolic_analysis():
             metric, objective = ResidualMetric(system), FixedObjective(system)
-            is_small = metric.stats.get("nnz_factor", np.inf) <= _CACHED_ENTRIES
-            lbfgs = Lbfgs(precision="float64" if is_small else "float32").prepare_without_barriers(system)
-            method, factor = HybridIteration(objective, metric, lbfgs, is_small), objective.hessian_matrix.factor
+            is_double = metric.stats.get("nnz_factor", np.inf) <= _CACHED_ENTRIES or _needs_double_precision(metric)
+            lbfgs = Lbfgs(precision="float64" if is_double else "float32").prepare_without_barriers(system)
+            method, factor = HybridIteration(objective, metric, lbfgs, is_double), objective.hessian_matrix.factor
         facts = metric.stats | {"nnz_hessian_factor": float(factor.nonzeros)}
         choice = f"a factor of the Hessian with {factor.nonzeros:,} entries; for L-BFGS, {lbfgs.description}"
         choice += objective.interpreted_energies
@@ -152,9 +157,20 @@ class HybridNewton:
 
         def ignore_contact() -> PreparedHybrid:
             alone = objective.ignore_barriers()
-            return replace(found, fixed_objective=alone, method=HybridIteration(alone, metric, lbfgs, is_small))
+            return replace(found, fixed_objective=alone, method=HybridIteration(alone, metric, lbfgs, is_double))
 
         return skip_idle_contact(found, system, ignore_contact)
+
+
+def _needs_double_precision(metric: ResidualMetric) -> bool:
+    """Return whether float32 leaves directions Q^-1 g without a digit.
+
+    No eigenvalue of Q relative to the inertia exceeds twice the largest ratio of their diagonals, as Q is diagonally
+    dominant.
+    """
+    system = metric.system
+    inertia = system.inertia_diagonal[system.free_vertices]
+    return bool((2.0 * metric.free_diagonal > _FLOAT32_CONDITION * inertia).any())
 
 
 class PreparedHybrid(PreparedDescent):
@@ -191,6 +207,7 @@ class SolveControl:
         is_minimum: whether the last point was reached by an unmodified Newton step that agrees with its model.
         residual: residual at the last point [J^(1/2)], None if it is not known.
         solver_phases: iterations and cost in Newton steps of each method so far.
+        first_run: L-BFGS started at the initial guess, if it is.
     """
 
     limits: LoopLimits = ONE_ITERATION
@@ -199,6 +216,7 @@ class SolveControl:
     is_minimum: bool = False
     residual: float | None = None
     solver_phases: dict[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
+    first_run: AcceleratedState | None = None
 
     def add_phase(self, name: str, num_iterations: int, cost: float) -> None:
         """Record iterations and the cost of a method, and set `num_iterations`."""
@@ -213,12 +231,16 @@ class _HybridState(SolverState):
     def __init__(self, prepared: PreparedHybrid, step: StepObjective, guess: Positions) -> None:
         self._prepared, self._metric, self._step, self._control = prepared, prepared.metric, step, SolveControl()
         self.positions = step.apply_exact_pins(guess)
-        method, first = prepared.hybrid_iteration, None
-        if method.exact_lbfgs:
-            first = method.start_lbfgs(step, self.positions)
-            self.start_residual = first.start_residual
-        self._points = method.iterate_from(step, self.positions, self._control, first)
+        self._points = prepared.hybrid_iteration.iterate_from(step, self.positions, self._control)
         self._point: DescentPoint | None = None
+
+    def compute_start_residual(self) -> float | None:
+        """Return the residual at the initial guess [J^(1/2)] by L-BFGS, which then continues from there."""
+        method = self._prepared.hybrid_iteration
+        if method.exact_lbfgs is None:
+            return None
+        self._control.first_run = method.start_lbfgs(self._step, self.positions)
+        return self._control.first_run.start_residual
 
     def step_state(self) -> bool:
         return self._advance(ONE_ITERATION)
@@ -269,26 +291,38 @@ class _HybridState(SolverState):
 
 
 class _MeasuredRule(ShiftScheduleRule):
-    """The smallest multiple of the inertia, or else the shift schedule; measures the steps of the exact method.
+    """The smallest multiple of the inertia, or the shift schedule; measures the steps of the exact method.
 
     Attributes:
         is_delivered: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
         is_exact_only: whether only the unmodified Hessian may be factorised.
     """
 
-    def __init__(self, inertia_diagonal: NDArray[np.float64]) -> None:
-        """Create the rule with the diagonal of the inertia (3f,) [N/m]."""
-        self._inertia_diagonal, self._shift = inertia_diagonal, InertiaShift(0.0, _MAX_SHIFT)
-        self._level: int | None = None
+    def __init__(self, method: HybridIteration) -> None:
+        self._inertia_diagonal, self._factor = method.inertia_diagonal, method.factor
+        self._shift, self._level, self._before = InertiaShift(0.0, _MAX_SHIFT), cast(int | None, None), 0.0
+        self._steps = {name: deque[tuple[float, float]](maxlen=_MEASURED_STEPS) for name in ("schedule", "shift")}
+        self._name = "schedule"
         self.is_delivered = self.is_exact_only = False
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
-        self.is_delivered = False
+        self.is_delivered, self._before = False, self._factor.num_factorisations
+        self._name = max(self._steps, key=self._gain)
         if self.is_exact_only:
             self._level = 0 if hessian.factorise() else None
+        elif self._name == "schedule":
+            self._level = factorise_shifted(hessian, diagonal)
         else:
             self._level = self._shift.find_smallest(lambda shift: self._factorise_shifted(hessian, diagonal, shift))
         return self._level
+
+    def _gain(self, name: str) -> float:
+        """Return the decrease [J] per factorisation in the last steps, infinite before there are enough."""
+        steps = self._steps[name]
+        if len(steps) < _MEASURED_STEPS:
+            return np.inf
+        fall, cost = map(sum, zip(*steps, strict=True))
+        return fall / cost
 
     def _factorise_shifted(self, hessian: Hessian, diagonal: NDArray[np.float64], shift: float) -> int | None:
         """Factorise with a multiple of the inertia added, or by the shift schedule if it is infinite."""
@@ -299,7 +333,10 @@ class _MeasuredRule(ShiftScheduleRule):
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         slope = inner_product(at.gradient, at.positions - to.positions)
         fall, (low, high) = objective_decrease(step, at, to), _MODEL_RANGE
-        self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
+        if self._name == "shift":
+            self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
+        if self._level:
+            self._steps[self._name].append((fall, self._factor.num_factorisations - self._before))
         self.is_delivered = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
 
 
@@ -317,7 +354,7 @@ class HybridIteration:
     identifies_saddles: ClassVar[bool] = True
 
     def __init__(
-        self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated, is_small: bool
+        self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated, is_double: bool
     ) -> None:
         self.metric, self._lbfgs = metric, lbfgs
         self.newton = NewtonIteration(metric, has_local_roundoff=True)
@@ -326,7 +363,7 @@ class HybridIteration:
             objective.system.inertia_diagonal[objective.system.free_vertices], 3
         )
         self.factor = factor = objective.hessian_matrix.factor
-        is_exact = is_small and not objective.has_barriers
+        is_exact = is_double and not objective.has_barriers
         is_exact = is_exact and objective.system is without_vertex_contact(objective.system)
         self.exact_lbfgs = lbfgs if is_exact else None
         constant, per_spring, per_entry = _LBFGS_NANOSECONDS
@@ -339,15 +376,11 @@ class HybridIteration:
         """Yield the points after `start`."""
         return self.iterate_from(step, start.positions, SolveControl())
 
-    def iterate_from(
-        self, step: StepObjective, p: Positions, control: SolveControl, first: AcceleratedState | None = None
-    ) -> Iterator[DescentPoint]:
-        """Yield the points after the positions p, (n, 3) [m]; restarts after an escape from a saddle.
-
-        `first` is L-BFGS started at p, if it is.
-        """
+    def iterate_from(self, step: StepObjective, p: Positions, control: SolveControl) -> Iterator[DescentPoint]:
+        """Yield the points after the positions p, (n, 3) [m]; restarts after an escape from a saddle."""
         lower, point = lower_start_positions(step, p), None
-        p, first = lower, first if lower is p else None
+        first, control.first_run = control.first_run if lower is p else None, None
+        p = lower
         while point is None or not point.is_stalled:
             if not (step.has_contact_elements or has_active_barrier(step, p)):
                 run, first = first or self.start_lbfgs(step, p), None
@@ -403,7 +436,8 @@ class _Approach:
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = run
         self._point, self._rounds = DescentPoint(start, start), init_rounds(method.newton_cost)
-        self._rule, self._steepest = _MeasuredRule(method.inertia_diagonal), 0.0
+        self._rule, self._steepest = _MeasuredRule(method), 0.0
+        self._floor = method.metric.energy_roundoff(start) ** 0.5  # [J^(1/2)]
         self._predicting: PredictedTensionNewton | None = None
         self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
         self._name, self._recent_steps = "", deque[tuple[float, float]](maxlen=_MEASURED_STEPS)  # [J], cost
@@ -435,6 +469,8 @@ class _Approach:
     def _choose_method(self) -> str:
         if self._rule.is_delivered or self._is_trial_due or not any(self._gains.values()):
             return "newton"
+        if self._gains["lbfgs"] == np.inf:
+            return "lbfgs"
         return max(self._gains, key=lambda name: self._gains[name])
 
     def _run_lbfgs(self) -> DescentPoint:
@@ -446,10 +482,7 @@ class _Approach:
             rounds["gain"], rounds["group_residual"] = np.inf, 0.0
         if step.barrier_energies:  # each round is checked for collisions
             limits = limits._replace(max_iterations=1)
-        before, floor = (
-            int(rounds["num_iterations"][0]),
-            self._method.metric.energy_roundoff(self._point.positions) ** 0.5,
-        )
+        before, floor = int(rounds["num_iterations"][0]), self._floor
         limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
         limits = LoopLimits(limits.max_iterations, limit, max(floor, limits.residual_floor), RESIDUAL_EACH)
         rounds["rival_gain"] = max(self._gains["predicted tensions"], self._gains["newton"])
