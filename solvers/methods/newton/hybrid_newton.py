@@ -26,7 +26,7 @@ Hessian is unmodified and the decrease agrees with the quadratic model; then the
 method, and the exact method continues until a step does not deliver. An indefinite Hessian gets the smallest multiple
 of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
 (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
-in its last steps. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of
+when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of
 springs, entries and operations of the factors and from the factorisations made. Equal solves so make equal decisions
 and have bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them.
 
@@ -268,7 +268,8 @@ class _HybridState(SolverState):
             count += self._control.num_iterations if moved else 0
             if limits.residual_mode == RESIDUAL_EACH:
                 found = self.residual()
-                ended = check_residual(found, limits)
+                if not (self._point and self._point.is_past_saddle):  # no end next to a saddle, whose residual is small
+                    ended = check_residual(found, limits)
             if ended == REASON_ITERATIONS and not moved:
                 ended = REASON_STALLED
         if limits.residual_mode == RESIDUAL_LAST or (limits.residual_mode == RESIDUAL_EACH and count == 0):
@@ -301,13 +302,13 @@ class _MeasuredRule(ShiftScheduleRule):
     def __init__(self, method: HybridIteration) -> None:
         self._inertia_diagonal, self._factor = method.inertia_diagonal, method.factor
         self._shift, self._level, self._before = InertiaShift(0.0, _MAX_SHIFT), cast(int | None, None), 0.0
-        self._steps = {name: deque[tuple[float, float]](maxlen=_MEASURED_STEPS) for name in ("schedule", "shift")}
-        self._name = "schedule"
+        self._gains = {"shift": np.inf, "schedule": np.inf}  # [J] per factorisation, when last used
+        self._name = "shift"
         self.is_delivered = self.is_exact_only = False
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
         self.is_delivered, self._before = False, self._factor.num_factorisations
-        self._name = max(self._steps, key=self._gain)
+        self._name = max(self._gains, key=lambda name: self._gains[name])
         if self.is_exact_only:
             self._level = 0 if hessian.factorise() else None
         elif self._name == "schedule":
@@ -315,14 +316,6 @@ class _MeasuredRule(ShiftScheduleRule):
         else:
             self._level = self._shift.find_smallest(lambda shift: self._factorise_shifted(hessian, diagonal, shift))
         return self._level
-
-    def _gain(self, name: str) -> float:
-        """Return the decrease [J] per factorisation in the last steps, infinite before there are enough."""
-        steps = self._steps[name]
-        if len(steps) < _MEASURED_STEPS:
-            return np.inf
-        fall, cost = map(sum, zip(*steps, strict=True))
-        return fall / cost
 
     def _factorise_shifted(self, hessian: Hessian, diagonal: NDArray[np.float64], shift: float) -> int | None:
         """Factorise with a multiple of the inertia added, or by the shift schedule if it is infinite."""
@@ -336,7 +329,7 @@ class _MeasuredRule(ShiftScheduleRule):
         if self._name == "shift":
             self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
         if self._level:
-            self._steps[self._name].append((fall, self._factor.num_factorisations - self._before))
+            self._gains[self._name] = fall / (self._factor.num_factorisations - self._before)
         self.is_delivered = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
 
 
