@@ -232,10 +232,13 @@ def test_no_newton_step_is_taken_where_lbfgs_is_sooner_at_the_limit():
 class ShiftedHessian:
     """A Hessian that has a factor with a shift, and without one where it is definite."""
 
+    num_factorisations = 0.0
+
     def __init__(self, is_definite: bool) -> None:
         self.is_definite = is_definite
 
     def factorise(self, scale: float = 1.0, shift: Any = 0.0) -> bool:
+        self.num_factorisations += 1.0
         return self.is_definite or bool(np.any(shift))
 
 
@@ -248,8 +251,8 @@ def test_only_a_step_by_the_unmodified_hessian_agrees_with_its_model(is_definite
     slope = np.vdot(at.gradient, at.gradient)
     while -step.objective_change(p, p - length * at.gradient)[0] > 0.6 * length * slope:
         length *= 1.1
-    rule = _MeasuredRule(inertia)
     hessian: Any = ShiftedHessian(is_definite)
+    rule = _MeasuredRule(inertia, hessian)
     assert rule.factorise_hessian(hessian, at, inertia) == (0 if is_definite else 1)
     rule.record_step(step, hessian, at, DescentPoint(p - length * at.gradient, at.gradient))
     assert rule.is_delivered == is_definite

@@ -73,6 +73,7 @@ from springbench.solvers.kernels.iteration_loop import (
     LoopLimits,
     check_residual,
 )
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import cache_symbolic_analysis
 from springbench.solvers.methods.local_global.accelerated_local_global import AcceleratedState
 from springbench.solvers.methods.newton.hessian_regularisation import ShiftScheduleRule, factorise_shifted
@@ -299,8 +300,9 @@ class _MeasuredRule(ShiftScheduleRule):
         is_exact_only: whether only the unmodified Hessian may be factorised.
     """
 
-    def __init__(self, method: HybridIteration) -> None:
-        self._inertia_diagonal, self._factor = method.inertia_diagonal, method.factor
+    def __init__(self, inertia_diagonal: NDArray[np.float64], factor: BlockCholesky) -> None:
+        """Create the rule with the diagonal of the inertia (3f,) [N/m] and the factor, which counts factorisations."""
+        self._inertia_diagonal, self._factor = inertia_diagonal, factor
         self._shift, self._level, self._before = InertiaShift(0.0, _MAX_SHIFT), cast(int | None, None), 0.0
         self._gains = {"shift": np.inf, "schedule": np.inf}  # [J] per factorisation, when last used
         self._name = "shift"
@@ -429,7 +431,7 @@ class _Approach:
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = run
         self._point, self._rounds = DescentPoint(start, start), init_rounds(method.newton_cost)
-        self._rule, self._steepest = _MeasuredRule(method), 0.0
+        self._rule, self._steepest = _MeasuredRule(method.inertia_diagonal, method.factor), 0.0
         self._floor = method.metric.energy_roundoff(start) ** 0.5  # [J^(1/2)]
         self._predicting: PredictedTensionNewton | None = None
         self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
