@@ -96,7 +96,7 @@ def measure_drape(
         spacing: spacing of the disc's lines [m].
     """
     half = round(DISC_RADIUS / spacing) * spacing
-    lines = np.linspace(-half, half, 2 * round(half / DISC_SPACING) + 1)
+    lines = np.linspace(-half, half, 2 * round(half / spacing) + 1)
     mesh = build_sheet(lines, lines, DISC_RADIUS * 1.0001)
     distance = np.hypot(mesh.rest_positions[:, 0], mesh.rest_positions[:, 2])
     weave: Any = OrthotropicStiffness(warp=fabric.warp, weft=fabric.weft, bias=fabric.shear, direction=(1.0, 0.0, 0.0))
