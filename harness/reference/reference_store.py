@@ -259,11 +259,8 @@ class ReferenceStore:
         """
         path = self.folder / f"converged-{_build_motion_name(spec, size, times)}.npz"
         witness = self._compute_contact_fingerprint(spec, size, times[-1])
-        stored = _read_arrays(path, [*_SELF_CONVERGED_FIELDS, "fingerprint", "error"])
-        known = bool(stored) and is_equal_to_roundoff(stored.pop("fingerprint"), witness)
-        if known and float(stored.pop("error")) <= error:
-            scalars = {key: stored.pop(key).item() for key in ("step", "last_change")}
-            return SelfConvergedTrajectory(**stored, **scalars)
+        if (stored := _read_self_converged(path, witness)) and stored[1] <= error:
+            return stored[0]
         error = refined_error or error
 
         def build_refined(h: float, integrator: str) -> Scene:
@@ -297,6 +294,8 @@ class ReferenceStore:
           InputError: the scene cannot be built.
           NotConverged: there is no such time.
         """
+        if found := self._find_stored_horizon(spec, size, t_end, error):
+            return found, ""
         last, reason, left = max(1, round(t_end / spec.time_step)), "", MAX_SECONDS
         step = t_end / last
         while True:
@@ -317,6 +316,16 @@ class ReferenceStore:
                 if last == 1 or left < SHORTEST_REFINEMENT:
                     raise
             last = max(1, last // 4)
+
+    def _find_stored_horizon(
+        self, spec: SceneSpec, size: int, t_end: float, error: float
+    ) -> SelfConvergedTrajectory | None:
+        """Find a stored motion at t_end [s] by which the error can be measured."""
+        path = self.folder / f"converged-{_build_motion_name(spec, size, [t_end])}.npz"
+        if not path.exists():
+            return None
+        stored = _read_self_converged(path, self._compute_contact_fingerprint(spec, size, t_end))
+        return stored[0] if stored and stored[0].count_known_times(CONTACT_MARGIN * error) else None
 
     def _save_horizon(
         self, spec: SceneSpec, size: int, found: SelfConvergedTrajectory, error: float
@@ -385,6 +394,16 @@ def _build_motion_name(spec: SceneSpec, size: int, times: Sequence[float]) -> st
 def _save_self_converged(path: Path, found: SelfConvergedTrajectory, witness: Positions, error: float) -> None:
     arrays = {name: np.asarray(getattr(found, name)) for name in _SELF_CONVERGED_FIELDS}
     _write_arrays(path, arrays | {"fingerprint": witness, "error": np.asarray(error)})
+
+
+def _read_self_converged(path: Path, witness: Positions) -> tuple[SelfConvergedTrajectory, float] | None:
+    """Read a stored motion and the error that it was computed for; None without one of the same scene."""
+    stored = _read_arrays(path, [*_SELF_CONVERGED_FIELDS, "fingerprint", "error"])
+    if not stored or not is_equal_to_roundoff(stored.pop("fingerprint"), witness):
+        return None
+    error = float(stored.pop("error"))
+    scalars = {key: stored.pop(key).item() for key in ("step", "last_change")}
+    return SelfConvergedTrajectory(**stored, **scalars), error
 
 
 def _build_minima(arrays: Arrays) -> KnownMinima:

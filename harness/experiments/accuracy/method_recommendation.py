@@ -82,6 +82,8 @@ SEARCH_TIME = 60.0
 """Default limit for the wall time of all measurements together [s]."""
 BUDGET_REFERENCE_ERROR = 1e-3
 """Relative error that the reference must resolve where a wall time is given: people who have one accept a percent."""
+CONTACT_BUDGET_ERROR = 0.02
+"""The same with contact, whose errors at a frame's time step are some percent, and whose reference is less accurate."""
 BUDGET_RANGE = 2.0
 """Multiple of a given wall time up to which methods are measured, to tell what more time would buy."""
 FIXED_ITERATIONS, FEWER_ITERATIONS = 50, [2, 5, 10, 20]
@@ -177,20 +179,26 @@ def _load_solver(name: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class RecommendationGoal:
-    """What a method must keep to; one of the two is given.
+    """What a method must keep to: one of error and wall time is given.
 
     Attributes:
         max_error: relative error at the end.
         frame_seconds: wall time [s] of a frame, which is a time step of the scene.
+        budget_error: relative error that the reference must resolve where a wall time is given.
     """
 
     max_error: float | None = None
     frame_seconds: float | None = None
+    budget_error: float = BUDGET_REFERENCE_ERROR
 
     @property
     def reference_error(self) -> float:
         """Relative error that the reference must resolve."""
-        return BUDGET_REFERENCE_ERROR if self.max_error is None else self.max_error
+        return self.budget_error if self.max_error is None else self.max_error
+
+    def loosen_for_contact(self) -> RecommendationGoal:
+        """Return the goal for a scene with contact, where a wall time resolves larger errors only."""
+        return replace(self, budget_error=CONTACT_BUDGET_ERROR)
 
     def select_methods(
         self, methods: Sequence[MeasuredMethod], frame: float, factor: float = 1.0
@@ -368,6 +376,8 @@ def recommend_method(
         partial(_plan_study, path, scene, size, goal, candidates, t_end, time_limit, store)
     )
     study, reference_error = planned
+    if reference_error and goal.max_error is None:
+        goal = goal.loosen_for_contact()
     if goal.max_error and reference_error:
         goal = replace(goal, max_error=goal.max_error - reference_error)
         print_message(
@@ -458,6 +468,7 @@ def _plan_study(
     if touches:
         print_message(describe_self_convergence(scene.path.stem))
         candidates = candidates.restrict_to_contact()
+        max_error = goal.loosen_for_contact().reference_error
         t_end = _find_contact_t_end(scene, size, max_error, t_end, reference_store, print_message)
     elif t_end is None:
         t_end = find_default_t_end(path, scene, size, max_error, reference_store, print_message)
