@@ -275,7 +275,7 @@ def _run_error_controlled(job: RunJob, max_error: float, session: TimingSession)
     """Return the rows of an error-controlled run, whose integrator and step size are chosen first."""
     run = job.run
     with _hold_timing_lock(run, job.tick) as lock_columns:
-        found = load_target(ERROR_CONTROL_TARGET)(run, max_error, job.tick)
+        found = load_target(ERROR_CONTROL_TARGET)(run, max_error, job.tick, job.files.results_folder)
     rows, seen, last = found.rows(), found.positions, dict[str, Any]()
     session.finish_timing()
     if job.positions_path:

@@ -58,6 +58,11 @@ class RunFiles:
             folder / "pictures" / f"{label}.png",
         )
 
+    @property
+    def results_folder(self) -> Path:
+        """Folder that contains the folder of each sweep."""
+        return self.rows_path.parents[2]
+
     def to_absolute(self) -> RunFiles:
         """Return the files as absolute paths.
 

@@ -9,6 +9,7 @@ Each line states in how many frames no primitives intersect, by the exact test o
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 from pyarrow import csv
@@ -25,6 +26,11 @@ select scene, size, max(vertices) as vertices, solver, parameters, any_value(sta
 from rows_of group by run_id, scene, size, solver, parameters order by scene, size, solver, parameters, num_frames"""
 
 
+def find_certificates(rows: pa.Table) -> list[dict[str, Any]]:
+    """Return a mapping for each run of a sweep's rows: its frames, and how many of them are free of intersections."""
+    return query_records(_CERTIFICATE_QUERY, rows)
+
+
 def write_certificates(rows: pa.Table, folder: Path) -> list[Path]:
     """Write certificates.csv and return its path.
 
@@ -38,5 +44,5 @@ def write_certificates(rows: pa.Table, folder: Path) -> list[Path]:
     """
     path = folder / "certificates.csv"
     with atomic_write(path) as partial:
-        csv.write_csv(pa.Table.from_pylist(query_records(_CERTIFICATE_QUERY, rows)), partial)
+        csv.write_csv(pa.Table.from_pylist(find_certificates(rows)), partial)
     return [path]

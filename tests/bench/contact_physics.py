@@ -1,10 +1,12 @@
-"""Contact against closed forms: Coulomb's law on a slope, creep below its angle, and refinement of the thickness.
+"""Contact against closed forms: Coulomb's law on a slope, creep below its angle, momentum, refinement of the thickness.
 
     python -m tests.bench.contact_physics [--publish results/published/contact-physics]
 
 A vertex of 1 kg at rest on a slope of 1:2 slides for a second, or sticks. n steps of implicit Euler lead
 n (n + 1)/2 dt^2 g (sin - mu cos) down the slope, the exact motion g (sin - mu cos) t^2/2. What sticks creeps at
-tan/mu times `eps_v`. The thickness of contact is halved for a sheet that
+tan/mu times `eps_v`. Two sheets collide in free space, by implicit Euler. Of
+the steps the largest change of momentum counts, relative to the sum of |m v|, and the largest x_(n+1) x m (v_(n+1) -
+v_n), which is 0 without a torque, relative to the sum of |x x m v|. The thickness of contact is halved for a sheet that
 sinks onto a ball (`tests.contact_refinement`).
 """
 
@@ -20,9 +22,13 @@ from rich.console import Console
 from rich.table import Table
 from springbench.harness.scenes.effects.contact_effect import ContactEffect
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
+from springbench.harness.scenes.effects.self_contact_effect import SelfContactEffect
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.mesh.network_mesh import NetworkMesh
-from springbench.harness.simulation.time_loop import SimulationStep, prepare, simulate_scene
+from springbench.harness.scenes.mesh.stack_mesh import StackMesh
+from springbench.harness.simulation.time_loop import MotionState, SimulationStep, prepare, simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
+from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StopRule
 
 from tests.bench.scripted_study import describe_moment, publish_rows
@@ -34,6 +40,8 @@ GRAVITY, SLOPE, NUM_STEPS, THICKNESS = 9.81, 0.5, 60, 0.005
 SIN, COS = SLOPE / np.hypot(1.0, SLOPE), 1.0 / np.hypot(1.0, SLOPE)
 SLIPS, STICKS = 0.4, 0.6
 """Coefficients of friction on either side of the slope's tangent."""
+THROWN = (0.1, -2.0, 0.0)
+"""Velocity of the upper sheet of a collision [m/s]."""
 
 
 def simulate_vertex(friction: float) -> list[SimulationStep]:
@@ -45,6 +53,38 @@ def simulate_vertex(friction: float) -> list[SimulationStep]:
     scene = build_test_scene(vertex, down, ground, size=0, time_step=1.0 / NUM_STEPS)
     prepared = prepare(scene, NewtonSolver())
     return list(simulate_scene(scene, prepared, StopRule(400, 1e-10), initial_guess="previous", frames=NUM_STEPS))
+
+
+def measure_collision(friction: float) -> tuple[float, float]:
+    """Return the largest change of momentum and of angular momentum in a step of two sheets that collide, relative."""
+    contact = SelfContactEffect(min_distance=0.02, friction=friction)
+    sheets = StackMesh(layer_spacing=0.05)
+    scene = build_test_scene(sheets, SpringsEffect(stretch=100.0, shear=20.0), contact, size=5)
+    p, v = scene.mesh.rest_positions, np.zeros_like(scene.mesh.rest_positions)
+    v[len(p) // 2 :] = THROWN
+    mass, state = scene.system.mass[:, None], MotionState(Motion(p, v), None, 0)
+    steps = simulate_scene(
+        scene,
+        prepare(scene, NewtonSolver()),
+        StopRule(100, 1e-11),
+        initial_guess="extrapolated",
+        frames=6,
+        initial_state=state,
+    )
+    changes = list[tuple[float, float]]()
+    for step in steps:
+        now = step.state.motion
+        changed, momentum = mass * (now.velocity - v), mass * now.velocity
+        turned = np.cross(now.positions, changed).sum(axis=0), np.cross(now.positions, momentum)
+        changes.append(
+            (
+                float(np.linalg.norm(changed.sum(axis=0)) / np.linalg.norm(momentum, axis=1).sum()),
+                float(np.linalg.norm(turned[0]) / np.linalg.norm(turned[1], axis=1).sum()),
+            )
+        )
+        v = now.velocity.copy()
+    linear, angular = np.max(changes, axis=0)
+    return float(linear), float(angular)
 
 
 def measure_physics() -> list[dict[str, Any]]:
@@ -61,6 +101,12 @@ def measure_physics() -> list[dict[str, Any]]:
         {"quantity": "creep speed", "value": float(creep.state.motion.velocity[0, 0])},
     ]
     distances = successive_distances([simulate_fall(thickness, 100.0) for thickness in THICKNESSES])
+    for friction in (0.0, 0.5):
+        linear, angular = measure_collision(friction)
+        rows += [
+            {"quantity": "momentum", "friction": friction, "value": linear},
+            {"quantity": "angular momentum", "friction": friction, "value": angular},
+        ]
     return rows + [
         {"quantity": "refinement", "thickness": thickness, "value": distance}
         for thickness, distance in zip(THICKNESSES, distances, strict=False)
@@ -73,9 +119,9 @@ def main() -> None:
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
     begin, rows = describe_moment(), measure_physics()
-    table = Table("quantity", "thickness [m]", "value", "implicit Euler", "closed form", box=SIMPLE_HEAD)
+    table = Table("quantity", "thickness [m]", "friction", "value", "implicit Euler", "closed form", box=SIMPLE_HEAD)
     for row in rows:
-        cells = (row.get(name) for name in ("thickness", "value", "discrete_form", "closed_form"))
+        cells = (row.get(name) for name in ("thickness", "friction", "value", "discrete_form", "closed_form"))
         table.add_row(row["quantity"], *("" if cell is None else f"{cell:.5g}" for cell in cells))
     Console(width=120).print(table)
     publish_rows(options.publish, CONFIG, "python -m tests.bench.contact_physics", rows, begin, is_timed=False)

@@ -20,6 +20,7 @@ from springbench.harness.reference.self_converged_trajectory import (
 )
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.results import parquet_rows
+from springbench.harness.results.run_schema import RUN_SCHEMA
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.solvers.contact.contact_potential import ObstacleContact
 from springbench.solvers.contact.obstacle_mesh import ObstacleCollisionMesh
@@ -101,6 +102,25 @@ def test_a_run_to_an_error_keeps_to_it_by_the_reference_whose_bound_counts(drop:
     assert row["reference_kind"] == "self-converged"
     assert row["error"] < row["error"] + row["reference_error"] <= row["error_estimated"] * (1.0 + 1e-9) <= 0.05
     assert row["integrator"] in LIMIT_INTEGRATORS
+
+
+@pytest.mark.long
+def test_a_sweep_to_an_error_measures_it_by_the_reference_and_refuses_what_cannot_be_measured(
+    drop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reference_store, "MAX_SECONDS", 10.0)
+    options = "options: {error_target: [0.05, 1e-8], frames: 12, record: false, pictures: false}"
+    (drop.parent / "sweep.yaml").write_text(f"scenes: [drop.yaml]\nsolvers: [newton]\n{options}\n")
+    answer = CliRunner().invoke(app, ["run", "sweep.yaml", "--in-process"])
+    assert answer.exit_code == 1, "one of the runs failed"
+    assert "an error of 1.0e-08 cannot be measured" in " ".join(answer.output.split())
+    rows = parquet_rows.read_rows((tmp_path / "results" / "sweep" / "rows").glob("*.parquet"), RUN_SCHEMA).to_pylist()
+    reached = [row for row in rows if row["error_requested"] == 0.05]
+    assert {row["status"] for row in reached} == {"ok"}
+    assert all(row["error_estimated"] <= 0.05 and row["integrator"] in LIMIT_INTEGRATORS for row in reached)
+    (refused,) = (row for row in rows if row["error_requested"] == 1e-8)
+    assert refused["status"] != "ok"
+    assert "contact has no certified reference" in refused["reason"]
 
 
 @pytest.mark.long

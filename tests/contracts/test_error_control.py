@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from springbench.harness.config.config_loader import load_scene
-from springbench.harness.errors import RunFailed
-from springbench.harness.experiments.error_control import candidate_methods as module
 from springbench.harness.experiments.error_control.candidate_methods import (
     ErrorTarget,
     list_candidate_methods,
@@ -20,7 +18,6 @@ from springbench.harness.experiments.error_control.method_search import (
     compute_predictability_horizon,
     search_cheapest_method,
 )
-from springbench.harness.experiments.error_control.step_doubling import estimate_by_step_doubling
 from springbench.harness.experiments.error_control.third_party_integrators import build_jacobian_sparsity
 from springbench.harness.reference.equations_of_motion import OdeField, build_ode_scene
 from springbench.harness.reference.perturbation_growth import estimate_growth
@@ -33,7 +30,6 @@ from springbench.harness.reference.reference_trajectory import (
     integrate_motion,
 )
 from springbench.harness.scenes.effects.air_drag_effect import AirDragEffect
-from springbench.harness.scenes.effects.contact_effect import ContactEffect
 from springbench.harness.scenes.effects.dashpots_effect import DashpotsEffect
 from springbench.harness.scenes.effects.gravity_effect import GravityEffect
 from springbench.harness.scenes.effects.pins_effect import PinsEffect
@@ -249,7 +245,7 @@ def test_a_refusal_names_the_longest_horizon_that_works(tmp_path):
 
 
 def test_long_steps_that_an_error_allows_cause_no_warning(caplog: pytest.LogCaptureFixture):
-    error_target = ErrorTarget.from_scene(SWINGING, 5, 40.0, lambda line: None)
+    error_target = ErrorTarget.from_scene(SWINGING, 5, 40.0)
     with caplog.at_level("WARNING", logger="springbench"):
         error_target.build_scene(20.0, "esdirk-4")
         assert not caplog.records
@@ -381,21 +377,3 @@ def test_drag_that_grows_with_the_square_of_the_speed_is_graded_too(tmp_path):
         lambda h: error_target.build_scene(h, "esdirk-4"), NewtonSolver(), error_target.t_end, error_target.num_frames
     ).integrate_motion(1e-6)
     assert found.measure_error(0, path.positions[-1]) < 1e-3
-
-
-def test_contact_is_refused_with_what_can_be_had(monkeypatch):
-    """Which is the difference that halving the steps makes: half as much each time, for the order is 1."""
-    floor = ContactEffect.model_validate({"obstacles": [{"kind": "plane", "point": [0.0, -9.0, 0.0]}]})
-    spec = chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD, floor)
-    monkeypatch.setattr(module, "_STEP_DOUBLING_SECONDS", 0.5)
-    with pytest.raises(RunFailed, match=r"contact begins and ends within steps.*steps of .* s end within .* of where"):
-        ErrorTarget.from_scene(spec, 5, END)
-    error_target = ErrorTarget(chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD), 5, END, FRAMES)
-    found = estimate_by_step_doubling(error_target.build_scene, END, FRAMES, time_budget=0.5)
-    error = integrate_motion(error_target.build_scene(error_target.frame_seconds, "substepping"), [END]).measure_error
-    scene, steps = error_target.build_scene(found.time_step, "implicit-euler"), round(END / found.time_step)
-    path = simulate_scene(
-        scene, prepare(scene, NewtonSolver()), StopRule(50, 1e-9), initial_guess="previous", frames=steps
-    )
-    true = error(0, [step.positions for step in path][-1])
-    assert found.relative_change == pytest.approx(0.5 * true, rel=0.3)  # h - h/2, and what is of order 2

@@ -132,7 +132,7 @@ def _execute_error_control(
     print_message: PrintMessage,
 ) -> bool:
     print_message("estimating how far ahead the motion can be predicted")
-    error_target = ErrorTarget.from_scene(scene, size, t_end, print_message, supports_contact=True)
+    error_target = ErrorTarget.from_scene(scene, size, t_end)
     folder = claim_folder(results / config.stem, config)
     with machine_info.limit_threads(1):
         before = read_stored_trials(folder / "accuracy", error_target)

@@ -10,7 +10,6 @@ from springbench.harness.config.config_loader import find_scene_mistakes
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.execution.progress_display import ThrottledMessages
-from springbench.harness.experiments.error_control.step_doubling import estimate_by_step_doubling
 from springbench.harness.reference.self_converged_trajectory import LIMIT_INTEGRATORS, has_contact
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.scenes.scene_builder import Scene
@@ -24,12 +23,6 @@ from springbench.solvers.registry import SOLVER_TABLE, SOLVERS, find_solver_info
 
 _WARMUP_TOLERANCE = 1e-2
 """Tolerance of the warm-up run, which only compiles, as a fraction of the mesh size."""
-_STEP_DOUBLING_SECONDS = 30.0
-"""Wall time for the step-doubling estimate where error control is not possible [s]."""
-_CONTACT_MESSAGE = (
-    "contact begins and ends within steps, where every method has order 1, so errors cannot be controlled; use a fixed "
-    "step size (--integrator, --time-step), and halve it until the motion does not change"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +49,6 @@ class ErrorTarget:
         scene: SceneSpec,
         size: int | None,
         t_end: float | None,
-        print_message: Callable[[str], None] | None = None,
-        *,
-        supports_contact: bool = False,
     ) -> ErrorTarget:
         """Return the target for a scene.
 
@@ -68,12 +58,9 @@ class ErrorTarget:
             scene: the scene.
             size: size of the mesh; the scene's default if None.
             t_end: simulated time [s]; that of the scene if None.
-            print_message: prints a remark.
-            supports_contact: whether errors are measured by a self-converged reference where there is contact.
 
         Raises:
             InputError: the size or the time step does not fit the scene.
-            RunFailed: the scene has contact, which is not supported.
         """
         scene.require_fixed_time_step()
         t_end = t_end or scene.frames * scene.time_step
@@ -81,18 +68,7 @@ class ErrorTarget:
         frames = max(1, round(t_end / scene.time_step))
         if mistakes := find_scene_mistakes(scene, [size]):
             raise InputError(mistakes)
-        target = cls(scene, size, t_end, frames)
-        if target.has_contact and not supports_contact:
-            if print_message:
-                print_message(
-                    "no error can be promised with contact; halving steps for "
-                    f"{_STEP_DOUBLING_SECONDS:g} s to tell what can be had"
-                )
-            raise RunFailed(
-                f"{_CONTACT_MESSAGE}; "
-                f"{estimate_by_step_doubling(target.build_scene, t_end, frames, time_budget=_STEP_DOUBLING_SECONDS)}"
-            )
-        return target
+        return cls(scene, size, t_end, frames)
 
     def build_scene(self, time_step: float, integrator: str) -> Scene:
         """Build the scene with a time step [s] and an integrator by name."""
@@ -174,6 +150,17 @@ def list_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
     if not is_minimiser(load_target(SOLVER_TABLE[solver.name])):
         raise Unsupported(f"{solver.name}: tells no error of its steps and does not minimise those of an integrator")
     return [(name, solver) for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order]
+
+
+def list_contact_methods_of_solver(solver: SolverSpec) -> list[tuple[str, SolverSpec]]:
+    """Return the integrators that support contact, combined with one solver.
+
+    Raises:
+        Unsupported: the solver does not minimise the steps of an integrator.
+    """
+    if not is_minimiser(load_target(SOLVER_TABLE[solver.name])):
+        raise Unsupported(f"{solver.name}: does not minimise steps, which error control with contact needs")
+    return [(name, solver) for name in LIMIT_INTEGRATORS]
 
 
 def prepare_candidate_methods(

@@ -6,18 +6,24 @@ Integrator and step size are chosen.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.errors import RunFailed
 from springbench.harness.execution.worker_process import ProgressCallback
-from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, list_methods_of_solver
+from springbench.harness.experiments.error_control.candidate_methods import (
+    ErrorTarget,
+    list_contact_methods_of_solver,
+    list_methods_of_solver,
+)
 from springbench.harness.experiments.error_control.method_search import (
     SearchResult,
     compute_predictability_horizon,
     search_cheapest_method,
 )
+from springbench.harness.reference.perturbation_growth import PerturbationGrowth
 from springbench.harness.results.quantities import compute_ms_per_step
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import Trajectory
@@ -101,7 +107,7 @@ class ErrorControlledRun:
         }
 
 
-def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> ErrorControlledRun:
+def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback, results: Path) -> ErrorControlledRun:
     """Find the cheapest method of the run's solver, and repeat it.
 
     It is repeated for all rounds of the run.
@@ -110,22 +116,16 @@ def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> 
         run: specification of the run.
         error: relative error at the end of the run.
         tick: called with the name of the phase as the run progresses.
+        results: folder of results, with the stored references by which errors with contact are measured.
 
     Raises:
         RunFailed: no setting reaches the error, or a round ends at positions that are not bitwise identical.
         Unsupported: the solver does not support error control. Errors of the solver are raised unchanged.
     """
-    pairs = list_methods_of_solver(run.solver)
     error_target = ErrorTarget.from_scene(run.scene, run.size, run.frames * run.scene.time_step)
     messages = list[str]()
     tick("choosing steps")
-    answer = search_cheapest_method(
-        error_target,
-        error,
-        compute_predictability_horizon(error_target, error, messages.append),
-        lambda line: tick("choosing steps"),
-        pairs,
-    )
+    answer = _search_method(run, error_target, error, tick, results, messages)
     best, rounds = answer.best_trial, list[Trajectory]()
     for _ in range(run.rounds):
         rounds.append(best.rerun_trial())
@@ -141,3 +141,27 @@ def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback) -> 
         best.measure_dissipation(error_target.frame_seconds),
         messages,
     )
+
+
+def _search_method(
+    run: RunSpec,
+    error_target: ErrorTarget,
+    error: float,
+    tick: ProgressCallback,
+    results: Path,
+    messages: list[str],
+) -> SearchResult:
+    """Search the cheapest method of the run's solver; remarks are added to the messages."""
+    if not error_target.has_contact:
+        pairs = list_methods_of_solver(run.solver)
+        growth = compute_predictability_horizon(error_target, error, messages.append)
+        return search_cheapest_method(error_target, error, growth, lambda line: tick("choosing steps"), pairs)
+    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
+
+    pairs = list_contact_methods_of_solver(run.solver)
+    reference = open_reference_store(results).require_contact_horizon(
+        error_target.scene, error_target.size, error_target.t_end, error=error
+    )
+    messages.append(f"the self-converged reference errs by up to {reference.get_error_bound(-1):.1e}, which counts")
+    growth = PerturbationGrowth.from_reference(reference)
+    return search_cheapest_method(error_target, error, growth, lambda line: tick("choosing steps"), pairs, reference)

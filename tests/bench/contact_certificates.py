@@ -1,0 +1,60 @@
+"""Certificates of contact from the rows of sweeps: in how many frames nothing intersects, and how many steps converged.
+
+    springbench run configs/hard-touch.yaml
+    python -m tests.bench.contact_certificates [results/hard-touch ...] [--publish FOLDER]
+
+A row states a run: its frames, those in which an exact test finds no edge that passes through a triangle, the steps
+that ended at their tolerance, and the reason of a run without frames. `springbench run
+configs/contact-certificates.yaml` simulates the touching scenes, in hours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from springbench.harness.report.intersection_certificates import find_certificates
+from springbench.harness.results.parquet_rows import read_rows
+from springbench.harness.results.run_schema import RUN_SCHEMA
+
+from tests.bench.scripted_study import publish_tables
+
+CONFIG = Path(__file__).parents[2] / "configs" / "hard-touch.yaml"
+PROVENANCE = ("commit", "cpu", "cores", "memory_gib", "operating_system", "versions", "started_at")
+
+
+def main() -> None:
+    """Print the certificates by solver."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("results", nargs="*", type=Path, default=[Path("results/hard-touch")])
+    parser.add_argument("--publish", type=Path, help="folder of a published study")
+    options = parser.parse_args()
+    paths = [path for folder in options.results for path in sorted((folder / "rows").glob("*.parquet"))]
+    rows = read_rows(paths, RUN_SCHEMA)
+    found = find_certificates(rows)
+    table = Table("solver", "runs", "frames", "free of intersections", "steps", "converged", box=SIMPLE_HEAD)
+    for solver in dict.fromkeys(row["solver"] for row in found):
+        own = [row for row in found if row["solver"] == solver]
+        free, converged, frames = (
+            sum(row[name] or 0 for row in own)
+            for name in ("num_intersection_free_frames", "num_converged_steps", "num_frames")
+        )
+        table.add_row(solver, *map(str, (len(own), frames, free, frames, converged)))
+    Console(width=120).print(table)
+    if options.publish:
+        command = "python -m tests.bench.contact_certificates " + " ".join(
+            f"results/{os.path.basename(folder)}" for folder in options.results
+        )
+        moments: list[dict[str, Any]] = rows.select(list(PROVENANCE)).to_pylist()
+        tables = {"measurements": pa.Table.from_pylist(found)}
+        publish_tables(options.publish, CONFIG, command, tables, moments, is_timed=False)
+
+
+if __name__ == "__main__":
+    main()
