@@ -11,7 +11,6 @@ configs/contact-certificates.yaml` simulates the touching scenes, in hours.
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +34,11 @@ def main() -> None:
     parser.add_argument("results", nargs="*", type=Path, default=[Path("results/hard-touch")])
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    paths = [path for folder in options.results for path in sorted((folder / "rows").glob("*.parquet"))]
-    rows = read_rows(paths, RUN_SCHEMA)
-    found = find_certificates(rows)
+    found, moments = list[dict[str, Any]](), list[dict[str, Any]]()
+    for folder in options.results:
+        rows = read_rows(sorted((folder / "rows").glob("*.parquet")), RUN_SCHEMA)
+        found += [{"sweep": folder.name, **one} for one in find_certificates(rows)]
+        moments += rows.select(list(PROVENANCE)).to_pylist()
     table = Table("solver", "runs", "frames", "free of intersections", "steps", "converged", box=SIMPLE_HEAD)
     for solver in dict.fromkeys(row["solver"] for row in found):
         own = [row for row in found if row["solver"] == solver]
@@ -48,10 +49,9 @@ def main() -> None:
         table.add_row(solver, *map(str, (len(own), frames, free, frames, converged)))
     Console(width=120).print(table)
     if options.publish:
-        command = "python -m tests.bench.contact_certificates " + " ".join(
-            f"results/{os.path.basename(folder)}" for folder in options.results
+        command = " ".join(
+            ["python -m tests.bench.contact_certificates", *(f"results/{folder.name}" for folder in options.results)]
         )
-        moments: list[dict[str, Any]] = rows.select(list(PROVENANCE)).to_pylist()
         tables = {"measurements": pa.Table.from_pylist(found)}
         publish_tables(options.publish, CONFIG, command, tables, moments, is_timed=False)
 
