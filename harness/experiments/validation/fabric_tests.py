@@ -85,9 +85,17 @@ def measure_bending_length(fabric: PublishedFabric, solver: Solver) -> MeasuredB
     return MeasuredBand(float(overhang) / 2.0, low, high)
 
 
-def measure_drape(fabric: PublishedFabric, solver: Solver) -> tuple[MeasuredBand, Positions, NDArray[np.int64]]:
-    """Simulate the drape test; drape coefficient and band in percent, with positions and triangles of the specimen."""
-    half = round(DISC_RADIUS / DISC_SPACING) * DISC_SPACING
+def measure_drape(
+    fabric: PublishedFabric, solver: Solver, spacing: float = DISC_SPACING
+) -> tuple[MeasuredBand, Positions, NDArray[np.int64]]:
+    """Simulate the drape test; drape coefficient and band in percent, with positions and triangles of the specimen.
+
+    Args:
+        fabric: the fabric.
+        solver: the solver.
+        spacing: spacing of the disc's lines [m].
+    """
+    half = round(DISC_RADIUS / spacing) * spacing
     lines = np.linspace(-half, half, 2 * round(half / DISC_SPACING) + 1)
     mesh = build_sheet(lines, lines, DISC_RADIUS * 1.0001)
     distance = np.hypot(mesh.rest_positions[:, 0], mesh.rest_positions[:, 2])
