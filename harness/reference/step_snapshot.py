@@ -29,11 +29,16 @@ from springbench.harness.simulation.time_loop import (
     simulate_scene,
 )
 from springbench.solvers.model.integrators import Motion
+from springbench.solvers.model.rounding_bound import is_gradient_roundoff
 from springbench.solvers.model.step_problem import DirichletPins, Positions, Solver, StepProblem, StepStart, StopRule
 
 SNAPSHOT_NAMES = ("early", "middle", "peak")
 REFERENCE_STOP_RULE = StopRule(500, 1e-12)
 """Stop rule of the reference run: Newton's method reaches the last digits in one more iteration."""
+
+_MAX_ROUNDOFF_RATIO = 4.0 * REFERENCE_STOP_RULE.roundoff_floor
+"""Gradient over its rounding bound, up to which a step without iterations left has converged: near contacts iterates
+remain at up to 16."""
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -116,7 +121,10 @@ def run_reference(
         initial_state=initial_state,
     )
     for step in run:
-        if step.solution.termination_reason == "max-iter" or not np.isfinite(step.positions).all():
+        if not np.isfinite(step.positions).all() or (
+            step.solution.termination_reason == "max-iter"
+            and not is_gradient_roundoff(step.problem, step.solution.positions, _MAX_ROUNDOFF_RATIO)
+        ):
             raise RunFailed(f"step {step.index} of the reference run does not converge")
         stated = step.problem
         violence[step.index - 1] = stated.value(stated.current_positions) - stated.value(step.solution.positions)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from springbench.harness.errors import RunFailed
+from springbench.harness.reference import step_snapshot
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.step_snapshot import (
     StepSnapshot,
@@ -214,3 +215,12 @@ def test_complete_files_alone_are_left(tmp_path):
     for path in tmp_path.iterdir():
         with np.load(path, allow_pickle=False) as stored:
             assert all(stored[name].dtype.kind in "fiU" for name in stored)
+
+
+def test_a_step_without_iterations_left_has_converged_if_its_gradient_is_round_off(monkeypatch):
+    monkeypatch.setattr(step_snapshot, "REFERENCE_STOP_RULE", StopRule(1, 1e-12, roundoff_floor=0.0))
+    scene, solver = build_exact_scene(SPEC, SIZE), NewtonSolver()
+    with pytest.raises(RunFailed, match="step 1 of the reference run does not converge"):
+        run_reference(scene, solver, 1)
+    monkeypatch.setattr(step_snapshot, "_MAX_ROUNDOFF_RATIO", 1e30)
+    assert set(run_reference(scene, solver, 1)[0]) == {1}
