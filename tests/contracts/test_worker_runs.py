@@ -138,24 +138,27 @@ def test_no_worker_stays_behind(how: signal.Signals, tmp_path: Path, monkeypatch
         # A shell that started these tests in the background has made its children deaf to Ctrl-C.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    parent, workers = psutil.Process(process.pid), []
-    while not workers and process.poll() is None:
-        sleep(0.01)
-        workers = [child for child in parent.children(recursive=True) if child.name() == parent.name() and busy(child)]
-    assert workers, "it ended before it had a worker"
-    process.send_signal(how)
-    process.wait()
+    try:
+        parent, workers = psutil.Process(process.pid), []
+        while not workers and process.poll() is None:
+            sleep(0.01)
+            workers = [child for child in parent.children(recursive=True) if is_busy_worker(child, parent)]
+        assert workers, "it ended before it had a worker"
+        process.send_signal(how)
+        process.wait()
+    finally:
+        process.kill()  # else its run holds the lock of timing for the tests that follow
     assert process.returncode == (130 if how == signal.SIGINT else -how)
     gone, alive = psutil.wait_procs(workers, timeout=60.0)
     assert gone
     assert not alive
 
 
-def busy(process: psutil.Process) -> bool:
-    """Whether it has taken its run: it has computed for a while."""
+def is_busy_worker(process: psutil.Process, parent: psutil.Process) -> bool:
+    """Whether it is a fork of its parent that has computed for a while."""
     try:
-        return process.cpu_times().user > 0.3
-    except psutil.NoSuchProcess:
+        return process.name() == parent.name() and process.cpu_times().user > 0.3
+    except psutil.NoSuchProcess:  # others come and go
         return False
 
 
