@@ -115,9 +115,8 @@ class _PageFields:
         started = about["started"]
         date = started[-1][:10] if started else "undated"
         commits = ", ".join(commit[:9] for commit in about["commits"]) or "unknown"
-        where = " and ".join(
-            f"{machine['cpu']}, {machine['cores']} core{'s' * (machine['cores'] != 1)}" for machine in about["machines"]
-        )
+        machines = [f"{one['cpu']}, {one['cores']} core{'s' * (one['cores'] != 1)}" for one in about["machines"]]
+        where = " and ".join(dict.fromkeys(machines))  # several may differ in their system alone
         requested = about.get("requested_runs")
         count = f"{about['runs']:,}" + (f" of {requested:,}" if requested else "")
         loads = [f"{load:.0f}" for load in about.get("load_average", ())]
