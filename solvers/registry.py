@@ -31,7 +31,6 @@ SOLVERS = {
     "xpbd": "springbench.solvers.methods.position_based.xpbd:Xpbd",
     "xpbd-small-steps": "springbench.solvers.methods.position_based.xpbd:XpbdSmallSteps",
     "vbd": "springbench.solvers.methods.vertex_block.vbd:VertexBlockDescent",
-    "vbd-ogc": "springbench.solvers.methods.vertex_block.vbd_offset_contact:OffsetContactDescent",
     "symplectic-euler": "springbench.solvers.methods.time_stepping.symplectic_euler:SymplecticEuler",
     "velocity-verlet": "springbench.solvers.methods.time_stepping.explicit_integrators:VelocityVerlet",
     "blanes-moan-4": "springbench.solvers.methods.time_stepping.explicit_integrators:BlanesMoan4",
@@ -49,6 +48,7 @@ SOLVERS = {
     "mgpbd": "springbench.solvers.methods.position_based.mgpbd:MultigridXpbd",
     "jgs2": "springbench.solvers.methods.vertex_block.jgs2:Jgs2",
     "avbd": "springbench.solvers.methods.vertex_block.avbd:AugmentedVertexBlockDescent",
+    "vbd-ogc": "springbench.solvers.methods.vertex_block.vbd_offset_contact:OffsetContactDescent",
 }
 
 OPTIONAL_SOLVERS = {

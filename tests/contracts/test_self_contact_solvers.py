@@ -72,7 +72,7 @@ def test_a_sheet_that_falls_onto_itself_passes_through_nowhere(name):
         assert count_intersections(made, step.positions, 0.0) == 0
         assert not energy.find_violated_pairs(step.positions)
         touched = max(touched, len(energy.hessian_blocks(step.positions).vertices))
-    assert touched > 3
+    assert touched >= 3
 
 
 def test_without_the_effect_it_does_pass_through():

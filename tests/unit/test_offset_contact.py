@@ -15,9 +15,12 @@ from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.effects.surface_contact_effect import SurfaceContactEffect
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from springbench.harness.scenes.mesh.stack_mesh import StackMesh
+from springbench.harness.scenes.primitive_obstacles import PlaneObstacle
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.scenes.vertex_selectors import BoxRegion
 from springbench.harness.simulation.instrumentation_pass import count_intersections
 from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
+from springbench.solvers.contact.collision_mesh import CollisionMesh
 from springbench.solvers.contact.collisions import Candidates, pad_positions
 from springbench.solvers.contact.contact_potential import BarrierContact, SelfContact
 from springbench.solvers.contact.offset_blocks import SurfaceAdjacency, find_offset_contacts
@@ -80,8 +83,14 @@ def crumpled(seed: int) -> tuple[SelfContact, Positions, np.ndarray]:
     return contact, p + rng.uniform(-1.0, 1.0, p.shape) * (0.08, 0.006, 0.08), triangles
 
 
+def collision_mesh_of(contact: BarrierContact) -> CollisionMesh:
+    """The mesh of a contact without obstacles."""
+    assert isinstance(contact.collision_mesh, CollisionMesh)
+    return contact.collision_mesh
+
+
 def blocks(contact: SelfContact, p: Positions, radius: float) -> tuple[Candidates, np.ndarray, np.ndarray]:
-    mesh = contact.collision_mesh
+    mesh = collision_mesh_of(contact)
     pairs = mesh.find_proximity_candidates(p, radius)
     adjacency = SurfaceAdjacency.from_primitives(mesh.edges.primitives, mesh.triangles.primitives, len(p))
     touches, clearance = np.empty(len(pairs.vertices), bool), np.full(len(p), np.inf)
@@ -96,7 +105,7 @@ def blocks(contact: SelfContact, p: Positions, radius: float) -> tuple[Candidate
 def test_the_pairs_in_contact_are_those_of_ipctk(seed):
     ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
     contact, p, triangles = crumpled(seed)
-    edges = contact.collision_mesh.edges.primitives
+    edges = collision_mesh_of(contact).edges.primitives
     mesh = ipctk.CollisionMesh(p, edges, triangles)
     mesh.init_adjacencies()
     edge_of = {tuple(sorted(edge)): k for k, edge in enumerate(mesh.edges.tolist())}
@@ -138,7 +147,7 @@ def displaced(seed: int, p: Positions, bound: np.ndarray, share: float) -> Posit
 def test_displacements_within_their_bounds_never_collide(seed, share):
     ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
     contact, p, triangles = crumpled(seed)
-    mesh = ipctk.CollisionMesh(p, contact.collision_mesh.edges.primitives, triangles)
+    mesh = ipctk.CollisionMesh(p, collision_mesh_of(contact).edges.primitives, triangles)
     clearance = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION).clearance
     assert (clearance > 0.0).all()
     q = displaced(seed, p, FRACTION * clearance, share)
@@ -149,7 +158,7 @@ def test_displacements_within_their_bounds_never_collide(seed, share):
 def test_larger_displacements_do_collide():
     ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
     contact, p, triangles = crumpled(1)
-    mesh = ipctk.CollisionMesh(p, contact.collision_mesh.edges.primitives, triangles)
+    mesh = ipctk.CollisionMesh(p, collision_mesh_of(contact).edges.primitives, triangles)
     found = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION)
     assert not ipctk.is_step_collision_free(mesh, p, displaced(1, p, found.clearance + CONTACT_THICKNESS, 0.6))
 
@@ -170,8 +179,8 @@ def single_contact(x: np.ndarray, edges: bool, friction: float, start: np.ndarra
     fill_row_entries(np.arange(4)[None], starts, entries)
     one = np.ones(1)
     return OffsetContacts(
-        starts, *entries, np.ones(1, bool), 4 * np.arange(4)[None], np.array([edges]), CONTACT_THICKNESS * one,
-        CONTACT_DHAT * one, 7.0 * one, friction * one, 1e-4 * one, x, np.ones(4), start,
+        starts, entries[0], entries[1], np.ones(1, bool), 4 * np.arange(4)[None], np.array([edges]),
+        CONTACT_THICKNESS * one, CONTACT_DHAT * one, 7.0 * one, friction * one, 1e-4 * one, x, np.ones(4), start,
     )  # fmt: skip
 
 
@@ -215,9 +224,9 @@ def test_the_forces_of_vertices_are_derivatives_of_the_activation(edges, gap):
     force = np.linalg.norm(sum(gradient for gradient, _ in found[:ends]))
     n = found[0][0] / np.linalg.norm(found[0][0])
     values = [energy(x + s * n * (np.arange(4) < ends)[:, None], edges) for s in (-1e-5, 0.0, 1e-5)]
-    curvature = (values[0] - 2 * values[1] + values[2]) / 1e-10
+    curvature = float((values[0] - 2 * values[1] + values[2]) / 1e-10)
     for gradient, block in found:
-        share = (np.linalg.norm(gradient) / force) ** 2
+        share = float((np.linalg.norm(gradient) / force) ** 2)
         np.testing.assert_allclose(block, share * curvature * np.outer(n, n), rtol=0, atol=1e-4 * share * curvature)
 
 
@@ -239,7 +248,7 @@ APART = SelfContactEffect(min_distance=0.01, friction=0.3)
 
 def pressed_sheets(*effects: Any) -> Scene:
     """Two sheets, of which the upper one falls onto the lower one, which is pinned."""
-    pins = PinsEffect(box={"low": (-9.0, -0.01, -9.0), "high": (9.0, 0.01, 9.0)})
+    pins = PinsEffect(box=BoxRegion(low=(-9.0, -0.01, -9.0), high=(9.0, 0.01, 9.0)))
     springs = SpringsEffect(stretch=100.0, shear=20.0)
     return build_test_scene(StackMesh(layer_spacing=0.03), springs, GravityEffect(), pins, *effects, size=5)
 
@@ -248,7 +257,7 @@ def test_sheets_that_meet_stay_apart_and_every_frame_is_reached_without_collisio
     ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
     made = pressed_sheets(APART)
     (contact,) = (energy for energy in made.system.energies if isinstance(energy, BarrierContact))
-    edges = contact.collision_mesh.edges.primitives
+    edges = collision_mesh_of(contact).edges.primitives
     p, touched = build_initial_state(made).motion.positions, 0
     steps = simulate_scene(
         made, prepare(made, OffsetContactDescent()), StopRule(40), initial_guess="previous", frames=15
@@ -276,23 +285,23 @@ def test_solves_repeat_to_the_last_bit_and_end_at_the_iterate_of_their_number():
         for _ in range(2):  # the second solve has the candidates of the first
             solution = prepared.solve(problem, StopRule(count, 1e-3))
             np.testing.assert_array_equal(solution.positions, path[count - 1])
-        assert solution.num_iterations == count
-        assert np.isnan(solution.residual)
+            assert solution.num_iterations == count
+            assert np.isnan(solution.residual)
 
 
 def test_without_contact_of_surfaces_the_sweeps_are_those_of_vbd():
     made = pressed_sheets()
     problem = build_problem(made, build_initial_state(made), "previous")
-    ends = [
+    end, expected = (
         solver.prepare(made.system).solve(problem, StopRule(7)).positions
         for solver in (OffsetContactDescent(), VertexBlockDescent())
-    ]
-    np.testing.assert_array_equal(*ends)
+    )
+    np.testing.assert_array_equal(end, expected)
 
 
 def test_contact_of_vertices_and_of_surfaces_are_refused_together():
-    plane: Any = {"kind": "plane", "point": (0.0, -1.0, 0.0)}
-    both = ContactEffect(obstacles=[plane]), SurfaceContactEffect(obstacles=[plane])
+    plane = PlaneObstacle(point=(0.0, -1.0, 0.0))
+    both = ContactEffect(obstacles=(plane,)), SurfaceContactEffect(obstacles=(plane,))
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=100.0), *both, size=3)
     with pytest.raises(Unsupported, match=r"vbd-ogc: .*surface-contact with the same obstacles"):
         OffsetContactDescent().prepare(made.system)

@@ -296,7 +296,7 @@ class OffsetContactState(SweepState):
             row_starts=starts,
             contact_index=entries[0],
             vertex_slot=entries[1],
-            has_contact=touched[blocks.spring_packets.row_offset // 4].reshape(-1, LANES).any(axis=1),
+            has_contact=np.logical_or.reduce(touched[blocks.spring_packets.row_offset // 4].reshape(-1, LANES), axis=1),
             row_offsets=4 * rows,
             is_edge_pair=joined("is_edge_pair"),
             min_distance=joined("min_distance"),
