@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
+#include <type_traits>
 #include <vector>
 
 using Vector = double __attribute__((vector_size(32)));
@@ -67,7 +68,7 @@ struct Steps {
         }
     }
 
-    // Columns c to c + W - 1 of L, x: those of the forward substitution.
+    // Forward substitution by columns c to c + W - 1 of L, which have one structure.
     template <int W> void forward(int c, Vector* x) const {
         const int *start = static_cast<int*>(L->p), *row = static_cast<int*>(L->i), *nz = static_cast<int*>(L->nz);
         const double* value[W];
@@ -86,7 +87,7 @@ struct Steps {
         }
     }
 
-    // The same columns in the backward substitution, with D.
+    // Backward substitution by the same columns, and division by D.
     template <int W> void backward(int c, Vector* x) const {
         const int *start = static_cast<int*>(L->p), *row = static_cast<int*>(L->i), *nz = static_cast<int*>(L->nz);
         const double* value[W];
@@ -106,24 +107,22 @@ struct Steps {
         }
     }
 
+    // Calls a function with the number of columns of a block as a constant.
+    template <class Function> void with_width(std::size_t block, Function function) const {
+        switch (blocks[block + 1] - blocks[block]) {
+            case 1: function(std::integral_constant<int, 1>()); break;
+            case 2: function(std::integral_constant<int, 2>()); break;
+            case 3: function(std::integral_constant<int, 3>()); break;
+            default: function(std::integral_constant<int, MAX_COLUMNS>());
+        }
+    }
+
     // x = (L D L')^-1 x, with rows in the order of L.
     void solve(Vector* x) const {
-        for (std::size_t k = 0; k + 1 < blocks.size(); ++k) {
-            switch (blocks[k + 1] - blocks[k]) {
-                case 1: forward<1>(blocks[k], x); break;
-                case 2: forward<2>(blocks[k], x); break;
-                case 3: forward<3>(blocks[k], x); break;
-                default: forward<4>(blocks[k], x);
-            }
-        }
-        for (std::size_t k = blocks.size() - 1; k-- > 0;) {
-            switch (blocks[k + 1] - blocks[k]) {
-                case 1: backward<1>(blocks[k], x); break;
-                case 2: backward<2>(blocks[k], x); break;
-                case 3: backward<3>(blocks[k], x); break;
-                default: backward<4>(blocks[k], x);
-            }
-        }
+        for (std::size_t k = 0; k + 1 < blocks.size(); ++k)
+            with_width(k, [&](auto width) { forward<width.value>(blocks[k], x); });
+        for (std::size_t k = blocks.size() - 1; k-- > 0;)
+            with_width(k, [&](auto width) { backward<width.value>(blocks[k], x); });
     }
 
     // Finds neighbouring columns of one structure: each has the rows of the one before it but the first.
