@@ -62,7 +62,7 @@ class OdeField:
         if system.length_constraints:
             raise NotIntegrable("lengths that are exact make it no differential equation; give them a stiffness")
         if without_barriers(without_vertex_contact(system)) is not system:
-            raise NotIntegrable("contact is stiff, and its friction begins anew each step; leave it out")
+            raise NotIntegrable("contact is stiff, and its friction restarts in each step; leave it out")
         x = Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
         arrays = x.edges, x.stiffness, x.rest_length, x.rest_direction
         self._springs = arrays if compiled else None

@@ -37,8 +37,9 @@ REFERENCE_STOP_RULE = StopRule(500, 1e-12)
 """Stop rule of the reference run: Newton's method reaches the last digits in one more iteration."""
 
 _MAX_ROUNDOFF_RATIO = 4.0 * REFERENCE_STOP_RULE.roundoff_floor
-"""Gradient over its rounding bound, up to which a step without iterations left has converged: near contacts iterates
-remain at up to 16."""
+"""Largest ratio of the gradient to its rounding bound at which a step that reaches the iteration limit has converged.
+
+Near contacts iterates stagnate at ratios up to 16."""
 
 Arrays = Mapping[str, NDArray[Any]]
 

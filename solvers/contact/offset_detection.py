@@ -87,28 +87,29 @@ class OffsetSurface(NamedTuple):
             bound_fraction: displacement bound of a vertex relative to its clearance.
         """
         p, mesh = contact.append_obstacle_positions(p), contact.collision_mesh
-        found = self._find_candidates(contact, p, reach)
-        x, touches = pad_positions(p), np.empty(len(found.vertices), np.bool_)
-        clearance, gap = np.full(len(p), reach), np.empty(len(found.vertices))
-        offset_blocks.find_offset_contacts(self.adjacency, found, x, reach, bound_fraction, gap, touches, clearance)
-        points = int(touches[: found.num_point_triangle].sum())
-        kept = found._replace(
-            vertices=found.vertices[touches],
-            num_point_triangle=points,
-            distance_scale=found.distance_scale[touches],
-            stiffness=found.stiffness[touches],
-            mollifier_threshold=np.zeros(int(touches.sum())),
+        candidates = self._find_candidates(contact, p, reach)
+        x, is_contact = pad_positions(p), np.empty(len(candidates.vertices), np.bool_)
+        clearance, gap = np.full(len(p), reach), np.empty(len(candidates.vertices))
+        offset_blocks.find_offset_contacts(
+            self.adjacency, candidates, x, reach, bound_fraction, gap, is_contact, clearance
+        )
+        num_contacts = int(is_contact.sum())
+        contacts = candidates._replace(
+            vertices=candidates.vertices[is_contact],
+            num_point_triangle=int(is_contact[: candidates.num_point_triangle].sum()),
+            distance_scale=candidates.distance_scale[is_contact],
+            stiffness=candidates.stiffness[is_contact],
+            mollifier_threshold=np.zeros(num_contacts),
             dhat=reach,
         )
-        many = len(kept.vertices)
-        met = build_collisions(kept, x, allocate_collisions(many, kept.min_distance, reach))
-        scale = met.distance_scale.copy()
+        collisions = build_collisions(contacts, x, allocate_collisions(num_contacts, contacts.min_distance, reach))
+        scale = collisions.distance_scale.copy()
         return OffsetCollisions(
-            met.vertices.copy(),
-            met.kind == EDGE_EDGE,
+            collisions.vertices.copy(),
+            collisions.kind == EDGE_EDGE,
             scale * mesh.min_distance,
             scale * mesh.dhat,
-            self._average_stiffness(met.vertices, met.coefficients),
+            self._average_stiffness(collisions.vertices, collisions.coefficients),
             clearance,
         )
 

@@ -111,4 +111,4 @@ def test_an_exception_in_a_thread_ends_all_threads_and_is_raised(task: int, phas
     for _ in range(20):  # now in one thread, now in the other
         with pytest.raises(ValueError, match="the task that fails"):
             run_team(team, task, phase)
-        run_team(team, -1, phase)  # the next run begins anew
+        run_team(team, -1, phase)  # the team is ready for another run
