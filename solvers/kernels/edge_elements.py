@@ -45,7 +45,7 @@ class EdgePackets(NamedTuple):
         has_limits, has_dashpots: whether there are any.
         limit_index: of each entry, eight strain limits, -1 for none.
         dashpot_index: of each entry, eight dashpots counted from 1, negative at the second end, 0 for none.
-        dashpot_names: one of the concatenated dashpots between the vertices of each (d,).
+        first_dashpot: index of the first of the concatenated dashpots between the same vertices (d,).
         dashpot_stiffness: the sum of their stiffnesses (d,) [N/m].
         packet_start: first entry of each packet (b + 1,).
     """
@@ -58,7 +58,7 @@ class EdgePackets(NamedTuple):
     has_dashpots: bool
     limit_index: NDArray[np.int32]
     dashpot_index: NDArray[np.int32]
-    dashpot_names: NDArray[np.int64]
+    first_dashpot: NDArray[np.int64]
     dashpot_stiffness: NDArray[np.float64]
     packet_start: NDArray[np.int64]
 
@@ -75,7 +75,7 @@ class EdgePackets(NamedTuple):
         data, blocks = allocate_aligned(4 * len(self.dashpot_index)), allocate_aligned(6 * LANES * self._num_packets)
         scale = np.sqrt(self.dashpot_stiffness)
         _write_dashpots(
-            self, scale[:, None] * axis[self.dashpot_names], scale * offset[self.dashpot_names], data, blocks
+            self, scale[:, None] * axis[self.first_dashpot], scale * offset[self.first_dashpot], data, blocks
         )
         return self._replace(dashpot_data=data, dashpot_blocks=blocks)
 
@@ -92,14 +92,14 @@ class AttachedEdges(NamedTuple):
         limit_index: of each spring, the strain limit, -1 for none.
         dashpot_index: of each spring, the dashpot counted from 1, negative if it runs in the opposite direction, 0 for
             none.
-        dashpot_names, dashpot_stiffness: see `EdgePackets`.
+        first_dashpot, dashpot_stiffness: see `EdgePackets`.
         stiffness, min_length, max_length: of the concatenated strain limits (m,).
     """
 
     springs: Springs
     limit_index: NDArray[np.int32]
     dashpot_index: NDArray[np.int32]
-    dashpot_names: NDArray[np.int64]
+    first_dashpot: NDArray[np.int64]
     dashpot_stiffness: NDArray[np.float64]
     stiffness: NDArray[np.float64]
     min_length: NDArray[np.float64]
@@ -119,18 +119,18 @@ class AttachedEdges(NamedTuple):
         proper = np.flatnonzero(dashpot_ends[:, 0] != dashpot_ends[:, 1])
         size = 1 + int(max((ends.max(initial=0) for ends in (springs.edges, limit_ends, dashpot_ends)), default=0))
         _, first, kind = np.unique(vertex_pair_keys(dashpot_ends[proper], size), return_index=True, return_inverse=True)
-        names = proper[first]
-        damping = np.zeros(len(names))
+        first_dashpot = proper[first]
+        damping = np.zeros(len(first_dashpot))
         np.add.at(damping, kind, np.concatenate([np.empty(0), *(e.stiffness for e in dashpots)])[proper])
         # Which spring has each edge: an existing one, the first of its pair, or a new one behind the springs.
         keys = np.concatenate(
-            [vertex_pair_keys(ends, size) for ends in (springs.edges, limit_ends, dashpot_ends[names])]
+            [vertex_pair_keys(ends, size) for ends in (springs.edges, limit_ends, dashpot_ends[first_dashpot])]
         )
         rank = np.zeros(len(keys), np.int64)
         rank[len(springs.edges) : len(springs.edges) + len(limit_ends)] = _rank_repeated(
             vertex_pair_keys(limit_ends, size)
         )
-        taken = np.concatenate([springs.edges, limit_ends, dashpot_ends[names]])
+        taken = np.concatenate([springs.edges, limit_ends, dashpot_ends[first_dashpot]])
         _, owner, kind = np.unique(keys * (1 + rank.max(initial=0)) + rank, return_index=True, return_inverse=True)
         owner = owner[kind]
         added = np.flatnonzero((owner == np.arange(len(keys))) & (np.arange(len(keys)) >= len(springs.edges)))
@@ -151,11 +151,11 @@ class AttachedEdges(NamedTuple):
         opposite = whole.edges[loose, 0] != limit_ends[limit_index[loose], 0]
         whole.rest_direction[loose] = np.where(opposite[:, None], -axis, axis)
         at = place[behind.stop :]
-        aligned = whole.edges[at, 0] == dashpot_ends[names, 0]
-        dashpot_index[at] = np.where(aligned, 1, -1) * np.arange(1, len(names) + 1)
+        aligned = whole.edges[at, 0] == dashpot_ends[first_dashpot, 0]
+        dashpot_index[at] = np.where(aligned, 1, -1) * np.arange(1, len(first_dashpot) + 1)
         none = np.empty(0)
         numbers = (np.concatenate([none, *(getattr(e, x) for e in limits)]) for x in _LIMIT_FIELDS)
-        return cls(whole, limit_index, dashpot_index, names, damping, *numbers)
+        return cls(whole, limit_index, dashpot_index, first_dashpot, damping, *numbers)
 
     def build_packets(
         self,
@@ -184,7 +184,7 @@ class AttachedEdges(NamedTuple):
             row[limit >= 0] = values[limit[limit >= 0]]
         data[3] = np.where(has_fixed_end, _FULL_SHARE, _HALF_SHARE)
         offset, numbers = deduplicate_packets(*data)
-        has_dashpots = len(self.dashpot_names) > 0
+        has_dashpots = len(self.first_dashpot) > 0
         many = len(spring_index) if has_dashpots else 0
         return EdgePackets(
             offset,
@@ -195,7 +195,7 @@ class AttachedEdges(NamedTuple):
             has_dashpots,
             limit,
             dashpot,
-            self.dashpot_names,
+            self.first_dashpot,
             self.dashpot_stiffness,
             packet_start,
         )

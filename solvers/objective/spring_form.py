@@ -184,12 +184,12 @@ def _join_pairs(springs: Springs, pairs: NDArray[np.int64], weight: NDArray[np.f
         weight: their stiffnesses w [N/m], of either sign.
     """
     size = 1 + int(max(springs.edges.max(initial=0), pairs.max(initial=0)))
-    known, first = np.unique(vertex_pair_keys(springs.edges, size), return_index=True)
-    wanted = vertex_pair_keys(pairs, size)
-    is_joined = np.isin(wanted, known)
-    at = first[np.searchsorted(known, wanted[is_joined])]
+    spring_keys, first = np.unique(vertex_pair_keys(springs.edges, size), return_index=True)
+    pair_keys = vertex_pair_keys(pairs, size)
+    is_joined = np.isin(pair_keys, spring_keys)
+    at = first[np.searchsorted(spring_keys, pair_keys[is_joined])]
     is_joined[is_joined] = (springs.stiffness[at] > 0.0) & (springs.stiffness[at] + weight[is_joined] > 0.0)
-    at = first[np.searchsorted(known, wanted[is_joined])]
+    at = first[np.searchsorted(spring_keys, pair_keys[is_joined])]
     k, rest = springs.stiffness.copy(), springs.rest_length.copy()
     k[at] += weight[is_joined]
     rest[at] *= springs.stiffness[at] / k[at]
