@@ -29,6 +29,7 @@ from springbench.harness.experiments.error_control.method_search import (
     SearchResult,
     Trial,
     compute_predictability_horizon,
+    search_cheapest_contact_method,
     search_cheapest_method,
 )
 from springbench.harness.experiments.error_control.stored_trials import (
@@ -137,7 +138,10 @@ def _execute_error_control(
     with machine_info.limit_threads(1):
         before = read_stored_trials(folder / "accuracy", error_target)
         if error_target.has_contact:
-            answer = _search_contact_method(error_target, error, results, print_message)
+            print_message(describe_self_convergence(scene.path.stem))
+            answer = search_cheapest_contact_method(
+                error_target, error, results, print_message, print_message, list_contact_methods()
+            )
         else:
             seen = compute_predictability_horizon(error_target, error, print_message)
             answer = _search_method(error_target, error, seen, [] if rerun else before, print_message)
@@ -221,21 +225,6 @@ def _search_method(
     except RunFailed as failed:
         print_message(f"{failed}; so all methods are tried")
         return search_cheapest_method(error_target, error, growth, print_message)
-
-
-def _search_contact_method(
-    error_target: ErrorTarget, error: float, results: Path, print_message: PrintMessage
-) -> SearchResult:
-    """Search the cheapest method for a scene with contact, by the self-converged reference. Raises RunFailed."""
-    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
-
-    print_message(describe_self_convergence(error_target.scene.path.stem))
-    reference = open_reference_store(results).require_contact_horizon(
-        error_target.scene, error_target.size, error_target.t_end, error=error
-    )
-    print_message(f"the reference itself errs by up to {reference.get_error_bound(-1):.1e}, which counts")
-    growth = PerturbationGrowth.from_reference(reference)
-    return search_cheapest_method(error_target, error, growth, print_message, list_contact_methods(), reference)
 
 
 def _verify_error(

@@ -21,9 +21,9 @@ from springbench.harness.experiments.error_control.candidate_methods import (
 from springbench.harness.experiments.error_control.method_search import (
     SearchResult,
     compute_predictability_horizon,
+    search_cheapest_contact_method,
     search_cheapest_method,
 )
-from springbench.harness.reference.perturbation_growth import PerturbationGrowth
 from springbench.harness.results.quantities import compute_ms_per_step
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import Trajectory
@@ -156,12 +156,7 @@ def _search_method(
         pairs = list_methods_of_solver(run.solver)
         growth = compute_predictability_horizon(error_target, error, messages.append)
         return search_cheapest_method(error_target, error, growth, lambda line: tick("choosing steps"), pairs)
-    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
-
     pairs = list_contact_methods_of_solver(run.solver)
-    reference = open_reference_store(results).require_contact_horizon(
-        error_target.scene, error_target.size, error_target.t_end, error=error
+    return search_cheapest_contact_method(
+        error_target, error, results, messages.append, lambda line: tick("choosing steps"), pairs
     )
-    messages.append(f"the self-converged reference errs by up to {reference.get_error_bound(-1):.1e}, which counts")
-    growth = PerturbationGrowth.from_reference(reference)
-    return search_cheapest_method(error_target, error, growth, lambda line: tick("choosing steps"), pairs, reference)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log, sqrt
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -224,6 +225,37 @@ def search_cheapest_method(
         RunFailed: no method reaches the error.
     """
     return _MethodSearch(error_target, max_error, growth, print_message, reference).find_cheapest(candidates)
+
+
+def search_cheapest_contact_method(
+    error_target: ErrorTarget,
+    max_error: float,
+    results: Path,
+    print_message: Callable[[str], None],
+    report_trial: Callable[[str], None],
+    candidates: Sequence[tuple[str, SolverSpec]],
+) -> SearchResult:
+    """Find the cheapest method for a scene with contact, whose errors a self-converged reference measures.
+
+    Args:
+        error_target: the scene and its end time.
+        max_error: relative error to reach.
+        results: folder of results, with the stored references.
+        print_message: prints a remark on the reference.
+        report_trial: prints a remark on the search.
+        candidates: integrators and solvers to try.
+
+    Raises:
+        RunFailed: no method reaches the error, or the reference does not resolve it at the end time.
+    """
+    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store  # for contact alone
+
+    reference = open_reference_store(results).require_contact_horizon(
+        error_target.scene, error_target.size, error_target.t_end, error=max_error
+    )
+    print_message(f"the reference itself errs by up to {reference.get_error_bound(-1):.1e}, which counts")
+    growth = PerturbationGrowth.from_reference(reference)
+    return search_cheapest_method(error_target, max_error, growth, report_trial, candidates, reference)
 
 
 _MethodSetting = tuple[Method, float]
