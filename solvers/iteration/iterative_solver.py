@@ -163,7 +163,7 @@ class IterativeSolver(ABC):
         if (stop.rtol is not None or stop.atol > 0.0) and self.residual_iterate != "none":
             near, limit = (
                 _ROUNDOFF_CHECK_FRACTION * self.residual_scale(problem) if stop.roundoff_floor > 0.0 else 0.0,
-                stop.atol,
+                float(stop.atol),
             )
             if stop.rtol is not None:
                 known = run.compute_start_residual() if problem.initial_guess is problem.current_positions else None

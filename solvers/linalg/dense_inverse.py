@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse import csr_array
 from springbench.solvers.jit.kernel_compilation import cached_njit
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions
 
 _ROWS_PER_BLOCK = 4
@@ -65,10 +66,13 @@ class DenseInverse:
         self.factor_bytes = stored.nbytes
         self.flops = 2 * 3 * stored.size
         self.inverse_matrix, self._columns = stored, np.zeros((3, padded), precision)
+        self._multiply_contiguous = TypedKernel(multiply_dense)
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
-        multiply_dense(self.inverse_matrix, self._columns, b, out)
+        is_contiguous = b.flags.c_contiguous and out.flags.c_contiguous
+        multiply = self._multiply_contiguous.call if is_contiguous else multiply_dense
+        multiply(self.inverse_matrix, self._columns, b, out)
 
 
 # Reordering of sums permits vectorisation; NaN and infinity keep their meaning.

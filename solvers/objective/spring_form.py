@@ -72,6 +72,11 @@ class SpringForm:
         """Return the absolute energy [J] of the pairs with negative stiffness at p (n, 3) [m]."""
         return 0.5 * abs(float(np.einsum("ij,ij->", p, self._negative_stiffness @ p))) if self.form_builders else 0.0
 
+    @property
+    def has_edges(self) -> bool:
+        """Whether there are strain limits or dashpots."""
+        return bool(self.strain_limits or self.dashpots)
+
     @cached_property
     def _negative_stiffness(self) -> csr_array:
         below = self.springs_and_forms.stiffness < 0.0
@@ -81,7 +86,7 @@ class SpringForm:
 
     def attach_edges(self, springs: Springs) -> AttachedEdges | None:
         """Attach the strain limits and dashpots to springs between the same vertices; None if there are none."""
-        if not (self.strain_limits or self.dashpots):
+        if not self.has_edges:
             return None
         from springbench.solvers.kernels.edge_elements import AttachedEdges
 

@@ -14,6 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.linalg import memory
 from springbench.solvers.linalg.cholesky.block_front import PANEL_DEPTH, round_up_columns, round_up_rows
 from springbench.solvers.linalg.cholesky.block_multifrontal import FactorisationScratch, run_stages
@@ -36,13 +37,14 @@ _MIN_FACTORISATION = 0.2
 
 
 class _Workspace(NamedTuple):
-    """What a number of threads needs: schedules, scratch memory and shared state, and their number or None."""
+    """What a number of threads needs: schedules, scratch memory and shared state, their number or None, the kernel."""
 
     schedule: FactorisationSchedule
     solve_schedule: FactorisationSchedule
     scratch: FactorisationScratch
     team: ThreadTeam
     threads: int | None
+    run_stages: TypedKernel
 
 
 class BlockCholesky:
@@ -89,6 +91,7 @@ class BlockCholesky:
                 f"where {memory.format_bytes(free)} may be taken; take numba or newton-cg, or a coarser mesh"
             )
         self.panels = np.zeros(f.panel_start[-1] + TILE_ROWS)
+        self._no_values, self._no_vectors = np.empty((0, d, d)), np.empty((0, d))
         self._workspaces = {1: self._allocate(schedule, updates, 1)}
 
     def _plan(self, threads: int) -> tuple[FactorisationSchedule, int]:
@@ -112,7 +115,8 @@ class BlockCholesky:
             np.zeros((threads, 2, int(members.max(initial=0)) + 1), np.int64),
         )
         team = ThreadTeam.from_task_count(groups)
-        return _Workspace(schedule, select_solve(schedule), scratch, team, threads if threads > 1 else None)
+        kernel = TypedKernel(run_stages)
+        return _Workspace(schedule, select_solve(schedule), scratch, team, threads if threads > 1 else None, kernel)
 
     def _current_workspace(self) -> _Workspace:
         """Return the workspace for Numba's number of threads, one if a second does not pay off."""
@@ -127,11 +131,12 @@ class BlockCholesky:
         Returns:
             Whether H is positive definite.
         """
-        return self._factorise(values, np.empty((0, self.fronts.block_size)))
+        return self._factorise(values, self._no_vectors)
 
     def _factorise(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> bool:
-        schedule, _, scratch, team, threads = self._current_workspace()
-        failed = run_stages(self.fronts, schedule, values, self.panels, x, scratch, team, threads)
+        schedule, _, scratch, team, threads, kernel = self._current_workspace()
+        values = np.ascontiguousarray(values, np.float64)
+        failed = kernel.call(self.fronts, schedule, values, self.panels, x, scratch, team, threads)
         self.failed_vertex = -1
         if failed >= 0:
             self.failed_vertex = int(scratch.failed_vertices[np.argmin(scratch.failures)])
@@ -141,10 +146,9 @@ class BlockCholesky:
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return H^-1 b, both (n, d), with the last factorisation."""
-        x = np.array(b, order="C")
-        _, schedule, scratch, team, threads = self._current_workspace()
-        size = self.fronts.block_size
-        run_stages(self.fronts, schedule, np.empty((0, size, size)), self.panels, x, scratch, team, threads)
+        x = np.array(b, np.float64, order="C")
+        _, schedule, scratch, team, threads, kernel = self._current_workspace()
+        kernel.call(self.fronts, schedule, self._no_values, self.panels, x, scratch, team, threads)
         return x
 
     def factorise_and_solve(self, values: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -157,5 +161,5 @@ class BlockCholesky:
         Returns:
             Solution (n, d); None if H is not positive definite.
         """
-        x = np.array(b, order="C")
+        x = np.array(b, np.float64, order="C")
         return x if self._factorise(values, x) else None

@@ -18,6 +18,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.linalg.cholesky.inverse_panels import preserve_column_sums, write_inverse_panels
 from springbench.solvers.linalg.cholesky.supernode_amalgamation import COLUMN_LANES, MAX_PANEL_WIDTH
@@ -204,10 +205,14 @@ class SupernodalCholesky:
         self._factor = SupernodalFactor(
             squares, panels, *lists, work, ThreadTeam.from_task_count(len(self.work_shares) - 1)
         )
+        self._solve_in_thread = TypedKernel(solve_from_arrays)
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
-        solve_from_arrays(*self._factor, b, out, self.choose_num_threads())
+        threads = self.choose_num_threads()
+        is_usual = threads is None and b.flags.c_contiguous and out.flags.c_contiguous
+        solve = self._solve_in_thread.call if is_usual else solve_from_arrays
+        solve(*self._factor, b, out, threads)
 
     def choose_num_threads(self) -> int | None:
         """Return the number of threads of a solve, None for one."""

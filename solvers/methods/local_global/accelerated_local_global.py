@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.iteration.iterative_solver import SolverState
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels import accelerated_descent, descent_rounds
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.iteration_loop import LoopLimits
@@ -98,6 +99,15 @@ def allocate_window(
     )
 
 
+_init_window, _propose_trial, _judge_trial, _accept_trial = (
+    TypedKernel(accelerated_descent.init_window),
+    TypedKernel(accelerated_descent.propose_trial),
+    TypedKernel(accelerated_descent.judge_trial),
+    TypedKernel(accelerated_descent.accept_trial),
+)
+"""The kernels of `InterpretedState`, whose windows are in float64."""
+
+
 class InterpretedState(AcceleratedState):
     """A solve with any energies and any factor."""
 
@@ -112,12 +122,12 @@ class InterpretedState(AcceleratedState):
         self._trial_correction = np.zeros_like(self._trial_positions)
         self._trial_positions[:] = objective.apply_exact_pins(guess)
         self._evaluate_trial()
-        accelerated_descent.init_window(window, self._solve_trial())
+        _init_window.call(window, self._solve_trial())
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents descent."""
         window, now = self._window, self._window.window_state
-        accelerated_descent.propose_trial(window)
+        _propose_trial.call(window)
         verdict = accelerated_descent.TRIAL_AGAIN
         while verdict == accelerated_descent.TRIAL_AGAIN:
             if not self._shorten_trial():
@@ -126,7 +136,7 @@ class InterpretedState(AcceleratedState):
             now["objective_change"], now["roundoff"] = self._objective.objective_change(
                 self.positions, self._trial_positions
             )
-            verdict = accelerated_descent.judge_trial(window)
+            verdict = _judge_trial.call(window)
         if verdict == accelerated_descent.TRIAL_STALLED:
             return False
         self._accept_trial()
@@ -162,4 +172,4 @@ class InterpretedState(AcceleratedState):
         return self._trial_correction.ravel()
 
     def _accept_trial(self) -> None:
-        accelerated_descent.accept_trial(self._window, self._solve_trial())
+        _accept_trial.call(self._window, self._solve_trial())

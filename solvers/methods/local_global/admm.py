@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.linalg.solver_selection import build_linear_solver
 from springbench.solvers.methods.local_global import admm_local_step as kernels
 from springbench.solvers.methods.local_global.prefactored import (
@@ -133,6 +134,7 @@ class PreparedAdmm(IterativeSolver):
     Attributes:
         local_global: the factorised ADMM matrix.
         residual_metric: Q with its factor, for residuals.
+        project_edges: the kernel of the local step.
     """
 
     def __init__(
@@ -151,6 +153,7 @@ class PreparedAdmm(IterativeSolver):
             weight,
         )
         self.description, self.stats = base.description, base.stats
+        self.project_edges = TypedKernel(kernels.run_admm_local_step)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
@@ -183,6 +186,7 @@ class _AdmmState(SolverState):
             edges.rest_direction,
             prepared.penalty_weight,
         )
+        self._project_edges = prepared.project_edges
         self._step = StepObjective(prepared.fixed_objective, problem)
         self._constant_term = self._local_global.constant_right_hand_side(problem)
         for energy in problem.energies:
@@ -193,7 +197,7 @@ class _AdmmState(SolverState):
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
-        kernels.run_admm_local_step(
+        self._project_edges.call(
             *self._edges, self.positions, self._constant_term, self._scaled_dual, self._right_hand_side
         )
         self._local_global.solve_correction(self._right_hand_side, self.positions)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
+from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import local_global_iteration, step_setup
 from springbench.solvers.kernels import spring_local_step as kernels
 from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, LoopLimits, iteration_limit
@@ -267,17 +268,19 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         return {"local": local, "global": lambda: self.base.solve_correction(y, out)}
 
     def step_arrays(self, problem: StepProblem, guess: Positions) -> list[Positions]:
-        """Return target, force, pin targets and guess; read-only arrays are copied.
-
-        The kernels are compiled for writable arrays.
-        """
+        """Return target, force, pin targets and guess, for the kernels."""
         given = (problem.inertial_target, self.spring_form.compute_force(problem), problem.pin_targets, guess)
-        return [x if x.flags.carray else np.array(x, np.float64, order="C") for x in given]
+        return [*map(as_kernel_array, given)]
 
     @cached_property
     def thread_team(self) -> ThreadTeam:
         """The thread team of whole solves."""
         return ThreadTeam.from_task_count(int(self.iteration_plan.top_range[2]))
+
+    @cached_property
+    def solve_kernels(self) -> tuple[TypedKernel, TypedKernel]:
+        """The kernel `step_setup.solve_step` for one thread, and for several."""
+        return TypedKernel(step_setup.solve_step), TypedKernel(step_setup.solve_step)
 
     @cached_property
     def shared_scratch(self) -> StepScratch:
@@ -313,22 +316,17 @@ class _CompiledState(SolverState):
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Iterate up to the limits; return count, residual and reason."""
-        made = self._prepared
-        fixed = (
-            made.iteration_plan,
-            self._spring_packets,
-            made.norm_packets,
-            made.vertex_rows,
-            *made.shared_scratch,
-            tuple(self._arrays),
-        )
-        answer = step_setup.solve_step(*fixed, limits, made.num_threads(), made.thread_team, self.positions)
+        made, threads = self._prepared, self._prepared.num_threads()
+        solve_step = made.solve_kernels[threads is not None].call
+        packets = self._spring_packets, made.norm_packets
+        memory = made.vertex_rows, *made.shared_scratch, tuple(self._arrays)
+        answer = solve_step(made.iteration_plan, *packets, *memory, limits, threads, made.thread_team, self.positions)
         self._arrays[-1] = self.positions  # where the next ones go on
         return answer
 
     def residual_from(self, p: Positions) -> float:
         """Return |p - LG(p)|_Q of positions p (n, 3), by one iteration from there."""
-        self._arrays[-1] = p if p.flags.carray else np.array(p, np.float64, order="C")
+        self._arrays[-1] = as_kernel_array(p)
         return self.run_iterations(iteration_limit(1))[1]
 
     def step_state(self) -> bool:

@@ -21,6 +21,7 @@ if they rotate little in a step. `device: cuda` computes the same iterates in
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -29,6 +30,7 @@ from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.device_interface import PrecisionOptions
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, SubsteppingState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.methods.local_global.prefactored import require_only_springs
 from springbench.solvers.methods.position_based import xpbd_projection as kernels
 from springbench.solvers.methods.vertex_block import colouring
@@ -124,6 +126,11 @@ class PreparedXpbd(IterativeSolver):
     description: str
     stats: dict[str, float] = field(default_factory=dict)
 
+    @cached_property
+    def project_springs(self) -> TypedKernel:
+        """The kernel of the iterations."""
+        return TypedKernel(kernels.run_projections)
+
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> XpbdState:
         """Start a solve at the positions that the vertices have without springs."""
         return XpbdState(self, vertex_terms.compute_anchor_positions(problem))
@@ -146,7 +153,7 @@ class XpbdState(SolverState):
     def run_unchecked(self, num_iterations: int) -> int:
         """Do iterations in one call; return their number."""
         made = self._prepared
-        kernels.run_projections(
+        made.project_springs.call(
             made.coloured_constraints,
             made.constraint_relaxation,
             made.vertex_compliance,

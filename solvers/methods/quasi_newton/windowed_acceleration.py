@@ -14,13 +14,14 @@ the solve terminates as "stalled" and its iterate stays unchanged.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, compute_max_coordinate
+from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.acceleration_coefficients import require_history_size
@@ -181,6 +182,12 @@ class _CompiledEngine:
             bundles, plan.anchor_stiffness, self._rows.row_of_vertex[pins.vertices[pins.exact_mask]]
         )
         self._free_states: list[_AccelerationMemory] = []
+        self._solve_kernels = _SolveKernels(
+            TypedKernel(accelerated_step.start_solve),
+            TypedKernel(accelerated_step.run_solve),
+            TypedKernel(accelerated_step.run_solve_rounds),
+            TypedKernel(step_setup.read_positions),
+        )
 
     def _allocate_state(self) -> _AccelerationMemory:
         whole = 4 * len(self._plan.anchor_stiffness)
@@ -200,11 +207,21 @@ class _CompiledEngine:
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
         """Start a solve from an initial guess (n, 3) [m]."""
         state = self._free_states.pop() if self._free_states else self._allocate_state()
-        return _CompiledAccelerationState(self._free_states, state, self._spring_form, problem, initial_guess)
+        kernels = self._solve_kernels
+        return _CompiledAccelerationState(self._free_states, state, kernels, self._spring_form, problem, initial_guess)
 
 
 _AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow]
 """Work arrays of a solve."""
+
+
+class _SolveKernels(NamedTuple):
+    """The kernels of a solve, see `springbench.solvers.methods.quasi_newton.accelerated_step`."""
+
+    start_solve: TypedKernel
+    run_solve: TypedKernel
+    run_solve_rounds: TypedKernel
+    read_positions: TypedKernel
 
 
 class _CompiledAccelerationState(AcceleratedState):
@@ -214,31 +231,31 @@ class _CompiledAccelerationState(AcceleratedState):
         self,
         free_states: list[_AccelerationMemory],
         state: _AccelerationMemory,
+        solve_kernels: _SolveKernels,
         parts: SpringForm,
         problem: StepProblem,
         guess: Positions,
     ) -> None:
-        self._free_states, self._memory = free_states, state
+        self._free_states, self._memory, self._solve_kernels = free_states, state, solve_kernels
         step, window = state
-        step = step._replace(spring_packets=parts.update_edges(step.spring_packets, problem))
+        if parts.has_edges:
+            step = step._replace(spring_packets=parts.update_edges(step.spring_packets, problem))
         self._state = step, window
-        # The kernels are compiled for writable arrays.
-        given = [
-            np.array(x, order="C")
-            for x in (problem.inertial_target, parts.compute_force(problem), problem.pin_targets, guess)
-        ]
-        step.objective_values[2] = parts.negative_energy(guess)
-        self.positions = np.empty_like(guess)
-        self.start_residual = accelerated_step.start_solve(*self._state, *given)
-        step.objective_values[1] += parts.edge_energy_scale(guess)
+        given = problem.inertial_target, parts.compute_force(problem), problem.pin_targets, guess
+        if parts.form_builders:
+            step.objective_values[2] = parts.negative_energy(guess)
+        self.positions = np.empty(guess.shape)
+        self.start_residual = solve_kernels.start_solve.call(step, window, *map(as_kernel_array, given))
+        if parts.has_edges:
+            step.objective_values[1] += parts.edge_energy_scale(guess)
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return their number, the residual and the reason of the end."""
-        return accelerated_step.run_solve(*self._state, limits, self.positions)
+        return self._solve_kernels.run_solve.call(*self._state, limits, self.positions)
 
     def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
         """Run rounds of iterations within the limits, compiled."""
-        return accelerated_step.run_solve_rounds(*self._state, rounds, limits, self.positions)
+        return self._solve_kernels.run_solve_rounds.call(*self._state, rounds, limits, self.positions)
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
@@ -257,7 +274,7 @@ class _CompiledAccelerationState(AcceleratedState):
         """Return the gradient of the objective (n, 3) [N] at the current point."""
         step, window = self._state
         out = np.empty_like(self.positions)
-        step_setup.read_positions(step.vertex_rows, window.descent, out)
+        self._solve_kernels.read_positions.call(step.vertex_rows, window.descent, out)
         return np.negative(out, out=out)
 
     def __del__(self) -> None:

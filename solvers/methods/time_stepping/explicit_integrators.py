@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.methods.time_stepping.explicit_forces import (
     ExplicitForces,
     SingleIterateState,
@@ -355,12 +356,16 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
         velocity[pins] = (end - begin) / frame
         return p.reshape(-1, 4)[: s.num_vertices, :3].copy(), velocity, step_stats
 
+    @cached_property
+    def _run_splitting(self) -> TypedKernel:
+        return TypedKernel(run_splitting)
+
     def _compose(
         self, forces: FrameForces, method: SplittingMethod, p: NDArray[np.float64], v: NDArray[np.float64]
     ) -> None:
         count = self.substep_choice.num_substeps
         h = self.system.time_step / count
-        run_splitting(forces, method.drifts, *self._kick_factors, count, h, p, v, np.zeros_like(v))
+        self._run_splitting.call(forces, method.drifts, *self._kick_factors, count, h, p, v, np.zeros_like(v))
 
     def _integrate(
         self,

@@ -15,13 +15,16 @@ The bound is sharp for a single spring, and within 3 % for chains and nets. With
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import ceil
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels.spring_local_step import SpringPackets
 from springbench.solvers.methods.local_global.prefactored import require_only_springs
 from springbench.solvers.methods.time_stepping.explicit_forces import SingleIterateState, pad_rows
@@ -123,17 +126,31 @@ class PreparedSymplecticEuler(IterativeSolver):
         """Start a solve whose only iteration is the whole step."""
         return SingleIterateState(*self._integrate_step(problem))
 
+    @cached_property
+    def _run_steps(self) -> TypedKernel:
+        return TypedKernel(run_symplectic_euler)
+
+    @cached_property
+    def _pinned_vertices(self) -> NDArray[np.int64]:
+        return self.system.pins.vertices.copy()
+
+    @cached_property
+    def _velocity_rate(self) -> NDArray[np.float64]:
+        """Change of the velocity in a substep by a unit force (n,) [s/kg], 0 for pinned vertices."""
+        s, h = self.system, self.system.time_step / self.num_substeps
+        return np.divide(h, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask)
+
     def _integrate_step(self, problem: StepProblem) -> tuple[Positions, Positions]:
         s, pins, start = self.system, self.system.pins.vertices, problem.step_start
         h = s.time_step / self.num_substeps
-        rate = np.divide(h, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask)
         begin, end = start.positions[pins], problem.pin_targets.copy()
         p = pad_rows(start.positions, pad_far=True)
         v, force = pad_rows(start.velocity), pad_rows(problem.external_force)
         v.reshape(-1, 4)[pins] = 0.0
         force = self.spring_packets.build_right_hand_side(np.zeros(s.num_vertices + 2), force)
-        run_symplectic_euler(
-            self.spring_packets, pins.copy(), begin, end, force, rate, h, self.num_substeps, p, v, np.zeros_like(v)
+        pinned = self._pinned_vertices, begin, end
+        self._run_steps.call(
+            self.spring_packets, *pinned, force, self._velocity_rate, h, self.num_substeps, p, v, np.zeros_like(v)
         )
         velocity = v.reshape(-1, 4)[: s.num_vertices, :3].copy()
         velocity[pins] = (end - begin) / s.time_step
