@@ -20,15 +20,6 @@ def compute_anchor_stiffness(system: System) -> NDArray[np.float64]:
     return total
 
 
-def compute_anchor_force(problem: StepProblem) -> Positions:
-    """Return y (n, 3) [N]; at exact pins it is that of inertia and force."""
-    s = problem.system
-    y = s.inertia_diagonal[:, None] * problem.inertial_target + problem.external_force
-    soft, vertices, weight = s.penalty_pins
-    y[vertices] += weight[:, None] * problem.pin_targets[soft]
-    return y
-
-
 def compute_anchor_positions(problem: StepProblem) -> Positions:
     """Return the minimum y/h (n, 3) [m] of these terms, with exact pins on their targets.
 

@@ -38,6 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels import iteration_loop
 from springbench.solvers.kernels.iteration_loop import LoopLimits
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
@@ -169,6 +170,12 @@ class PreparedAugmentedVertexBlockDescent(IterativeSolver):
     exact_mask: NDArray[np.bool_]
 
     @cached_property
+    def augmented_iteration(self) -> TypedKernel:
+        """The kernel of sweeps and dual updates, for steps without active contacts."""
+        elements = self.vertex_block_descent.vertex_elements
+        return TypedKernel(kernels.build_augmented_iteration(elements.iteration_kernel))
+
+    @cached_property
     def least_squares_multipliers(self) -> LagrangeMultipliers:
         """Return the least-squares multipliers of the length constraints."""
         return LagrangeMultipliers(
@@ -261,7 +268,7 @@ class AugmentedSweepState(SweepState):
         self._constraint_elements = hard._replace(parameters=hard.parameters.copy())
         self._element_data = (*others, self._constraint_elements)
         self._colour_packets = self._colour_packets._replace(majorant=self._colour_packets.majorant.copy())
-        self._kernel = kernels.build_augmented_iteration(made.vertex_elements.iteration_kernel)
+        self._kernel = prepared.augmented_iteration.kernel
         kernels.write_edge_parameters(self._colour_packets, self._constraint_elements, self._duals, self._rows)
 
     @property
@@ -303,9 +310,10 @@ class AugmentedSweepState(SweepState):
 
     def run_unchecked(self, num_iterations: int) -> int:
         """Run sweeps, each followed by a dual update; return their number."""
-        self._kernel(
+        kernel = self._augmented_solver.augmented_iteration
+        (kernel.call if self._half_spaces is None else self._kernel)(
             self._colour_packets, self._half_spaces, self._element_data, self._right_hand_side,
             self._sweep_scratch, self._rows, num_iterations, self._constraint_elements, self._duals,
         )  # fmt: skip
-        self.positions = self._rows.reshape(-1, 4)[self._prepared.row_of_vertex, :3].copy()
+        self._read_positions()
         return num_iterations

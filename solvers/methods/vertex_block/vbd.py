@@ -20,9 +20,10 @@ at w_1. With these restarts rho needs no tuning: overestimates perform as well a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,12 @@ from springbench.solvers.contact.half_space.vertex_contact import (
     begin_active_contacts,
     without_vertex_contact,
 )
-from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.device_interface import PrecisionOptions
 from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
+from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
@@ -53,9 +55,6 @@ if TYPE_CHECKING:
     from springbench.solvers.contact.half_space.half_space_potential import ContactPlanes
     from springbench.solvers.methods.local_global.half_space_contact import ContactFreeSolver
     from springbench.solvers.objective.fixed_objective import FixedObjective
-
-_PADDING_COORDINATE = 1e100
-"""Coordinate at which padding springs of a packet end: far from all vertices, whatever the unit of length."""
 
 
 @dataclass(frozen=True)
@@ -206,6 +205,38 @@ class PreparedVertexBlockDescent(IterativeSolver):
         return BarrierVbdState(sweeps, step, initial_guess, self.hessian_majorant, self.spectral_radius, gauge)
 
     @cached_property
+    def sweep_kernels(self) -> SweepKernels:
+        """The kernels of a solve."""
+        return SweepKernels(
+            TypedKernel(kernels.start_sweeps),
+            TypedKernel(self.vertex_elements.iteration_kernel),
+            TypedKernel(step_setup.read_positions),
+        )
+
+    @cached_property
+    def free_memory(self) -> list[SweepMemory]:
+        """Work arrays of solves that have ended."""
+        return []
+
+    def allocate_memory(self) -> SweepMemory:
+        """Allocate the work arrays of a solve."""
+        packets, size = self.colour_packets.spring_packets, len(self.anchor_stiffness)
+        entries = int(np.diff(packets.packet_start).max(initial=0))
+        p, previous, older, descent = (allocate_aligned(4 * size) for _ in range(4))
+        springs = allocate_aligned((PACKET_SCRATCH_SIZE + SPRING_SCRATCH_SIZE * entries) * LANES)
+        sums = allocate_aligned(9 * LANES)
+        scratch = kernels.SweepScratch(previous, older, descent, springs, sums, np.zeros(1), np.zeros(1))
+        return SweepMemory(p, packets.build_right_hand_side(self.anchor_stiffness), scratch)
+
+    @cached_property
+    def vertex_rows(self) -> step_setup.VertexRows:
+        """The rows of the vertices, and the constant data of their right-hand side."""
+        s, row, none = self.system, self.row_of_vertex, np.empty(0, np.int64)
+        offset = self.colour_packets.spring_packets.right_hand_side_offset(len(self.anchor_stiffness))[row]
+        pins = np.array(s.pins.weight), np.array(s.pins.vertices)
+        return step_setup.VertexRows(row, offset, s.inertia_diagonal, *pins, np.empty(0), none, none)
+
+    @cached_property
     def _fixed_objective(self) -> FixedObjective:
         from springbench.solvers.objective.fixed_objective import FixedObjective
 
@@ -239,33 +270,45 @@ class PreparedVertexBlockDescent(IterativeSolver):
         )
 
 
+class SweepMemory(NamedTuple):
+    """Work arrays of a solve: positions in rows, right-hand side and scratch memory."""
+
+    rows: NDArray[np.float64]
+    right_hand_side: NDArray[np.float64]
+    sweep_scratch: kernels.SweepScratch
+
+
+class SweepKernels(NamedTuple):
+    """The kernels of a solve; `run_iterations` is for steps without active contacts and without elements."""
+
+    start_sweeps: TypedKernel
+    run_iterations: TypedKernel
+    read_positions: TypedKernel
+
+
 class SweepState(SolverState):
     """State of a solve: sweeps over all vertices in one step problem."""
 
     def __init__(self, prepared: PreparedVertexBlockDescent, problem: StepProblem, guess: Positions) -> None:
+        self._prepared = prepared
+        self._memory = memory = prepared.free_memory.pop() if prepared.free_memory else prepared.allocate_memory()
         form, blocks = prepared.spring_form, prepared.colour_packets
-        blocks = blocks._replace(spring_packets=form.update_edges(blocks.spring_packets, problem))
+        if form.has_edges:
+            blocks = blocks._replace(spring_packets=form.update_edges(blocks.spring_packets, problem))
         contacts = begin_active_contacts(problem)
         self._element_data = prepared.vertex_elements.update_elements(problem)
-        self._prepared, self._colour_packets, self._compute_residual = (
-            prepared,
-            blocks,
-            prepared.residual_solver.build_residual(problem),
-        )
-        pull = vertex_terms.compute_anchor_force(replace(problem, external_force=form.compute_force(problem)))
-        p, y = (prepared.pack_rows(x) for x in (vertex_terms.apply_exact_pins(guess, problem), pull))
-        self._right_hand_side = blocks.spring_packets.build_right_hand_side(prepared.anchor_stiffness, y)
+        self._colour_packets, self._problem = blocks, problem
+        self._compute_residual: Callable[[Positions], float] | None = None
         self._half_spaces = prepared.build_half_spaces(contacts) if contacts else None
-        p[-4] = _PADDING_COORDINATE
-        entries = int(np.diff(blocks.spring_packets.packet_start).max(initial=0))
-        scratch = (
-            allocate_aligned((PACKET_SCRATCH_SIZE + SPRING_SCRATCH_SIZE * entries) * LANES),
-            allocate_aligned(9 * LANES),
+        self._rows, self._right_hand_side, self._sweep_scratch = memory
+        given = problem.inertial_target, form.compute_force(problem), problem.pin_targets, guess
+        prepared.sweep_kernels.start_sweeps.call(
+            prepared.vertex_rows, *map(as_kernel_array, given), self._right_hand_side, self._sweep_scratch, self._rows
         )
-        self._sweep_scratch = kernels.SweepScratch(
-            p.copy(), p.copy(), np.zeros_like(p), *scratch, np.zeros(1), np.full(1, np.nan)
-        )
-        self._rows, self.positions = p, guess
+        self.positions = guess
+
+    def __del__(self) -> None:
+        self._prepared.free_memory.append(self._memory)
 
     def step_state(self) -> bool:
         """Do one iteration; return False if round-off prevents any further change."""
@@ -273,6 +316,8 @@ class SweepState(SolverState):
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        if self._compute_residual is None:
+            self._compute_residual = self._prepared.residual_solver.build_residual(self._problem)
         return self._compute_residual(self.positions)
 
     def sweep_without_contact(self, p: Positions) -> Positions:
@@ -309,7 +354,9 @@ class SweepState(SolverState):
     def run_unchecked(self, num_iterations: int) -> int:
         """Run sweeps over all vertices in one call; return their number."""
         made = self._prepared
-        made.vertex_elements.iteration_kernel(
+        is_usual = self._half_spaces is None and self._element_data is None
+        iterate = made.sweep_kernels.run_iterations.call if is_usual else made.vertex_elements.iteration_kernel
+        iterate(
             self._colour_packets,
             self._half_spaces,
             self._element_data,
@@ -319,5 +366,9 @@ class SweepState(SolverState):
             self._rows,
             num_iterations,
         )
-        self.positions = self._rows.reshape(-1, 4)[made.row_of_vertex, :3].copy()
+        self._read_positions()
         return num_iterations
+
+    def _read_positions(self) -> None:
+        self.positions = np.empty(self.positions.shape)
+        self._prepared.sweep_kernels.read_positions.call(self._prepared.vertex_rows, self._rows, self.positions)

@@ -226,7 +226,7 @@ class OffsetContactState(SweepState):
         self._rows.reshape(-1, 4)[prepared.sweeps.row_of_vertex[free], :3] = ahead[free]
         truncated = kernels.truncate_displacements(self._packed, prepared.sweeps.colour_packets.num_free, self._rows)
         self._needs_detection = truncated > prepared.max_truncated
-        self._store_positions()
+        self._read_positions()
 
     @staticmethod
     def _append_rows(rows: NDArray[np.float64], obstacles: list[Positions]) -> NDArray[np.float64]:
@@ -237,16 +237,13 @@ class OffsetContactState(SweepState):
             out[len(rows) :].reshape(-1, 4)[:, :3] = np.concatenate(obstacles)
         return out
 
-    def _store_positions(self) -> None:
-        self.positions = self._rows.reshape(-1, 4)[self._prepared.row_of_vertex, :3].copy()
-
     def run_unchecked(self, num_iterations: int) -> int:
         """Run sweeps over all vertices, with detections between them; return their number."""
         made, done = self._prepared, 0
         sweep = _select_kernel(made)
         while done < num_iterations:
             if self._needs_detection:
-                self._store_positions()
+                self._read_positions()
                 self._detect_contacts(self.positions)
             count, truncated = sweep(
                 self._colour_packets,
@@ -260,7 +257,7 @@ class OffsetContactState(SweepState):
             )
             done += count
             self._needs_detection = truncated > self._offset.max_truncated
-        self._store_positions()
+        self._read_positions()
         return done
 
     def _detect_contacts(self, p: Positions) -> None:

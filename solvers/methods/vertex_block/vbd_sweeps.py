@@ -11,6 +11,7 @@ from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.spring_local_step import SpringPackets, add_degenerate_packet
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.kernels.spring_objective import value_and_descent as objective
+from springbench.solvers.kernels.step_setup import write_positions, write_right_hand_side
 from springbench.solvers.methods.vertex_block.vbd_packets import vbd_newton_step
 from springbench.solvers.simd.spring_packets import LANES
 
@@ -52,6 +53,33 @@ class SweepScratch(NamedTuple):
     packet_sums: NDArray[np.float64]
     omega: NDArray[np.float64]
     objective_value: NDArray[np.float64]
+
+
+PADDING_COORDINATE = 1e100
+"""Coordinate at which padding springs of a packet end: far from all vertices, whatever the unit of length."""
+
+
+@jit_kernel
+def start_sweeps(vertex_rows, target, force, pin_targets, guess, right, work, p):
+    """Write the right-hand side of a step and its initial positions, and reset the scratch memory.
+
+    Args:
+        vertex_rows: rows of the vertices.
+        target, force: inertial target [m] and external force [N] (n, 3).
+        pin_targets: targets of the pins (q, 3) [m].
+        guess: initial guess (n, 3) [m].
+        right: output, see `SpringPackets.build_right_hand_side`.
+        work: scratch memory.
+        p: output, positions in rows of four [m]; two padding rows are last.
+    """
+    write_right_hand_side(vertex_rows, target, force, pin_targets, right)
+    p[:] = 0.0
+    write_positions(vertex_rows, guess, pin_targets, p)
+    p[len(p) - 4] = PADDING_COORDINATE
+    work.spring_scratch[:], work.packet_sums[:], work.descent_scratch[:] = 0.0, 0.0, 0.0
+    work.omega[0], work.objective_value[0] = 0.0, np.nan
+    for k in range(len(p)):
+        work.previous_positions[k] = work.older_positions[k] = p[k]
 
 
 @jit_inner
