@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from math import sqrt
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
@@ -20,6 +21,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
+from springbench.solvers.jit.typed_kernel import TypedKernel
+from springbench.solvers.kernels import objective_kernels, quadratic_form_kernels
 from springbench.solvers.kernels.line_search_conditions import (
     ARMIJO_FRACTION,
     is_approximate_wolfe_step,
@@ -28,6 +31,7 @@ from springbench.solvers.kernels.line_search_conditions import (
 from springbench.solvers.linalg.direct_solvers import DenseCholesky
 from springbench.solvers.linalg.solver_selection import build_linear_solver
 from springbench.solvers.model import system_matrix_assembly
+from springbench.solvers.model.rounding_bound import EPS
 from springbench.solvers.model.step_problem import Positions, ProjectiveEnergy, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
@@ -81,6 +85,7 @@ def backtracking_line_search(
     directional_curvature: float = 0.0,
     relax_locally: Callable[[Positions], Positions] | None = None,
     uses_rounded_slope: bool = False,
+    slope: float | None = None,
 ) -> DescentPoint | None:
     """Return the first point at initial_step, initial_step/2, ... with sufficient decrease, or None.
 
@@ -96,19 +101,19 @@ def backtracking_line_search(
             point.
         uses_rounded_slope: whether a decrease is also sufficient if it is by the slope along the rounded displacement:
             the rounding of positions may absorb most of a displacement, as at stiff pins.
+        slope: derivative along the direction [J], if it is known.
     """
-    slope = inner_product(at.gradient, direction)
+    slope = inner_product(at.gradient, direction) if slope is None else slope
     t = step.max_step_size(at.positions, direction, initial_step)
     for _ in range(MAX_HALVINGS if slope + directional_curvature < 0.0 < t else 0):
-        p = step.apply_exact_pins(at.positions + t * direction)
+        p, rise, noise, gradient = step.try_step(at.positions, direction, t, slope, directional_curvature)
         lower = relax_locally(p) if relax_locally else p
         if lower is not p and step.objective_change(at.positions, lower)[0] <= ARMIJO_FRACTION * t * (
             slope + 0.5 * t * directional_curvature
         ):
             return DescentPoint(lower, step.gradient(lower))
-        rise, noise = step.objective_change(at.positions, p)
-        if is_armijo_step(rise, t, slope, directional_curvature):
-            return DescentPoint(p, step.gradient(p))
+        if gradient is not None or is_armijo_step(rise, t, slope, directional_curvature):
+            return DescentPoint(p, step.gradient(p) if gradient is None else gradient)
         if rise <= noise and 0.0 < noise < np.inf:
             gradient = step.gradient(p)
             if is_approximate_wolfe_step(abs(inner_product(gradient, direction)), slope, ARMIJO_FRACTION):
@@ -164,12 +169,13 @@ class ResidualMetric:
             NotPositiveDefinite: the positions of some vertices are not determined.
             Unsupported: no linear solver fits in memory.
         """
-        self.system = system
+        self.system, self._has_penalty_pins = system, not system.pins.exact_mask.all()
         self._Q = system_matrix_assembly.assemble_system_matrix(
             system, [e for e in system.energies if isinstance(e, ProjectiveEnergy)]
         )
         self.free_block = csr_array(csr_array(self._Q[system.free_vertices])[:, system.free_vertices])
         self.free_diagonal: NDArray[np.float64] = np.asarray(self.free_block.diagonal(), np.float64)
+        self._multiply_matrix = TypedKernel(quadratic_form_kernels.multiply_matrix)
         self.unpinned_trace = float(self._Q.diagonal()[system.unpinned_mask].sum())
         self.stats = {"nnz_system": float(self._Q.nnz)}
         free, nothing = system.free_vertices, (DenseCholesky(np.eye(0)), "nothing to solve for")
@@ -179,7 +185,7 @@ class ResidualMetric:
 
     def energy_roundoff(self, p: Positions) -> float:
         """Return a bound of g H^-1 g [J] for a gradient g due to rounding of the positions p (n, 3)."""
-        return float(np.finfo(np.float64).eps * np.abs(p).max(initial=0.0)) ** 2 * self.unpinned_trace
+        return (EPS * objective_kernels.compute_max_magnitude(p)) ** 2 * self.unpinned_trace
 
     def significant_vertices(self, p: Positions, decrease: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which vertices are of connected components whose decrease exceeds round-off.
@@ -191,7 +197,7 @@ class ResidualMetric:
         labels, largest = self._component_labels, np.zeros(len(p))
         np.maximum.at(largest, labels, np.abs(p).max(axis=1, initial=0.0))
         stiffness = np.bincount(labels, self._Q.diagonal() * self.system.unpinned_mask, minlength=len(p))
-        roundoff = stiffness * (np.finfo(np.float64).eps * largest) ** 2
+        roundoff = stiffness * (EPS * largest) ** 2
         return (np.bincount(labels, decrease, minlength=len(p)) > roundoff)[labels]
 
     @cached_property
@@ -200,8 +206,12 @@ class ResidualMetric:
 
     def solve(self, b: Positions) -> Positions:
         """Return Q^-1 b, (n, 3), zero at exactly pinned vertices."""
-        out, free = np.zeros_like(b), self.system.free_vertices
-        x = np.empty((len(free), 3))
+        free = self.system.free_vertices
+        if len(free) == len(b):
+            out = np.empty_like(b, order="C")
+            self.factor.solve(np.ascontiguousarray(b), out)
+            return out
+        out, x = np.zeros_like(b), np.empty((len(free), 3))
         self.factor.solve(np.ascontiguousarray(b[free]), x)
         out[free] = x
         return out
@@ -212,11 +222,12 @@ class ResidualMetric:
 
     def correction_norm(self, e: Positions, gradient: Positions) -> float:
         """Return that residual for e = Q^-1 g, which is overwritten."""
-        pins = self.system.pins
-        if pins.exact_mask.all():  # then |Q^-1 g|_Q is what g does along it
+        if not self._has_penalty_pins:  # then |Q^-1 g|_Q is what g does along it
             return max(inner_product(e, gradient), 0.0) ** 0.5  # in this order, which keeps NaN
-        e[pins.vertices] = 0.0
-        return system_matrix_assembly.energy_norm(self._Q, e)
+        e[self.system.pins.vertices] = 0.0
+        product = np.empty_like(e)
+        self._multiply_matrix.call(self._Q.indptr, self._Q.indices, self._Q.data, e, product)
+        return sqrt(max(inner_product(e, product), 0.0))  # in this order, which keeps NaN
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,10 +252,9 @@ class PreparedDescent(IterativeSolver):
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess (n, 3) [m]."""
-        step, start = self._build_step(problem, initial_guess)
-        return _DescentState(
-            self, step, pick_lower_start(step, start) if has_active_barrier(step, start.positions) else start
-        )
+        step, guess = self._build_step(problem, initial_guess)
+        start = pick_lower_start(step, guess) if has_active_barrier(step, guess.positions) else guess
+        return _DescentState(self, step, guess, start)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)] at p (n, 3) [m]."""
@@ -267,8 +277,10 @@ class PreparedDescent(IterativeSolver):
 class _DescentState(SolverState):
     """The state of a solve; a stalled point has the previous positions."""
 
-    def __init__(self, prepared: PreparedDescent, step: StepObjective, start: DescentPoint) -> None:
-        self._metric, self._method, self._step = prepared.metric, prepared.method, step
+    def __init__(
+        self, prepared: PreparedDescent, step: StepObjective, guess: DescentPoint, start: DescentPoint
+    ) -> None:
+        self._metric, self._method, self._step, self._guess = prepared.metric, prepared.method, step, guess
         self._points, self._point, self.positions = prepared.method.iterate_points(step, start), start, start.positions
 
     def step_state(self) -> bool:
@@ -276,6 +288,10 @@ class _DescentState(SolverState):
         before, self._point = self._point, next(self._points, self._point)
         self.positions = self._point.positions
         return not self._point.is_stalled or self.positions is not before.positions
+
+    def compute_start_residual(self) -> float:
+        """Return the residual at the initial guess [J^(1/2)]."""
+        return self._metric.residual(self._guess.gradient)
 
     def residual(self) -> float:
         """Return the residual [J^(1/2)] at the iterate."""

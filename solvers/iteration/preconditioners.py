@@ -70,8 +70,8 @@ class _FactorPreconditioner:
 
     def __call__(self, step: StepObjective, p: Positions) -> tuple[Hessian, Preconditioner]:
         hessian = step.hessian(p)
-        beyond = step.has_contact_elements or any(
-            len(blocks.vertices) for blocks in hessian.barrier_hessian.pair_blocks
+        beyond = step.has_contact_elements or (
+            step.barrier_energies and any(len(blocks.vertices) for blocks in hessian.barrier_hessian.pair_blocks)
         )
         return hessian, ScaledPreconditioner(
             self._metric, *_contact_blocks(step, hessian, len(p))

@@ -13,6 +13,7 @@ been measured, its decrease per cost replaces the promise.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -133,9 +134,10 @@ def build_compiled_rounds(
 
 def init_rounds(newton_cost: float) -> Any:
     """Return the state of rounds at their start, (1,); the cost of a Newton step is in groups."""
-    rounds = _INITIAL_ROUNDS.copy()
-    rounds["newton_cost"] = newton_cost
-    return rounds
+    return np.frombuffer(bytearray(_initial_content(newton_cost)), ROUND_STATE_DTYPE)  # NumPy copies field by field
 
 
-_INITIAL_ROUNDS = np.array([(0, GROUP_ITERATIONS, 0, -1.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0)], ROUND_STATE_DTYPE)
+@cache
+def _initial_content(newton_cost: float) -> bytes:
+    initial = 0, GROUP_ITERATIONS, 0, -1.0, 0.0, 0.0, np.inf, 0.0, 0.0, newton_cost
+    return np.array([initial], ROUND_STATE_DTYPE).tobytes()

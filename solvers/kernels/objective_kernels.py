@@ -14,6 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.jit.typed_kernel import as_kernel_array
+from springbench.solvers.kernels.line_search_conditions import is_armijo_step
+from springbench.solvers.kernels.quadratic_form_kernels import add_product, change_form
 from springbench.solvers.kernels.spring_law import spring_energy_change, unit_direction
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.rounding_bound import EPS
@@ -57,14 +60,38 @@ class StepData(NamedTuple):
 
     @classmethod
     def from_problem(cls, problem: StepProblem) -> StepData:
-        """Copy a step's arrays; the kernels are compiled for writable arrays."""
-        soft, _, _ = problem.system.penalty_pins
+        """Select a step's arrays."""
+        soft, vertices, _ = problem.system.penalty_pins
+        pin_targets = problem.pin_targets if len(vertices) == len(soft) else problem.pin_targets[soft]
         return cls(
-            *(
-                np.array(a, order="C")
-                for a in (problem.inertial_target, problem.external_force, problem.pin_targets[soft])
-            )
+            as_kernel_array(problem.inertial_target),
+            as_kernel_array(problem.external_force),
+            as_kernel_array(pin_targets),
         )
+
+
+@jit_kernel
+def compute_max_magnitude(p):
+    """Return the largest absolute coordinate of p (n, 3), 0 for none; NaN if there is one."""
+    largest = 0.0
+    for v in range(len(p)):
+        for c in range(3):
+            size = abs(p[v, c])
+            if size > largest or size != size:
+                largest = size
+    return largest
+
+
+@jit_kernel
+def predict_positions(inertia_diagonal, target, force, pinned_vertices, pin_targets, out):
+    """Write the positions (n, 3) [m] under inertia and force alone, with pinned vertices on their targets, to `out`."""
+    for v in range(len(out)):
+        h = inertia_diagonal[v]
+        for c in range(3):
+            out[v, c] = target[v, c] + (force[v, c] / h if h > 0.0 else 0.0)
+    for q in range(len(pinned_vertices)):
+        for c in range(3):
+            out[pinned_vertices[q], c] = pin_targets[q, c]
 
 
 @jit_inner
@@ -77,6 +104,11 @@ def spring_direction(terms, e, p):
 @jit_kernel
 def gradient(terms, step_data, p, out):
     """Write the gradient [N] at p, both (n, 3), of springs, inertia, force and penalty pins to `out`."""
+    _write_gradient(terms, step_data, p, out)
+
+
+@jit_inner
+def _write_gradient(terms, step_data, p, out):
     for v in range(len(p)):
         for c in range(3):
             out[v, c] = (
@@ -139,6 +171,11 @@ def row_norm(x, v):
 @jit_kernel
 def objective_change(terms, step_data, p, q):
     """Return g(q) - g(p) [J] of springs, inertia, force and penalty pins, p and q (n, 3)."""
+    return _change_objective(terms, step_data, p, q)
+
+
+@jit_inner
+def _change_objective(terms, step_data, p, q):
     total = 0.0
     for v in range(len(p)):
         for c in range(3):
@@ -155,3 +192,46 @@ def objective_change(terms, step_data, p, q):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         total += spring_energy_change(terms.stiffness[e], terms.rest_length[e], i, j, p, q)
     return total
+
+
+class ExactPins(NamedTuple):
+    """The exactly pinned vertices (x,) and their targets (x, 3) [m]."""
+
+    vertices: NDArray[np.int64]
+    targets: Positions
+
+
+@jit_kernel
+def try_step(terms, form, step_data, exact_pins, p, direction, step_size, slope, curvature, q, out):
+    """Evaluate a trial of a line search, and the gradient there if the objective decreases enough.
+
+    Args:
+        terms: objective terms.
+        form: quadratic form, or None.
+        step_data: data of the step.
+        exact_pins: exactly pinned vertices, which are moved to their targets.
+        p: current positions (n, 3) [m].
+        direction: search direction (n, 3) [m].
+        step_size: multiple of the direction.
+        slope, curvature: first and second derivative along the direction [J].
+        q: output, positions of the trial (n, 3) [m].
+        out: output, gradient at q (n, 3) [N], zero at exactly pinned vertices, if the decrease is sufficient.
+
+    Returns:
+        The change of the objective [J], and whether the decrease is sufficient.
+    """
+    for v in range(len(p)):
+        for c in range(3):
+            q[v, c] = p[v, c] + step_size * direction[v, c]
+    for k in range(len(exact_pins.vertices)):
+        for c in range(3):
+            q[exact_pins.vertices[k], c] = exact_pins.targets[k, c]
+    change = _change_objective(terms, step_data, p, q) + change_form(form, p, q)
+    if not is_armijo_step(change, step_size, slope, curvature):
+        return change, False
+    _write_gradient(terms, step_data, q, out)
+    add_product(form, q, out)
+    for k in range(len(exact_pins.vertices)):
+        for c in range(3):
+            out[exact_pins.vertices[k], c] = 0.0
+    return change, True

@@ -78,6 +78,14 @@ def _add_product(form, x, out):
 @jit_kernel
 def energy_change(form, p, q):
     """Return q'Lq/2 - p'Lp/2 [J], p and q (n, 3)."""
+    return change_form(form, p, q)
+
+
+@jit_inner
+def change_form(form, p, q):
+    """Return q'Lq/2 - p'Lp/2 [J], p and q (n, 3); 0 without a form."""
+    if form is None:
+        return 0.0
     total = 0.0
     for i in range(len(form.vertex_weight)):
         h = 0.5 * form.vertex_weight[i]
@@ -106,6 +114,19 @@ def add_quadratic_blocks(form, diagonal, off_diagonal, values):
         add_to_diagonal(values, diagonal[form.pairs[k, 1]], w)
         add_to_diagonal(values, off_diagonal[k, 0], -w)
         add_to_diagonal(values, off_diagonal[k, 1], -w)
+
+
+@jit_kernel
+def multiply_matrix(pointers, columns, values, x, out):
+    """Write the product of a matrix in compressed rows with x (n, 3) to `out` (n, 3)."""
+    for i in range(len(out)):
+        s0, s1, s2 = 0.0, 0.0, 0.0
+        for e in range(pointers[i], pointers[i + 1]):
+            a, j = values[e], columns[e]
+            s0 += a * x[j, 0]
+            s1 += a * x[j, 1]
+            s2 += a * x[j, 2]
+        out[i, 0], out[i, 1], out[i, 2] = s0, s1, s2
 
 
 @jit_inner

@@ -182,7 +182,7 @@ def assemble_hessian(terms, places, constant, p, tension, negative_fraction, val
         places: block indices.
         constant: blocks of inertia, pins and other terms independent of p; None if there are no other terms.
         p: positions (n, 3) [m].
-        tension: tension of each spring (m,) [N].
+        tension: tension of each spring (m,) [N]; empty for the tensions at p.
         negative_fraction: factor of the springs' negative transverse parts.
         values: output (b, 3, 3) [N/m].
     """
@@ -198,7 +198,8 @@ def assemble_hessian(terms, places, constant, p, tension, negative_fraction, val
         if i == j:
             continue
         n0, n1, n2, length = spring_direction(terms, e, p)
-        lateral = transverse_stiffness(terms.stiffness[e], terms.rest_length[e], tension[e], length)
+        force = tension[e] if len(tension) else terms.stiffness[e] * (length - terms.rest_length[e])
+        lateral = transverse_stiffness(terms.stiffness[e], terms.rest_length[e], force, length)
         lateral = lateral * negative_fraction if lateral < 0.0 < terms.rest_length[e] else lateral
         xx, xy, xz, yy, yz, zz = axial_hessian(terms.stiffness[e], lateral, n0, n1, n2)
         if places.diagonal_block[i] >= 0:

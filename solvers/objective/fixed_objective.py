@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels import objective_kernels, spring_hessian
 from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
 from springbench.solvers.model import system_matrix_assembly
@@ -32,6 +33,19 @@ class ElementEnergy(NamedTuple):
     elements: Elements
 
 
+class ObjectiveKernels(NamedTuple):
+    """Kernels of springs and single vertices, see `objective_kernels` and `spring_hessian`, for C-contiguous arrays."""
+
+    gradient: TypedKernel
+    objective_change: TypedKernel
+    try_step: TypedKernel
+    predict_positions: TypedKernel
+    linearise_tensions: TypedKernel
+    assemble_hessian: TypedKernel
+    linearise_springs: TypedKernel
+    multiply_hessian: TypedKernel
+
+
 class FixedObjective:
     """The parts of a system's objective that do not change from step to step.
 
@@ -40,13 +54,28 @@ class FixedObjective:
         other_energy_indices: indices of energies without one.
         forms_with_force: indices of quadratic forms with a force, or with one that changes from step to step.
         projective_indices: indices of projective energies other than springs.
-        has_inertia: whether each vertex has inertia.
+        pinned_vertices: vertices of all pins.
+        exact_pins: vertices of the exact pins.
+        exact_pin_indices: their indices among all pins.
+        kernels: kernels of springs and single vertices.
     """
 
     def __init__(self, system: System) -> None:
-        self.system, self.has_inertia = system, bool((system.inertia_diagonal > 0.0).all())
+        self.system, self.pinned_vertices = system, np.array(system.pins.vertices)
         self.springs = Springs.from_parts([e for e in system.energies if isinstance(e, Springs)])
         self.objective_terms = objective_kernels.ObjectiveTerms.from_system(system, self.springs)
+        self.exact_pin_indices = np.flatnonzero(system.pins.exact_mask)
+        self.exact_pins = system.pins.vertices[self.exact_pin_indices]
+        self.kernels = ObjectiveKernels(
+            TypedKernel(objective_kernels.gradient),
+            TypedKernel(objective_kernels.objective_change),
+            TypedKernel(objective_kernels.try_step),
+            TypedKernel(objective_kernels.predict_positions),
+            TypedKernel(spring_hessian.linearise_tensions),
+            TypedKernel(spring_hessian.assemble_hessian),
+            TypedKernel(spring_hessian.linearise_springs),
+            TypedKernel(spring_hessian.multiply_hessian),
+        )
         self.quadratic_form: QuadraticForm | None = None
         self.forms_with_force: list[int] = []
         self.element_energy_indices: list[int] = []

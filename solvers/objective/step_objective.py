@@ -11,11 +11,12 @@ summed once.
 from __future__ import annotations
 
 from functools import cached_property, reduce
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from springbench.solvers.jit.typed_kernel import as_kernel_array
 from springbench.solvers.kernels import objective_kernels, quadratic_form_kernels, spring_hessian
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size
@@ -36,6 +37,25 @@ SLOPE_FALLBACK_RATIO = 1e-10
 """Relative change of an energy below which the mean slope is more accurate than the difference of values."""
 
 
+_NO_INDICES, _NO_VALUES = np.empty(0, np.int64), np.empty(0)
+_TENSIONS_AT_POINT = _NO_VALUES
+
+
+class TrialStep(NamedTuple):
+    """A trial of a line search.
+
+    Attributes:
+        positions: (n, 3) [m].
+        change, noise: change of the objective [J] and its round-off, as of `StepObjective.objective_change`.
+        gradient: gradient there (n, 3) [N], if it was computed.
+    """
+
+    positions: Positions
+    change: float
+    noise: float
+    gradient: Positions | None
+
+
 class StepObjective:
     """The objective g of one step. All positions are (n, 3) [m], with exactly pinned vertices on their targets.
 
@@ -50,6 +70,8 @@ class StepObjective:
         if len(problem.system.energies) != len(fixed_objective.system.energies):
             raise ValueError("the objective was made for a system of other energies than the step's")
         self.fixed_objective, self.problem = fixed_objective, problem
+        self._step_data: objective_kernels.StepData | None = None
+        self._pins: objective_kernels.ExactPins | None = None
         self.element_energies: list[ElementEnergy] = []
         self.other_energies: list[Energy] = []
         self.barrier_energies: list[BarrierEnergy] = []
@@ -59,8 +81,11 @@ class StepObjective:
             or fixed_objective.other_energy_indices
         ):
             begun: Any = problem.energies
-            for k in fixed_objective.forms_with_force:
-                begun[k].add_projection(problem.inertial_target, self.step_data.external_force)
+            if fixed_objective.forms_with_force:
+                force = problem.external_force.copy()
+                for k in fixed_objective.forms_with_force:
+                    begun[k].add_projection(problem.inertial_target, force)
+                self._step_data = self.step_data._replace(external_force=force)
             found = (
                 ElementEnergy(k, k in fixed_objective.projective_indices, begun[k].element_law, begun[k].elements)
                 for k in fixed_objective.element_energy_indices
@@ -69,13 +94,15 @@ class StepObjective:
             self.other_energies = [begun[k] for k in fixed_objective.other_energy_indices]
             self.barrier_energies = [energy for energy in self.other_energies if is_barrier_energy(energy)]
         self._constant_cache: tuple[BlockMatrix, FloatArray] | None = None
-        pins = problem.system.pins
-        self._exact_pins, self._exact_targets = pins.vertices[pins.exact_mask], problem.pin_targets[pins.exact_mask]
+        self._exact_pins = fixed_objective.exact_pins
+        self._has_exact_pins = len(self._exact_pins) > 0
 
-    @cached_property
+    @property
     def step_data(self) -> objective_kernels.StepData:
         """The step's inertial target, force and targets of penalty pins, for the kernels."""
-        return objective_kernels.StepData.from_problem(self.problem)
+        if self._step_data is None:
+            self._step_data = objective_kernels.StepData.from_problem(self.problem)
+        return self._step_data
 
     @cached_property
     def step_matrix(self) -> StepMatrix:
@@ -104,32 +131,41 @@ class StepObjective:
     def apply_exact_pins(self, p: Positions) -> Positions:
         """Return a copy of p with the exactly pinned vertices on their targets."""
         out = np.array(p, np.float64, order="C")
-        out[self._exact_pins] = self._exact_targets
+        if self._has_exact_pins:
+            out[self._exact_pins] = self.exact_pins.targets
         return out
+
+    @property
+    def exact_pins(self) -> objective_kernels.ExactPins:
+        """The exact pins and their targets, for the kernels."""
+        if self._pins is None:
+            targets = self.problem.pin_targets[self.fixed_objective.exact_pin_indices]
+            self._pins = objective_kernels.ExactPins(self._exact_pins, targets)
+        return self._pins
 
     def inertial_prediction(self) -> Positions:
         """Return the positions (n, 3) under inertia and external force alone, pinned vertices on their targets."""
-        problem, h = self.problem, self.problem.system.inertia_diagonal[:, None]
-        if self.fixed_objective.has_inertia:
-            p = problem.inertial_target + problem.external_force / h
-        else:
-            p = problem.inertial_target + np.divide(
-                problem.external_force, h, out=np.zeros_like(problem.external_force), where=h > 0.0
-            )
-        p[problem.system.pins.vertices] = problem.pin_targets
-        return p
+        problem, fixed, out = self.problem, self.fixed_objective, np.empty(self.problem.inertial_target.shape)
+        target, force, pins = map(
+            as_kernel_array, (problem.inertial_target, problem.external_force, problem.pin_targets)
+        )
+        inertia = fixed.objective_terms.inertia_diagonal
+        fixed.kernels.predict_positions.call(inertia, target, force, fixed.pinned_vertices, pins, out)
+        return out
 
     def gradient(self, p: Positions) -> Positions:
         """Return the gradient [N], (n, 3), zero at exactly pinned vertices."""
+        p, fixed = np.ascontiguousarray(p), self.fixed_objective
         out = np.empty_like(p)
-        objective_kernels.gradient(self.fixed_objective.objective_terms, self.step_data, p, out)
-        if self.fixed_objective.quadratic_form is not None:
-            quadratic_form_kernels.add_gradient(self.fixed_objective.quadratic_form, p, out)
+        fixed.kernels.gradient.call(fixed.objective_terms, self.step_data, p, out)
+        if fixed.quadratic_form is not None:
+            quadratic_form_kernels.add_gradient(fixed.quadratic_form, p, out)
         for one in self.element_energies:
             one.element_law.add_gradient(one.elements, p, out)
         for energy in self.other_energies:
             energy.add_gradient(p, out)
-        out[self._exact_pins] = 0.0
+        if self._has_exact_pins:
+            out[self._exact_pins] = 0.0
         return out
 
     def objective_change(self, p: Positions, q: Positions) -> tuple[float, float]:
@@ -137,12 +173,10 @@ class StepObjective:
 
         Such an energy contributes the difference of its values, or the mean slope if that difference is cancelled.
         """
-        change, noise = (
-            objective_kernels.objective_change(self.fixed_objective.objective_terms, self.step_data, p, q),
-            0.0,
-        )
-        if self.fixed_objective.quadratic_form is not None:
-            change += quadratic_form_kernels.energy_change(self.fixed_objective.quadratic_form, p, q)
+        p, q, fixed = np.ascontiguousarray(p), np.ascontiguousarray(q), self.fixed_objective
+        change, noise = fixed.kernels.objective_change.call(fixed.objective_terms, self.step_data, p, q), 0.0
+        if fixed.quadratic_form is not None:
+            change += quadratic_form_kernels.energy_change(fixed.quadratic_form, p, q)
         for one in self.element_energies:
             change += one.element_law.energy_change(one.elements, p, q)
         for energy in self.other_energies:
@@ -160,10 +194,35 @@ class StepObjective:
                 noise += VALUE_ROUNDOFF * scale
         return change, noise
 
+    def try_step(
+        self, p: Positions, direction: Positions, step_size: float, slope: float, curvature: float
+    ) -> TrialStep:
+        """Return the trial p + step_size * direction of a line search, with its gradient if the decrease suffices.
+
+        Without other energies than springs and quadratic forms this is one kernel.
+
+        Args:
+            p: positions (n, 3) [m].
+            direction: search direction (n, 3) [m].
+            step_size: multiple of the direction.
+            slope, curvature: first and second derivative along the direction [J].
+        """
+        if self.element_energies or self.other_energies:
+            q = self.apply_exact_pins(p + step_size * direction)
+            return TrialStep(q, *self.objective_change(p, q), None)
+        p, direction, fixed = np.ascontiguousarray(p), np.ascontiguousarray(direction), self.fixed_objective
+        q, gradient = np.empty_like(p), np.empty_like(p)
+        terms = fixed.objective_terms, fixed.quadratic_form, self.step_data, self.exact_pins
+        change, is_sufficient = fixed.kernels.try_step.call(
+            *terms, p, direction, step_size, slope, curvature, q, gradient
+        )
+        return TrialStep(q, change, 0.0, gradient if is_sufficient else None)
+
     def linearise_tensions(self, p: Positions, d: Positions) -> FloatArray:
         """Return the springs' tensions [N], (m,), at p, linearised for a displacement d."""
-        out = np.empty(len(self.fixed_objective.objective_terms.stiffness))
-        spring_hessian.linearise_tensions(self.fixed_objective.objective_terms, p, d, out)
+        fixed, out = self.fixed_objective, np.empty(len(self.fixed_objective.objective_terms.stiffness))
+        p, d = np.ascontiguousarray(p), np.ascontiguousarray(d)
+        fixed.kernels.linearise_tensions.call(fixed.objective_terms, p, d, out)
         return out
 
     def hessian(self, p: Positions) -> Hessian:
@@ -207,22 +266,30 @@ class Hessian:
     """The Hessian [N/m] at a point, over the free vertices (f,), with the blocks of elements and of collisions."""
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
-        self._step_objective, self._positions = step, p
+        self._step_objective, self._positions, self._kernels = step, p, step.fixed_objective.kernels
         self._objective_terms, self.free_vertices = (
             step.fixed_objective.objective_terms,
             step.fixed_objective.system.free_vertices,
         )
-        parts = [
-            woodbury.sparse_part(energy, p) for energy in step.other_energies if energy not in step.barrier_energies
-        ]
-        self._low_rank_columns = woodbury.low_rank_columns(step.other_energies, p) if step.other_energies else None
-        self._sparse_part = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
-        self.element_hessians = step.element_hessians(p)
+        self._low_rank_columns, self._sparse_part = None, None
+        if step.other_energies:
+            parts = [
+                woodbury.sparse_part(energy, p) for energy in step.other_energies if energy not in step.barrier_energies
+            ]
+            self._low_rank_columns = woodbury.low_rank_columns(step.other_energies, p)
+            self._sparse_part = reduce(lambda a, b: csr_array(a + b), parts) if parts else None
+        self.element_hessians = step.element_hessians(p) if step.element_energies else []
         self.barrier_hessian = BarrierHessian(step.barrier_energies, p)
 
-    @cached_property
+    @property
     def _matrix_and_entries(self) -> tuple[BlockMatrix, IndexArray, FloatArray]:
         """The matrix, and the places and values in it of energies without an element-wise form."""
+        if not self._step_objective.other_energies:
+            return self._step_objective.fixed_objective.hessian_matrix, _NO_INDICES, _NO_VALUES
+        return self._extended_matrix_and_entries
+
+    @cached_property
+    def _extended_matrix_and_entries(self) -> tuple[BlockMatrix, IndexArray, FloatArray]:
         step, whole = self._step_objective, self._step_objective.fixed_objective
         rows, columns, entries = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
         if self._sparse_part is not None:
@@ -288,14 +355,9 @@ class Hessian:
 
         Returns None if it is not positive definite.
         """
-        out = np.zeros_like(b)
-        x = self._factor.factorise_and_solve(
-            self._assemble(negative_fraction, shift, tension).values, b[self.free_vertices]
-        )
-        if x is None:
-            return None
-        out[self.free_vertices] = x
-        return out
+        values = self._assemble(negative_fraction, shift, tension).values
+        x = self._factor.factorise_and_solve(values, self._select_free(b))
+        return None if x is None else self._extend_to_all(x, b)
 
     def _assemble(
         self,
@@ -305,48 +367,58 @@ class Hessian:
         projected: ProjectedHessian | None = None,
     ) -> BlockMatrix:
         matrix, places, entries = self._matrix_and_entries
-        step, tension = self._step_objective, self._current_tensions if tension is None else tension
+        step, tension = self._step_objective, _TENSIONS_AT_POINT if tension is None else tension
         constant = step.constant_blocks(matrix, self._positions)
-        spring_hessian.assemble_hessian(
-            self._objective_terms,
-            matrix.block_indices,
-            constant,
-            self._positions,
-            tension,
-            negative_fraction,
-            matrix.values,
-        )
-        elements = projected.element_hessians if projected else self.element_hessians
-        for one, curvature in zip(step.element_energies, elements, strict=True):
+        terms, p = self._objective_terms, np.ascontiguousarray(self._positions)
+        # The blocks of elements are constant in some steps only, so that their type changes.
+        assemble = spring_hessian.assemble_hessian if step.element_energies else self._kernels.assemble_hessian.call
+        assemble(terms, matrix.block_indices, constant, p, tension, float(negative_fraction), matrix.values)
+        if step.element_energies:
+            self._add_elements(matrix, projected.element_hessians if projected else self.element_hessians)
+        if projected:
+            for k, blocks in enumerate(projected.pair_blocks):
+                blocks.add_blocks(matrix.element_block_indices(-1 - k, blocks.vertices), matrix.values)
+        elif step.barrier_energies:
+            self.barrier_hessian.add_to_matrix(negative_fraction, matrix)
+        if len(places):
+            matrix.values.reshape(-1)[places] += entries
+        if isinstance(shift, np.ndarray) or shift != 0.0:
+            matrix.values.reshape(-1)[matrix.diagonal_entries] += shift
+        return matrix
+
+    def _add_elements(self, matrix: BlockMatrix, element_hessians: list[FloatArray]) -> None:
+        """Add the Hessians of the elements of each energy that are not constant."""
+        for one, curvature in zip(self._step_objective.element_energies, element_hessians, strict=True):
             if not one.element_law.has_constant_hessian:
                 at = matrix.element_block_indices(one.energy_index, one.elements.vertices)
                 add_blocks(one.elements, at, curvature, matrix.values)
-        for k, blocks in enumerate(projected.pair_blocks if projected else []):
-            blocks.add_blocks(matrix.element_block_indices(-1 - k, blocks.vertices), matrix.values)
-        if not projected:
-            self.barrier_hessian.add_to_matrix(negative_fraction, matrix)
-        values = matrix.values.reshape(-1)
-        values[places] += entries
-        values[matrix.diagonal_entries] += shift
-        return matrix
 
     def solve(self, b: Positions) -> Positions:
         """Solve with the last factor for b (n, 3).
 
         The result is zero at vertices that are not free.
         """
+        return self._extend_to_all(self._factor.solve(self._select_free(b)), b)
+
+    def _select_free(self, b: Positions) -> Positions:
+        return b[self.free_vertices] if len(self.free_vertices) < len(b) else b
+
+    def _extend_to_all(self, x: Positions, b: Positions) -> Positions:
+        """Return x (f, 3) with rows of zeros at vertices that are not free, as many in all as in b."""
+        if len(x) == len(b):
+            return x
         out = np.zeros_like(b)
-        out[self.free_vertices] = self._factor.solve(b[self.free_vertices])
+        out[self.free_vertices] = x
         return out
 
-    @cached_property
+    @property
     def _factor(self) -> BlockCholesky | woodbury.Woodbury:
-        matrix = self._matrix_and_entries[0]
-        return (
-            matrix.factor
-            if self._low_rank_columns is None
-            else woodbury.Woodbury(matrix, self._low_rank_columns[self.free_vertices])
-        )
+        return self._matrix_and_entries[0].factor if self._low_rank_columns is None else self._updated_factor
+
+    @cached_property
+    def _updated_factor(self) -> woodbury.Woodbury:
+        assert self._low_rank_columns is not None
+        return woodbury.Woodbury(self._matrix_and_entries[0], self._low_rank_columns[self.free_vertices])
 
     @cached_property
     def _current_tensions(self) -> FloatArray:
@@ -355,7 +427,7 @@ class Hessian:
     @cached_property
     def _linear_terms(self) -> FloatArray:
         linear = np.empty((len(self._objective_terms.stiffness), 4))
-        spring_hessian.linearise_springs(self._objective_terms, self._positions, linear)
+        self._kernels.linearise_springs.call(self._objective_terms, np.ascontiguousarray(self._positions), linear)
         return linear
 
     @cached_property
@@ -373,13 +445,14 @@ class Hessian:
 
     def matvec(self, x: Positions) -> Positions:
         """Return the exact Hessian times x (n, 3); x and the product are zero at vertices that are not free."""
-        product, out = np.empty_like(x), np.zeros_like(x)
-        spring_hessian.multiply_hessian(*self.kernel_arguments, x, product)
+        x = np.ascontiguousarray(x)
+        product, has_elements = np.empty_like(x), bool(self._step_objective.element_energies)
+        multiply = spring_hessian.multiply_hessian if has_elements else self._kernels.multiply_hessian.call
+        multiply(*self.kernel_arguments, x, product)
         if self._sparse_part is not None:
             product += (self._sparse_part @ x.ravel()).reshape(-1, 3)
         if self._low_rank_columns is not None:
             product += self._low_rank_columns @ np.einsum("nik,ni->k", self._low_rank_columns, x)
-        for pairs in self.barrier_hessian.pair_blocks:
+        for pairs in self.barrier_hessian.pair_blocks if self._step_objective.barrier_energies else ():
             pairs.add_product(x, product)
-        out[self.free_vertices] = product[self.free_vertices]
-        return out
+        return self._extend_to_all(self._select_free(product), x)

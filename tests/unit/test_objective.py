@@ -224,3 +224,35 @@ def test_pairs_of_free_vertices_are_listed_once_and_in_order():
     assert (number[:-1] < 0).any()  # some vertices are not free
     i, j = objective.free_vertex_pairs(vertices)
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == sorted(expected)
+
+
+@problems
+@pytest.mark.parametrize("is_view", [False, True])
+def test_a_trial_of_a_line_search_is_the_objective_at_its_end(problem, is_view):
+    step, p, q = stepped(problem)
+    direction = q - p
+    if is_view:  # every second row of larger arrays
+        p, direction = (np.repeat(x, 2, axis=0)[::2] for x in (p, direction))
+    end = step.apply_exact_pins(p + 0.5 * direction)
+    for slope, is_sufficient in ((-1e300, False), (1e300, True)):
+        trial = step.try_step(p, direction, 0.5, slope, 0.0)
+        np.testing.assert_array_equal(trial.positions, end)
+        assert (trial.change, trial.noise) == step.objective_change(p, end)
+        if not is_sufficient:
+            assert trial.gradient is None
+        elif not step.other_energies:
+            assert trial.gradient is not None
+            np.testing.assert_array_equal(trial.gradient, step.gradient(end))
+
+
+@pytest.mark.parametrize("mass", [1.0, 0.0])
+def test_the_inertial_prediction_is_where_no_energy_acts(mass):
+    problem = build_random_problem(2, weights=(np.inf, 3.0))
+    problem = replace(problem, system=replace(problem.system, mass=mass * problem.system.mass))
+    found, h = (
+        StepObjective(FixedObjective(problem.system), problem).inertial_prediction(),
+        problem.system.inertia_diagonal,
+    )
+    expected = problem.inertial_target + (problem.external_force / h[:, None] if mass else 0.0)
+    expected[problem.system.pins.vertices] = problem.pin_targets
+    np.testing.assert_array_equal(found, expected)

@@ -65,8 +65,11 @@ def factorise_shifted(
     Returns:
         The level; 0 is the exact Hessian; None if no level has a factor.
     """
-    tried = enumerate(schedule[first_level:], first_level)
-    return next((k for k, (keep, by) in tried if hessian.factorise(keep, shift + by * diagonal)), None)
+    for level in range(first_level, len(schedule)):
+        keep, by = schedule[level]
+        if hessian.factorise(keep, shift + by * diagonal if by > 0.0 else shift):
+            return level
+    return None
 
 
 class RegularisationRule(Protocol):

@@ -115,6 +115,9 @@ _MEASURED_STEPS = 3
 _MAX_SHIFT = 1e3
 """Largest multiple of the inertia that is added to an exact Hessian; then its negative parts are reduced instead."""
 
+_NO_GRADIENT = np.empty((0, 3))
+"""In place of the gradient at a point of L-BFGS, whose residual is known and whose gradient nothing needs."""
+
 _LBFGS_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), (2e5, 0.023, 20.0)
 """Costs of an L-BFGS iteration (constant, per spring, per entry of the factor) and of a Newton step (constant, per
 flop, per entry), fitted to 16 scenes of 6 to 4096 vertices on one core with AVX-512; their ratio alone matters."""
@@ -216,7 +219,7 @@ class SolveControl:
     must_escape: bool = False
     is_minimum: bool = False
     residual: float | None = None
-    solver_phases: dict[str, tuple[int, float]] = field(default_factory=dict[str, tuple[int, float]])
+    solver_phases: dict[str, tuple[int, float]] = field(default_factory=dict)
     first_run: AcceleratedState | None = None
 
     def add_phase(self, name: str, num_iterations: int, cost: float) -> None:
@@ -265,7 +268,7 @@ class _HybridState(SolverState):
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         count, found, ended = 0, np.nan, REASON_ITERATIONS
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
-            moved = self._advance(limits._replace(max_iterations=limits.max_iterations - count))
+            moved = self._advance(limits._replace(max_iterations=limits.max_iterations - count) if count else limits)
             count += self._control.num_iterations if moved else 0
             if limits.residual_mode == RESIDUAL_EACH:
                 found = self.residual()
@@ -323,7 +326,8 @@ class _MeasuredRule(ShiftScheduleRule):
         """Factorise with a multiple of the inertia added, or by the shift schedule if it is infinite."""
         if shift == np.inf:
             return factorise_shifted(hessian, diagonal, first_level=1)
-        return int(shift > 0.0) if hessian.factorise(1.0, shift * self._inertia_diagonal) else None
+        added = shift * self._inertia_diagonal if shift > 0.0 else 0.0
+        return int(shift > 0.0) if hessian.factorise(1.0, added) else None
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         slope = inner_product(at.gradient, at.positions - to.positions)
@@ -431,12 +435,15 @@ class _Approach:
         """Start at positions (n, 3) [m], with L-BFGS started there."""
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = run
-        self._point, self._rounds = DescentPoint(start, start), init_rounds(method.newton_cost)
-        self._rule, self._steepest = _MeasuredRule(method.inertia_diagonal, method.factor), 0.0
+        self._point, self._rounds = DescentPoint(start, _NO_GRADIENT), init_rounds(method.newton_cost)
+        self._num_lbfgs_iterations, self._rival_gain = 0, 0.0  # those of the rounds
+        self._measured_rule: _MeasuredRule | None = None
+        self._steepest = 0.0
         self._floor = method.metric.energy_roundoff(start) ** 0.5  # [J^(1/2)]
         self._predicting: PredictedTensionNewton | None = None
         self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
-        self._name, self._recent_steps = "", deque[tuple[float, float]](maxlen=_MEASURED_STEPS)  # [J], cost
+        self._name = ""
+        self._recent_steps: deque[tuple[float, float]] = deque(maxlen=_MEASURED_STEPS)  # [J], cost
         self._is_trial_due, self._patience, self._spent, self._fallen = False, _FIRST_PATIENCE, 0.0, 0.0
         self._trial_cost = _FIRST_PATIENCE * method.newton_cost  # spent by the others until the exact method is tried
 
@@ -459,11 +466,23 @@ class _Approach:
                     point = self._take_newton_step() if name == "newton" else self._take_predicted_step()
                     self._record_step(name, point, self._method.factor.num_factorisations - before)
             if point is not self._point:
-                self._point, self._control.is_minimum = point, self._rule.is_delivered
+                self._point, self._control.is_minimum = point, self._is_delivered
                 yield point
 
+    @property
+    def _rule(self) -> _MeasuredRule:
+        """The regularisation of the exact method; a solve by L-BFGS alone needs none."""
+        if self._measured_rule is None:
+            self._measured_rule = _MeasuredRule(self._method.inertia_diagonal, self._method.factor)
+        return self._measured_rule
+
+    @property
+    def _is_delivered(self) -> bool:
+        """Whether the last step of the exact method delivered."""
+        return self._measured_rule is not None and self._measured_rule.is_delivered
+
     def _choose_method(self) -> str:
-        if self._rule.is_delivered or self._is_trial_due or not any(self._gains.values()):
+        if self._is_delivered or self._is_trial_due or not any(self._gains.values()):
             return "newton"
         if self._gains["lbfgs"] == np.inf:
             return "lbfgs"
@@ -478,23 +497,28 @@ class _Approach:
             rounds["gain"], rounds["group_residual"] = np.inf, 0.0
         if step.barrier_energies:  # each round is checked for collisions
             limits = limits._replace(max_iterations=1)
-        before, floor = int(rounds["num_iterations"][0]), self._floor
+        floor, rival_gain = self._floor, max(self._gains["predicted tensions"], self._gains["newton"])
         limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
         limits = LoopLimits(limits.max_iterations, limit, max(floor, limits.residual_floor), RESIDUAL_EACH)
-        rounds["rival_gain"] = max(self._gains["predicted tensions"], self._gains["newton"])
+        if rival_gain != self._rival_gain:
+            rounds["rival_gain"] = self._rival_gain = rival_gain
         count, residual, ended = self._run.run_rounds(rounds, limits)
-        cost = (int(rounds["num_iterations"][0]) - before) / GROUP_ITERATIONS
+        before, self._num_lbfgs_iterations = self._num_lbfgs_iterations, int(rounds["num_iterations"][0])
+        cost = (self._num_lbfgs_iterations - before) / GROUP_ITERATIONS
         self._control.add_phase("lbfgs", count, cost / self._method.newton_cost)
-        point, gain = _current_point(self._run), float(rounds["gain"][0])
-        self._control.residual = residual if self._method.exact_lbfgs else None
+        if self._method.exact_lbfgs:
+            point, self._control.residual = DescentPoint(self._run.positions.copy(), _NO_GRADIENT), residual
+        else:
+            point = _current_point(self._run)
         self._spent += cost
         if ended == REASON_SWITCH and rounds["is_unsuited"]:
             self._predicting = PredictedTensionNewton(self._method, step, self._origin())
             self._gains |= {"lbfgs": 0.0, "predicted tensions": np.inf}
             rounds["is_unsuited"], rounds["initial_residual"] = 0, np.inf
         elif ended == REASON_SWITCH:
+            gain = float(rounds["gain"][0])
             self._gains["lbfgs"] = max(gain, 0.0)
-            self._is_trial_due = gain >= float(rounds["rival_gain"][0])
+            self._is_trial_due = gain >= rival_gain
         elif ended == REASON_STALLED or residual <= floor:
             self._gains["lbfgs"], self._is_trial_due = 0.0, True
         return point
@@ -537,7 +561,7 @@ class _Approach:
             self._gains[name] = total_fall / total_cost if total_cost > 0.0 else 0.0
         if name == "newton":
             others = self._fallen / self._spent if self._spent > 0.0 else 0.0
-            is_better = self._rule.is_delivered or self._gains["newton"] > others
+            is_better = self._is_delivered or self._gains["newton"] > others
             self._patience = _FIRST_PATIENCE if is_better else 2.0 * self._patience
             self._is_trial_due, self._spent, self._fallen = False, 0.0, 0.0
             rounds = self._rounds
@@ -550,7 +574,8 @@ class _Approach:
     def _escape(self) -> DescentPoint | None:
         """Return a lower point next to the saddle point at which the iteration is, or None."""
         self._control.must_escape = False
-        step, at, diagonal = self._step, self._point, self._method.system_diagonal
+        step, diagonal = self._step, self._method.system_diagonal
+        at = _current_point(self._run) if self._run is not None else self._point
         hessian = step.hessian(at.positions)
         if not hessian.factorise(0.0):
             return None

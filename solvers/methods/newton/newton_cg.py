@@ -33,6 +33,7 @@ from springbench.solvers.iteration.preconditioners import (
     build_preconditioner,
 )
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
+from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
 from springbench.solvers.linalg.dense_inverse import DenseInverse
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
@@ -252,6 +253,7 @@ class _CompiledCG:
         self._thread_count, self._exact_pins = factor.choose_num_threads, system.pins.vertices[system.pins.exact_mask]
         self._factor = newton_cg_kernel.embed_factor(factor, system.free_vertices)
         self._scratch = np.zeros((4, system.num_vertices, 3))
+        self._solve_usual = TypedKernel(newton_cg_kernel.solve_direction)
 
     def compute_direction(
         self, hessian: Hessian, solve: Preconditioner, at: DescentPoint, descent: Positions, eta: float
@@ -261,5 +263,8 @@ class _CompiledCG:
         shrunk = solve.inverse_scaling if isinstance(solve, ScaledPreconditioner) else None
         solving = self._factor, self._thread_count(), self._exact_pins, shrunk
         newton = newton_cg_kernel.NewtonEquation(hessian.kernel_arguments, *solving, d, *self._scratch)
-        newton_cg_kernel.solve_direction(newton, at.gradient, descent, eta, _MAX_CG_ITERATIONS)
+        is_usual = shrunk is None and newton.num_threads is None and not hessian.element_hessians
+        solve_direction = self._solve_usual.call if is_usual else newton_cg_kernel.solve_direction
+        gradient = np.ascontiguousarray(at.gradient)
+        solve_direction(newton, gradient, np.ascontiguousarray(descent), eta, _MAX_CG_ITERATIONS)
         return d

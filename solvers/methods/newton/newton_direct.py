@@ -172,39 +172,43 @@ class NewtonIteration:
         if level is None:
             return at._replace(is_stalled=True), steepest
         direction = -hessian.solve(at.gradient)
-        fall = -inner_product(at.gradient, direction)
+        slope: float | None = inner_product(at.gradient, direction)
+        fall = -slope
         steepest = max(fall, steepest)
         known = fall > self._metric.energy_roundoff(at.positions)
         if not known and self._has_local_roundoff:
             falls = -np.einsum("ij,ij->i", at.gradient, direction)
             is_significant = self._metric.significant_vertices(at.positions, falls)
             known, direction = bool(is_significant.any()), np.where(is_significant[:, None], direction, 0.0)
+            slope = None
         slight = fall <= _SADDLE_SLOPE_RATIO * steepest
         if level > 0 and (slight or not known) and type(rule) is not ShiftScheduleRule:
             return self.next_point(step, at, steepest, ShiftScheduleRule())
         found = None
         if known and not (slight and level > 0):
-            found = self._search_direction(step, at, direction, level == 0)
+            found = self._search_direction(step, at, direction, slope, level == 0)
         if found is None and level > 0:
             found = escape_saddle(step, at, hessian, self._system_diagonal) or (
-                self._backtrack(step, at, direction) if known else None
+                self._backtrack(step, at, direction, slope) if known else None
             )
         if found is not None:
             rule.record_step(step, hessian, at, found)
         return found or at._replace(is_stalled=True), steepest
 
     def _search_direction(
-        self, step: StepObjective, at: DescentPoint, direction: Positions, exact: bool
+        self, step: StepObjective, at: DescentPoint, direction: Positions, slope: float | None, exact: bool
     ) -> DescentPoint | None:
         """Return a lower point along a direction, or None; `exact` means an unmodified Hessian."""
         if self._friction_search is None or not exact or not step.has_contact_elements:
-            return self._backtrack(step, at, direction)
+            return self._backtrack(step, at, direction, slope)
         return self._friction_search.watchdog_search(
             step, at, direction, lambda point: self._exact_newton_direction(step, point)
         )
 
-    def _backtrack(self, step: StepObjective, at: DescentPoint, direction: Positions) -> DescentPoint | None:
-        return backtracking_line_search(step, at, direction, uses_rounded_slope=self._has_local_roundoff)
+    def _backtrack(
+        self, step: StepObjective, at: DescentPoint, direction: Positions, slope: float | None
+    ) -> DescentPoint | None:
+        return backtracking_line_search(step, at, direction, uses_rounded_slope=self._has_local_roundoff, slope=slope)
 
     @staticmethod
     def _exact_newton_direction(step: StepObjective, at: DescentPoint) -> Positions | None:

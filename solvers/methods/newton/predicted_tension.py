@@ -101,7 +101,8 @@ class PredictedTensionNewton:
     def _solve_shifted(self, hessian: Hessian, b: Positions, shift: float) -> Positions | None:
         """Solve with a multiple of the inertia added; an infinite one drops negative transverse parts instead."""
         keep, by = (1.0, shift) if shift < np.inf else (0.0, 0.0)
-        return hessian.factorise_and_solve(b, keep, by * self._method.inertia_diagonal, self._predicted_tensions)
+        added = by * self._method.inertia_diagonal if by > 0.0 else 0.0
+        return hessian.factorise_and_solve(b, keep, added, self._predicted_tensions)
 
     def _line_search(
         self, at: DescentPoint, direction: Positions, slope: float
