@@ -18,6 +18,9 @@ from numba.core.compiler import Compiler, CompileResult, compile_result
 LINKED_KIND = "linked"
 """Mark that distinguishes the reduced form of `LinkedLibrary` from that of Numba's libraries."""
 
+_C_WRAPPER_NAME = "cfunc_wrapper"
+"""Name of the module in which Numba wraps a function for calls from C."""
+
 _LIBRARY_CLASS: Any = JITCodeLibrary
 _COMPILER_CLASS: Any = Compiler
 """Untyped, because the declared signatures differ from those of their subclasses."""
@@ -25,6 +28,11 @@ _COMPILER_CLASS: Any = Compiler
 
 class LinkedLibrary(_LIBRARY_CLASS):
     """Code for linking only: lowered, with everything that it calls, and without an address."""
+
+    def add_ir_module(self, ir_module: Any) -> None:
+        """Add a module of code, but no wrapper for calls from C, which need an address."""
+        if ir_module.name != _C_WRAPPER_NAME:
+            super().add_ir_module(ir_module)
 
     def finalize(self) -> None:
         """Link the modules of the called functions into this one."""

@@ -10,10 +10,12 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 from numba import njit, types  # noqa: TID251
 from numba.core.registry import CPUDispatcher
+from numba.core.targetconfig import TargetConfig
 from numba.core.typing.templates import signature
 from springbench.solvers.jit.inline_linking import KernelCompiler, LinkedCompiler, ParallelCompiler
 from springbench.solvers.jit.kernel_cache import KernelCache
@@ -21,8 +23,26 @@ from springbench.solvers.jit.kernel_cache import KernelCache
 _no_wrapper_options: Any = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 _linked_options: Any = {**_no_wrapper_options, "pipeline_class": LinkedCompiler}
 
+_FLAGS_CLASS: Any = TargetConfig
 _DISPATCHER_CLASS: Any = CPUDispatcher
 """Untyped, because the declared signatures differ from those of its subclasses."""
+
+
+@cache
+def _default_flags(flags_class: Any) -> dict[str, Any]:
+    return {name: option.default for name, option in flags_class.options.items()}
+
+
+def _read_flags(flags: Any) -> dict[str, Any]:
+    """Return the values of all flags of a compilation, as the method of Numba that this replaces does.
+
+    That one reads them one by one, where type inference compares them for each call in a kernel: a quarter of the time
+    of a compilation.
+    """
+    return {**_default_flags(type(flags)), **flags._values}
+
+
+_FLAGS_CLASS.values = _read_flags
 
 
 class KernelDispatcher(_DISPATCHER_CLASS):
