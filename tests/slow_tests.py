@@ -50,11 +50,7 @@ LONG_NAME_PARTS = (
         "test_a_full_disk_is_a_failure_and",
         "test_a_balloon_of_a_thousand_vertices",
     ),
-    *(
-        "is_free_and_the_way_to_it[newton]",
-        "test_every_fragment_shows_something",
-        "test_a_sweep_runs_and_gives_the_same_positions",
-    ),
+    *("is_free_and_the_way_to_it[newton]",),
     *("blocks of 3000 bytes-supernodal", "test_a_program_that_takes_twice_as_long", "in_any_order_of_imports"),
     *("test_a_config_next_to_files_of_these_names", "it_is_said_to_be[effects-dashpots-1e12]"),
     "test_an_impact_that_the_steps_do_not_resolve_has_no_truth",
@@ -65,12 +61,10 @@ LONG_NAME_PARTS = (
         "whichever_method_wins[single-spring",
     ),
     *(
-        "a_hundred_steps[penalty-",
         "an_example_runs[own_report]",
         "has_order_1[surface-contact]",
         "has_order_1[self-contact]",
     ),
-    *("ends_no_command[accuracy]", "ends_no_command[roofline]", "ends_no_command[gallery]"),
     *(
         "its_files_and_nothing_else[without pictures]",
         "blocks of 30000 bytes-supernodal, float16",

@@ -41,7 +41,7 @@ def ends(folder: Path) -> dict[str, dict[str, str]]:
     return {s: last[s] for s in sorted(taken, key=taken.__getitem__)}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_three_clicks_lead_to_the_fastest_solver_its_last_frame_and_the_command_that_repeats_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

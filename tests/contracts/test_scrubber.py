@@ -44,7 +44,7 @@ def study(folder: Path) -> str:
     return update_page(folder, with_recordings=True).as_uri()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_each_iterate_is_shown_with_its_distance_to_the_reference(tmp_path: Path):
     page = study(tmp_path)
     files = {solver: read_replay(tmp_path / f"study/recordings/net-6-early-{solver}.rrd") for solver in AMPLITUDES}
