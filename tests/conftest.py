@@ -39,21 +39,15 @@ settings.load_profile("suite")
 
 
 _COMPILING_FILE = "solver_contract.py"
-"""It calls nearly all kernels, and has them compiled where they are not there yet."""
+"""It calls nearly all kernels, and has them compiled where they are not there yet, which is before the slow tests."""
 _KERNEL_FREE_PREFIXES = (
-    "worker",
-    "bare_",
-    "stale",
-    "damaged",
-    "full_disk",
-    "plugins",
-    "hostile",
-    "regress",
-    "pytest_plugin",
-    "abba",
+    *("worker", "user_code", "hostile_plugins", "shared_folders", "reproduce", "publish", "device.py", "new_study"),
+    *("kill_and_resume", "page.py", "accuracy.py", "bare_", "stale", "damaged", "full_disk", "plugins", "hostile"),
+    *("regress", "pytest_plugin", "abba"),
 )
-"""Files that need few of them: what runs beside it, so that no kernel is compiled twice at once. The first ones run
-sweeps, whose workers are forks as long as no thread of Numba runs."""
+"""Files that need few of them: what runs beside it, so that no kernel is compiled twice at once. The first ones start
+workers, which are forks of this process as long as no thread of Numba or Rerun runs in it, and else import everything
+anew. Long ones follow, which should not be the last."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -67,12 +61,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Files go to the test runner's processes in this order, which its `--no-loadscope-reorder` keeps."""
+    compiles = config.option.markexpr != "slow"
 
     def order(item: pytest.Item) -> int:
         name = item.path.name.removeprefix("test_")
-        if name == _COMPILING_FILE:
+        if compiles and name == _COMPILING_FILE:
             return -1
         return next(
             (rank for rank, start in enumerate(_KERNEL_FREE_PREFIXES) if name.startswith(start)),
@@ -97,3 +92,11 @@ def pytest_collection_finish() -> None:
     """What is there now stays: collections of garbage, automatic or asked for, need not look at it again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def without_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs, and their pictures, are made in this process: for tests whose subject is no worker, which takes seconds."""
+    from springbench.harness.execution import isolated_worker
+
+    monkeypatch.setattr(isolated_worker, "can_isolate_processes", lambda: False)

@@ -18,6 +18,9 @@ from springbench.harness.experiments.accuracy.accuracy_study import run_accuracy
 from springbench.harness.recording.recording_reader import read_replay
 from springbench.harness.reference import reference_store
 from springbench.harness.reference.certified_minimum import INACCURATE, KnownMinima, certify_minimum
+from springbench.harness.report import accuracy_report
+from springbench.harness.report.charts.chart_description import ChartDescription
+from springbench.harness.report.charts.chart_table import CHART_NAMES
 from springbench.harness.results import parquet_rows
 from springbench.solvers.methods.local_global.reference_local_global import SparseLocalGlobal
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, System
@@ -95,6 +98,55 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
     made = Home(tmp_path_factory.mktemp("accuracy") / "home")
     assert made.run(isolated=True) == UNITS
     return made
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A solver that fails in its first iteration."""
+
+    is_minimiser: ClassVar[bool] = True
+    is_monotone: ClassVar[bool] = True
+
+    def prepare(self, system: System) -> PreparedSolver:
+        prepared: Any = SparseLocalGlobal().prepare(system)
+
+        class Failing:
+            def iterates(self, problem: Any) -> Iterator[Positions]:
+                raise ArithmeticError("it slipped")
+
+            def __getattr__(self, name: str) -> Any:
+                return getattr(prepared, name)
+
+        failing: Any = Failing()
+        return failing
+
+
+@dataclass(frozen=True)
+class Crashing(Broken):
+    """A solver that takes its process along."""
+
+    def prepare(self, system: System) -> PreparedSolver:
+        os.abort()
+
+
+def test_a_solver_that_crashes_is_a_row_and_the_others_are_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The first that runs anything in this process: its workers are forks, and not started anew.
+    monkeypatch.setitem(SOLVERS, "crashing", f"{__name__}:Crashing")
+    config = CONFIG.partition("work:")[0].replace("[sparse,", "[crashing,").replace("[early, peak]", "early")
+    made = Home(tmp_path, config)
+    assert made.run(isolated=True) == 2
+    (problem,) = made.rows("snapshot")
+    lost = made.rows("curve", solver="crashing")
+    assert [(row["problem_digest"], row["initial_guess"]) for row in lost] == [
+        (problem["problem_digest"], guess) for guess in ("previous", "inertial")
+    ]
+    for row in lost:
+        assert row["status"] == "failed"
+        assert "crashed by SIGABRT" in row["reason"]
+    assert {row["status"] for row in made.rows("curve", solver="newton")} == {"ok"}
+    assert made.run(isolated=True) == 0
 
 
 def test_each_curve_is_of_a_problem_whose_minimum_is_certified(home: Home) -> None:
@@ -216,27 +268,6 @@ def test_a_minimum_that_is_not_certified_is_reported_and_nothing_is_graded_by_it
     assert all(row["position_error_max_m"] is None and row["objective"] is not None for row in ended)
 
 
-@dataclass(frozen=True)
-class Broken:
-    """A solver that fails in its first iteration."""
-
-    is_minimiser: ClassVar[bool] = True
-    is_monotone: ClassVar[bool] = True
-
-    def prepare(self, system: System) -> PreparedSolver:
-        prepared: Any = SparseLocalGlobal().prepare(system)
-
-        class Failing:
-            def iterates(self, problem: Any) -> Iterator[Positions]:
-                raise ArithmeticError("it slipped")
-
-            def __getattr__(self, name: str) -> Any:
-                return getattr(prepared, name)
-
-        failing: Any = Failing()
-        return failing
-
-
 def test_a_solver_that_fails_is_a_row_and_the_others_are_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,33 +278,6 @@ def test_a_solver_that_fails_is_a_row_and_the_others_are_measured(
         assert row["status"] == "failed"
         assert "ArithmeticError: it slipped" in row["reason"]
     assert {row["status"] for row in made.rows("curve", solver="newton")} == {"ok"}
-
-
-@dataclass(frozen=True)
-class Crashing(Broken):
-    """A solver that takes its process along."""
-
-    def prepare(self, system: System) -> PreparedSolver:
-        os.abort()
-
-
-def test_a_solver_that_crashes_is_a_row_and_the_others_are_measured(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(SOLVERS, "crashing", f"{__name__}:Crashing")
-    config = CONFIG.partition("work:")[0].replace("[sparse,", "[crashing,").replace("[early, peak]", "early")
-    made = Home(tmp_path, config)
-    assert made.run(isolated=True) == 2
-    (problem,) = made.rows("snapshot")
-    lost = made.rows("curve", solver="crashing")
-    assert [(row["problem_digest"], row["initial_guess"]) for row in lost] == [
-        (problem["problem_digest"], guess) for guess in ("previous", "inertial")
-    ]
-    for row in lost:
-        assert row["status"] == "failed"
-        assert "crashed by SIGABRT" in row["reason"]
-    assert {row["status"] for row in made.rows("curve", solver="newton")} == {"ok"}
-    assert made.run() == 0
 
 
 def commanded(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str]:
@@ -287,8 +291,21 @@ def commanded(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
 def test_the_command_measures_and_draws(
     home: Home, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code, printed = commanded(capsys, monkeypatch, "accuracy", str(home.config), "--results", str(home.folder.parent))
+    """What is drawn of rows is tested with the reports; here, that each chart is drawn of these."""
+    drawn: dict[str, ChartDescription] = {}
+
+    def note_sheets(chart: ChartDescription, stem: Path) -> list[Path]:
+        drawn[stem.name] = chart
+        return [stem.with_suffix(".png")]
+
+    monkeypatch.setattr(accuracy_report, "draw_chart_sheets", note_sheets)
+    code, printed = commanded(
+        capsys, monkeypatch, "accuracy", str(home.config), "--results", str(home.folder.parent), "--in-process"
+    )
     assert code == 0, printed
     assert f"{UNITS} of {UNITS} units are there already" in printed
+    assert set(drawn) == set(CHART_NAMES)
+    assert drawn["convergence"].frames
+    assert drawn["work"].frames
     assert (home.folder.parent / "index.html").is_file()
     assert (home.folder.parent / "site" / "data" / home.folder.name / "convergence.js").is_file()

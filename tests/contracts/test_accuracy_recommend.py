@@ -52,6 +52,9 @@ WAYS = [
 COUNT = len(REFINEMENTS) * 3
 
 
+pytestmark = pytest.mark.usefixtures("without_workers")
+
+
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """A grid of six simulations."""
@@ -75,6 +78,11 @@ def recommend(scene: Path, error: float, **more: Any) -> tuple[MethodRecommendat
     return found, display.finished_units
 
 
+def row_cost(row: dict[str, Any]) -> float:
+    """Seconds per simulated second, by the processor where others had it too."""
+    return row["cpu_seconds"] / row["t_end"] if row["preempted"] else row["seconds_per_simulated_second"]
+
+
 def measured(scene: Path) -> list[Path]:
     return sorted((scene.parent / "results").glob("*/accuracy/*-work-*.parquet"))
 
@@ -87,10 +95,10 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
     table = parquet_rows.read_rows(measured(scene), ACCURACY_SCHEMA).to_pylist()
     within = [row for row in table if row["error"] <= 0.1]
     assert 0 < len(within) < len(table), "the error separates nothing"
-    cheapest = min(within, key=lambda row: row["seconds_per_simulated_second"])
+    cheapest = min(within, key=row_cost)
     assert (found.best_method.error, found.best_method.seconds_per_simulated_second) == (
         cheapest["error"],
-        cheapest["seconds_per_simulated_second"],
+        row_cost(cheapest),
     )
     assert found.best_method.work_spec.case.scene.time_step == cheapest["time_step"]
     assert found.checked_method.error == found.best_method.error  # the same simulation gives the same positions

@@ -29,7 +29,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bytes]:
     home = tmp_path_factory.mktemp("finished")
     (home / "good.yaml").write_text(scene())
     (home / "sweep.yaml").write_text(SWEEP)
-    result = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])
+    result = CliRunner().invoke(
+        app, ["run", "--in-process", str(home / "sweep.yaml"), "--results", str(home / "results")]
+    )
     assert result.exit_code == 0, result.output
     return {path.relative_to(home): path.read_bytes() for path in home.rglob("*") if path.is_file()}
 
@@ -91,14 +93,18 @@ def test_the_runs_of_damaged_rows_and_recordings_are_done_again(home: Path):
     recording = home / "results/sweep/recordings" / f"{second.stem}.rrd"
     os.truncate(first, 100)
     os.truncate(recording, recording.stat().st_size - 100)
-    result = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])
+    result = CliRunner().invoke(
+        app, ["run", "--in-process", str(home / "sweep.yaml"), "--results", str(home / "results")]
+    )
     assert result.exit_code == 0, result.output
     said = " ".join(result.output.split())
     assert f"{first.name} holds no rows" in said
     assert f"{recording.name} is cut before its end" in said
     assert parquet_rows.read_rows([first, second], required_columns=("status",)).num_rows > 0
     assert len(read_replay(recording).frames) == 3
-    again = CliRunner().invoke(app, ["run", str(home / "sweep.yaml"), "--results", str(home / "results")])
+    again = CliRunner().invoke(
+        app, ["run", "--in-process", str(home / "sweep.yaml"), "--results", str(home / "results")]
+    )
     assert "2 of 2 runs are there already" in again.output
 
 
@@ -125,11 +131,11 @@ def test_two_configs_of_one_name_do_not_share_their_results(home: Path):
     (home / "other").mkdir()
     (home / "other" / "sweep.yaml").write_text((home / "sweep.yaml").read_text())
     (home / "other" / "good.yaml").write_text(scene(frames="3"))
-    result = attempt(home, ["run", "other/sweep.yaml"])
+    result = attempt(home, ["run", "--in-process", "other/sweep.yaml"])
     assert result.code == 2
     assert "holds the results of another file of this name" in result.said
     (home / "sweep.yaml").unlink()  # it was moved
-    assert attempt(home, ["run", "other/sweep.yaml"]).code == 0
+    assert attempt(home, ["run", "--in-process", "other/sweep.yaml"]).code == 0
 
 
 def test_an_answer_is_text_and_no_markup(home: Path):

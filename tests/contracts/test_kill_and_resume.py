@@ -52,7 +52,13 @@ PROCESSES.set_forkserver_preload(
         "springbench.harness.cli.main",
         "springbench.harness.config.config_loader",
         "springbench.harness.experiments.sweep_runner",
+        "springbench.harness.recording.recording_reader",
+        "springbench.harness.recording.rerun_recorder",
+        "springbench.harness.report.run_picture",
+        "springbench.harness.report.site",
+        "springbench.harness.report.timing_plot",
         "springbench.harness.report.timing_table",
+        "springbench.harness.simulation.timing_pass",
     ]
 )
 

@@ -113,15 +113,6 @@ def test_a_run_that_took_too_long_is_done_again_with_another_limit(tmp_path: Pat
     assert {row["status"] for row in first_rows(made).values()} == {"ok"}
 
 
-def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    made = write_plugin_solver(tmp_path, monkeypatch, solve_code="import os; globals()['seen'] = os.getpid()")
-    assert (result := ran(made)).exit_code == 0, result.output
-    module = made.solver_path.stem
-    assert not hasattr(sys.modules.get(module), "seen")
-    assert ran(made, "--rerun", "--in-process").exit_code == 0
-    assert sys.modules[module].seen == os.getpid()
-
-
 LONG = (
     "scenes: [scene.yaml]\nsolvers: [sparse]\noptions: {frames: 100000, rounds: 1, max_iterations: 50, record: false}\n"
 )
@@ -190,6 +181,23 @@ def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_mea
     assert len([*(tmp_path / "r").rglob("*.parquet")]) == 2
 
 
+def leave(*_: Any, **__: Any) -> None:
+    """End the process."""
+    os._exit(3)
+
+
+# The last ones, which run in this process: after that no worker is a fork of it, and each takes seconds to begin.
+
+
+def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = write_plugin_solver(tmp_path, monkeypatch, solve_code="import os; globals()['seen'] = os.getpid()")
+    assert (result := ran(made)).exit_code == 0, result.output
+    module = made.solver_path.stem
+    assert not hasattr(sys.modules.get(module), "seen")
+    assert ran(made, "--rerun", "--in-process").exit_code == 0
+    assert sys.modules[module].seen == os.getpid()
+
+
 def test_the_plot_of_times_has_the_name_of_its_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from springbench.harness.report import timing_plot
 
@@ -197,11 +205,6 @@ def test_the_plot_of_times_has_the_name_of_its_sweep(tmp_path: Path, monkeypatch
         (tmp_path / "title.txt").write_text(title)
 
     monkeypatch.setattr(timing_plot, "draw_timing_plot", write_title)
-    made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, max_iterations: 5")
+    made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, max_iterations: 5, record: false")
     assert (result := ran(made, "--in-process")).exit_code == 0, result.output
     assert (tmp_path / "title.txt").read_text() == "sweep"
-
-
-def leave(*_: Any, **__: Any) -> None:
-    """End the process."""
-    os._exit(3)
