@@ -58,12 +58,13 @@ def after_iterations(backend: Solver, problem, count: int) -> Positions:
     return p
 
 
+@pytest.mark.parametrize("steps", [25, pytest.param(100, marks=pytest.mark.long)])
 @small
 @pins
-def test_backends_agree_after_a_hundred_steps(name, weight):
+def test_backends_agree_after_many_steps(name, weight, steps):
     made = SCENE_BUILDERS[name](weight)
     assert (
-        apart([simulate_trajectory(made, backend, 100) for backend in WAYS])
+        apart([simulate_trajectory(made, backend, steps) for backend in WAYS])
         <= AGREEMENT * made.mesh.bounding_box_diagonal
     )
 

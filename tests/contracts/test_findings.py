@@ -26,12 +26,8 @@ PARTS = ("**Question.**", "| set-up | |", "![", "**Answer.**", "**Limits.**")
 MAX_FINDINGS, MAX_FINDING_WORDS = 12, 600
 
 
-def test_pages_and_pictures_are_those_of_the_published_set() -> None:
-    assert check_pages(ROOT) == []
-
-
 @pytest.mark.slow
-def test_pictures_look_as_the_present_code_draws_them() -> None:
+def test_pages_and_pictures_are_those_of_the_published_set_and_look_as_the_present_code_draws_them() -> None:
     assert check_pages(ROOT, draws_pictures=True) == []
 
 

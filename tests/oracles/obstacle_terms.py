@@ -26,7 +26,9 @@ from tests.oracles.self_contact_terms import (
 )
 
 _MAX_TRIALS = 200
-"""Maximum number of moves towards an obstacle, none longer than the mesh spacing."""
+"""Maximum number of moves towards an obstacle."""
+_RANGE_TOLERANCE = 0.05
+"""Distance from the target at which a move ends, relative to the activation distance: the pair is in range already."""
 _NUM_DIRECTIONS = 20
 """Number of directions that are tried, since some lead into another obstacle."""
 
@@ -150,10 +152,11 @@ def move_to_obstacle(
     at = p - p.mean(axis=0)
     # A plane separates them at first.
     out = float(((there - middle) @ direction).max() - (at @ direction).min()) + effect.min_distance + dhat
-    distance = effect.min_distance + dhat * rng.uniform(0.3, 0.7)
+    distance, max_move = effect.min_distance + dhat * rng.uniform(0.3, 0.7), spacing
     for _ in range(_MAX_TRIALS):
-        free = one.min_distance(np.concatenate([middle + out * direction + at, there]), distance + spacing) - distance
-        if free < 1e-3 * dhat:
+        free = one.min_distance(np.concatenate([middle + out * direction + at, there]), distance + max_move) - distance
+        if free < _RANGE_TOLERANCE * dhat:
             break
         out -= free
+        max_move = 2.0 * free  # as long as nothing is found, twice as far each time
     return middle + out * direction + at
