@@ -331,15 +331,14 @@ def _add_runs(runs, run, count, b, size, source, start, target, column):
 def _forward_substitution(fronts, schedule, supernode, panels, x, scratch, thread):
     """Perform the forward substitution with the panel of a supernode; children precede parents."""
     first, own, _, head, stride = _front_sizes(fronts, supernode)
-    front, updates, runs = scratch.fronts[thread], scratch.updates, scratch.runs[thread]
-    size = fronts.block_size
+    front, updates, size = scratch.fronts[thread], scratch.updates, fronts.block_size
     front[: stride + TILE_ROWS] = 0.0
     _gather_vertices(x, fronts.member_vertices, first, own, front, ZERO, size)
     child = fronts.first_child[supernode]
     while child >= 0:
         rows = fronts.member_start[child + 1] - fronts.member_start[child] - fronts.num_columns[child]
         at = _locate_update(schedule, child, thread) + _update_width(fronts, child) * round_up_rows_inner(size * rows)
-        _add_runs(runs, ZERO, _find_runs(fronts, child, own, head, ZERO, runs), ZERO, size, updates, at, front, 0)
+        _add_update(fronts, child, rows, own, head, updates, at, front)
         child = fronts.next_sibling[child]
     width = round_up_columns_inner(size * own)
     for tile in range(0, width, TILE_COLUMNS):
@@ -402,14 +401,39 @@ def _update_width(fronts, supernode):
 
 
 @jit_inner
+def _add_update(fronts, child, rows, num_columns, below_offset, updates, at, front):
+    """Add a child's update of the right-hand side to the front."""
+    first, size = fronts.member_start[child] + fronts.num_columns[child], fronts.block_size
+    for k in range(rows):
+        q = fronts.parent_position[first + k]
+        to = size * q if q < num_columns else below_offset + size * (q - num_columns)
+        if size == 3:
+            for c in range(3):
+                front[to + c] += updates[at + 3 * k + c]
+        else:
+            for c in range(size):
+                front[to + c] += updates[at + size * k + c]
+
+
+@jit_inner
 def _gather_vertices(x, members, first, count, front, at, size):
-    for k in range(count):
-        for c in range(size):
-            front[at + size * k + c] = x[members[first + k], c]
+    if size == 3:  # loops of constant length are unrolled
+        for k in range(count):
+            for c in range(3):
+                front[at + 3 * k + c] = x[members[first + k], c]
+    else:
+        for k in range(count):
+            for c in range(size):
+                front[at + size * k + c] = x[members[first + k], c]
 
 
 @jit_inner
 def _scatter_vertices(front, at, x, members, first, count, size):
-    for k in range(count):
-        for c in range(size):
-            x[members[first + k], c] = front[at + size * k + c]
+    if size == 3:
+        for k in range(count):
+            for c in range(3):
+                x[members[first + k], c] = front[at + 3 * k + c]
+    else:
+        for k in range(count):
+            for c in range(size):
+                x[members[first + k], c] = front[at + size * k + c]
