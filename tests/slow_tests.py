@@ -9,6 +9,7 @@ the next of them would make it.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,7 @@ LONG_NAME_PARTS = (
     *(
         "a_drawing_process_that_is_lost",
         "whichever_method_wins[chain-5-0.5-0.0001]",
+        "whichever_method_wins[chain-5-0.5-0.001]",
         "whichever_method_wins[single-spring",
     ),
     *(
@@ -87,15 +89,16 @@ def read_slow_names() -> frozenset[str]:
 def mark_slow_tests(items: list[pytest.Item]) -> None:
     """Mark items `long` by LONG_NAME_PARTS and `slow` by the list, unless they are long already."""
     slow = read_slow_names()
+    find_long, find_slow = (
+        re.compile("|".join(map(re.escape, parts))).search for parts in (LONG_NAME_PARTS, SLOW_NAME_PARTS)
+    )
     for item in items:
         if item.get_closest_marker("long"):
             continue
         name = item.nodeid
-        if any(part in name for part in LONG_NAME_PARTS):
+        if find_long(name):
             item.add_marker(pytest.mark.long)
-        elif slow & {name, name.partition("[")[0], name.partition("::")[0]} or any(
-            kind in name for kind in SLOW_NAME_PARTS
-        ):
+        elif slow & {name, name.partition("[")[0], name.partition("::")[0]} or find_slow(name):
             item.add_marker(pytest.mark.slow)
 
 

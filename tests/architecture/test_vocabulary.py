@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,25 +82,24 @@ def find_definitions(tree: ast.Module, file: str) -> Iterator[Definition]:
                 pending.append(node)
 
 
-DEFINITIONS = [
-    definition
-    for path in FILES
-    for definition in find_definitions(ast.parse(path.read_text()), path.relative_to(ROOT).as_posix())
-]
-PUBLIC = [definition for definition in DEFINITIONS if not definition.name.startswith("_")]
+@cache
+def list_public_definitions() -> list[Definition]:
+    """Return all definitions whose names do not begin with an underscore."""
+    found = (find_definitions(ast.parse(path.read_text()), path.relative_to(ROOT).as_posix()) for path in FILES)
+    return [one for definitions in found for one in definitions if not one.name.startswith("_")]
 
 
 def test_no_public_name_uses_a_word_of_the_dialect() -> None:
-    assert not {f"{one.file}: {one.name}" for one in PUBLIC if DIALECT & set(one.words)}
+    assert not {f"{one.file}: {one.name}" for one in list_public_definitions() if DIALECT & set(one.words)}
 
 
 def test_no_docstring_begins_with_a_word_of_the_dialect() -> None:
-    first_lines = ((one, one.docstring.partition("\n")[0].lower()) for one in PUBLIC)
+    first_lines = ((one, one.docstring.partition("\n")[0].lower()) for one in list_public_definitions())
     assert not {f"{one.file}: {line}" for one, line in first_lines if DIALECT & set(re.findall(r"\w+", line))}
 
 
 def test_public_names_have_two_words_or_a_reason() -> None:
-    one_word = {one.name for one in PUBLIC if not one.is_module and len(one.words) == 1}
+    one_word = {one.name for one in list_public_definitions() if not one.is_module and len(one.words) == 1}
     assert one_word - ONE_WORD == set(), "give it a second word, or a reason in this file"
     assert ONE_WORD - one_word == set(), "these are no longer defined"
 
