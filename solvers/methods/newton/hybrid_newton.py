@@ -87,7 +87,7 @@ from springbench.solvers.methods.newton.newton_direct import NewtonIteration
 from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, objective_decrease
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
 from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated
-from springbench.solvers.model.barrier_energy import ignore_barriers
+from springbench.solvers.model.barrier_energy import ignore_barriers, without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import Hessian, StepObjective
@@ -363,6 +363,7 @@ class HybridIteration:
             objective.system.inertia_diagonal[objective.system.free_vertices], 3
         )
         self.factor = factor = objective.hessian_matrix.factor
+        self._system_has_barriers = without_barriers(objective.system) is not objective.system
         is_exact = is_double and not objective.has_barriers
         is_exact = is_exact and objective.system is without_vertex_contact(objective.system)
         self.exact_lbfgs = lbfgs if is_exact else None
@@ -404,7 +405,7 @@ class HybridIteration:
 
     def start_lbfgs(self, step: StepObjective, p: Positions) -> AcceleratedState:
         """Start L-BFGS at p, without surface contact."""
-        return self._lbfgs.init_state(ignore_barriers(step.problem), p)
+        return self._lbfgs.init_state(ignore_barriers(step.problem) if self._system_has_barriers else step.problem, p)
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
