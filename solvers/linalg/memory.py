@@ -13,7 +13,7 @@ def allocate_aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
     """Return zeros that start at a cache line, so that no vector of that size or less crosses two lines."""
     bytes_ = np.dtype(dtype).itemsize * size
     raw = np.zeros(bytes_ + 64, np.uint8)
-    begin = -raw.__array_interface__["data"][0] % 64
+    begin = -raw.ctypes.data % 64
     return raw[begin : begin + bytes_].view(dtype)
 
 
