@@ -24,6 +24,7 @@ from springbench.harness.experiments.experiment_units import (
     execute_units,
     require_threads,
 )
+from springbench.harness.experiments.kernel_precompilation import compile_missing_kernels
 from springbench.harness.experiments.run_unit import RunUnit
 from springbench.harness.experiments.sweep_plan import REQUIRED_COLUMNS, RunFiles, find_stale_run_ids, plan_runs
 from springbench.harness.results import parquet_rows
@@ -131,6 +132,8 @@ def run_sweep(
             )  # here, for workers that are forks of this process
             for solver in {p.run.solver.name: None for p in todo if not isinstance(p.run.solver.name, PluginName)}:
                 load_target(SOLVER_TABLE[solver])
+            if isolated:
+                compile_missing_kernels({p.run.solver.name for p in todo}, print_message)
         many = min(num_workers or choose_num_workers(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
         if away:

@@ -90,6 +90,11 @@ class KernelCache(_NUMBA_CACHE):
             )
         )
 
+    @property
+    def is_writable(self) -> bool:
+        """Whether code can be stored."""
+        return os.access(_writable_root(os.path.dirname(self._source_file)), os.W_OK)
+
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         """Return the cached code of a signature, or None if there is none."""
         target_context.refresh()
@@ -117,6 +122,13 @@ class KernelCache(_NUMBA_CACHE):
             compiled = compile_code()
             self._store_code(sig, compiled)
             return compiled
+
+    def measure_code(self, sig: Any, target_context: Any) -> int:
+        """Return the size of the cached code of a signature [bytes], or 0 if there is none."""
+        try:
+            return self._entry_path(self._entry_key(sig, target_context)).stat().st_size
+        except OSError:
+            return 0
 
     def save_overload(self, sig: Any, data: CompileResult) -> None:
         """Do nothing: `compile_once` has stored the code."""

@@ -1,0 +1,65 @@
+"""Record which kernels the solvers of the quick start call, for the processes that compile them together.
+
+    python -m tests.record_kernels
+
+Each run is a process of its own, on a small mesh.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from springbench.harness.experiments.kernel_precompilation import SIGNATURES_PATH
+
+SOLVERS = ("dense", "sparse", "numba")
+SCENE = Path(__file__).resolve().parents[1] / "configs" / "scenes" / "hanging-cloth.yaml"
+
+_RECORD_RUN = """
+import json, sys
+from springbench.harness.cli.main import main
+from springbench.solvers.jit.kernel_signatures import measure_called_kernels
+path, sys.argv = sys.argv[1], ["springbench", *sys.argv[2:]]
+try:
+    main()
+except SystemExit as end:
+    if end.code:
+        raise
+with open(path, "w") as file:
+    json.dump([*measure_called_kernels().items()], file)
+"""
+
+
+def record_kernels(solver: str) -> dict[str, int]:
+    """Run a solver on the hanging cloth.
+
+    Returns: size of the machine code [bytes] of each kernel that it called; kernel and arguments are JSON.
+    """
+    with TemporaryDirectory() as folder:
+        path, sweep = Path(folder) / "kernels.json", Path(folder) / "sweep.yaml"
+        keys = {"scenes": [str(SCENE)], "sizes": [8], "solvers": [solver], "options": {"frames": 10, "pictures": False}}
+        sweep.write_text(json.dumps(keys))
+        arguments = ["run", str(sweep), "--in-process", "--results", folder]
+        subprocess.run([sys.executable, "-c", _RECORD_RUN, str(path), *arguments], check=True, capture_output=True)
+        return {json.dumps(signature): size for signature, size in json.loads(path.read_text())}
+
+
+def format_signatures(recorded: Mapping[str, Mapping[str, int]]) -> str:
+    """Return the content of the file, from what each solver calls; the kernels with the most code are the first."""
+    sizes = {kernel: size for kernels in recorded.values() for kernel, size in kernels.items()}
+    order = {kernel: number for number, kernel in enumerate(sorted(sizes, key=lambda kernel: (-sizes[kernel], kernel)))}
+    solvers = {solver: sorted(map(order.__getitem__, kernels)) for solver, kernels in recorded.items()}
+    lines = {
+        "solvers": [f"{json.dumps(solver)}: {numbers}" for solver, numbers in solvers.items()],
+        "kernels": list(order),
+    }
+    parts = {name: ",\n    ".join(some) for name, some in lines.items()}
+    return f'{{\n  "solvers": {{\n    {parts["solvers"]}\n  }},\n  "kernels": [\n    {parts["kernels"]}\n  ]\n}}\n'
+
+
+if __name__ == "__main__":
+    SIGNATURES_PATH.write_text(format_signatures({solver: record_kernels(solver) for solver in SOLVERS}))
