@@ -311,10 +311,10 @@ def _to_plain_data(value: Any, at: ConfigKey = ()) -> Any:
     if value is None or isinstance(value, str | int | float):
         return value
     of = value if isinstance(value, type) else cast(object, value).__class__
-    came = f"the class {of.__name__}" if of is value else f"an object of {of.__name__}"
+    got = f"the class {of.__name__}" if of is value else f"an object of {of.__name__}"
     file = Path(getattr(sys.modules.get(of.__module__), "__file__", None) or "mine.py").name
-    wanted = f'its name; write the class into a file beside the scenes, and give "./{file}:{of.__name__}"'
-    raise InputError(InputMistake(f"got {came}; expected {wanted}", key=format_key(at)))
+    expected = f'its name; write the class into a file next to the scenes, and give "./{file}:{of.__name__}"'
+    raise InputError(InputMistake(f"got {got}; expected {expected}", key=format_key(at)))
 
 
 def load_rows(folder: str | Path) -> Any:

@@ -44,14 +44,14 @@ class InputError(SpringbenchError):
         super().__init__("\n".join(map(str, self.mistakes)))
 
 
-def suggest_name(came: object, allowed: Iterable[str]) -> str:
+def suggest_name(got: object, allowed: Iterable[str]) -> str:
     """Format the allowed names, and the closest one as a suggestion for a typo.
 
     Args:
-        came: name that the user gave.
+        got: name that the user gave.
         allowed: valid names.
     Returns: `one of a, b, c; did you mean 'b'?`, as the end of a message.
     """
     names = sorted(allowed)
-    near = difflib.get_close_matches(str(came), names, n=1)
+    near = difflib.get_close_matches(str(got), names, n=1)
     return f"one of {', '.join(names)}" + (f"; did you mean {near[0]!r}?" if near else "")

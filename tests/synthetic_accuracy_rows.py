@@ -187,7 +187,7 @@ def build_full_rows() -> list[dict[str, Any]]:
                         rows += build_curve_rows(scene, size, moment, solver, initial_guess=guess, minimum_index=branch)
                 if scene == "block":
                     rows.append(
-                        build_failure_row(scene, size, moment, "dense", "unsupported", "dense knows springs alone")
+                        build_failure_row(scene, size, moment, "dense", "unsupported", "dense supports springs alone")
                     )
                     rows.append(
                         build_failure_row(scene, size, moment, "vbd", "diverged", "not finite from iteration 3 on")

@@ -18,7 +18,7 @@ SOLVER_COSTS = {"sparse": 5.0, "numba": 1.0, "anderson": 1.4, "newton": 9.0, "xp
 """Milliseconds a step of 100 vertices."""
 SCENE_NAMES = ("hanging-cloth", "flag-in-wind", "curtain")
 FRAME_COUNT = 6
-UNSUPPORTED_REASON = "knows springs </script> alone, and the scene has wind"
+UNSUPPORTED_REASON = "supports springs </script> alone, and the scene has wind"
 _MACHINE_COLUMNS = {
     "machine_id": "0123456789ab", "node_id": "ab", "cpu": "A processor of 3 GHz", "cores": 8, "memory_gib": 31.2,
     "operating_system": "Linux 6.1 x86_64", "versions": json.dumps({"numpy": "2.4"}), "commit": "1" * 40,

@@ -103,7 +103,7 @@ def expand_studies(
     curves = [unit for i, study in enumerate(fields.curves) for unit in expansion.expand_curves(study, ("curves", i))]
     work = [unit for i, study in enumerate(fields.work) for unit in expansion.expand_work(study, ("work", i))]
     if len(curves) + len(work) > MAX_UNITS:
-        document.add_mistake(f"asks for {len(curves) + len(work)} units of work; at most {MAX_UNITS} are allowed")
+        document.add_mistake(f"requests {len(curves) + len(work)} units of work; at most {MAX_UNITS} are allowed")
     for name, scene in scenes.items():
         sizes = [unit.case.size for unit in (*curves, *work) if unit.case.scene_name == name]
         document.mistakes.extend(check_scene_parts(document, name, scene, sizes) if not document.mistakes else [])

@@ -81,7 +81,7 @@ SWEEP = ConfigKind("a sweep", ("scenes",), _RUN_USAGE)
 ACCURACY = ConfigKind("an accuracy config", ("curves", "work"), "`springbench accuracy`")
 GATES = ConfigKind("a gates file", ("gates",), "`springbench regress` without --baseline")
 CONFIG_KINDS = (ACCURACY, GATES, SWEEP, SCENE)
-"""All kinds; an accuracy config has the key of a sweep, too, so it comes first."""
+"""All kinds; an accuracy config has the key of a sweep, too, so it is first."""
 
 
 def find_config_kind(keys: Iterable[str]) -> ConfigKind | None:
@@ -504,5 +504,5 @@ def find_scene_mistakes(scene: SceneSpec, sizes: Sequence[int]) -> list[InputMis
 def check_file_name(document: ConfigDocument) -> None:
     """Add a mistake if the file's name is not a valid name of results."""
     if not NAME_PATTERN.fullmatch(document.path.stem):
-        wanted = "rename it to letters, digits, `.`, `_` and `-`, at most 64, the first a letter or a digit"
-        document.add_mistake(f"the file's name becomes the name of results; {wanted}")
+        expectation = "rename it to letters, digits, `.`, `_` and `-`, at most 64, the first a letter or a digit"
+        document.add_mistake(f"the file's name becomes the name of results; {expectation}")

@@ -55,7 +55,7 @@ class GridExpansion:
         extra = [job for i, entry in enumerate(self.fields.include) for job in self._expand_include(i, entry, options)]
         count = sum(len(s) * len(v) * prod(map(len, o.values())) for _, s, v, o in [*jobs, *extra])
         if count > MAX_RUNS:
-            self.document.add_mistake(f"asks for {count} runs; at most {MAX_RUNS} are allowed", ("options",))
+            self.document.add_mistake(f"requests {count} runs; at most {MAX_RUNS} are allowed", ("options",))
         if self.document.mistakes:
             return ()
         grid = self._apply_exclude([run for job in jobs for run in self._expand_product(*job)])

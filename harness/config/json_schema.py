@@ -62,10 +62,10 @@ def _build_tagged_union(models: dict[str, type[ConfigModel]], tag: str) -> Any:
         make(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})
         for name, model in models.items()
     ]
-    own: Any = make(  # only its code knows the keys, and a schema runs no user code
+    own: Any = make(  # its keys are in its code, and a schema runs no user code
         f"Own {tag}",
         __config__=ConfigDict(extra="allow"),
-        __doc__="Your own: `module:Name`, or `./file.py:Name` beside the config.",
+        __doc__="Your own: `module:Name`, or `./file.py:Name` next to the config.",
         **{tag: (Annotated[str, Field(pattern=PLUGIN_PATTERN)], ...)},
     )
     return Annotated[reduce(lambda one, other: one | other, tagged), Field(discriminator=tag)] | own

@@ -162,7 +162,7 @@ class SolverSpec:
 class RunSpec(FixedOptions, RunOptions):
     """One run, built with `model_construct` from validated values.
 
-    size: 0 if the mesh comes from a file. frames, time_step (that of the scene here) and initial_guess are resolved.
+    size: 0 if the mesh is from a file. frames, time_step (that of the scene here) and initial_guess are resolved.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)

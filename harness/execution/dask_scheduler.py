@@ -91,10 +91,10 @@ def _start_batch_cluster(path: Path) -> Any:
         options = dict(YAML(typ="safe").load(path.read_text()) or {})
         kind, jobs = str(options.pop("kind")), int(options.pop("jobs"))
     except (OSError, TypeError, ValueError, KeyError) as error:
-        wanted = (
+        expected = (
             "expected a mapping with `kind` (SLURM, PBS, ...), `jobs` and the options of that dask-jobqueue cluster"
         )
-        raise InputError(InputMistake(f"cannot be read ({error}); {wanted}", path)) from None
+        raise InputError(InputMistake(f"cannot be read ({error}); {expected}", path)) from None
     try:
         dask_jobqueue = import_module("dask_jobqueue")
     except ModuleNotFoundError:

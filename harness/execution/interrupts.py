@@ -1,6 +1,6 @@
 """Interrupt handling: Ctrl-C ends a command with one message and exit code 130.
 
-This holds from the first import to the last picture.
+This applies from the first import to the last picture.
 * During an import the interrupt is deferred, because extension modules turn a KeyboardInterrupt into an ImportError and
   print it.
 * If a callback or a destructor swallows the KeyboardInterrupt, it is raised again.
@@ -22,7 +22,7 @@ from typing import NoReturn
 INTERRUPT_EXIT_CODE = 130
 """Exit code of a command that Ctrl-C stopped, by shell convention."""
 
-INTERRUPT_MESSAGE = "springbench: stopped; what is complete is kept, and the same command goes on from there"
+INTERRUPT_MESSAGE = "springbench: stopped; completed results remain, and the same command resumes from there"
 
 _RETRY_SECONDS = 0.02
 """Seconds until a deferred interrupt is tried again."""
@@ -79,7 +79,7 @@ def is_interrupted() -> bool:
 def exit_process() -> NoReturn:
     """Print that the command was stopped, and exit.
 
-    The interpreter's regular exit ends by a signal if Ctrl-C came during `exec`.
+    The interpreter's regular exit ends by a signal if Ctrl-C was pressed during `exec`.
     """
     ignore_interrupts()
     _kill_workers()

@@ -338,7 +338,7 @@ class _TaskOutput:
     def _add_output(self, output: bytes) -> None:
         """Show and store output.
 
-        Bytes that may be the start of the end marker are held back until the next ones arrive.
+        Bytes that may be the start of the end marker are buffered until the next ones arrive.
         """
         self._pending += output
         at = self._pending.find(self.end)

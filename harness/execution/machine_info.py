@@ -107,7 +107,7 @@ def read_commit(root: Path = _PROJECT_ROOT) -> str:
 
     Returns: the commit, or "unknown" outside a checkout.
     """
-    # An explicit repository keeps git from using one that merely contains the project.
+    # An explicit repository prevents git from using one that merely contains the project.
     git = ["git", "--no-optional-locks", f"--git-dir={root / '.git'}", f"--work-tree={root}"]
     try:
         completed = subprocess.run(
@@ -174,8 +174,8 @@ def check_thread_count(number: int) -> None:
     """Raise InputError if this process may not use the given number of threads."""
     usable = _count_usable_cores()
     if not 1 <= number <= usable:
-        wanted = f"should be from 1 to {usable}, the cores that this process may use, not {number}"
-        raise InputError(InputMistake(wanted, key="threads"))
+        expected = f"should be from 1 to {usable}, the cores that this process may use, not {number}"
+        raise InputError(InputMistake(expected, key="threads"))
 
 
 @contextmanager

@@ -89,8 +89,8 @@ def _extract_array(path: Path, name: str, allows_nonfinite: bool) -> NDArray[np.
             names = [info.filename.removesuffix(".npy") for info in packed.infolist()]
             found = [info for info in packed.infolist() if info.filename == f"{name}.npy"]
             if len(found) != 1:
-                there = f"; it holds {', '.join(x[:40] for x in names[:5])}" if names else ""
-                raise InputError(InputMistake(f"holds {len(found)} arrays `{name}`, expected one{there}", path))
+                there = f"; it contains {', '.join(x[:40] for x in names[:5])}" if names else ""
+                raise InputError(InputMistake(f"contains {len(found)} arrays `{name}`, expected one{there}", path))
             if found[0].flag_bits & 1:
                 raise InputError(InputMistake("is encrypted; store it without a password", path))
             if found[0].file_size > MAX_NPZ_BYTES:
@@ -116,17 +116,17 @@ def _parse_npy(content: bytes, what: InputMistake, allows_nonfinite: bool) -> ND
     except ValueError as error:
         raise refuse(f"has no head of an array ({error})") from None
     if dtype.kind not in "fiu":
-        raise refuse(f"holds values of type {dtype}; expected real numbers")
+        raise refuse(f"contains values of type {dtype}; expected real numbers")
     if any(not isinstance(n, int) or n < 0 for n in shape):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise refuse(f"has the shape {shape}; expected whole numbers")
     count, begun = prod(shape), file.tell()
     if count * dtype.itemsize != len(content) - begun:
-        raise refuse(f"promises {count * dtype.itemsize:,} bytes, and {len(content) - begun:,} are there")
+        raise refuse(f"declares {count * dtype.itemsize:,} bytes, and {len(content) - begun:,} are there")
     if 8 * count > MAX_NPZ_BYTES:
         raise refuse(f"has {count:,} numbers; at most {MAX_NPZ_BYTES // 8:,} are read")
     with np.errstate(over="ignore"):
         numbers = np.frombuffer(content, dtype, count, begun).astype(np.float64)
     if not (allows_nonfinite or np.isfinite(numbers).all()):
         at = int(np.flatnonzero(~np.isfinite(numbers))[0])
-        raise refuse(f"holds {numbers[at]} (number {at:,} from 0); expected finite numbers")
+        raise refuse(f"contains {numbers[at]} (number {at:,} from 0); expected finite numbers")
     return np.ascontiguousarray(numbers.reshape(shape, order="F" if is_fortran else "C"))

@@ -57,7 +57,7 @@ MAX_CLOCK_OFFSET = 60.0
 _MAX_ATTEMPTS = 4
 """Largest number of attempts for a run whose worker is lost."""
 
-_SCHEDULER_LOST_MESSAGE = "the scheduler is gone; what was done is kept, and the same command does the rest"
+_SCHEDULER_LOST_MESSAGE = "the scheduler is gone; completed results remain, and the same command does the rest"
 
 _WORKER_POLL_SECONDS, _TASK_POLL_SECONDS = 1.0, 0.05
 """Seconds between two queries of the workers; seconds between two queries of the tasks if none has finished."""
@@ -263,7 +263,9 @@ def execute_on_cluster(
         WriteError: no worker can write any more.
         RunFailed: the connection to the scheduler is lost.
     """
-    token = folder / "rows" / f".{uuid4().hex}.partial"  # who sees it shares the folder; it goes as such files do
+    token = (
+        folder / "rows" / f".{uuid4().hex}.partial"
+    )  # a worker that sees it shares the folder; it is removed as such files are
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
     threads, last_query_time = dict[str, int](), 0.0
     going: dict[Future, tuple[int, RunUnit]] = {}

@@ -32,7 +32,7 @@ def build_failure_columns(error: BaseException, solver_files: Collection[Path] =
     Raises:
         WriteError: if this is the error.
     """
-    if isinstance(error, WriteError):  # that is no outcome: a row of it would keep the run from being done again
+    if isinstance(error, WriteError):  # that is no outcome: a row of it would prevent its repetition
         raise error
     if isinstance(error, StepError) and error.__cause__:
         return build_failure_columns(error.__cause__, solver_files) | {"frame": error.frame}

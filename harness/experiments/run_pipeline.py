@@ -80,7 +80,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunJob:
-    """A run to execute, its files, and who is notified of its progress.
+    """A run to execute, its files, and the callback that gets its progress.
 
     Attributes:
         run: specification of the run.
@@ -387,7 +387,7 @@ def _find_first_diverged_frame(
         RunSetup.from_run(run).observe_first_frames(failure_row["frame"] - 1)
     except StepError as earlier:
         return build_failure_columns(earlier, solver_files)
-    except Exception:  # what went wrong is known already
+    except Exception:  # the failure is reported already
         return failure_row
     return failure_row
 

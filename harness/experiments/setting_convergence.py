@@ -12,7 +12,7 @@ is compared with the finest setting.
 
 Effective stiffness: the mesh is hung by its highest vertices along its longest side, with its own material and a drag
 that lets it come to rest. The ratio of the true sag to that of the setting is how stiff the material seems: unconverged
-constraints give way, and unconverged descent does not reach its sag in time.
+constraints yield, and unconverged descent does not reach its sag in time.
 """
 
 from __future__ import annotations
@@ -105,15 +105,15 @@ def complete_settings(settings: Sequence[StepSetting], solver: SolverSpec) -> li
       solver: solver or engine with its parameters.
 
     Raises:
-      InputError: a setting has iterations, and the solver has none; or the other way round.
+      InputError: a setting has iterations, and the solver has none; or vice versa.
     """
     iterates = has_iterations_in_substep(load_target(SOLVER_TABLE[solver.name])(**solver.parameters), solver.name)
     for one in settings:
         if bool(one.iterations) != iterates:
             there = "iterates within a substep" if iterates else "has no iterations within a substep"
-            wanted = f"{one.substeps}x10" if iterates else str(one.substeps)
+            expected = f"{one.substeps}x10" if iterates else str(one.substeps)
             raise InputError(
-                InputMistake(f"got {one}; {solver.name} {there}: expected such as {wanted}", key="--setting")
+                InputMistake(f"got {one}; {solver.name} {there}: expected such as {expected}", key="--setting")
             )
     return list(dict.fromkeys(settings)) or [StepSetting(1, DEFAULT_ITERATIONS if iterates else 0)]
 
@@ -484,7 +484,7 @@ def _find_reference(
             raise RunFailed(
                 f"with contact an error of {describe_percent(error)} can be measured up to {until:g} s, for later the "
                 f"self-converged motion is known to {trajectory.disagreement.max():.1e} of the displacement only; "
-                f"ask for --t-end {until:g}, or a larger --error"
+                f"use --t-end {until:g}, or a larger --error"
             )
         print_message(f"the motion is known well enough up to {until:g} s, to which the comparison is limited")
         simulator.shorten_motion(num_known)

@@ -108,7 +108,7 @@ def plan_runs(runs: Iterable[RunSpec], folder: Path, machine_ids: Sequence[str |
             state = COMPLETED if there["status"] == "ok" else there["status"]
             limits = there["time_limit"], there["memory_limit"]
             if state in _LIMIT_STATUSES and limits != (run.time_limit, run.memory_limit):
-                state = NOT_STARTED  # who failed within other limits has said nothing of these
+                state = NOT_STARTED  # a failure within other limits says nothing of these
             older = there["source_fingerprint"] != code_of(run)
         if state == COMPLETED and run.record:
             damage = _describe_damage(files.recording_path)

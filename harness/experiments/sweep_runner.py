@@ -170,7 +170,7 @@ def run_sweep(
             )
         except TaskFailure as lost:
             raise RunFailed(
-                f"the process that draws {lost}; what was measured is kept, and the same command draws it"
+                f"the process that draws {lost}; measured results remain, and the same command draws them"
             ) from None
     return SweepResults(table, stale_ids)
 

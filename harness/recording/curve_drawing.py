@@ -111,11 +111,11 @@ def _round_tick_step(last: int) -> int:
     return int(next(f * power for f in (1, 2, 5, 10) if f * power * 5 >= last))
 
 
-def _spread_labels(wanted: list[float]) -> list[float]:
+def _spread_labels(heights: list[float]) -> list[float]:
     """Spread label heights at least one line apart, within the drawing and in order."""
-    order, placed = sorted(range(len(wanted)), key=wanted.__getitem__), dict[int, float]()
+    order, placed = sorted(range(len(heights)), key=heights.__getitem__), dict[int, float]()
     height = -math.inf
     for k in order:
-        height = placed[k] = max(wanted[k], height + _LINE_HEIGHT)
+        height = placed[k] = max(heights[k], height + _LINE_HEIGHT)
     over = max(0.0, height - _HEIGHT)
-    return [max(0.0, placed[k] - over) if over else placed[k] for k in range(len(wanted))]
+    return [max(0.0, placed[k] - over) if over else placed[k] for k in range(len(heights))]

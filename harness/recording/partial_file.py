@@ -47,7 +47,7 @@ class PartialFile:
         _first_pid = _first_pid or os.getpid()
         isolated_worker.FORK_BLOCKERS.add("Rerun's streams")
         if not _broken_streams and os.getpid() == _first_pid:  # else this would wait for ever, or refuse
-            rerun_bindings.flush_and_cleanup_orphaned_recordings()  # the library keeps two threads of each until then
+            rerun_bindings.flush_and_cleanup_orphaned_recordings()  # the library has two threads for each until then
         rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
         self.stream = rr.RecordingStream(
             re.sub(r"[^\w .-]", "-", application),  # the viewer warns of other characters

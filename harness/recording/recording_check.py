@@ -54,8 +54,8 @@ def require_recorded_frames(
     last = max(run)
     origin, end, found = _read_frames(path, run)
     if end != last or last not in found:
-        came = f"frame {end}" if end >= 0 else "no frame"
-        raise RunFailed(f"{path.name}: the recording ends with {came}, the run with frame {last}")
+        last_frame = f"frame {end}" if end >= 0 else "no frame"
+        raise RunFailed(f"{path.name}: the recording ends with {last_frame}, the run with frame {last}")
     for frame, p in run.items():
         if frame not in found:
             raise RunFailed(f"{path.name}: frame {frame} was not recorded")
@@ -86,7 +86,7 @@ class _ReadFrame(NamedTuple):
     colours: NDArray[np.uint32]
 
 
-def _read_frames(path: Path, wanted: Collection[int]) -> tuple[NDArray[np.float64], int, dict[int, _ReadFrame]]:
+def _read_frames(path: Path, expected: Collection[int]) -> tuple[NDArray[np.float64], int, dict[int, _ReadFrame]]:
     """Read the origin, the last frame's number (-1 for none), and the selected frames."""
     end, found = -1, dict[int, _ReadFrame]()
     with open_recording_source(path) as source:
@@ -98,7 +98,7 @@ def _read_frames(path: Path, wanted: Collection[int]) -> tuple[NDArray[np.float6
                     continue
                 numbers, times = (batch[name].cast(pa.int64()).to_numpy() for name in ("frame", "time"))
                 end = max(end, int(numbers.max()))
-                for k in np.flatnonzero(np.isin(numbers, [*wanted])).tolist():
+                for k in np.flatnonzero(np.isin(numbers, [*expected])).tolist():
                     p, of = read_cell(batch, positions, k).reshape(-1, 3), read_cell(batch, colours, k)
                     found[int(numbers[k])] = _ReadFrame(times[k] / 1e9, p.copy(), of.copy())
     return origin, end, found

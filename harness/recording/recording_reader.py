@@ -103,16 +103,16 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> RecordingR
     """
     with open_recording_source(path) as source:
         springs = read_network(source)
-        wanted = None
+        requested = None
         if frames is not None:
             known = np.array([index for index, _, _ in iterate_positions(source)])
-            wanted = {_resolve_frame(path, frame, known) for frame in frames}
-        found = {index: (time, p.copy()) for index, time, p in iterate_positions(source, wanted)}
+            requested = {_resolve_frame(path, frame, known) for frame in frames}
+        found = {index: (time, p.copy()) for index, time, p in iterate_positions(source, requested)}
         order = sorted(found)
         times = np.array([found[index][0] for index in order])
         stacked = np.empty((len(order), len(found[order[0]][1]) if order else 0, 3), np.float32)
         for k, index in enumerate(order):
-            stacked[k] = found.pop(index)[1]  # so that memory never holds all frames twice
+            stacked[k] = found.pop(index)[1]  # so that all frames are never in memory twice
         title, facts = read_properties(source)
         return RecordingReplay(
             title=title,
@@ -185,8 +185,8 @@ def open_recording_source(path: Path) -> Generator[RecordingSource]:
     with path.open("rb") as file:
         start = file.read(len(_MAGIC))
     if start != _MAGIC:
-        came = explain_unreadable_file(path) or f"begins with {start!r}"
-        raise InputError(InputMistake(f"{came}; it is not a Rerun recording (.rrd)", file=path))
+        beginning = explain_unreadable_file(path) or f"begins with {start!r}"
+        raise InputError(InputMistake(f"{beginning}; it is not a Rerun recording (.rrd)", file=path))
     require_intact(path, _try_reading)
     with ExitStack() as stack, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # for files without a footer, which `complete` reports
@@ -265,7 +265,7 @@ def read_properties(source: RecordingSource) -> tuple[str, dict[str, Any]]:
             name: get_scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
         }
         if chunk.entity_path == "/__properties/run":
-            facts |= values  # what changed at the end comes last
+            facts |= values  # what changed at the end is last
         title = values.get(_NAME_COMPONENT, title)
     return title, facts
 

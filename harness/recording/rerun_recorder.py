@@ -275,7 +275,7 @@ class RerunRecorder:
             viewer_blueprint.SERIES_COLOURS[k % len(viewer_blueprint.SERIES_COLOURS)] for k in range(len(frames))
         )
         self._stream.log("/convergence", rr.AnyValues(frames=frames, times=times), static=True)
-        self._file.flush_stream()  # before the values: who reads a file that was cut knows whose they are
+        self._file.flush_stream()  # before the values: a reader of a file that was cut has their owners
         for name, values in {"residual": table[0], "objective": table[1]}.items():
             self._stream.log(f"/convergence/{name}", rr.SeriesLines(names=names, colors=colours), static=True)
             columns = rr.Scalars.columns(scalars=values.ravel()).partition([len(frames)] * longest)

@@ -42,9 +42,9 @@ def round_scale_end(strain: NDArray[np.float64]) -> float:
     known = np.abs(strain[np.isfinite(strain)])
     if not len(known):
         return DEFAULT_STRAIN_RANGE
-    wanted = max(float(np.quantile(known, 0.99)), MIN_STRAIN_RANGE)
-    decade = 10.0 ** np.floor(np.log10(wanted) + 1e-9)
-    return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= 0.999 * wanted))
+    extent = max(float(np.quantile(known, 0.99)), MIN_STRAIN_RANGE)
+    decade = 10.0 ** np.floor(np.log10(extent) + 1e-9)
+    return float(next(step * decade for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * decade >= 0.999 * extent))
 
 
 def format_percent(strain: float, digits: int = 3) -> str:

@@ -129,7 +129,7 @@ def _complex_step_derivative(energy: Any, x: Positions, direction: NDArray[np.fl
     try:
         with warnings.catch_warnings(action="error", category=np.exceptions.ComplexWarning):
             return complex(energy.value(x + 1j * _COMPLEX_STEP * direction)).imag / _COMPLEX_STEP
-    except Exception:  # user code for real positions may fail in any way
+    except Exception:  # user code for real positions may fail with any exception
         return float("nan")
 
 

@@ -116,7 +116,7 @@ class PerturbationGrowth:
         longest = self.compute_longest_horizon(error)
         possible = [f"an --error of {_round_digits(ceil, least, 2):g} or more"] if least < 1.0 else []
         possible += [f"a --t-end of {longest:g} s or less"] if longest else []
-        return f"ask for {', or '.join(possible) or 'another scene'}"
+        return f"use {', or '.join(possible) or 'another scene'}"
 
 
 def estimate_growth(spec: SceneSpec, size: int, t_end: float) -> PerturbationGrowth:

@@ -330,7 +330,7 @@ class ReferenceStore:
     def _save_horizon(
         self, spec: SceneSpec, size: int, found: SelfConvergedTrajectory, error: float
     ) -> SelfConvergedTrajectory:
-        """Store the motion at its only time, at which other requests will ask for it."""
+        """Store the motion at its only time, the same for all requests."""
         path = self.folder / f"converged-{_build_motion_name(spec, size, found.times.tolist())}.npz"
         if not path.exists():
             witness = self._compute_contact_fingerprint(spec, size, float(found.times[-1]))
@@ -350,7 +350,7 @@ class ReferenceStore:
         if reason:
             raise NotConverged(
                 f"with contact an error of {error:g} can be measured up to {found.times[-1]:.4g} s only, for {reason}; "
-                f"ask for a --t-end of {found.times[-1]:.4g} or less, or a larger --error"
+                f"use a --t-end of {found.times[-1]:.4g} or less, or a larger --error"
             )
         return found
 

@@ -85,7 +85,7 @@ class ReferenceTrajectory:
                 if not found <= REFERENCE_MARGIN * error:
                     raise UnpredictableMotion(
                         f"after {t:g} s {what} has grown to {found:.1e} of the displacement: an error of {error:.1e} "
-                        "cannot be measured there; ask for a shorter horizon or a larger error"
+                        "cannot be measured there; use a shorter horizon or a larger error"
                     )
 
 

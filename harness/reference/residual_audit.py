@@ -67,12 +67,15 @@ class AuditedSolver(DelegatingSolver):
         reached, round_off, _ = self._stationarity(problem, found.positions)
         if not self._claims:
             return {"stationarity_audit": reached}
-        yardstick = self._stationarity.compute_initial_residual(problem)
-        message, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * yardstick
+        initial_residual = self._stationarity.compute_initial_residual(problem)
+        message, truth = f"{self._name}: reports a residual of {found.residual:.3g} J^(1/2)", reached * initial_residual
         if np.isnan(found.residual) and found.num_iterations:
             raise RunFailed(f"{message}; expected |Q^-1 grad g|_Q, which is {truth:.3g} (or `is_minimiser = False`)")
-        claimed = RESIDUAL_SLACK * found.residual / yardstick + round_off
-        enough = RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / yardstick if yardstick else 0.0) + round_off
+        claimed = RESIDUAL_SLACK * found.residual / initial_residual + round_off
+        enough = (
+            RESIDUAL_SLACK * max(stop.rtol or 0.0, stop.atol / initial_residual if initial_residual else 0.0)
+            + round_off
+        )
         if found.termination_reason != "converged":
             enough = np.inf
         if claimed < reached or enough < reached:  # it may be the residual of the iterate before

@@ -51,7 +51,7 @@ SceneBuilder = Callable[[float, str], Scene]
 
 
 class NotConverged(UnpredictableMotion):
-    """The motion has no limit that is known as accurately as the user asked for."""
+    """The motion has no limit that is known as accurately as requested."""
 
     exit_code = 2
 
@@ -116,7 +116,7 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
         known = self.count_known_times(CONTACT_MARGIN * error)
         if known < len(self.times):
             least = float(self.disagreement[known]) / CONTACT_MARGIN
-            can = f"ask for an error of {least:.1g} or more, or a shorter horizon" if least < 1.0 else "none can be had"
+            can = f"use an error of {least:.1g} or more, or a shorter horizon" if least < 1.0 else "none can be had"
             raise NotConverged(
                 f"contact has no certified reference, and an error of {error:.1e} cannot be measured: "
                 f"{self.describe_uncertainty(known)}; {can}"
@@ -151,14 +151,14 @@ def compute_self_converged(
         is_solved = all(motion.is_solved for motion in ends.values())
         if before and is_solved:
             found = _compare_motions(ends, before, times, times[-1] / steps)
-            wanted = CONTACT_MARGIN * min(error, MAX_RELATIVE_ERROR)
-            if found.disagreement.max() <= wanted or (found.has_disagreement and found.last_change <= wanted):
+            limit = CONTACT_MARGIN * min(error, MAX_RELATIVE_ERROR)
+            if found.disagreement.max() <= limit or (found.has_disagreement and found.last_change <= limit):
                 break
         before, steps = ends if is_solved else None, 2 * steps
     if found is None:
         raise NotConverged(
             f"contact has no certified reference, and two motions of solved steps take longer than {seconds:g} s; "
-            "ask for a shorter horizon or a smaller size"
+            "use a shorter horizon or a smaller size"
         )
     return found
 
@@ -185,23 +185,23 @@ class _SampledMotion:
 def _sample_motion(scene: Scene, times: Sequence[float], until: float) -> _SampledMotion | None:
     """Sample the motion at the given times; None if the time limit is exceeded."""
     h = scene.system.time_step
-    wanted = [round(t / h) for t in times]
-    if any(abs(k * h - t) > 1e-9 * times[-1] for k, t in zip(wanted, times, strict=True)):
+    step_numbers = [round(t / h) for t in times]
+    if any(abs(k * h - t) > 1e-9 * times[-1] for k, t in zip(step_numbers, times, strict=True)):
         raise NotConverged("the times are no whole numbers of steps")
     samples: dict[int, tuple[Positions, Positions]] = {}
     is_solved = True
     run = simulate_scene(
-        scene, prepare(scene, NewtonSolver()), SOLVED_STOP_RULE, initial_guess="previous", frames=wanted[-1]
+        scene, prepare(scene, NewtonSolver()), SOLVED_STOP_RULE, initial_guess="previous", frames=step_numbers[-1]
     )
     for step in run:
         if not np.isfinite(step.positions).all():
             raise NotConverged(f"the motion is not finite from {step.index * h:.3g} s on")
         is_solved &= step.solution.termination_reason != "max-iter"
-        if step.index in wanted:
+        if step.index in step_numbers:
             samples[step.index] = step.positions.copy(), step.state.motion.velocity.copy()
-        if thread_time() > until and step.index < wanted[-1]:
+        if thread_time() > until and step.index < step_numbers[-1]:
             return None
-    p, v = (np.array([samples[k][i] for k in wanted]) for i in (0, 1))
+    p, v = (np.array([samples[k][i] for k in step_numbers]) for i in (0, 1))
     return _SampledMotion(scene.system.free_vertices, build_initial_state(scene).motion.positions, p, v, is_solved)
 
 

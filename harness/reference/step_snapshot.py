@@ -221,8 +221,8 @@ def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
     return StepSnapshot(int(arrays["frame"]), problem, after, *digest) if same else None
 
 
-def is_equal_to_roundoff(found: NDArray[np.float64], wanted: NDArray[np.float64]) -> bool:
+def is_equal_to_roundoff(found: NDArray[np.float64], expected: NDArray[np.float64]) -> bool:
     """Return whether two arrays are equal up to processor-dependent summation order."""
-    if found.shape != wanted.shape:
+    if found.shape != expected.shape:
         return False
-    return bool(np.abs(found - wanted).max(initial=0.0) <= 1e-9 * np.abs(wanted).max(initial=0.0))
+    return bool(np.abs(found - expected).max(initial=0.0) <= 1e-9 * np.abs(expected).max(initial=0.0))

@@ -46,7 +46,7 @@ def read_ablations(folder: Path, kind: str) -> dict[str, list[dict[str, Any]]]:
     found = {name: rows for name, rows in found.items() if select_kind(rows, kind)}
     if not found:
         command = "springbench ablate SCENE" + (" --all-solvers" if kind == "overhead" else "")
-        raise InputError(InputMistake(f"holds nothing of that kind; expected the rows of `{command}`", folder))
+        raise InputError(InputMistake(f"contains nothing of that kind; expected the rows of `{command}`", folder))
     return found
 
 

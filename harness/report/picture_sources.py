@@ -10,7 +10,7 @@ from pathlib import Path
 import pyarrow as pa
 
 SOURCES_KEY = "Source"
-"""Keyword of the PNG text that holds the digest."""
+"""Keyword of the PNG text that contains the digest."""
 
 
 def digest_runs(title: str, table: pa.Table, stale_ids: Collection[str]) -> str:

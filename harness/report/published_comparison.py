@@ -55,12 +55,12 @@ def compare_with_published(results: Path, studies: Sequence[PublishedStudy]) -> 
     folders = row_store.find_row_folders(results, "rows")
     own = [row for folder in folders for row in _read_rows(folder)]
     if not own:
-        raise InputError(InputMistake("holds no rows of `springbench run`; run a sweep first", results))
+        raise InputError(InputMistake("contains no rows of `springbench run`; run a sweep first", results))
     found = [line for study in studies if study.find_table("rows") for line in _compare_with_study(own, study)]
     if not found:
         there = ", ".join(study.study_name for study in studies if study.find_table("rows"))
         example = "`springbench run configs/quickstart.yaml`"
-        why = f"holds no run on a scene and size of a published study ({there}); such as {example} has them"
+        why = f"contains no run on a scene and size of a published study ({there}); such as {example} has them"
         raise InputError(InputMistake(why, results))
     return found
 

@@ -56,7 +56,7 @@ def inspect_recordings(
     """
     paths = find_recordings(paths)
     if len(paths) != 1 and (export or csv):
-        raise InputError(f"--export and --csv take one recording; {len(paths)} came")
+        raise InputError(f"--export and --csv take one recording, not {len(paths)}")
     if frame is not None and export is None:
         raise InputError(InputMistake("chooses the frame to export; name a file with --export too", key="--frame"))
     for path in paths:
@@ -164,8 +164,8 @@ def _print_difference(paths: list[Path], console: Console) -> None:
     a, b = (read_replay(path, [last]) for path in paths)
     console.rule("difference")
     if a.positions.shape != b.positions.shape:
-        came = f"{a.positions.shape[1]} and {b.positions.shape[1]}"
-        raise InputError(f"{paths[0]} and {paths[1]} have {came} vertices: their positions cannot be compared")
+        counts = f"{a.positions.shape[1]} and {b.positions.shape[1]}"
+        raise InputError(f"{paths[0]} and {paths[1]} have {counts} vertices: their positions cannot be compared")
     apart = np.linalg.norm(a.absolute_positions(0) - b.absolute_positions(0), axis=1)
     spacing = float(a.rest_lengths.mean()) if len(a.rest_lengths) else np.nan
     figures = {"max": apart.max(), "rms": math.sqrt((apart**2).mean())}

@@ -95,7 +95,7 @@ def run_query(sql: str, results: Path, *, max_rows: int = MAX_SHOWN_ROWS, cpu_se
     every = list(chain(*folders.values()))
     files = sum(len(row_store.list_unit_files(folder)) for folder in every)
     if not files and not any(row_store.packed_path(folder).exists() for folder in every):
-        raise InputError(f"{results}: holds no rows; run a sweep first, or name its folder with --results")
+        raise InputError(f"{results}: contains no rows; run a sweep first, or name its folder with --results")
     limits = sandbox.CallLimits(cpu_seconds + _SECONDS_PER_FILE * files, QUERY_MEMORY_BYTES)
     try:
         return sandbox.call_in_sandbox(_run_with_retries, sql, folders, max_rows, limits=limits)

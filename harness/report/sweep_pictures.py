@@ -205,9 +205,9 @@ class SolverGroup:
 
 def group_by_scene(drawn: list[PictureJob], folder: Path) -> list[SolverGroup]:
     """Group runs by scene and size; only groups of two or more runs are returned."""
-    alike: dict[str, list[PictureJob]] = {}
+    by_scene: dict[str, list[PictureJob]] = {}
     for p in drawn:
-        alike.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
+        by_scene.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)
     return [
         SolverGroup(
             label,
@@ -215,7 +215,7 @@ def group_by_scene(drawn: list[PictureJob], folder: Path) -> list[SolverGroup]:
             folder / "recordings" / f"{label}-solvers.rrd",
             folder / "pictures" / f"{label}-solvers.png",
         )
-        for label, some in alike.items()
+        for label, some in by_scene.items()
         if len(some) > 1
     ]
 

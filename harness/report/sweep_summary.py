@@ -189,7 +189,7 @@ def _describe_dissipation(ok_runs: Sequence[RunTimes], names: Mapping[str, str])
 
 
 def _describe_losses(run: RunTimes) -> str:
-    """Describe where the energy of a run went, in words."""
+    """Describe the energy balance of a run, in words."""
     words = describe_losses(
         _name_integrator(run),
         (run.frames or 0) * (run.time_step or 0.0),

@@ -294,7 +294,7 @@ def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Tab
         )
     )
     longest = max(map(len, [*names.values(), *scenes]), default=0)
-    # Lines longer than a narrow terminal keep their numbers; Rich would replace them by ellipses.
+    # Lines longer than a narrow terminal still show their numbers; Rich would replace them by ellipses.
     most = Measurement.get(wide := Console(width=1000), wide.options, out).maximum
     out.width = max(min(most, TABLE_WIDTH), most - max(0, longest - _MIN_NAME_WIDTH))
     return out

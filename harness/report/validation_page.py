@@ -30,7 +30,7 @@ LIMITS = """What springs cannot do:
   to the stiffness along the threads.
 * Bending is that of an isotropic sheet with one rigidity, of the least curvature. Folds bend fabrics further, where
   they are softer: drape is therefore stiffer than that of a fabric. Friction and hysteresis of yarns are missing.
-* Compressed cells resist until the mesh buckles, where yarns give way at once; so drape is stiffer on coarse meshes."""
+* Compressed cells resist until the mesh buckles, where yarns yield at once; so drape is stiffer on coarse meshes."""
 """Statement of the model's limits, on every page."""
 
 

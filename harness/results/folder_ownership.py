@@ -27,7 +27,7 @@ def read_owner(folder: Path) -> Path | None:
     All symbolic links of the path are resolved.
     """
     note = folder / OWNER_FILE
-    with suppress(OSError, ValueError):  # the file of a copied folder may hold no path
+    with suppress(OSError, ValueError):  # the file of a copied folder may contain no path
         if note.is_file():
             with note.open("rb") as file:
                 owner = os.fsdecode(file.read(_MAX_PATH_BYTES).strip())
@@ -51,7 +51,7 @@ def claim_folder(folder: Path, config: Path) -> Path:
     if owner and not owner.samefile(config):
         raise InputError(
             InputMistake(
-                f"holds the results of another file of this name, {owner}; rename one of the two, or choose another "
+                f"contains the results of another file of this name, {owner}; rename one of the two, or choose another "
                 "folder with --results",
                 folder,
             )

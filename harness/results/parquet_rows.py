@@ -242,7 +242,7 @@ def _read_packed(paths: Sequence[Path]) -> dict[Path, pa.Table]:
             with file.open("rb") as content:
                 table = pq.read_table(content, filters=chosen, partitioning=None)
         except (pa.ArrowException, OSError) as error:
-            problem = explain_unreadable_file(file) or f"holds no packed rows ({error}); take it out of the results"
+            problem = explain_unreadable_file(file) or f"contains no packed rows ({error}); take it out of the results"
             raise InputError(InputMistake(problem, file)) from error
         names_of_rows: Any = table[row_store.FILE_COLUMN].combine_chunks()
         of_row = names_of_rows.dictionary_encode()
@@ -320,12 +320,12 @@ def _read_unit(
         table = pa.concat_tables([schema.empty_table(), found], promote_options="default")
         table.validate(full=True)  # text is UTF-8
     except (pa.ArrowException, OSError) as error:
-        problem = explain_unreadable_file(path) or f"holds no rows ({error}); take it out of the results"
+        problem = explain_unreadable_file(path) or f"contains no rows ({error}); take it out of the results"
         raise InputError(InputMistake(problem, path)) from error
     lacking = [name for name in required_columns if name not in table.column_names or table[name].null_count]
     if lacking or not len(table):
         why = f"no {lacking[0]}" if lacking else "it is empty"
-        raise InputError(InputMistake(f"holds no rows of a run ({why}); take it out of the results", path))
+        raise InputError(InputMistake(f"contains no rows of a run ({why}); take it out of the results", path))
     return table
 
 

@@ -2,7 +2,7 @@
 # PyArrow's stubs do not type most keywords.
 """Published set of results: compact tables of each study, and what made them.
 
-`results/published/<study>/` holds one Parquet file for each table of a results folder (`TABLE_FILES`) and
+`results/published/<study>/` contains one Parquet file for each table of a results folder (`TABLE_FILES`) and
 `study.json`: config, command, commits, machines, versions, dates, load and checksums. `springbench publish-study`
 writes all of it. The tables are packed rows (`springbench.harness.results.row_store`) without the columns that no
 repetition can confirm, so `open_study_folder` presents a study as an ordinary folder of results to every report.
@@ -118,7 +118,7 @@ def list_studies(published: Path) -> list[PublishedStudy]:
     if not found:
         raise InputError(
             InputMistake(
-                "holds no published studies; run this in a checkout of springbench, or give its path", published
+                "contains no published studies; run this in a checkout of springbench, or give its path", published
             )
         )
     return found

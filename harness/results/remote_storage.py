@@ -36,7 +36,7 @@ ROW_FOLDER_NAMES = ("rows", "accuracy", "ablation")
 def parse_location(value: str | Path) -> Path | str:
     """Parse a path or URL of results; a URL remains text."""
     if "\0" in str(value):
-        raise typer.BadParameter("holds NUL, which no path and no URL can")
+        raise typer.BadParameter("contains NUL, which no path and no URL can")
     return value if isinstance(value, Path) or "://" in value else Path(value)
 
 
@@ -117,8 +117,8 @@ class RemoteStorage:
         try:
             self.filesystem.invalidate_cache()
             there = self._list_remote()
-            wanted = {n: token for n, token in there.items() if not only_rows or _is_row_file(n)}
-            new = [n for n, token in wanted.items() if self.index.get(n, [""])[0] != token]
+            expected = {n: token for n, token in there.items() if not only_rows or _is_row_file(n)}
+            new = [n for n, token in expected.items() if self.index.get(n, [""])[0] != token]
             new = [n for n in new if self._local_token(n) in ("", self.index.get(n, ["", ""])[1])]
             for start in range(0, len(new), _BATCH_SIZE):
                 self._download_files(new[start : start + _BATCH_SIZE], there)
@@ -165,7 +165,7 @@ class RemoteStorage:
             there = self._list_remote()
         except Exception as error:  # of whatever library speaks to it
             raise RunFailed(
-                f"{self.url}: cannot be written: {_format_error(error)}; all is kept "
+                f"{self.url}: cannot be written: {_format_error(error)}; all results remain "
                 f"in {self.folder}, and the next command "
                 "with this URL sends it"
             ) from error

@@ -79,7 +79,7 @@ def list_packed_units(folder: Path) -> frozenset[str]:
 
 @lru_cache(maxsize=16)
 def _read_packed_units(path: Path, *state: int) -> frozenset[str]:
-    import pyarrow as pa  # for those who have packed rows
+    import pyarrow as pa  # imported where it is used
     import pyarrow.parquet as pq
 
     try:
@@ -94,7 +94,7 @@ def _read_packed_units(path: Path, *state: int) -> frozenset[str]:
             raise OSError(f"{foreign[0]!r} is the name of no unit")
         return found
     except (pa.ArrowException, OSError, KeyError) as error:
-        problem = explain_unreadable_file(path) or f"holds no packed rows ({error}); take it out of the results"
+        problem = explain_unreadable_file(path) or f"contains no packed rows ({error}); take it out of the results"
         raise InputError(InputMistake(problem, path)) from error
 
 
@@ -131,7 +131,7 @@ def group_units(paths: Iterable[Path]) -> tuple[list[UnitGroup], list[int]]:
     Raises:
         InputError: for a damaged packed file.
     """
-    alike: dict[bytes, list[tuple[str, int]]] = {}
+    by_kind: dict[bytes, list[tuple[str, int]]] = {}
     packed: dict[Path, dict[str, int]] = {}
     damaged: list[int] = []
     there: dict[Path, frozenset[str]] = {}
@@ -144,8 +144,8 @@ def group_units(paths: Iterable[Path]) -> tuple[list[UnitGroup], list[int]]:
         elif (kind := _read_schema_key(str(path))) is None:
             damaged.append(number)
         else:
-            alike.setdefault(kind, []).append((str(path), number))
-    found = [UnitGroup(tuple(f for f, _ in files), tuple(n for _, n in files)) for files in alike.values()]
+            by_kind.setdefault(kind, []).append((str(path), number))
+    found = [UnitGroup(tuple(f for f, _ in files), tuple(n for _, n in files)) for files in by_kind.values()]
     return found + [UnitGroup((str(path),), packed_numbers=names) for path, names in packed.items()], damaged
 
 

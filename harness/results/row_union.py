@@ -114,7 +114,7 @@ def build_union(
         raise SchemaMismatch(str(error)) from error
     names = [name.casefold() for name in whole.names]
     if len({*names, *_RESERVED_COLUMNS}) < len(names) + len(_RESERVED_COLUMNS):
-        raise SchemaMismatch("columns whose names DuckDB cannot tell apart")
+        raise SchemaMismatch("columns whose names DuckDB cannot distinguish")
     types = _read_column_types(connection, whole)
     sources: list[str] = []
     columns: list[str] = []

@@ -2,8 +2,8 @@
 # pyarrow's stubs have incomplete types of columns.
 """Validation of row values from untrusted files: names become files, text becomes links and JSON.
 
-A rule belongs to a column name, for all kinds of rows. A column without a rule may hold any value of its type. Null is
-always valid; readers state the columns that they require.
+A rule belongs to a column name, for all kinds of rows. A column without a rule may contain any value of its type. Null
+is always valid; readers state the columns that they require.
 """
 
 from __future__ import annotations
@@ -130,10 +130,9 @@ class InvalidValue(NamedTuple):
     expected: str
 
     def __str__(self) -> str:
-        came = repr(self.value[:_MAX_QUOTED_LENGTH] if isinstance(self.value, str) else self.value)
+        got = repr(self.value[:_MAX_QUOTED_LENGTH] if isinstance(self.value, str) else self.value)
         return (
-            f"got {came if len(came) <= _MAX_QUOTED_LENGTH else came[:_MAX_QUOTED_LENGTH] + '…'}; "
-            f"expected {self.expected}"
+            f"got {got if len(got) <= _MAX_QUOTED_LENGTH else got[:_MAX_QUOTED_LENGTH] + '…'}; expected {self.expected}"
         )
 
 
@@ -153,9 +152,9 @@ def _find_invalid_texts(name: str, column: Any, rule: TextRule) -> Iterator[Inva
         return
     bad = [text for text in column.unique().to_pylist() if text is not None and not _is_valid_text(text, rule)]
     if bad:
-        wanted = rule.expected if max(map(len, bad)) <= MAX_TEXT_LENGTH else _LENGTH_RULE.expected
+        expectation = rule.expected if max(map(len, bad)) <= MAX_TEXT_LENGTH else _LENGTH_RULE.expected
         rows = pc.is_in(column, pa.array(bad, column.type)).to_numpy(zero_copy_only=False)
-        yield from (InvalidValue(int(row), name, column[int(row)].as_py(), wanted) for row in np.flatnonzero(rows))
+        yield from (InvalidValue(int(row), name, column[int(row)].as_py(), expectation) for row in np.flatnonzero(rows))
 
 
 def _is_valid_text(text: str, rule: TextRule) -> bool:

@@ -29,7 +29,7 @@ RUN_COLUMNS = (
     ColumnSpec("run_id", _TEXT, "", "hash of everything that determines the run's result and timing"),
     ColumnSpec("sweep", _TEXT, "", "name of the sweep, the stem of its file"),
     ColumnSpec("scene", _TEXT, "", "name of the scene, the stem of its file"),
-    ColumnSpec("size", _INT, "", "mesh size of the sweep; 0 if the mesh comes from a file"),
+    ColumnSpec("size", _INT, "", "mesh size of the sweep; 0 if the mesh is from a file"),
     ColumnSpec("solver", _TEXT, "", "name of the solver"),
     ColumnSpec("parameters", _TEXT, "", "parameters of the solver, as JSON"),
     ColumnSpec("family", _TEXT, "", "family of methods; `local-global` is the paper's method"),

@@ -162,7 +162,7 @@ class ConvergenceStudy:
           max_error: relative error.
 
         Returns:
-          The cheaper one of more substeps and more iterations; None where errors fall too slowly to tell.
+          The cheaper one of more substeps and more iterations; None where errors fall too slowly to decide.
         """
         known = {result.setting: result.error for result in self.results if 0.0 < result.error < inf}
         if not known:
@@ -218,7 +218,7 @@ class ConvergenceStudy:
             lines[0] += f"{describe_percent(error)}."
         lines += [self._describe_row(one) for one in self.assessments]
         if apart := self.largest_difference:
-            verb = "need not hold" if apart.change > self.error_requested else "holds to that"
+            verb = "need not be valid" if apart.change > self.error_requested else "is valid to that error"
             lines.append(
                 f"The motions of {apart.first} and {apart.second} differ by {describe_percent(apart.change)}: "
                 f"what is found with one {verb} with the other."

@@ -23,8 +23,8 @@ RESIDUAL_FACTOR = 2.0
 MAX_DIFFERING_SHARE = 0.02
 """Largest share of runs that may differ between processors.
 
-Where a step may go either way, the last bit decides. Between an EPYC and a Xeon that is one run in a thousand of the
-hard cases; a tenth of them has few runs, so that two per cent are allowed.
+Where a step has two possible outcomes, the last bit decides. Between an EPYC and a Xeon that is one run in a thousand
+of the hard cases; a tenth of them has few runs, so that two per cent are allowed.
 """
 
 CURVE_LEVELS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)

@@ -29,7 +29,7 @@ class MethodTimes(NamedTuple):
 
     Attributes:
         task: scene and size; in accuracy studies also what is solved, and to which error.
-        method: what differs between the methods of a task; the solver comes first.
+        method: what differs between the methods of a task; the solver is first.
         seconds: times by step or by round [s], positive.
         is_paired_by_step: whether they are times of steps; rounds otherwise.
         is_preempted: whether the load of the machine delayed them.

@@ -21,7 +21,7 @@ _STIFFNESS_FRACTION = 0.1
 _MAX_NAMED_PAIRS = 3
 """Maximum number of pairs that a message names."""
 
-END_OF_STEP_REASON = ("keeps apart what it finds at the end of a step",)
+END_OF_STEP_REASON = ("separates the pairs that it finds at the end of a step",)
 
 
 def collision_primitives(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

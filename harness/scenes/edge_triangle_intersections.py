@@ -76,7 +76,7 @@ def find_edge_triangle_intersections(p: FloatArray, edges: IndexArray, triangles
     if not (len(edges) and len(triangles)):
         return found
     if not np.isfinite(p).all():
-        raise ValueError("positions should be finite to tell whether they intersect")
+        raise ValueError("positions should be finite to decide whether they intersect")
     for e, t in _overlapping_box_pairs(p, edges, triangles):
         is_open = ~_has_separating_axis(p, edges[e], triangles[t])
         e, t = e[is_open], t[is_open]

@@ -90,7 +90,7 @@ class KeyFrameMotion(ConfigModel):
             start_time: [s].
             end_time: [s].
             points: declared positions (q, 3) [m].
-            slack: the bound holds for all points within this distance [m] of `points`.
+            slack: the bound is valid for all points within this distance [m] of `points`.
         """
         times, values = self.key_table
         k = int(np.clip(np.searchsorted(times, start_time, side="right"), 1, max(1, len(times) - 1)))

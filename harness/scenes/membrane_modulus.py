@@ -87,7 +87,7 @@ def compute_area_stiffness(mesh: Mesh) -> FloatArray:
         problem = "area needs the faces of a mesh from a file; use continuum, which suits generated meshes"
         raise InputError(InputMistake(problem, key="scaling_rule"))
     lengths = mesh.spring_distances
-    for wrong, what in ((lengths == 0.0, "no length"), (mesh.spring_areas == 0.0, "no face beside it")):
+    for wrong, what in ((lengths == 0.0, "no length"), (mesh.spring_areas == 0.0, "no adjacent face")):
         if wrong.any():
             i, j = mesh.springs[int(wrong.argmax())].tolist()
             numbers = mesh.format_file_numbers(i, j)

@@ -1,4 +1,4 @@
-"""What holds a mesh in a scene: pinned and attached vertices, and seams that effects sew."""
+"""Supports of a mesh in a scene: pinned and attached vertices, and seams that effects sew."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ _HOLDING_EFFECTS = ("pins", "attachments")
 _JOINING_EFFECTS = ("sewing",)
 _OTHER_EFFECTS = ("springs", "gravity", "constant-force", "wind", "air-drag", "ether-drag", "dashpots", "rayleigh",
                   "bending", "strain-limits", "gas", "self-contact")  # fmt: skip
-"""Effects that neither hold nor join anything; an obstacle or user code may."""
+"""Effects that neither support nor join anything; an obstacle or user code may."""
 _MAX_MODULUS_VERTICES = 50_000
 """Number of vertices above which the modulus is not computed: its factorisation would delay the start by seconds."""
 _LOG = logging.getLogger("springbench")
 
 
 def find_mesh_support(scene: SceneSpec, mesh: Mesh) -> MeshSupport | None:
-    """Find what holds the mesh of a scene; None if obstacles or user code may do so."""
-    held, joined = [NO_VERTICES], [NO_PAIRS]
+    """Find the supports of the mesh of a scene; None if obstacles or user code may do so."""
+    supported, joined = [NO_VERTICES], [NO_PAIRS]
     for k, effect in enumerate(scene.effects):
         if effect.kind not in (*_HOLDING_EFFECTS, *_JOINING_EFFECTS, *_OTHER_EFFECTS):
             return None
         chosen = [one.select_vertices(mesh, f"effects[{k}]") for _, one in find_selections(effect)]
         if effect.kind in _HOLDING_EFFECTS:
-            held += chosen
+            supported += chosen
         elif effect.kind in _JOINING_EFFECTS:
             every = np.concatenate([NO_VERTICES, *chosen])
             joined.append(np.column_stack([every[:-1], every[1:]]))
-    return MeshSupport(np.unique(np.concatenate(held)), np.concatenate(joined))
+    return MeshSupport(np.unique(np.concatenate(supported)), np.concatenate(joined))
 
 
 def log_mesh_remarks(scene: SceneSpec, mesh: Mesh) -> None:
-    """Log what is suspicious in the mesh of a scene if it comes from a file, and the membrane stiffness it has."""
+    """Log what is suspicious in the mesh of a scene if it is from a file, and the membrane stiffness it has."""
     if not isinstance(scene.mesh, FileMesh):
         return
     path: Path = scene.mesh.find_geometry_path()

@@ -39,7 +39,7 @@ from springbench.solvers.model.step_problem import (
 )
 from springbench.solvers.model.system_matrix_assembly import assemble_system_matrix
 
-if TYPE_CHECKING:  # for those who have any
+if TYPE_CHECKING:
     from springbench.harness.scenes.edge_triangle_intersections import IntersectionCheck
 
 _LOG = logging.getLogger("springbench")
@@ -255,7 +255,7 @@ def _require_unique(spec: SceneSpec, parts: list[EffectContribution]) -> None:
     for i, part in enumerate(parts):
         for what in part.exclusive_features:
             if first.setdefault(what, i) != i:
-                problem = f"{what} is there already, as effects[{first[what]}]; the two would add up, so keep one"
+                problem = f"{what} is there already, as effects[{first[what]}]; the two would add up, so remove one"
                 raise InputError(InputMistake(problem, key=f"effects[{i}]"))
 
 

@@ -1,6 +1,6 @@
 """Effects and meshes from plug-ins: named by a scene, and imported where they are used.
 
-A scene is passed around with `PluginEffect` and `PluginMesh`, which hold only name and parameters.
+A scene is passed around with `PluginEffect` and `PluginMesh`, which contain only name and parameters.
 `SceneSpec.load_plugins` replaces them, in a process that may crash. Results of the plug-in code are checked, and its
 errors name it.
 """
@@ -39,12 +39,12 @@ IMPORT_NOTICE = "\0importing "
 
 def load_plugin(document: ConfigDocument, plugin: PluginName, part_kind: str, key: ConfigKey) -> Any:
     """Load a plug-in of one of PLUGIN_KINDS, which runs its code; None after a recorded mistake."""
-    wanted, fits = PLUGIN_KINDS[part_kind]
+    expected, fits = PLUGIN_KINDS[part_kind]
     document.user_code.on_import(f"{IMPORT_NOTICE}{plugin}")
     try:
         with preserve_working_directory():
             made = load_target(plugin.import_target)
-        problem = "" if fits(made) else f"is no {part_kind}; expected {wanted}"
+        problem = "" if fits(made) else f"is no {part_kind}; expected {expected}"
         if lacks := sorted(getattr(made, "__abstractmethods__", ())):
             problem = problem or f"has no method `{'`, `'.join(lacks)}`, which its base class requires"
     except AttributeError as error:
@@ -218,8 +218,8 @@ def build_checked_contribution(
             f"{plugin}: `build_contribution` wrote to the mesh or the masses, which it was given; change copies"
         )
     if not isinstance(made, EffectContribution):
-        wanted = "expected a springbench.harness.scenes.effects.effect_interface.EffectContribution"
-        raise InputError(f"{plugin}: `build_contribution` returned {_describe_value(made)}; {wanted}")
+        expected = "expected a springbench.harness.scenes.effects.effect_interface.EffectContribution"
+        raise InputError(f"{plugin}: `build_contribution` returned {_describe_value(made)}; {expected}")
     with attribute_errors(plugin, "build_contribution"):
         for field in fields(made):
             _require_true(isinstance(getattr(made, field.name), tuple), f"`{field.name}` should be a tuple")
@@ -256,9 +256,9 @@ class _CheckedFunction:
     def __call__(self, *arguments: Any) -> Any:
         with attribute_errors(self.plugin, self.quantity.partition(" ")[0]):
             found: Any = self.function(*(one.copy() if _is_array(one) else one for one in arguments))
-            wanted = self.num_vertices, 3
-            if not _is_array(found) or found.shape != wanted:
-                raise ValueError(f"gave {_describe_value(found)}; expected a {self.quantity} of shape {wanted}")
+            expected = self.num_vertices, 3
+            if not _is_array(found) or found.shape != expected:
+                raise ValueError(f"gave {_describe_value(found)}; expected a {self.quantity} of shape {expected}")
         return found
 
 
@@ -272,15 +272,15 @@ def _require_true(holds: bool, problem: str) -> None:
 
 
 def _require_array(array: Any, shape: tuple[int | None, ...], what: str, *, integers: bool = False) -> None:
-    wanted = f"{what} should be an array of {'integers' if integers else 'float64'} of shape "
-    wanted += f"({', '.join('any' if n is None else str(n) for n in shape)})"
+    expected = f"{what} should be an array of {'integers' if integers else 'float64'} of shape "
+    expected += f"({', '.join('any' if n is None else str(n) for n in shape)})"
     if (
         not _is_array(array)
         or array.ndim != len(shape)
         or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True))
         or not (array.dtype.kind == "i" if integers else array.dtype == np.float64)
     ):
-        raise ValueError(f"{wanted}, not {_describe_value(array)}")
+        raise ValueError(f"{expected}, not {_describe_value(array)}")
     if not integers and not np.isfinite(array).all():
         raise ValueError(f"{what} has values that are not finite, the first at {np.argwhere(~np.isfinite(array))[0]}")
 
@@ -295,7 +295,7 @@ def _require_indices(array: Any, shape: tuple[int | None, ...], what: str, count
 def _require_pin(pin: Any, count: int) -> None:
     _require_true(
         isinstance(pin, PinGroup),
-        f"`pins` holds {_describe_value(pin)}; expected springbench.harness.scenes.effects.effect_interface.PinGroup",
+        f"got {_describe_value(pin)} in `pins`; expected springbench.harness.scenes.effects.effect_interface.PinGroup",
     )
     _require_indices(pin.vertices, (None,), "`vertices` of a pin", count)
     _require_array(pin.targets, (len(pin.vertices), 3), "`targets` of a pin")

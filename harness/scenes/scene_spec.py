@@ -208,8 +208,8 @@ class SceneSpec(SceneFields):
     def require_fixed_time_step(self) -> None:
         """Raise InputError if the steps differ in length."""
         if self.alternate_time_step is not None:
-            key, wanted = "alternate_time_step", "what is measured here depends on one time step; leave it out"
-            raise InputError(InputMistake(wanted, self.path, self.key_lines.get(key), key))
+            key, expected = "alternate_time_step", "what is measured here depends on one time step; leave it out"
+            raise InputError(InputMistake(expected, self.path, self.key_lines.get(key), key))
 
     @cached_property
     def scene_digest(self) -> str:

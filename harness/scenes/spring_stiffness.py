@@ -158,7 +158,7 @@ def _area_scale(mesh: Mesh, family: str, reference: int | None) -> NDArray[np.fl
 
 def _liu2013_scale(mesh: Mesh, family: str, reference: int | None) -> float:
     if reference is None or reference < 2:
-        problem = f"got {reference}; liu2013 needs the mesh size, at least 2, at which the constants hold"
+        problem = f"got {reference}; liu2013 needs the mesh size, at least 2, at which the constants are valid"
         raise InputError(InputMistake(problem, key="reference_size"))
     if mesh.resolution < 2:
         problem = f"liu2013 needs a mesh that has a size of at least 2, this one has {mesh.resolution or 'none'}"

@@ -79,8 +79,8 @@ class RecordedFrames(ConfigModel):
         path = self.positions if isinstance(self.positions, Path) else None
         found = read_npz_array(path, "positions") if path else np.array(self.positions)
         if found.ndim != 3 or found.shape[2] != 3 or not found.size or not (np.abs(found) <= MAX_COORDINATE).all():
-            wanted = f"expected numbers up to {MAX_COORDINATE:g} m of shape (frames, points, 3)"
-            problem = f"got positions {found.shape}; {wanted}"
+            expected = f"expected numbers up to {MAX_COORDINATE:g} m of shape (frames, points, 3)"
+            problem = f"got positions {found.shape}; {expected}"
             raise InputError(InputMistake(problem, path) if path else f"frames: {problem}")
         return found
 
@@ -164,9 +164,9 @@ class MeshObstacle(ConfigModel):
             raise InputError("the mesh has no triangles, so there is nothing to meet")
         if self.frames:
             if len(points) != self.frames.frame_positions.shape[1]:
-                came = f"{self.frames.frame_positions.shape[1]:,} points for a mesh of {len(points):,}"
+                counts = f"{self.frames.frame_positions.shape[1]:,} points for a mesh of {len(points):,}"
                 path = self.frames.positions if isinstance(self.frames.positions, Path) else None
-                raise InputError(InputMistake(f"got {came}; expected as many", path, key="frames"))
+                raise InputError(InputMistake(f"got {counts}; expected as many", path, key="frames"))
             points = self.frames.frame_positions[0]
         return self.scale * points + np.array(self.offset), triangles
 

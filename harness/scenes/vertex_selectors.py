@@ -172,16 +172,16 @@ def _describe_value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _select_loops(found: list[BoundaryLoop], wanted: tuple[int, ...], name: str, what: str) -> list[IndexArray]:
-    if missing := [k for k in wanted if k >= len(found)]:
+def _select_loops(found: list[BoundaryLoop], expected: tuple[int, ...], name: str, what: str) -> list[IndexArray]:
+    if missing := [k for k in expected if k >= len(found)]:
         raise InputError(f"{name}: got {missing[0]}; the mesh has {len(found)} {what}, counted from 0")
-    return [found[k].vertices for k in wanted]
+    return [found[k].vertices for k in expected]
 
 
-def _select_by_attribute(mesh: Mesh, wanted: AttributeRange, name: str) -> IndexArray:
-    if wanted.name not in mesh.attributes:
-        known = suggest_name(wanted.name, mesh.attributes) if mesh.attributes else "none; meshes from files may"
-        raise InputError(f"{name}: got {wanted.name!r}; this mesh has {known}")
-    values = mesh.attributes[wanted.name]
-    low, high = (end if end is not None else sign * np.inf for end, sign in ((wanted.low, -1), (wanted.high, 1)))
+def _select_by_attribute(mesh: Mesh, expected: AttributeRange, name: str) -> IndexArray:
+    if expected.name not in mesh.attributes:
+        known = suggest_name(expected.name, mesh.attributes) if mesh.attributes else "none; meshes from files may"
+        raise InputError(f"{name}: got {expected.name!r}; this mesh has {known}")
+    values = mesh.attributes[expected.name]
+    low, high = (end if end is not None else sign * np.inf for end, sign in ((expected.low, -1), (expected.high, 1)))
     return np.flatnonzero((values >= low) & (values <= high))

@@ -97,8 +97,8 @@ class ConfigDocument:
                 key = _locate_error(detail, data)
                 problems.setdefault(key, []).append(_describe_problem(detail, model, key))
             for key, messages in problems.items():
-                came = messages[0].partition(_EXPECTED_PREFIX)[0] + _EXPECTED_PREFIX  # all members of a union quote it
-                others = [problem.removeprefix(came) for problem in messages[1:]]
+                got = messages[0].partition(_EXPECTED_PREFIX)[0] + _EXPECTED_PREFIX  # all members of a union quote it
+                others = [problem.removeprefix(got) for problem in messages[1:]]
                 self.add_mistake(" or ".join([messages[0], *others]), at + key)
             return None
 
@@ -194,12 +194,12 @@ def _describe_problem(detail: ErrorDetails, model: type[BaseModel], key: ConfigK
         return message.removeprefix("Value error, ")
     if kind.startswith("union_tag"):
         kinds = [one.model_fields["kind"].default for one in _models_at(model, detail["loc"])]
-        came = detail.get("ctx", {}).get("tag")
-        if came is not None:
-            return f"unknown kind {quote_value(came)}; expected {suggest_name(came, kinds)}"
+        got = detail.get("ctx", {}).get("tag")
+        if got is not None:
+            return f"unknown kind {quote_value(got)}; expected {suggest_name(got, kinds)}"
         return f"got {quote_value(detail['input'])}{_EXPECTED_PREFIX}a mapping with a `kind`, {suggest_name('', kinds)}"
-    wanted = message.removeprefix("Input should be ").replace("a valid array", "a list")
-    return f"got {quote_value(detail['input'])}{_EXPECTED_PREFIX}{wanted}"
+    expected = message.removeprefix("Input should be ").replace("a valid array", "a list")
+    return f"got {quote_value(detail['input'])}{_EXPECTED_PREFIX}{expected}"
 
 
 def _models_at(model: type[BaseModel], location: ConfigKey) -> list[type[BaseModel]]:

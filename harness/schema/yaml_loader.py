@@ -45,7 +45,7 @@ def read_config_bytes(path: Path) -> bytes:
 
 
 def read_yaml(path: Path) -> ConfigDocument:
-    """Read a YAML file that holds one mapping.
+    """Read a YAML file that contains one mapping.
 
     Raise InputError with the line for anything else.
     """
@@ -63,7 +63,7 @@ def read_yaml(path: Path) -> ConfigDocument:
         node = yaml.compose(text)
     except ReaderError as error:
         at = int(error.position)
-        problem = f"holds the character {chr(error.character)!r}, which is not allowed"
+        problem = f"contains the character {chr(error.character)!r}, which is not allowed"
         raise InputError(InputMistake(problem, path, text.count("\n", 0, at) + 1)) from error
     except (YAMLError, ValueError) as error:
         mark = error.problem_mark if isinstance(error, MarkedYAMLError) else None
@@ -75,7 +75,7 @@ def read_yaml(path: Path) -> ConfigDocument:
     document = ConfigDocument(path, {})
     if not isinstance(node, MappingNode):
         document.lines = {(): node.start_mark.line + 1} if node else {}
-        document.add_mistake("should hold a mapping of keys to values; it is " + ("a value" if node else "empty"))
+        document.add_mistake("should contain a mapping of keys to values; it is " + ("a value" if node else "empty"))
     else:
         document.data = _NodeConverter(document).convert_node(node, (), 0)
     if document.mistakes:
@@ -106,7 +106,7 @@ def _explain_parse_error(problem: str, lines: list[str], column: int) -> str:
     if begin + len(line[begin:end].partition(":")[0]) >= column or not colon:
         return "a key stands where the line above has not ended; give both the same indent, and each key a colon"
     mark = "'" if set(value) & set('"\\') else '"'
-    return f"the value of `{key[:40]}` holds a colon; put it in quotes, {key[:40]}: {mark}{value[:80]}{mark}"
+    return f"the value of `{key[:40]}` contains a colon; put it in quotes, {key[:40]}: {mark}{value[:80]}{mark}"
 
 
 _SCALAR_PARSERS: dict[str, Callable[[str], Any]] = {

@@ -324,8 +324,8 @@ class _AdaptiveIntegration:
         cause = "is not solved" if ratio == inf else f"errs by {ratio:.2g} times what it may"
         return StepSizeUnderflow(
             f"frame {len(self._seen)}, after {time:.6g} s: even a step of {MIN_RELATIVE_STEP:g} s {cause}; up to there "
-            f"{self._accepted} steps kept to {self._tolerance:.2g} m: forces are too sudden there, or round-off is "
-            "larger; ask for a larger --error or a shorter --t-end"
+            f"{self._accepted} steps were within {self._tolerance:.2g} m: forces are too sudden there, or round-off is "
+            "larger; use a larger --error or a shorter --t-end"
         )
 
 

@@ -1,4 +1,4 @@
-"""Energy of a motion: its growth without a source, and where the energy of each step goes.
+"""Energy of a motion: its growth without a source, and the losses of each step.
 
 The gain of a motion is compared with the energy that the scene supplies:
 
@@ -39,10 +39,10 @@ Sources are changing forces, moving pins and obstacles, and energies whose param
 two ends. Exactly pinned vertices have no kinetic energy.
 
 A start may have pinned vertices away from their targets. The constraint projects them, which is no part of the motion:
-its energy at the start is that after the projection. Midpoint has its stage while the pins are still on their way, and
-solvers of frames move them uniformly; the work on that way is then a source. Penalty pins that reach their targets in
-this first step act as exact ones during the run: the kinetic energy of their vertices, which may ring, is work of the
-pins.
+its energy at the start is that after the projection. Midpoint has its stage while the pins are still moving, and
+solvers of frames move them uniformly; the work of that motion is then a source. Penalty pins that reach their targets
+in this first step act as exact ones during the run: the kinetic energy of their vertices, which may ring, is work
+of the pins.
 
 The terms are evaluated separately, so their sum tests them: it differs from the change of the energy by round-off.
 
@@ -106,7 +106,7 @@ BLOW_UP_FACTOR = 1e6
 """Ratio of gain to available energy above which a motion has diverged: it is a thousand times as fast as possible."""
 
 _ACTIVE_LENGTH_RTOL = 1e-6
-"""Distance from a bound, relative to it, within which a length is taken to be constrained: solves keep lengths to
+"""Distance from a bound, relative to it, within which a length is taken to be constrained: solves satisfy lengths to
 1e-9 and better."""
 
 _PLACED_RTOL = 1e-2
@@ -170,7 +170,7 @@ class EnergyGrowth(NamedTuple):
 
 
 class _StepAccount:
-    """What both balances of a run know: its scene, its motion so far, and the potentials after the last step."""
+    """Data of both balances of a run: its scene, its motion so far, and the potentials after the last step."""
 
     def __init__(self, scene: Scene, mass: NDArray[np.float64]) -> None:
         """Start at the scene's start; `mass` (n,) [kg] has kinetic energy where a vertex has no exact pin."""
@@ -631,11 +631,11 @@ class DissipationBudget(_StepAccount):
         entries = np.concatenate([direction, -direction], axis=1).ravel()
         gradients = scipy.sparse.csr_array((entries, (rows, columns)), shape=(count, x.size))
         free = (3 * self._free[:, None] + np.arange(3)).ravel()
-        of_free, wanted = gradients[:, free], residual[self._free].ravel()
+        of_free, expected = gradients[:, free], residual[self._free].ravel()
         normal = of_free @ of_free.T + scipy.sparse.diags_array(np.full(count, _REGULARISATION))
         factor, tensions = splu(scipy.sparse.csc_array(normal)), np.zeros(count)
         for _ in range(_NUM_REFINEMENTS):
-            tensions += factor.solve(of_free @ (wanted - of_free.T @ tensions))
+            tensions += factor.solve(of_free @ (expected - of_free.T @ tensions))
         return (gradients.T @ tensions).reshape(x.shape)
 
     def _parameter_work(

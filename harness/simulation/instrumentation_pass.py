@@ -154,7 +154,7 @@ def observe_run(
             )
         for step in iterate_steps(scene, prepared, settings, clock):
             if observed:
-                observed.result()  # raises here what went wrong there
+                observed.result()  # raises here the exception of that thread
             # A solver's memory may be reused by the next solve, so it is not read concurrently with the next step.
             balance = energy.add_step(step)
             if balance.is_above(BLOW_UP_FACTOR):

@@ -60,7 +60,7 @@ class CoarseLevel:
 
 def build_interpolation(sources: Positions, targets: Positions) -> csr_array:
     """Build the interpolation weights (targets, sources) between rest positions, each (n, 3) [m]."""
-    from scipy.spatial import cKDTree  # for those who need it
+    from scipy.spatial import cKDTree  # imported where it is used
 
     tree: Any = cKDTree(sources)
     found = tree.query(targets, k=min(_NUM_NEIGHBOURS, len(sources)))
@@ -71,7 +71,7 @@ def build_interpolation(sources: Positions, targets: Positions) -> csr_array:
     linear = np.concatenate([np.ones((*near.shape, 1)), away], axis=2)
     normal = np.einsum("nki,nk,nkj->nij", linear, inverse, linear)
     # Points on a line or in a plane leave directions undetermined, which need no weights.
-    pseudo_inverse: Any = np.linalg.pinv  # of stacks of matrices, which its types do not tell
+    pseudo_inverse: Any = np.linalg.pinv  # of stacks of matrices, which its types do not state
     first = np.asarray(pseudo_inverse(normal, rcond=1e-13, hermitian=True), np.float64)[:, :, 0]
     weights = inverse * np.einsum("nki,ni->nk", linear, first)
     start = np.arange(0, near.size + 1, near.shape[1])

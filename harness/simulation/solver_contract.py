@@ -86,8 +86,8 @@ class SolverContract:
         lacks = [name for name in _REQUIRED_METHODS if not callable(getattr(prepared, name, None))]
         lacks += [name for name in _REQUIRED_PROPERTIES if not hasattr(prepared, name)]
         if lacks:
-            came = "None" if prepared is None else f"a {type(prepared).__name__}"
-            raise RunFailed(f"{line}: `prepare` gave {came}, which has no `{'`, `'.join(lacks)}`")
+            got = "None" if prepared is None else f"a {type(prepared).__name__}"
+            raise RunFailed(f"{line}: `prepare` gave {got}, which has no `{'`, `'.join(lacks)}`")
         return ContractCheckedSolver(
             prepared, self, frozenset(map(str, source_digest.find_class_sources(type(self._solver))))
         )
@@ -122,9 +122,9 @@ class ContractCheckedSolver(DelegatingSolver):
                 f"{line}: gave a {type(found).__name__}; expected a springbench.solvers.model.step_problem.Solution"
             )
         p: Any = found.positions
-        came = f"{p.dtype} of shape {p.shape}" if _is_array(p) else f"a {type(p).__name__}"
-        if came != (wanted := f"float64 of shape {problem.inertial_target.shape}"):
-            raise RunFailed(f"{line}: gave positions as {came}; expected {wanted}")
+        got = f"{p.dtype} of shape {p.shape}" if _is_array(p) else f"a {type(p).__name__}"
+        if got != (expected := f"float64 of shape {problem.inertial_target.shape}"):
+            raise RunFailed(f"{line}: gave positions as {got}; expected {expected}")
         return found
 
     def _locate_write(self, problem: StepProblem, stop: StopRule) -> str:

@@ -143,7 +143,7 @@ def measure_run(
 
     prepared = None
     for round in range(settings.rounds + 1):
-        prepared = None  # what it holds is free again before the next one takes as much
+        prepared = None  # its memory is free again before the next one takes as much
         with watch("prepare"):
             began = perf_counter()
             prepared = prepare(scene, solver)

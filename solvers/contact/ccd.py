@@ -48,7 +48,7 @@ def allocate_ccd_scratch() -> tuple[NDArray[np.int64], NDArray[np.float64], NDAr
 
 @jit_kernel
 def collision_free_step_size(candidates, p, displacement, max_step, local_indices, corners, relative_displacement):
-    """Return the largest step size that keeps all candidate pairs separated, on linear trajectories.
+    """Return the largest step size at which all candidate pairs stay separated, on linear trajectories.
 
     Args:
         candidates: point-triangle pairs, then edge-edge pairs.
@@ -140,7 +140,7 @@ def _packet_max(a, b):
 
 @jit_inner
 def pair_time_of_impact(candidates, e, p, displacement, max_step, edges, local_indices, corners, relative_displacement):
-    """Return the largest step size in [0, max_step] that keeps one pair separated.
+    """Return the largest step size in [0, max_step] at which one pair stays separated.
 
     Args:
         candidates: the candidate pairs.

@@ -166,9 +166,9 @@ class CollisionMesh:
         keys, share = self.rest_close_pairs
         if not (len(keys) and len(met)):
             return np.ones(len(met))
-        wanted = self._pair_keys(met, first)
-        at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-        return np.where(keys[at] == wanted, share[at], 1.0)
+        expected = self._pair_keys(met, first)
+        at = np.minimum(np.searchsorted(keys, expected), len(keys) - 1)
+        return np.where(keys[at] == expected, share[at], 1.0)
 
     def _pair_keys(self, met: IndexArray, first: int) -> IndexArray:
         """Return a unique key of each pair."""

@@ -1,7 +1,7 @@
 """Active collisions at a position: the distinct closest point pairs of all candidates.
 
 If a closest point is a vertex or lies on an edge, all triangles and edges around it share it. One point-point or
-point-edge collision then represents many pairs, with the sum of their stiffnesses (counted in the same way by Li et al.
+point-edge collision then represents many pairs, with the sum of their stiffnesses (counted likewise by Li et al.
 2020, "Incremental potential contact", section 5). Pairs with a mollifier, which depends on four vertices, and pairs
 with scaled distances remain separate. Distances are computed in 8-lane packets.
 """
@@ -204,7 +204,7 @@ def insert_collision(candidates, e, edges, tile, lane, slots, out, count):
     elif kind == POINT_EDGE and b < a:
         a, b, s, t = b, a, t, s
     if kind <= POINT_EDGE and scale == 1.0:
-        # Neighbouring vertices have nearby indices, so nearby slots keep the table in cache.
+        # Neighbouring vertices have nearby indices, so nearby slots let the table stay in cache.
         slot = (16 * i + ((5 * a + b) & 15)) & (len(slots) - 1)
         while slots[slot] >= 0:
             k = slots[slot]

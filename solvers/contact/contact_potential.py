@@ -88,14 +88,14 @@ class BarrierContact:
         if not self.friction:
             return self
         begun = self.append_obstacle_positions(start.positions)
-        grip = self._build_tangential_collisions(
+        tangential = self._build_tangential_collisions(
             begun
             if start.normal_force_positions is None
             else self.append_obstacle_positions(start.normal_force_positions),
             begun,
             start,
         )
-        return self if grip is self.tangential_collisions else replace(self, tangential_collisions=grip)
+        return self if tangential is self.tangential_collisions else replace(self, tangential_collisions=tangential)
 
     def _build_tangential_collisions(
         self, p: Positions, start_positions: Positions, start: StepStart
@@ -234,7 +234,7 @@ class BarrierContact:
         return self.hessian_blocks(p).assemble_matrix(len(p))
 
     def collision_free_step_size(self, p: Positions, direction: Positions) -> float:
-        """Return the largest step size up to 1 that keeps all gaps open.
+        """Return the largest step size up to 1 at which all gaps stay open.
 
         Args:
             p: positions (n, 3) [m].
@@ -372,9 +372,9 @@ class ObstacleContact(BarrierContact):
     def collision_free_step_size_moving(self, p: Positions, direction: Positions, start_fraction: float) -> float:
         """Return the largest collision-free step size while the obstacles move to their end positions."""
         there = self.at_fraction(start_fraction).current_positions
-        way = np.concatenate([direction, self.end_positions - there])
+        displacement = np.concatenate([direction, self.end_positions - there])
         return candidate_cache.find_collision_free_step_size(
-            self.collision_mesh, self.candidate_caches, np.concatenate([p, there]), way
+            self.collision_mesh, self.candidate_caches, np.concatenate([p, there]), displacement
         )
 
     def at_fraction(self, fraction: float) -> Self:

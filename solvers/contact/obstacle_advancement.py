@@ -73,20 +73,20 @@ def _find_clear_positions(problem: StepProblem, energies: Sequence[BarrierEnergy
     ends += [q for energy in energies for q in energy.comoving_positions(p)]
     for _ in range(_MAX_ROUNDS):
         most, along = 0.0, np.zeros_like(p)
-        for way in [np.zeros_like(p)] + [(1.0 - part) * (q - problem.step_start.positions) for q in ends[1:]]:
-            way[exact] = 0.0
-            t = min(energy.collision_free_step_size_moving(p, way, part) for energy in energies)
+        for shift in [np.zeros_like(p)] + [(1.0 - part) * (q - problem.step_start.positions) for q in ends[1:]]:
+            shift[exact] = 0.0
+            t = min(energy.collision_free_step_size_moving(p, shift, part) for energy in energies)
             if t > most:
-                most, along = t, way
+                most, along = t, shift
             if t == 1.0:
-                return p + way
+                return p + shift
         p, part = p + _SAFE_FRACTION * most * along, part + _SAFE_FRACTION * most * (1.0 - part)
         waiting = [energy.at_fraction(part) for energy in energies]
         for _ in range(_PUSHES_PER_ROUND):
             p = _push_out(problem, waiting, p)
     raise NoClearance(
-        f"obstacles leave no room: what is in their way could be moved out of it for {part:.3g} of the step's length; "
-        "reduce their motion per step, or use a smaller step size"
+        f"obstacles leave no room: the vertices in their path could be moved out of it for {part:.3g} of the step's "
+        "length; reduce their motion per step, or use a smaller step size"
     )
 
 
@@ -103,6 +103,6 @@ def _push_out(problem: StepProblem, energies: Sequence[BarrierEnergy], p: Positi
         blocks.add_blocks(places, curvature)
     diagonal = np.maximum(system.inertia_diagonal, 1e-9 * float(curvature.max(initial=0.0)) or 1.0)
     curvature += diagonal[:, None, None] * np.eye(3)
-    way = np.asarray(-0.5 * np.linalg.solve(curvature, gradient[:, :, None])[:, :, 0], np.float64)
-    way[system.pins.vertices[system.pins.exact_mask]] = 0.0
-    return p + max_step_size(energies, p, way) * way
+    shift = np.asarray(-0.5 * np.linalg.solve(curvature, gradient[:, :, None])[:, :, 0], np.float64)
+    shift[system.pins.vertices[system.pins.exact_mask]] = 0.0
+    return p + max_step_size(energies, p, shift) * shift

@@ -2,7 +2,7 @@
 
     b_v = gamma min(reach, gaps of all pairs of a point and a triangle or of two edges that v belongs to)
 
-With gamma < 1/2 no two vertices of a pair close its gap, whichever way they move by up to b_v: the points of a
+With gamma < 1/2 no two vertices of a pair close its gap, in whichever direction they move by up to b_v: the points of a
 triangle or an edge move by no more than one of its vertices. Source: Chen et al. 2025, "Offset geometric contact", ACM
 TOG 44(4). There a contact counts once, whatever the number of primitives around its features; barriers count all.
 """

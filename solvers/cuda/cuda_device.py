@@ -17,7 +17,9 @@ from springbench.solvers.iteration.device_interface import SIMULATOR_NAME, is_de
 from springbench.solvers.linalg.memory import format_bytes
 from springbench.solvers.model.step_problem import Unsupported
 
-INSTALL_HINT = "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs beside NVIDIA's driver"
+INSTALL_HINT = (
+    "`.venv/bin/pip install -e '.[cuda]'` in the checkout installs what it needs in addition to NVIDIA's driver"
+)
 _REPORTED_PACKAGES = "numba-cuda", "cuda-bindings", "cuda-core", "cuda-toolkit", "nvidia-ml-py"
 _DRIVER_MODULES = ("cudadrv", "cuda.bindings", "cuda.core")
 """Parts of the names of modules that raise driver errors."""
@@ -42,7 +44,7 @@ def require_device(solver: str) -> Any:
     if is_simulated():
         return import_module("numba.cuda")
     if is_device_lost():
-        raise Unsupported(f"{solver}: this process has lost its device; start it anew")
+        raise Unsupported(f"{solver}: this process has lost its device; restart it")
     try:
         version("numba-cuda")
     except PackageNotFoundError as error:
@@ -52,7 +54,9 @@ def require_device(solver: str) -> Any:
     try:
         cuda = import_module("numba.cuda")
         cuda.current_context()
-    except Exception as error:  # without a driver, without a device, with one that another holds: each has its own
+    except (
+        Exception
+    ) as error:  # without a driver, without a device, with one that another process locks: each has its own
         why = " ".join(str(error).split()).rstrip(":. ")
         raise Unsupported(f"{solver}: there is no CUDA device ({why}); {INSTALL_HINT}") from error
     return cuda
@@ -107,9 +111,9 @@ def read_device_state() -> dict[str, float | None]:
     found: dict[str, float | None] = dict.fromkeys(_NVML_QUERIES)
     with _open_nvml() as nvml, suppress(Exception):  # the library, its driver or the permission may be missing
         handle = _nvml_handle(nvml, import_module("numba.cuda").get_current_device())
-        for name, ask in _NVML_QUERIES.items():
+        for name, query in _NVML_QUERIES.items():
             with suppress(Exception):  # not every device reports all values
-                found[name] = float(ask(nvml, handle))
+                found[name] = float(query(nvml, handle))
     return found
 
 

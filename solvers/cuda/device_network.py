@@ -143,9 +143,9 @@ class DeviceNetwork:
         axis = np.concatenate(
             [parts.springs_and_forms.rest_direction, *(e.direction for e in dashpots), none.reshape(0, 3)]
         )
-        hold = system.inertia_diagonal + parts.vertex_weight
+        diagonal = system.inertia_diagonal + parts.vertex_weight
         _, pinned, weight = system.penalty_pins
-        hold[pinned] += weight
+        diagonal[pinned] += weight
         free = len(system.free_vertices)
         return cls(
             system,
@@ -157,7 +157,7 @@ class DeviceNetwork:
             stiffness,
             rest,
             axis,
-            hold[free_order],
+            diagonal[free_order],
         )
 
     @property
@@ -191,6 +191,6 @@ def require_known_energies(solver: str, system: System) -> None:
     unknown = {*there, *parts.unsupported_energies, *(type(e).__name__ for e in parts.strain_limits)}
     if unknown:
         raise Unsupported(
-            f"{solver}, device: cuda: its kernels know springs, bending, attachments, linear drag and dashpots; not "
+            f"{solver}, device: cuda: its kernels support springs, bending, attachments, linear drag and dashpots; not "
             f"{', '.join(sorted(unknown))}; take device: cpu"
         )

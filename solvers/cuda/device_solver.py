@@ -172,7 +172,7 @@ class DeviceSolver(IterativeSolver):
             return super().solve(problem, stop)
 
     def release_state(self, run: SolverState) -> None:
-        """Keep the state of a solve that has ended for the next one."""
+        """Store the state of a solve that has ended for the next one."""
         assert isinstance(run, DeviceSolverState)
         self._finished_states.append(run)
 

@@ -46,9 +46,9 @@ import newton
 import numpy as np
 net = np.load("{name}.npz")  # the network, and where springbench's run of Newton ended
 builder = newton.ModelBuilder(gravity=(0.0, 0.0, 0.0))
-held = set(net["pinned"].tolist())
+pinned = set(net["pinned"].tolist())
 for i, (p, v, m) in enumerate(zip(net["positions"], net["velocities"], net["mass"])):
-    builder.add_particle(p, 0.0 * v if i in held else v, 0.0 if i in held else m, radius=0.0)
+    builder.add_particle(p, 0.0 * v if i in pinned else v, 0.0 if i in pinned else m, radius=0.0)
 for (i, j), k in zip(net["ends"].tolist(), net["stiffness"]):
     builder.add_spring(i, j, k, 0.0, control=0.0)
 builder.spring_rest_length = net["rest_length"].tolist()

@@ -36,9 +36,9 @@ control.setValueUInt(pbd.TimeStepController.NUM_SUB_STEPS, {substeps})
 control.setValueUInt(pbd.TimeStepController.MAX_ITERATIONS, {iterations})
 control.setValueUInt(pbd.TimeStepController.MAX_ITERATIONS_V, 0)
 control.setValueInt(pbd.TimeStepController.VELOCITY_UPDATE_METHOD, pbd.TimeStepController.ENUM_VUPDATE_FIRST_ORDER)
-particles, held = model.getParticles(), set(net["pinned"].tolist())
+particles, pinned = model.getParticles(), set(net["pinned"].tolist())
 for i, (p, v, m) in enumerate(zip(net["positions"], net["velocities"], net["mass"])):
-    particles.addVertex(p), particles.setMass(i, 0.0 if i in held else m), particles.setVelocity(i, v)
+    particles.addVertex(p), particles.setMass(i, 0.0 if i in pinned else m), particles.setVelocity(i, v)
 for (i, j), k, r in zip(net["ends"].tolist(), net["stiffness"], net["rest_length"]):
     model.addDistanceConstraint_XPBD(i, j, k)
     model.getConstraints()[-1].restLength = r
@@ -118,8 +118,8 @@ PYPBD_GRAVITY = (0.0, -9.81, 0.0)
 def _require_gravity(network: EngineNetwork, problem: StepProblem) -> None:
     found = network.uniform_acceleration(problem.external_force)
     if found is None or not np.allclose(found, PYPBD_GRAVITY, rtol=0.0, atol=1e-9):
-        came = "loads of another kind" if found is None else f"({', '.join(f'{x:g}' for x in found)}) m/s²"
-        raise Unsupported(f"pypbd: has gravity of 9.81 m/s² along -y and no other force; the scene has {came}")
+        found_loads = "loads of another kind" if found is None else f"({', '.join(f'{x:g}' for x in found)}) m/s²"
+        raise Unsupported(f"pypbd: has gravity of 9.81 m/s² along -y and no other force; the scene has {found_loads}")
 
 
 def _limit_openmp_threads() -> None:

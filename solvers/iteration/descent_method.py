@@ -223,11 +223,11 @@ class ResidualMetric:
     def correction_norm(self, e: Positions, gradient: Positions) -> float:
         """Return that residual for e = Q^-1 g, which is overwritten."""
         if not self._has_penalty_pins:  # then |Q^-1 g|_Q is what g does along it
-            return max(inner_product(e, gradient), 0.0) ** 0.5  # in this order, which keeps NaN
+            return max(inner_product(e, gradient), 0.0) ** 0.5  # in this order, so that NaN remains
         e[self.system.pins.vertices] = 0.0
         product = np.empty_like(e)
         self._multiply_matrix.call(self._Q.indptr, self._Q.indices, self._Q.data, e, product)
-        return sqrt(max(inner_product(e, product), 0.0))  # in this order, which keeps NaN
+        return sqrt(max(inner_product(e, product), 0.0))  # in this order, so that NaN remains
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ initial guess to q is free of collisions: there the gradient and the Hessian of 
 a step replaces those of all iterates. Otherwise, and if a barrier acts at the initial guess, the method with contact
 solves the step from the initial guess.
 
-The k-th iterate is that of the method without contact where its certificate holds, else that of the method with
+The k-th iterate is that of the method without contact where its certificate is valid, else that of the method with
 contact. It depends on the problem alone.
 """
 

@@ -159,7 +159,7 @@ class IterativeSolver(ABC):
         Without a tolerance only the last residual is computed.
         """
         run = self._initial_state(problem)
-        limits, yardstick, close = iteration_limit(stop.max_iterations), float("nan"), False
+        limits, initial_residual, close = iteration_limit(stop.max_iterations), float("nan"), False
         if (stop.rtol is not None or stop.atol > 0.0) and self.residual_iterate != "none":
             near, limit = (
                 _ROUNDOFF_CHECK_FRACTION * self.residual_scale(problem) if stop.roundoff_floor > 0.0 else 0.0,
@@ -167,8 +167,8 @@ class IterativeSolver(ABC):
             )
             if stop.rtol is not None:
                 known = run.compute_start_residual() if problem.initial_guess is problem.current_positions else None
-                yardstick = self.residual_at(problem, problem.current_positions) if known is None else known
-                limit, close = max(limit, stop.rtol * yardstick), stop.rtol <= _MINIMUM_CHECK_RTOL
+                initial_residual = self.residual_at(problem, problem.current_positions) if known is None else known
+                limit, close = max(limit, stop.rtol * initial_residual), stop.rtol <= _MINIMUM_CHECK_RTOL
             limits = LoopLimits(stop.max_iterations, limit, near, iteration_loop.RESIDUAL_EACH)
         count, residual, ended = self._iterate_to_roundoff(run, problem, limits, stop.roundoff_floor)
         while close and _has_converged(ended) and not run.can_terminate():
@@ -194,7 +194,7 @@ class IterativeSolver(ABC):
             run.positions,
             count,
             residual,
-            yardstick,
+            initial_residual,
             reason,
             run.velocity,
             self.residual_iterate,
@@ -214,7 +214,7 @@ class IterativeSolver(ABC):
         if self.identifies_saddles or self.residual_iterate == "none" or system.length_constraints:
             return None
         if not self._saddle_checks or self._saddle_checks[0].system is not system:
-            from springbench.solvers.iteration.saddle_check import SaddleCheck  # for those who need it
+            from springbench.solvers.iteration.saddle_check import SaddleCheck  # imported where it is used
             from springbench.solvers.objective.fixed_objective import FixedObjective
 
             self._saddle_checks[:] = [SaddleCheck(FixedObjective(system))]

@@ -56,6 +56,6 @@ def require_implicit_euler(system: System, solver: str) -> None:
     """Raise Unsupported if the step is that of another integrator."""
     if system.inertia_factor != 1.0:
         raise Unsupported(
-            f"{solver}: divides the step by itself and keeps its own velocity, which takes the place of an integrator; "
+            f"{solver}: divides the step itself and has its own velocity, which takes the place of an integrator; "
             "use the integrator implicit-euler"
         )

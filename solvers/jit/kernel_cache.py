@@ -102,7 +102,7 @@ class KernelCache(_NUMBA_CACHE):
         path = self._entry_path(key)
         try:
             there, compiled = pickle.loads(path.read_bytes())
-        except Exception:  # nothing is there, or what is there cannot be read: it is compiled and written anew
+        except Exception:  # nothing is there, or what is there cannot be read: it is compiled and written again
             return None
         with suppress(OSError):
             os.utime(path.parent)
@@ -221,7 +221,7 @@ def _lock_entry(path: Path) -> Generator[None]:
         yield
     finally:
         with suppress(OSError):
-            lock_path.unlink()  # who waits for it looks for the code first
+            lock_path.unlink()  # a process that waits for the lock looks for the code first
         os.close(lock)
 
 

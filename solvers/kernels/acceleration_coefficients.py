@@ -136,9 +136,9 @@ def _estimate_radius(now):
         now.spectral_radius, now.polynomial_degree = min(ratio, _MAX_SPECTRAL_RADIUS), 0
         return
     distance = np.arccosh((2.0 - now.spectral_radius) / now.spectral_radius)
-    promised = 1.0 / np.cosh(now.polynomial_degree * distance)
-    if ratio > promised**_RESTART_EXPONENT and ratio > promised:
-        wide = np.cosh(np.arccosh(max(1.0, ratio / promised)) / now.polynomial_degree)
+    predicted = 1.0 / np.cosh(now.polynomial_degree * distance)
+    if ratio > predicted**_RESTART_EXPONENT and ratio > predicted:
+        wide = np.cosh(np.arccosh(max(1.0, ratio / predicted)) / now.polynomial_degree)
         now.spectral_radius, now.polynomial_degree = (
             min(0.5 * now.spectral_radius * (1.0 + wide), _MAX_SPECTRAL_RADIUS),
             0,

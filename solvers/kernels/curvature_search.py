@@ -40,7 +40,7 @@ class CurvatureScratch(NamedTuple):
         inverse_blocks: packed 3 x 3 blocks of the preconditioner (n, 6) [m/N], zero for fixed vertices.
         absolute_stiffness: sum of the absolute terms of the diagonal (n,) [N/m].
         start: right-hand side b (n, 3), not overwritten.
-        residual, direction, product: (n, 3); the direction is the one found, the product also holds z.
+        residual, direction, product: (n, 3); the direction is the one found, the product also contains z.
     """
 
     inverse_blocks: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Rounds of a first-order method, and the rule that ends them when Newton's method promises more.
+"""Rounds of a first-order method, and the rule that ends them when Newton's method is predicted to gain more.
 
     q = D_k / D_(k-1),   remaining decrease = q D_k + q^2 D_k + ... = D_k q / (1 - q)
     switch if that per cost of a Newton step exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of a Newton step
@@ -7,7 +7,7 @@
 D_k is the decrease of the objective in the k-th group of rounds, and r_k the residual after it: no switch pays if the
 rounds reach the limit of the residual within the cost of one Newton step. Costs are counted in groups, from the numbers
 of entries and operations, and not measured by a clock: equal solves then make equal decisions. Once a Newton step has
-been measured, its decrease per cost replaces the promise.
+been measured, its decrease per cost replaces the prediction.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from springbench.solvers.kernels.iteration_loop import (
 )
 
 REASON_SWITCH = 4
-"""The termination reason of rounds after which another method promises more."""
+"""The termination reason of rounds after which another method is predicted to gain more."""
 
 GROUP_ITERATIONS = 10
 """Iterations of a group of rounds, whose decrease is measured."""
@@ -48,7 +48,7 @@ ROUND_STATE_DTYPE = np.dtype(
         ("group_residual", np.float64),  # residual before the group [J^(1/2)]; 0: not known
         ("gain", np.float64),  # decrease in the last group [J]; infinite before the first
         ("rival_gain", np.float64),  # decrease of the other methods per cost of a group [J]; 0: not measured
-        ("trial_iteration", np.float64),  # iterations from which on a promise counts
+        ("trial_iteration", np.float64),  # iterations from which on a prediction counts
         ("newton_cost", np.float64),  # cost of a Newton step in groups
     ]
 )
@@ -70,7 +70,7 @@ def round_size(num_iterations):
 
 @register_jitable(**jit_inner_options)
 def _judge_round(now, decrease, residual, residual_limit):
-    """Return SWITCH if another method promises more, else ITERATIONS."""
+    """Return SWITCH if another method is predicted to gain more, else ITERATIONS."""
     if now.num_iterations == PROBE_ITERATIONS and residual > _FAST_RESIDUAL_RATIO * now.initial_residual:
         now.is_unsuited = 1
         return REASON_SWITCH
@@ -85,8 +85,8 @@ def _judge_round(now, decrease, residual, residual_limit):
             return REASON_ITERATIONS
     if gain <= 0.0 or gain < now.rival_gain:
         return REASON_SWITCH
-    promises = now.num_iterations >= now.trial_iteration and now.newton_cost * (before - gain) < before
-    return REASON_SWITCH if promises else REASON_ITERATIONS
+    gains_more = now.num_iterations >= now.trial_iteration and now.newton_cost * (before - gain) < before
+    return REASON_SWITCH if gains_more else REASON_ITERATIONS
 
 
 def build_rounds(

@@ -328,7 +328,7 @@ def edge_energy_change(edges, entry, lane, v, d):
     before, after = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), np.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
     one, other = _limit_excess(edges, at, before), _limit_excess(edges, at, after)
     longer = other - one
-    if one * other > 0.0:  # the same limit: the difference of the lengths, which keeps its digits
+    if one * other > 0.0:  # the same limit: the difference of the lengths, which loses no digits
         longer = (d[0] * (v[0] + t0) + d[1] * (v[1] + t1) + d[2] * (v[2] + t2)) / (before + after)
     m0, m1, m2, stretch = _dashpot_at(edges, entry, lane, v[0], v[1], v[2])
     closer = m0 * d[0] + m1 * d[1] + m2 * d[2]

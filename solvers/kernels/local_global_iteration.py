@@ -13,8 +13,8 @@ all sums is independent of the number of threads. The threads are started once p
 waking a thread takes longer than an iteration.
 
 A vector has rows of four numbers: the slots of `Supernodal`, the groups' copies of the top, the vertices that do not
-move, and two padding rows of the packets. With `p` None it holds positions, and a solve gives the next ones. Otherwise
-it holds corrections of the positions p (n rows in float64), which may have a lower precision.
+move, and two padding rows of the packets. With `p` None it contains positions, and a solve gives the next ones.
+Otherwise it contains corrections of the positions p (n rows in float64), which may have a lower precision.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class IterationPlan(NamedTuple):
     row_shift: int
 
 
-# These take slices: then the compiler knows that a loop starts at no negative index, and vectorises it.
+# These take slices: then a loop provably starts at no negative index, and is vectorised.
 @jit_inner
 def _fill_zero(a):
     for i in range(len(a)):

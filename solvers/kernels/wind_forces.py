@@ -109,8 +109,8 @@ def compute_triangle_wind(p, v, triangles, air, limit, coefficients, forces, out
         f0 = pressure * (drag * u0 + lift * (n0 - along * u0))
         f1 = pressure * (drag * u1 + lift * (n1 - along * u1))
         f2 = pressure * (drag * u2 + lift * (n2 - along * u2))
-        most, wanted = limit[e] * speed, np.sqrt(f0 * f0 + f1 * f1 + f2 * f2)
-        share = most / wanted if wanted > most else 1.0
+        most, expected = limit[e] * speed, np.sqrt(f0 * f0 + f1 * f1 + f2 * f2)
+        share = most / expected if expected > most else 1.0
         forces[e, 0], forces[e, 1], forces[e, 2] = f0 * share / 3.0, f1 * share / 3.0, f2 * share / 3.0
     for corner in range(3):
         for e in range(len(triangles)):

@@ -75,7 +75,7 @@ class DenseInverse:
         multiply(self.inverse_matrix, self._columns, b, out)
 
 
-# Reordering of sums permits vectorisation; NaN and infinity keep their meaning.
+# Reordering of sums permits vectorisation; NaN and infinity are still respected.
 @cached_njit(fastmath={"contract", "reassoc", "nsz"})
 def multiply_dense(inverse, columns, b, out):
     """Compute out = inverse b.

@@ -165,9 +165,9 @@ def select_solver(
     n = len(Q.indptr) - 1
     room = compute_memory_limit() if memory_limit is None else memory_limit
     if linear == "cholespy":
-        return SolverChoice(linear, "as asked; its factor is not estimated beforehand")
+        return SolverChoice(linear, "as requested; its factor is not estimated beforehand")
     if linear == "inverse" or (linear == "auto" and n <= MAX_DENSE_VERTICES):
-        why = "as asked" if linear == "inverse" else f"{n} vertices, at most {MAX_DENSE_VERTICES}"
+        why = "as requested" if linear == "inverse" else f"{n} vertices, at most {MAX_DENSE_VERTICES}"
         return (
             SolverChoice("inverse", why)
             if _fits_in_memory(_estimate_inverse_cost(n), room)
@@ -175,13 +175,13 @@ def select_solver(
         )
     iterative = _estimate_cg_cost(Q)
     if linear == "cg":
-        found = SolverChoice("cg", f"as asked; {iterative.description}")
+        found = SolverChoice("cg", f"as requested; {iterative.description}")
         return found if _fits_in_memory(iterative, room) else _raise_out_of_memory(room, {"cg": iterative})
     pointers, neighbours = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32)
     symbolic = analyse_graph(pointers, neighbours)
     direct = estimate_supernodal_cost(symbolic, precision)
     if linear == "supernodal":
-        found = SolverChoice("supernodal", f"as asked; {direct.description}", symbolic)
+        found = SolverChoice("supernodal", f"as requested; {direct.description}", symbolic)
         return (
             found
             if _fits_in_memory(direct, room)

@@ -42,7 +42,7 @@ class DirichletPins:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LengthConstraints:
-    """Length constraints that hold exactly, from springs and strain limits of infinite stiffness.
+    """Length constraints that are satisfied exactly, from springs and strain limits of infinite stiffness.
 
     Attributes:
         edges: (m, 2).
@@ -120,7 +120,7 @@ class System:
         inertia_factor: the integrator's c.
         velocity_factor: the integrator's ratio of the velocity to the change of the stage, in units of 1/dt; None for
             sqrt(c).
-        length_constraints: length constraints that hold exactly.
+        length_constraints: length constraints that are satisfied exactly.
     """
 
     mass: NDArray[np.float64]

@@ -169,7 +169,7 @@ def require_determined_positions(system: System, Q: scipy.sparse.csr_array) -> N
 def energy_norm(Q: FloatArray | scipy.sparse.csr_array, e: FloatArray) -> float:
     """Return the energy norm |e|_Q = sqrt(tr(e'Qe)) [J^(1/2)] of a displacement (n, 3) [m]."""
     # If stiffness exceeds inertia by all digits of float64, round-off can make a sum of zero negative.
-    return sqrt(max(float(np.einsum("ij,ij->", e, Q @ e)), 0.0))  # in this order, which keeps NaN
+    return sqrt(max(float(np.einsum("ij,ij->", e, Q @ e)), 0.0))  # in this order, so that NaN remains
 
 
 def diagonal_matrix(values: FloatArray) -> scipy.sparse.csr_array:

@@ -92,7 +92,7 @@ class FixedObjective:
 
     def _classify_energies(self, energies: dict[int, Energy]) -> None:
         """Classify the energies that are not springs."""
-        from springbench.solvers.model.energies.quadratic_energy import Quadratic  # for those who need it
+        from springbench.solvers.model.energies.quadratic_energy import Quadratic  # imported where it is used
 
         quadratic = {k: e for k, e in energies.items() if isinstance(e, Quadratic)}
         if quadratic:
@@ -125,7 +125,7 @@ class FixedObjective:
         It is empty if there are none.
         """
         names = sorted({type(self.system.energies[k]).__name__ for k in self.other_energy_indices})
-        return f"; each iteration goes through Python for {', '.join(names)}" if names else ""
+        return f"; each iteration runs Python for {', '.join(names)}" if names else ""
 
     @cached_property
     def hessian_matrix(self) -> BlockMatrix:
@@ -140,7 +140,7 @@ class FixedObjective:
         ends = [self.springs.edges, *(vertex_pairs(elements.vertices) for elements in known)]
         if self.quadratic_form is not None:
             ends.append(self.quadratic_form.pairs)
-        i, j = np.concatenate(ends).T  # what has no stiffness, or cancels, keeps its places
+        i, j = np.concatenate(ends).T  # entries without stiffness, or that cancel, remain in the pattern
         return self._build_matrix(free, self.free_index[i], self.free_index[j])
 
     @cached_property

@@ -162,7 +162,7 @@ def _parse_plugin_name(name: str, folder: Path) -> PluginName:
     place, _, attribute = name.rpartition(":")
     if not attribute.isidentifier():
         raise InvalidPluginName(
-            f"got {name!r}; expected `module:Name`, or `./file.py:Name` for a file beside the config"
+            f"got {name!r}; expected `module:Name`, or `./file.py:Name` for a file next to the config"
         )
     if not place.endswith(".py") and "/" not in place:
         if not all(part.isidentifier() for part in place.split(".")):
@@ -174,10 +174,10 @@ def _parse_plugin_name(name: str, folder: Path) -> PluginName:
     path = Path(os.path.normpath(home / place))
     if not path.is_relative_to(home) or path.resolve() != path:
         raise InvalidPluginName(
-            f"{place} leaves the config's folder, itself or by a link; copy the file beside the config"
+            f"{place} leaves the config's folder, itself or by a link; copy the file next to the config"
         )
     if not path.is_file() or path.suffix != ".py":
-        raise InvalidPluginName(f"there is no file {place} of Python beside the config")
+        raise InvalidPluginName(f"there is no file {place} of Python next to the config")
     return PluginName(name, f"{path}:{attribute}", place, source_digest.digest_sources([path])[:12], str(path))
 
 
@@ -187,7 +187,7 @@ def _plugin_of_module(name: str, target: str, distribution_version: str | None) 
     source = find_module_source(module)
     if source is None:
         raise InvalidPluginName(
-            f"{name!r} names the module {module}, which Python does not find; install it beside springbench"
+            f"{name!r} names the module {module}, which Python does not find; install it next to springbench"
         )
     if distribution_version is None:
         owners = packages_distributions().get(module.partition(".")[0], [])

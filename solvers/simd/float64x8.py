@@ -50,7 +50,7 @@ class _Mask8Model(models.PrimitiveModel):
 
 
 @lower_cast(types.Float, FLOAT64X8)
-def _broadcast_scalar(context: Any, builder: Any, kind: Any, wanted: Any, value: Any) -> Any:
+def _broadcast_scalar(context: Any, builder: Any, kind: Any, expected: Any, value: Any) -> Any:
     return PacketBuilder(context, builder).broadcast_scalar(context.cast(builder, value, kind, types.float64), LANES)
 
 

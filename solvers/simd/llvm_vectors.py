@@ -131,4 +131,4 @@ def _prefetch_entry_code(typingctx: Any, array: Any, place: Any) -> Any:
 
 prefetch_entry: Any = intrinsic(
     _prefetch_entry_code
-)  # Numba passes the first argument itself, which type checkers do not know
+)  # Numba passes the first argument itself, which no type checker sees

@@ -37,4 +37,4 @@ def _sparse_row_product_code(typingctx: Any, values: Any, columns: Any, begin: A
 
 sparse_row_product: Any = intrinsic(
     _sparse_row_product_code
-)  # Numba passes the first argument itself, which type checkers do not know
+)  # Numba passes the first argument itself, which no type checker sees

@@ -80,4 +80,4 @@ def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any
 
 spring_energy_and_descent: Any = intrinsic(
     _spring_gradient_code
-)  # Numba passes the first argument itself, which type checkers do not know
+)  # Numba passes the first argument itself, which no type checker sees

@@ -26,6 +26,15 @@ DIALECT = _split_words(
     "shelf blame foresee oracle opinion grip peers goals"
 )
 """Words that stand for terms of the field; none is part of a public name or opens a docstring."""
+TEXT_DIALECT = DIALECT | _split_words(
+    "ask asked holds keeps knows promise promises promised came wanted everybody anybody"
+)
+"""Words that are in no text of the product: messages, help, labels, docstrings and comments. A file contains or states,
+a method supports or reaches, a user requests, a condition is satisfied, and results remain."""
+ALLOWED_TEXTS = {
+    "wanted": "name of a lock file, which other versions of the program on the machine lock as well",
+}
+"""Texts with such a word, and why."""
 
 SYMBOLS = _split_words(
     "solve step prepare residual iterates value gradient hessian stats description title order close main run "
@@ -82,10 +91,25 @@ def find_definitions(tree: ast.Module, file: str) -> Iterator[Definition]:
                 pending.append(node)
 
 
+class ParsedSource(NamedTuple):
+    """A file of the product: its text, and its tree."""
+
+    path: Path
+    text: str
+    tree: ast.Module
+
+
+@cache
+def parse_sources() -> list[ParsedSource]:
+    """Parse all files of the product, once."""
+    texts = ((path, path.read_text()) for path in FILES)
+    return [ParsedSource(path, text, ast.parse(text)) for path, text in texts]
+
+
 @cache
 def list_public_definitions() -> list[Definition]:
     """Return all definitions whose names do not begin with an underscore."""
-    found = (find_definitions(ast.parse(path.read_text()), path.relative_to(ROOT).as_posix()) for path in FILES)
+    found = (find_definitions(one.tree, one.path.relative_to(ROOT).as_posix()) for one in parse_sources())
     return [one for definitions in found for one in definitions if not one.name.startswith("_")]
 
 
@@ -96,6 +120,41 @@ def test_no_public_name_uses_a_word_of_the_dialect() -> None:
 def test_no_docstring_begins_with_a_word_of_the_dialect() -> None:
     first_lines = ((one, one.docstring.partition("\n")[0].lower()) for one in list_public_definitions())
     assert not {f"{one.file}: {line}" for one, line in first_lines if DIALECT & set(re.findall(r"\w+", line))}
+
+
+def find_texts(tree: ast.Module, source: str) -> Iterator[tuple[int, str]]:
+    """Yield the line and the text of each string, docstring and comment; of an f-string without its expressions."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.lineno, node.value
+    for number, line in enumerate(source.splitlines(), 1):
+        if "#" in line:
+            yield number, line.partition("#")[2]
+
+
+def find_dialect(tree: ast.Module, source: str) -> set[str]:
+    """Return the words of the dialect in the texts of a file, as `line: word`; words within a name are none."""
+    texts = ((line, text) for line, text in find_texts(tree, source) if text not in ALLOWED_TEXTS)
+    return {
+        f"{line}: {word}" for line, text in texts for word in TEXT_DIALECT & set(re.findall(r"[a-z_]+", text.lower()))
+    }
+
+
+@pytest.mark.parametrize("package", ["harness", "solvers"])
+def test_no_text_of_the_product_uses_a_word_of_the_dialect(package: str) -> None:
+    files = [one for one in parse_sources() if one.path.is_relative_to(ROOT / package)]
+    found = {f"{one.path.relative_to(ROOT)}:{at}" for one in files for at in find_dialect(one.tree, one.text)}
+    assert not found
+
+
+def test_each_allowed_text_is_still_there() -> None:
+    texts = {text for one in parse_sources() for _, text in find_texts(one.tree, one.text)}
+    assert set(ALLOWED_TEXTS) <= texts
+
+
+def test_words_of_the_dialect_are_found_in_every_kind_of_text() -> None:
+    source = '''"""What holds."""\nkept = f"{kept} came, {1}"  # nobody asks\nX = "kept_pairs"\n"""It keeps."""\n'''
+    assert find_dialect(ast.parse(source), source) == {"1: holds", "2: came", "2: asks", "2: nobody", "4: keeps"}
 
 
 def test_public_names_have_two_words_or_a_reason() -> None:

@@ -83,7 +83,7 @@ def scene(name: str, **changed: float) -> SceneSpec:
 def flag(stiffness: float | None = None) -> SceneSpec:
     """The assignment's flag; with a stiffness [N/m] of its springs it weighs what its mass does."""
     if not FLAG.exists():
-        pytest.skip("the assignment's scenes lie in a folder `shared` beside the repository, which is not there")
+        pytest.skip("the assignment's scenes lie in a folder `shared` next to the repository, which is not there")
     spec = load_scene(FLAG)
     if stiffness is None:
         return spec
@@ -134,7 +134,7 @@ def step_gates(
         assert enough, f"the hybrid does not come to an error of {error:g}"
         return solved("hybrid", scored, done)
 
-    def yardstick(backend: str) -> Work:
+    def baseline(backend: str) -> Work:
         scored = step()
         done = iterations or reached("numba", scored, error, ITERATIONS[backend])[0]  # both make the same iterates
         return solved(backend, scored, done)
@@ -143,7 +143,7 @@ def step_gates(
         yield Gate(
             name=f"accuracy-{name}-{error:g}-{backend}",
             candidate=candidate,
-            yardstick=lambda backend=backend: yardstick(backend),
+            baseline=lambda backend=backend: baseline(backend),
             limit=limit,
             why=f"a goal: the hybrid to {error:g} beside {iterations or 'as good'} iterations of {backend}",
             **_GOAL,
@@ -188,7 +188,7 @@ def trajectory_gates(name: str, error: float, best: Way, **limits: float) -> Ite
         assert wrong(best) <= error, f"{best} errs by more than {error:g}"
         return simulated(name, best)
 
-    def yardstick(backend: str) -> Work:
+    def baseline(backend: str) -> Work:
         # 30 steps a second and on, a fifth more each time; half of them are whole numbers, for half a second.
         euler = (Way("numba", STOP, "implicit-euler", 2 * round(15 * 1.2**k)) for k in count())
         way = next(way for way in euler if way.steps >= STEPS or wrong(way) <= error)
@@ -198,15 +198,15 @@ def trajectory_gates(name: str, error: float, best: Way, **limits: float) -> Ite
         yield Gate(
             name=f"accuracy-{name}-trajectory-{error:g}-{backend}",
             candidate=candidate,
-            yardstick=lambda backend=backend: yardstick(backend),
+            baseline=lambda backend=backend: baseline(backend),
             limit=limit,
             why=f"a goal: a total error of {error:g} in so much of the time of implicit Euler with {backend}",
             **_GOAL,
         )
 
 
-CLOTH, CURTAIN = scene("yardstick-cloth"), scene("liu2013")
-SOFT = scene("yardstick-cloth", mass=4096.0)
+CLOTH, CURTAIN = scene("baseline-cloth"), scene("liu2013")
+SOFT = scene("baseline-cloth", mass=4096.0)
 
 # Figures of these cloths that are known from elsewhere (after 50 iterations a gap of .77 from the current positions, of
 # .013 from the inertial target) are those of their eleventh step.

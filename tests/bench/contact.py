@@ -38,7 +38,7 @@ CONTACT = (
     Gate(
         name="idle-contact-against-none-64",
         candidate=lambda: fallen(FAR, size=64, frames=10),
-        yardstick=lambda: fallen(size=64, frames=10),
+        baseline=lambda: fallen(size=64, frames=10),
         limit=1.05,
         goal=1.02,
         why="a promise: obstacles that are far away cost one test of a box, at most 2 % of a step; measured 1.01 to "

@@ -41,7 +41,7 @@ Work = Callable[[], Positions]
 class Gate:
     """Two makers of work that must come to the same positions, and how their times may compare.
 
-    limit: of time of the candidate / time of the yardstick, which must hold on every machine; what becomes slower
+    limit: of time of the candidate / time of the baseline, which must hold on every machine; what becomes slower
     below it `springbench regress --baseline` finds; why: where the limit comes from; guards: the exact gates, tests of
     `test_exact.py`, that see on any machine what would make the candidate slow; clock: what time is, cpu or wall;
     goal: what the ratio is to become where it is not yet: the limit then keeps what has been reached; tolerance: the
@@ -52,7 +52,7 @@ class Gate:
 
     name: str
     candidate: Callable[[], Work]
-    yardstick: Callable[[], Work]
+    baseline: Callable[[], Work]
     limit: float
     why: str
     guards: tuple[str, ...]
@@ -169,7 +169,7 @@ GATES = (
         short=True,
         name="numba-against-sparse-64",
         candidate=lambda: simulated("numba", 64, frames=4),
-        yardstick=lambda: simulated("sparse", 64, frames=4),
+        baseline=lambda: simulated("sparse", 64, frames=4),
         tolerance=1e-9,
         limit=0.3,
         guards=("test_matrices_have_as_many_entries_as_stored", "test_a_tolerance_takes_as_many_iterations_as_stored"),
@@ -178,7 +178,7 @@ GATES = (
     Gate(
         name="sparse-against-dense-24",
         candidate=lambda: simulated("sparse", 24, frames=1),
-        yardstick=lambda: simulated("dense", 24, frames=1),
+        baseline=lambda: simulated("dense", 24, frames=1),
         tolerance=1e-9,
         limit=0.1,
         guards=("test_matrices_have_as_many_entries_as_stored", "test_a_tolerance_takes_as_many_iterations_as_stored"),
@@ -190,7 +190,7 @@ GATES = (
         candidate=lambda: projected(
             "numba", 64, repeats=50, linear_solver="cholespy"
         ),  # whose local step can be called
-        yardstick=lambda: projected("sparse", 64, repeats=50),
+        baseline=lambda: projected("sparse", 64, repeats=50),
         tolerance=1e-9,
         limit=0.2,
         guards=("test_a_step_allocates_as_many_arrays_as_stored",),
@@ -200,7 +200,7 @@ GATES = (
         short=True,
         name="harness-against-bare-solver-64",
         candidate=lambda: simulated("numba", 64, frames=20),
-        yardstick=lambda: solved("numba", 64, frames=20),
+        baseline=lambda: solved("numba", 64, frames=20),
         limit=1.1,
         goal=1.02,
         guards=("test_a_step_allocates_as_many_arrays_as_stored",),
@@ -210,7 +210,7 @@ GATES = (
     Gate(
         name="recording-against-simulating-alone-64",
         candidate=lambda: recorded("numba", 64, frames=90),
-        yardstick=lambda: simulated("numba", 64, frames=90),
+        baseline=lambda: simulated("numba", 64, frames=90),
         limit=1.25,
         goal=1.10,
         guards=("test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame",),

@@ -54,7 +54,7 @@ def _gate(against: str, factorise: Callable[[csr_array], LinearSolver], size: in
     return Gate(
         name=f"supernodal-solve-against-{against}-{size}",
         candidate=lambda: solves(SupernodalCholesky, size, repeats),
-        yardstick=lambda: solves(factorise, size, repeats),
+        baseline=lambda: solves(factorise, size, repeats),
         tolerance=1e-9,  # two factorisations, with pin weights of 1e10 among stiffnesses of 1e3
         limit=limit,
         guards=GUARDS,
@@ -67,7 +67,7 @@ def _step_gate(size: int) -> Gate:
     return Gate(
         name=f"supernodal-step-against-cholespy-{size}",
         candidate=lambda: stepped("supernodal", size, max(1, 64**2 // size**2)),
-        yardstick=lambda: stepped("cholespy", size, max(1, 64**2 // size**2)),
+        baseline=lambda: stepped("cholespy", size, max(1, 64**2 // size**2)),
         tolerance=1e-9,  # as above, in positions of a metre
         limit=0.8,
         guards=GUARDS,

@@ -1,4 +1,4 @@
-"""Gates on ratios of times. Without `--benchmark-only` nothing is timed: candidate and yardstick must agree."""
+"""Gates on ratios of times. Without `--benchmark-only` nothing is timed: candidate and baseline must agree."""
 
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
@@ -30,7 +30,7 @@ def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture, paired_benchmar
         extra_info = {key: getattr(gate, key) for key in ("goal", "why", "guards")}
         paired_benchmark(
             candidate,
-            gate.yardstick(),
+            gate.baseline(),
             max_ratio=gate.limit,
             clock=gate.clock,
             agreement_rtol=gate.tolerance,

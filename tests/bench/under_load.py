@@ -32,7 +32,7 @@ ASKED = ("harness-against-bare-solver-64", "numba-against-sparse-64", "idle-cont
 
 def run_gate(gate: Gate, budget: float) -> BenchmarkResult:
     """One benchmark of a gate, as by `paired_benchmark` of the pytest plugin."""
-    candidate, baseline = gate.candidate(), gate.yardstick()
+    candidate, baseline = gate.candidate(), gate.baseline()
     assert gate.tolerance is not None, f"{gate.name}: has no answers to compare"
     require_agreement(candidate(), baseline(), gate.tolerance)
     programs = build_program_pair(candidate, baseline, gate.clock)

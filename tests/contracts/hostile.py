@@ -35,8 +35,8 @@ LONG_LIST = "[" + ", ".join(map(str, range(2, 60))) + "]"
 SCENES: dict[str, tuple[str | bytes, str, int | None]] = {
     "empty file": ("", "is empty", None),
     "comments alone": ("# nothing\n", "is empty", None),
-    "a list": ("- mesh\n- mass\n", "should hold a mapping", 1),
-    "a word": ("mesh\n", "should hold a mapping", 1),
+    "a list": ("- mesh\n- mass\n", "should contain a mapping", 1),
+    "a word": ("mesh\n", "should contain a mapping", 1),
     "no keys of ours": ("colour: red\n", "expected a scene", None),
     "unfinished list": ("mesh: {kind: grid}\nframes: [1,\n", "is not YAML", 3),
     "tab as indent": ("mesh:\n\tkind: grid\n", "is not YAML", 2),

@@ -204,11 +204,11 @@ SCENES: dict[str, tuple[str, str]] = {
     ),
     "pins that go through a ball": (
         scene(effects=f"[{PINNED}, {{kind: contact, obstacles: [{BALL}]}}]"),
-        "pins hold vertex",
+        "pins fix vertex",
     ),
     "a ball that goes through pins": (
         scene(effects=f"[{{kind: pins, parts: [corners]}}, {{kind: contact, obstacles: [{RISING}]}}]"),
-        "pins hold vertex",
+        "pins fix vertex",
     ),
     "a part in Unicode": (scene(effects="[{kind: pins, parts: ['tоp']}]"), "parts"),
     "an index of 1e18": (scene(effects="[{kind: pins, indices: [1000000000000000000]}]"), "indices"),

@@ -106,7 +106,7 @@ MESHES: dict[str, tuple[bytes | str, str]] = {
     ),
     "999999999999999-rows-of-lists.ply": (
         ply(b"\0" * 100, n=999999999999999, vertex="property list uchar int x\n", kind=LITTLE),
-        "promises 999,999,999,999,999 rows of vertex",
+        "declares 999,999,999,999,999 rows of vertex",
     ),
     "10000-properties.ply": (
         ply(SQUARE, vertex=MANY),
@@ -130,7 +130,7 @@ MESHES: dict[str, tuple[bytes | str, str]] = {
     "infinite.stl": (stl((0, 0, 0, 1, 0, 0, float("inf"), 1, 0)), "infinite.stl"),
     "no-area.stl": (stl((0, 0, 0, 1, 0, 0, 2, 0, 0)), "without any size"),
     "all-corners-in-one.stl": (stl((1, 1, 1) * 3), "all-corners-in-one.stl"),
-    "more-than-promised.stl": (stl(*[(0, 0, 0, 1, 0, 0, 0, 1, 0)] * 2, count=1) + b"x" * 7, "more-than-promised.stl"),
+    "more-than-declared.stl": (stl(*[(0, 0, 0, 1, 0, 0, 0, 1, 0)] * 2, count=1) + b"x" * 7, "more-than-declared.stl"),
     "words.stl": (b"solid\nfacet normal a b c\nouter loop\nvertex x y z\nendloop\nendfacet\nendsolid\n", "words.stl"),
     "loop-of-two.stl": (
         b"solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nendloop\nendfacet\nendsolid\n",
@@ -226,14 +226,14 @@ BALL = np.zeros((2, 42, 3))
 ARRAYS: dict[str, tuple[bytes, str]] = {
     "a-bomb.npz": (b"", "at most 100,000,000"),  # made when it is written: see `big`
     "text.npz": (b"positions", "no whole .npz"),
-    "an-archive-of-nothing.npz": (npz(), "holds 0 arrays"),
+    "an-archive-of-nothing.npz": (npz(), "contains 0 arrays"),
     "a-pickle.npz": (npz(positions=np.array([{}], object)), "type object"),
     "a-pickle-alone.npz": (b"\x80\x04}\x94.", "no whole .npz"),
     "of-another-mesh.npz": (npz(positions=BALL[:, :41]), "41 points for a mesh of 42"),
     "of-two-coordinates.npz": (npz(positions=BALL[:, :, :2]), "(frames, points, 3)"),
     "of-no-frames.npz": (npz(positions=BALL[:0]), "(frames, points, 3)"),
     "far.npz": (npz(positions=BALL + 1e300), "up to 1e+12 m"),
-    "a-path-as-a-name.npz": (npz(**{"../../positions": BALL}), "holds 0 arrays"),
+    "a-path-as-a-name.npz": (npz(**{"../../positions": BALL}), "contains 0 arrays"),
     "the-same-twice.npz": (npz(positions=BALL).replace(b"PK\x05\x06", b"PK\x05\x07"), "no whole .npz"),
 }
 NETWORK = "{kind: network, positions: %s, springs: %s}"
@@ -270,8 +270,8 @@ CONFIGS: dict[str, tuple[str | bytes, str]] = {
     "a-pointer.yaml": ("version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS pointer"),
     "a-page.yaml": ("<html></html>", "is a web page"),
     "blanks.yaml": (" \n\n", "is empty"),
-    "a-colon.yaml": (scene(description="a: b"), ":7: is not YAML: the value of `description` holds a colon"),
-    "a-colon-in-braces.yaml": (scene(mesh="{kind: file, path: a: b.obj}"), "the value of `path` holds a colon"),
+    "a-colon.yaml": (scene(description="a: b"), ":7: is not YAML: the value of `description` contains a colon"),
+    "a-colon-in-braces.yaml": (scene(mesh="{kind: file, path: a: b.obj}"), "the value of `path` contains a colon"),
     "colons-for-ever.yaml": ("a: " * 50_000, "colon"),
     "an-at-sign.yaml": (scene(description="@home"), "cannot begin with '@'"),
 }

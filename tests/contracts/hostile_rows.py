@@ -103,7 +103,7 @@ SHOWN: dict[str, tuple[str, Any]] = {
     "a residual of NaN": ("residual", float("nan")),
     "a residual of infinity": ("residual", float("inf")),
     "a residual below zero": ("residual", -1.0),
-    "a yardstick of NaN": ("residual_initial", float("nan")),
+    "an initial residual of NaN": ("residual_initial", float("nan")),
     "an energy of infinity": ("energy_springs", float("inf")),
     "a distance of infinity": ("reference_distance", float("inf")),
     "a word for how it stopped": ("termination_reason", "bored"),

@@ -144,15 +144,15 @@ def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -
     other = scene.parent / "other" / scene.name
     other.write_text(SCENE)
     claim_folder(scene.parent / "results" / f"recommend-{scene.stem}", other)
-    with pytest.raises(InputError, match="holds the results of another file of this name"):
+    with pytest.raises(InputError, match="contains the results of another file of this name"):
         recommend(scene, 0.1)
     assert not measured(scene)
 
 
 def test_an_error_that_no_method_reaches_is_reported_with_the_nearest(scene: Path) -> None:
-    with pytest.raises(RunFailed, match=r"nothing that was measured keeps to an error of 1e-08 .* midpoint") as raised:
+    with pytest.raises(RunFailed, match=r"nothing that was measured reaches an error of 1e-08 .* midpoint") as raised:
         recommend(scene, 1e-8)
-    assert "ask for a larger --error or a shorter --t-end" in str(raised.value)
+    assert "use a larger --error or a shorter --t-end" in str(raised.value)
 
 
 def test_a_search_time_that_is_used_up_is_stated_and_the_search_goes_on_from_there(scene: Path) -> None:

@@ -98,7 +98,7 @@ def test_the_runs_of_damaged_rows_and_recordings_are_done_again(home: Path):
     )
     assert result.exit_code == 0, result.output
     said = " ".join(result.output.split())
-    assert f"{first.name} holds no rows" in said
+    assert f"{first.name} contains no rows" in said
     assert f"{recording.name} is cut before its end" in said
     assert parquet_rows.read_rows([first, second], required_columns=("status",)).num_rows > 0
     assert len(read_replay(recording).frames) == 3
@@ -133,7 +133,7 @@ def test_two_configs_of_one_name_do_not_share_their_results(home: Path):
     (home / "other" / "good.yaml").write_text(scene(frames="3"))
     result = attempt(home, ["run", "--in-process", "other/sweep.yaml"])
     assert result.code == 2
-    assert "holds the results of another file of this name" in result.said
+    assert "contains the results of another file of this name" in result.said
     (home / "sweep.yaml").unlink()  # it was moved
     assert attempt(home, ["run", "--in-process", "other/sweep.yaml"]).code == 0
 

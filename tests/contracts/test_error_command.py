@@ -23,7 +23,7 @@ from springbench.harness.experiments.error_control.stored_trials import (
     build_trial_rows,
     format_problem_id,
     read_stored_trials,
-    select_promising_methods,
+    select_best_predicted,
 )
 from springbench.harness.experiments.error_control.third_party_integrators import THIRD_PARTY_INTEGRATORS
 from springbench.harness.experiments.provenance import build_provenance_columns
@@ -163,15 +163,15 @@ def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, 
     answer = replace(answer, trials=tuple((one, promises[one.method.solver]) for one, _ in answer.trials))
     shared = {"problem_digest": format_problem_id(error_target), "error_requested": 1e-3} | build_provenance_columns()
     parquet_rows.write_rows(
-        tmp_path / "s-2-asked-0.001.parquet",
+        tmp_path / "s-2-error-0.001.parquet",
         [shared | row for row in build_trial_rows(answer, [], 1e-3)],
         ACCURACY_SCHEMA,
     )
 
     found = read_stored_trials(tmp_path, error_target)
-    assert select_promising_methods(found, 4e-3) == (1e-3, few[:2])
-    assert select_promising_methods(found, 2e-2) == (1e-3, [])
-    assert select_promising_methods([], 1e-3)[1] == []
+    assert select_best_predicted(found, 4e-3) == (1e-3, few[:2])
+    assert select_best_predicted(found, 2e-2) == (1e-3, [])
+    assert select_best_predicted([], 1e-3)[1] == []
     again = build_trial_rows(replace(answer, trials=answer.trials[:1]), found, 1e-3)
     assert {row["solver"] for row in again} == set(promises), "what is not tried again is not forgotten"
     assert not read_stored_trials(tmp_path, replace(error_target, num_frames=error_target.num_frames + 1))

@@ -126,7 +126,7 @@ def test_an_error_that_no_method_reaches_is_refused_with_the_nearest(monkeypatch
         "springbench.harness.experiments.error_control.method_search._MethodSearch._find_reference_trial",
         lambda *_: _truth(),
     )
-    with pytest.raises(RunFailed, match=r"no steps keep to an error of 0.01: b came nearest and reached 0\.3"):
+    with pytest.raises(RunFailed, match=r"no step size reaches an error of 0.01: b was nearest with 0\.3"):
         search_cheapest_method(
             ErrorTarget.from_scene(SPRING, 2, 0.2), 1e-2, estimate_growth(SPRING, 2, 0.2), lambda line: None
         )

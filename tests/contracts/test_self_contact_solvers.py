@@ -118,7 +118,7 @@ def test_all_methods_find_the_same_minimum_from_near_it():
     stated = replace(stated, initial_guess=lowest + energy.collision_free_step_size(lowest, away) * away)
     for name in SOON:
         found = prepare(made, solver(name)).solve(stated, StopRule(3000, 1e-7)).positions
-        # |Q^-1 grad g|_Q has fallen to 1e-7 of the yardstick, about 1 J^.5, over the softest curvature of about 1 N/m.
+        # |Q^-1 grad g|_Q has fallen to 1e-7 of the initial one, about 1 J^.5, over a softest curvature of 1 N/m.
         np.testing.assert_allclose(found, lowest, atol=5e-6)
 
 

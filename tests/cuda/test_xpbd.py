@@ -81,5 +81,5 @@ def test_solves_of_one_system_take_turns() -> None:
 
 @methods
 def test_what_it_does_not_know_it_refuses_by_name(method: Callable[..., Any]) -> None:
-    with pytest.raises(Unsupported, match="knows springs only; the scene has Bending"):
+    with pytest.raises(Unsupported, match="supports springs only; the scene has Bending"):
         method(device="cuda").prepare(cloth_with(BENDING_EFFECT).system)

@@ -62,8 +62,8 @@ ARCHIVE = (
     Mutation(
         "names-are-not-verified",
         "harness/experiments/archive/archive_verification.py",
-        "wrong = _find_differences([(row, asked_for) for row in published_run.rows], asked_for)",
-        "wrong = _find_differences([(row, row) for row in published_run.rows], asked_for)",
+        "wrong = _find_differences([(row, requested) for row in published_run.rows], requested)",
+        "wrong = _find_differences([(row, row) for row in published_run.rows], requested)",
         (f"{_PUBLISHED}::test_a_forged_column_does_not_hold",),
     ),
     Mutation(

@@ -84,15 +84,15 @@ _TABLE = (
     (
         "matrix-zeros-uncounted",
         f"{_FOLDER}/matrix_comparison.py",
-        "zeros = int((came.data == 0).sum())",
-        "zeros = int((came.data != 0).sum())",
+        "zeros = int((received.data == 0).sum())",
+        "zeros = int((received.data != 0).sum())",
         _COMPARED,
     ),
     (
         "matrix-of-any-sign",
         f"{_FOLDER}/matrix_comparison.py",
-        "np.abs(_square(came) - _square(expected)).max()",
-        "np.abs(np.abs(_square(came)) - np.abs(_square(expected))).max()",
+        "np.abs(_square(received) - _square(expected)).max()",
+        "np.abs(np.abs(_square(received)) - np.abs(_square(expected))).max()",
         _COMPARED,
     ),
     (

@@ -91,7 +91,7 @@ def test_a_step_that_starts_at_a_saddle_ends_at_a_minimum_below_it(solver: Solve
     assert at_the_bottom(given, p, saddle)
     assert solution.termination_reason != "max-iter"
     assert judge.measure_stationarity(given, p).above_roundoff == 0.0, (
-        "the yardstick is round-off, and so is all that may be left"
+        "the initial residual is round-off, and so is all that may be left"
     )
     assert given.value(p) < given.value(start) - 1e-6 * given.value_scale(start)
 

@@ -255,5 +255,5 @@ def test_the_command_leaves_the_results_of_another_scene_of_this_name_alone(tmp_
     ]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
-    assert "holds the results of another file of this name" in " ".join(result.stderr.split())
+    assert "contains the results of another file of this name" in " ".join(result.stderr.split())
     assert not list(tmp_path.glob("results/cloth/ablation/*"))

@@ -129,7 +129,7 @@ def test_a_solver_in_another_minimum_never_reaches_the_gaps_below_it(tmp_path: P
     [
         pytest.param({"is_certified": False}, "not certified", id="not certified"),
         pytest.param({"objective": None}, "no minimum is known", id="none known"),
-        pytest.param({"objective": made.LOWEST_ENERGY + 0.3}, "went below", id="a solver went below"),
+        pytest.param({"objective": made.LOWEST_ENERGY + 0.3}, "is below", id="a solver's energy is below"),
         pytest.param({}, "", id="certified"),
     ],
 )
@@ -274,12 +274,12 @@ def test_the_summary_is_json_with_a_time_for_each_accuracy(tmp_path: Path) -> No
 def test_every_failure_is_reported_with_its_reason(tmp_path: Path) -> None:
     rows = [
         *made.build_snapshot_rows("net", 10, "early"),
-        made.build_failure_row("net", 10, "early", "dense", "unsupported", "knows springs"),
+        made.build_failure_row("net", 10, "early", "dense", "unsupported", "supports springs"),
     ]
     work = next(made.build_work_rows("net", 10)) | {"status": "time-limit", "reason": "5 s", "error": None}
     found = list_failures(table(tmp_path, [*rows, work]))
     assert [(row["status"], row["reason"]) for row in found] == [
-        ("unsupported", "knows springs"),
+        ("unsupported", "supports springs"),
         ("time-limit", "5 s"),
     ]
 

@@ -71,4 +71,6 @@ def test_differences_that_depend_on_each_other_do_no_harm():
     solution = Anderson(8).prepare(problem.system).solve(problem, StopRule(500, 1e-12))
     assert solution.termination_reason in ("converged", "roundoff")
     begun = np.abs(problem.gradient(problem.current_positions)).max()
-    assert np.abs(problem.gradient(solution.positions)).max() <= 1e-10 * begun  # as asked, by the condition of one row
+    assert (
+        np.abs(problem.gradient(solution.positions)).max() <= 1e-10 * begun
+    )  # as requested, by the condition of one row

@@ -176,7 +176,7 @@ def test_all_mistakes_come_at_once(tmp_path):
         ("", None, "is empty"),
         ('{"obj": "mesh.obj",\n "k": 5,,}', 2, "is no JSON"),
         ("[1, 2]", None, "got a list"),
-        ('{"k": 1, "k": 2}', None, "'k' comes twice"),
+        ('{"k": 1, "k": 2}', None, "'k' occurs twice"),
         ("[" * 100_000, None, "cannot be read as JSON"),
         ('{"k": ' + "1" * 5000 + "}", None, "cannot be read as JSON"),
     ],

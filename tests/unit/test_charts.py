@@ -69,7 +69,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> AccuracyData:
             rows += made.build_curve_rows("net", size, "early", solver, minimum_index=index)
     rows += made.build_snapshot_rows("net", 6, "peak", certified=False)
     rows += made.build_curve_rows("net", 6, "peak", "lbfgs", status="time-limit", reason="the limit of 5 s was reached")
-    rows.append(made.build_failure_row("net", 6, "peak", "dense", "unsupported", "knows springs </script> alone"))
+    rows.append(made.build_failure_row("net", 6, "peak", "dense", "unsupported", "supports springs </script> alone"))
     rows += [*made.build_work_rows("net", 6), *made.build_liu2013_rows()]
     return read_accuracy(made.write_accuracy_rows(tmp_path_factory.mktemp("charts"), rows))
 

@@ -54,7 +54,7 @@ def test_an_energy_that_the_kernels_do_not_know_shows_in_the_choice(solver: Solv
     known, unknown = (solver.prepare(system).description for system in (SYSTEM, foreign(SYSTEM)))
     assert "iterations compiled" in known
     assert "through Python" not in known
-    assert "iterations through Python: the kernels do not know Foreign" in unknown
+    assert "iterations through Python: the kernels do not support Foreign" in unknown
     assert "compiled" not in unknown
 
 

@@ -136,7 +136,7 @@ BAD = {
     "a chain": (ChainMesh().build_mesh(4), "no triangles"),
     "a sheet": (GridMesh().build_mesh(3), "8 edges belong to one triangle only"),
     "a hole": (without(5), "3 edges belong to one triangle only"),
-    "a triangle that faces inwards": (flipped(5), "two triangles go the same way along the edge"),
+    "a triangle that faces inwards": (flipped(5), "two triangles traverse the edge in the same direction,"),
     "no volume": (FLAT, "encloses no volume"),
 }
 

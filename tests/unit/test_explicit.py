@@ -191,7 +191,7 @@ def test_an_error_that_no_step_keeps_ends_with_the_part_of_the_frame_that_was_re
     scene = made(SOFT, GravityEffect(), HELD)
     broken = replace(scene, constant_force=np.full_like(scene.constant_force, np.nan))
     ready = prepared("tsitouras-5", broken)
-    with pytest.raises(RuntimeError, match="was not kept within"):
+    with pytest.raises(RuntimeError, match="was not reached within"):
         run(broken, ready)
 
 

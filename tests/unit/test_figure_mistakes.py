@@ -36,10 +36,10 @@ BAD = {
         "--panels: got shares:right, map:geometry, of which some are curves and some are maps",
         "draw the others as a figure of their own",
     ),
-    "nothing of that kind": (["convergence"], "holds no accuracy rows; run `springbench accuracy CONFIG`", ""),
+    "nothing of that kind": (["convergence"], "contains no accuracy rows; run `springbench accuracy CONFIG`", ""),
     "no ablation": (["ablation"], "expected the rows of `springbench ablate SCENE`", ""),
     "no speed": (["speed"], "expected the rows of `springbench roofline CONFIG`", ""),
-    "no recordings": (["run"], "holds no recordings; run a sweep with `record: true`", ""),
+    "no recordings": (["run"], "contains no recordings; run a sweep with `record: true`", ""),
     "type that does not fit": (["timing", "--width", "40mm", "--font-size", "20"], "expected a wider figure", "is cut"),
     "a report without panels": (["medians"], "KIND: got 'medians'; expected one of", ""),
 }

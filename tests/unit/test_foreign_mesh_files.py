@@ -97,7 +97,7 @@ def test_a_ply_gives_a_mesh_with_its_numbers_in_double_precision(tmp_path):
         (b"property float y", b"property float u", "have no y"),
         (b"property float x", b"property half x", "the line 'property half x'"),
         (b"format ascii 1.0\n", b"", "names no format"),
-        (b"element face 1", b"element face 2", "promises 2 rows of face"),
+        (b"element face 1", b"element face 2", "declares 2 rows of face"),
         (b"4 0 1 2 3", b"4 0 1 2.5 3", "the vertex 2.5; expected a whole number"),
         (b"4 0 1 2 3", b"-4 0 1 2 3", "the length -4"),
         (b"4 0 1 2 3", b"4 0 1 two 3", "is no number"),
@@ -234,10 +234,10 @@ def test_the_reason_that_a_reader_prints_is_in_the_message(tmp_path, name, conte
         (
             "mass: 1\ndescription: Net: 10 x 10\n",
             2,
-            'value of `description` holds.*description: "Net: 10 x 10"',
+            'value of `description` contains.*description: "Net: 10 x 10"',
         ),
-        ("mesh: {kind: file, path: a: b.obj}\n", 1, 'value of `path` holds a colon.*path: "a: b.obj"'),
-        ("effects:\n  - kind: pins: all\n", 2, 'value of `kind` holds a colon.*kind: "pins: all"'),
+        ("mesh: {kind: file, path: a: b.obj}\n", 1, 'value of `path` contains a colon.*path: "a: b.obj"'),
+        ("effects:\n  - kind: pins: all\n", 2, 'value of `kind` contains a colon.*kind: "pins: all"'),
         ('description: say "x": y\n', 1, "'say \"x\": y'"),
         ("mass: 1\n  frames: 2\n", 2, "same indent"),
         ("description: @me\n", 1, "cannot begin with '@'; put the value in quotes"),
@@ -301,11 +301,11 @@ def test_a_file_that_was_cut_is_said_to_be_cut(tmp_path, name):
 
 def test_a_cut_legacy_vtk_file_of_surfaces_is_not_completed_by_arbitrary_numbers():
     assert file_truncation.find_strict_truncation(".vtk", LEGACY_POLYDATA) == ""
-    for n, section in ((4, "POLYGONS promises 4"), (20, "POLYGONS"), (31, "POINTS promises 9")):
+    for n, section in ((4, "POLYGONS declares 4"), (20, "POLYGONS"), (31, "POINTS declares 9")):
         assert section in file_truncation.find_strict_truncation(".vtk", LEGACY_POLYDATA[:-n])
     attributes = LEGACY_POLYDATA + b"\nPOINT_DATA 3\nSCALARS load float 1\nLOOKUP_TABLE default\n" + bytes(12)
     assert file_truncation.find_strict_truncation(".vtk", attributes) == ""
-    assert "SCALARS promises 3" in file_truncation.find_strict_truncation(".vtk", attributes[:-1])
+    assert "SCALARS declares 3" in file_truncation.find_strict_truncation(".vtk", attributes[:-1])
 
 
 @pytest.mark.parametrize("text", ["v 0 0 0\nv 1 0 0\nv 1", "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1"])

@@ -178,7 +178,7 @@ def test_the_only_array_of_a_file_is_read_and_named(tmp_path):
     found = align_submission(make_grader(path).scene, read, 1)
     assert found.notes[0] == "array: `U`, the only one in the file"
     np.savez(tmp_path / "q.npz", U=np.zeros((3, 5, 3)), V=np.zeros((3, 5, 3)))
-    with pytest.raises(InputError, match="it holds U, V"):
+    with pytest.raises(InputError, match="it contains U, V"):
         read_position_file(tmp_path / "q.npz", 5)
     np.save(tmp_path / "t.npy", np.zeros((5, 3, 3)))
     with pytest.raises(InputError, match=r"\(vertices, frames, 3\) = \(5, 3, 3\); expected \(frames, "):

@@ -188,7 +188,7 @@ def test_a_chain_is_not_exported_as_a_surface(chain: Path, tmp_path: Path):
 
 
 def test_one_file_takes_one_recording(cloth: Path, chain: Path, tmp_path: Path):
-    with pytest.raises(InputError, match="take one recording; 2 came"):
+    with pytest.raises(InputError, match="take one recording, not 2"):
         printed(cloth, chain, csv=tmp_path / "a.csv")
 
 

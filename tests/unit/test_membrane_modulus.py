@@ -212,7 +212,7 @@ def test_meshes_without_faces_are_refused(tmp_path):
         compute_spring_stiffness(GridMesh().build_mesh(4), scaling_rule="area", stretch=1.0, shear=1.0, bend=0.0)
     path = tmp_path / "mesh.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 2 2 0\nf 1 2 3\nl 3 4\n")
-    with pytest.raises(InputError, match=r"the spring 2-3 \(3, 4 in the file\) has no face beside it"):
+    with pytest.raises(InputError, match=r"the spring 2-3 \(3, 4 in the file\) has no adjacent face"):
         compute_spring_stiffness(
             FileMesh(path=path).build_mesh(), scaling_rule="area", stretch=1.0, shear=1.0, bend=0.0
         )

@@ -173,10 +173,10 @@ def test_a_scene_lists_parts_without_pins_or_attachments(tmp_path, caplog):
     (tmp_path / "scene.yaml").write_text(SCENE)
     code, output = run_command(tmp_path / "scene.yaml", "--strict")
     assert code == 1
-    assert "parts that nothing holds: 1 of 2, with 3 vertices (vertex 4, 5, 6)" in output
+    assert "parts without a support: 1 of 2, with 3 vertices (vertex 4, 5, 6)" in output
     assert not caplog.messages  # the report says it once
     CliRunner().invoke(app, ["list", str(tmp_path / "scene.yaml")])
-    assert any("parts that nothing holds: 1 of 2" in message for message in caplog.messages)
+    assert any("parts without a support: 1 of 2" in message for message in caplog.messages)
     assert any("`weld: 0` joins them" in message for message in caplog.messages)
     (tmp_path / "scene.yaml").write_text(SCENE.replace("mesh.obj", "mesh.obj, weld: 0"))
     assert run_command(tmp_path / "scene.yaml", "--strict")[0] == 0

@@ -69,7 +69,7 @@ def test_a_matrix_without_a_factor_is_refused(name: str):
 def test_other_energies_are_refused_before_anything_is_compiled(name: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cpp_backend, "load_library", lambda *_: pytest.fail("compiled"))
     system = build_cloth(3).system
-    with pytest.raises(Unsupported, match=f"{name}: knows springs only"):
+    with pytest.raises(Unsupported, match=f"{name}: supports springs only"):
         load_target(OPTIONAL_SOLVERS[name])().prepare(
             System(system.mass, system.time_step, (*system.energies, _Other()))
         )

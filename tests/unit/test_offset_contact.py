@@ -67,7 +67,7 @@ def test_the_activation_is_twice_continuously_differentiable_at_half_its_radius(
 
 
 def test_the_activation_is_that_of_ipctk():
-    ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
+    ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
     d = np.linspace(1e-3, 1.1, 60) * RADIUS
     value, force, curvature = activation(d)
     barrier = ipctk.TwoStageBarrier()
@@ -103,7 +103,7 @@ def blocks(contact: SelfContact, p: Positions, radius: float) -> tuple[Candidate
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_pairs_in_contact_are_those_of_ipctk(seed):
-    ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
+    ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
     contact, p, triangles = crumpled(seed)
     edges = collision_mesh_of(contact).edges.primitives
     mesh = ipctk.CollisionMesh(p, edges, triangles)
@@ -145,7 +145,7 @@ def displaced(seed: int, p: Positions, bound: np.ndarray, share: float) -> Posit
 @pytest.mark.parametrize("share", [1.0, 0.5])
 @pytest.mark.parametrize("seed", range(8))
 def test_displacements_within_their_bounds_never_collide(seed, share):
-    ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
+    ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
     contact, p, triangles = crumpled(seed)
     mesh = ipctk.CollisionMesh(p, collision_mesh_of(contact).edges.primitives, triangles)
     clearance = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION).clearance
@@ -156,7 +156,7 @@ def test_displacements_within_their_bounds_never_collide(seed, share):
 
 
 def test_larger_displacements_do_collide():
-    ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
+    ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
     contact, p, triangles = crumpled(1)
     mesh = ipctk.CollisionMesh(p, collision_mesh_of(contact).edges.primitives, triangles)
     found = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION)
@@ -254,7 +254,7 @@ def pressed_sheets(*effects: Any) -> Scene:
 
 
 def test_sheets_that_meet_stay_apart_and_every_frame_is_reached_without_collision():
-    ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
+    ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
     made = pressed_sheets(APART)
     (contact,) = (energy for energy in made.system.energies if isinstance(energy, BarrierContact))
     edges = collision_mesh_of(contact).edges.primitives

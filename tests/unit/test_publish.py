@@ -87,8 +87,8 @@ def test_what_was_published_comes_out_again(home: Path, name: str, tmp_path: Pat
         assert listed.output.count("done") == 2
     arguments = [*map(str, claims)]
     for solver in ("dense", "sparse"):
-        assert f"cloth 4 {solver}, positions: holds (2 steps, to the bit)" in arguments
-        assert any(line.startswith(f"cloth 4 {solver}, other columns: holds (") for line in arguments), arguments
+        assert f"cloth 4 {solver}, positions: confirmed (2 steps, to the bit)" in arguments
+        assert any(line.startswith(f"cloth 4 {solver}, other columns: confirmed (") for line in arguments), arguments
         assert any(line.startswith(f"cloth 4 {solver}, time of a step: ") for line in arguments)
     assert "times as long as" in claims[-1].subject
 
@@ -111,7 +111,7 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
 
     result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=False))
     assert result.exit_code == 1
-    for line in ("sweep.yaml: does not hold (was changed)", "mine.py: does not hold (was not", "(missing)"):
+    for line in ("sweep.yaml: refuted (was changed)", "mine.py: refuted (was not", "(missing)"):
         assert line in result.output
     assert "done again" not in result.output
 
@@ -165,17 +165,17 @@ FORGED: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
     ),
     "a failed rival": (
         lambda row: row | ({"status": "diverged", "reason": "it is bad"} if row["solver"] == "dense" else {}),
-        "end: does not hold",
+        "end: refuted",
     ),
-    "all 1,000 times as fast": (scaled("seconds", 1e-3), "time of a step: does not hold"),
-    "all 1,000 times as slow": (scaled("seconds", 1e3), "time of a step: does not hold"),
-    "no time": (lambda row: row | {"seconds": None}, "time of a step: does not hold"),
-    "no time at all": (scaled("seconds", 0.0), "time of a step: does not hold"),
-    "one 2.5 times as fast": (only(scaled("seconds", 0.4), solver="dense"), "takes .*does not hold"),
-    "another frame": (only(lambda row: row | {"frame": 7}, frame=2), "positions: .*does not hold|positions: does"),
+    "all 1,000 times as fast": (scaled("seconds", 1e-3), "time of a step: refuted"),
+    "all 1,000 times as slow": (scaled("seconds", 1e3), "time of a step: refuted"),
+    "no time": (lambda row: row | {"seconds": None}, "time of a step: refuted"),
+    "no time at all": (scaled("seconds", 0.0), "time of a step: refuted"),
+    "one 2.5 times as fast": (only(scaled("seconds", 0.4), solver="dense"), "takes .*refuted"),
+    "another frame": (only(lambda row: row | {"frame": 7}, frame=2), "positions: .*refuted|positions: refuted"),
     "another phase": (only(lambda row: row | {"phase": "magic"}, phase="prepare"), "a repeat has no magic"),
     "a phase that is null": (only(lambda row: row | {"phase": None}, phase="prepare"), "a repeat has no None"),
-    "a frame that is null": (only(lambda row: row | {"frame": None}, phase="step"), "positions: does not hold"),
+    "a frame that is null": (only(lambda row: row | {"frame": None}, phase="step"), "positions: refuted"),
     "a round that is null": (lambda row: row | {"round": None}, "a repeat has no"),
 }
 
@@ -240,8 +240,8 @@ def test_runs_that_no_config_requests_cannot_be_decided(home: Path, tmp_path: Pa
         content["results/sweep/rows/cloth-4-magic.parquet"] = parquet_rows.encode_rows(made_up)
 
     result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
-    assert "1 of 3 runs of sweep: cannot tell (the config asks for none such)" in result.output
-    assert result.exit_code == (1 if "does not hold" in result.output else 3), result.output
+    assert "1 of 3 runs of sweep: undecided (the config expands to no such run)" in result.output
+    assert result.exit_code == (1 if "refuted" in result.output else 3), result.output
     assert "no repeat confirms these columns: " in result.output
 
 
@@ -258,7 +258,7 @@ def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Pa
 
     result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
     assert result.exit_code == 1, result.output
-    assert "positions: does not hold (they differ from step 1 of 2 on)" in result.output
+    assert "positions: refuted (they differ from step 1 of 2 on)" in result.output
 
 
 def test_an_archive_whose_results_lead_to_another_config_is_refused(home: Path, tmp_path: Path):

@@ -125,7 +125,7 @@ def test_a_place_that_cannot_be_read_or_written_is_named_and_nothing_is_lost(con
     (tmp_path / "there").write_text("a file")
     url = f"file://{tmp_path / 'there'}"
     result = command("run", config, "--results", url)
-    assert (result.exit_code, "all is kept in" in result.output) == (1, True), result.output
+    assert (result.exit_code, "all results remain in" in result.output) == (1, True), result.output
     (tmp_path / "there").unlink()
     result = command("run", config, "--results", url)
     assert (result.exit_code, "1 of 1 runs are there already" in result.output) == (0, True), result.output

@@ -112,7 +112,7 @@ def test_what_cannot_be_merged_is_the_users_mistake(two: Path):
     with pytest.raises(InputError, match="in each other"):
         merge_results([two / "a", two / "b"], two / "a" / "all", lambda line: None)
     (two / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no rows"):
+    with pytest.raises(InputError, match="contains no rows"):
         merged(two, "a", "empty")
     unit = row_store.list_units(two / "a" / "sweep" / "rows")[0]
     unit.write_bytes(b"PAR1")

@@ -349,7 +349,7 @@ def test_rational_arithmetic_decides_what_round_off_leaves_open_and_nothing_else
 
 
 def test_crossings_agree_with_the_intersection_test_of_ipctk():
-    ipctk = pytest.importorskip("ipctk", reason="the yardstick is an optional extra")
+    ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
     for seed in range(12):
         _, p, triangles = build_touching_sheets(seed, noise=0.002 * seed)
         edges = unique_edges(triangles)

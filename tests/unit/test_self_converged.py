@@ -45,7 +45,7 @@ def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_
     monkeypatch.setattr(self_converged_trajectory, "compute_self_converged", None)
     again = ReferenceStore(tmp_path).load_trajectory(other, 3, [END], error=0.2)
     assert (again.positions == found.positions).all()
-    with pytest.raises(NotConverged, match=r"halving the steps further takes more than .* ask for an error of"):
+    with pytest.raises(NotConverged, match=r"halving the steps further takes more than .* use an error of"):
         again.require_accuracy(0.01)
     apart = replace(again, disagreement=np.array([0.3]), last_change=0.01)
     with pytest.raises(NotConverged, match=r"limits of implicit Euler and BDF2 differ.*; none can be had"):

@@ -138,7 +138,7 @@ def test_the_verdict_on_several_settings_has_a_line_for_each_and_what_the_neares
     assert lines[1] == "2 x 4: error 20 %, largest strain 10 %, hangs as if 0.5 times as stiff."
     assert (
         lines[3]
-        == "The motions of 2 x 4 and 4 x 8 differ by 17 %: what is found with one need not hold with the other."
+        == "The motions of 2 x 4 and 4 x 8 differ by 17 %: what is found with one need not be valid with the other."
     )
     assert lines[4] == "4 x 8: twice the substeps change the motion by 20 %, which is more than the required error."
     assert lines[6] == "Within 5 %: 4 x 4 is the cheapest, 16 ms a frame."
@@ -287,7 +287,7 @@ def test_with_contact_motions_are_compared_up_to_the_time_until_which_theirs_is_
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("first", "message"), [(0.001, r"up to 0.0333333 s.*ask for --t-end 0.0333333"), (0.5, "no certified reference")]
+    ("first", "message"), [(0.001, r"up to 0.0333333 s.*use --t-end 0.0333333"), (0.5, "no certified reference")]
 )
 def test_with_contact_a_time_that_is_too_long_is_refused(
     scene: Path, monkeypatch: pytest.MonkeyPatch, first: float, message: str

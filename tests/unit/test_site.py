@@ -277,7 +277,7 @@ def test_damaged_rows_keep_no_run_from_ending(tmp_path: Path):
 
 
 def test_a_folder_without_rows_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="holds no rows"):
+    with pytest.raises(InputError, match="contains no rows"):
         update_page(tmp_path)
     with pytest.raises(InputError, match="is no folder"):
         update_page(tmp_path / "none")

@@ -43,7 +43,7 @@ ROUNDS = 3
 
 
 def run(solver: str, **parameters: Any) -> RunSpec:
-    """A run of the yardstick cloth under another solver's name."""
+    """A run of the scene `yardstick-cloth` under another solver's name."""
     (made,) = load_config(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1, max_iterations=50).list_runs()
     return made.replace_options(solver=SolverSpec(solver, parameters))
 

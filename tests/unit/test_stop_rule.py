@@ -119,7 +119,7 @@ def test_the_floor_can_be_taken_away(backend):
 
 
 @backends
-def test_the_yardstick_is_taken_at_the_current_positions_whatever_the_first_guess(backend):
+def test_the_initial_residual_is_taken_at_the_current_positions_whatever_the_first_guess(backend):
     """A guess nearer to the solution makes a solve shorter, never stricter."""
     made = replace(build_cloth(8), initial_velocity=(1.0, 0.0, 0.0))
     current, inertial = (build_first_problem(made, guess) for guess in ("previous", "inertial"))

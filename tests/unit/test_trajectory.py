@@ -139,7 +139,7 @@ KNOWN = {
 @pytest.mark.parametrize("name", KNOWN)
 def test_the_assignments_scenes_have_the_known_errors_of_time_stepping(name):
     if not SHARED.is_dir():
-        pytest.skip("the assignment's scenes lie in a folder `shared` beside the repository, which is not there")
+        pytest.skip("the assignment's scenes lie in a folder `shared` next to the repository, which is not there")
     scene = load_scene(SHARED / f"{name}.json")
     truth = integrate_motion(build_exact_scene(scene, 0), [1.0])
     truth.require_accuracy(1e-3)

@@ -107,7 +107,7 @@ ROWS = [
     },
     {
         "kind": "closed form", "name": "b", "quantity": "x [m]", "refined": "cells", "levels": [1, 2, 4], "order": 1.0,
-        "exact": 1.0, "verdict": "refused", "remark": "knows springs only",
+        "exact": 1.0, "verdict": "refused", "remark": "supports springs only",
     },
     {
         "kind": "textile test", "name": "fabric c", "source": "s", "use": "u", "verdict": "outside band: drape",
@@ -121,7 +121,7 @@ def test_the_page_says_what_is_outside_a_band_and_what_springs_cannot_do(tmp_pat
     page = format_validation_page(ROWS, "newton")
     assert "| a | x [m] | 1 | 1.025 | 0.025 | 0.03 | 1.00 of 1 | confirmed |" in page
     assert "| b | x [m] | 1 | | | | | refused |" in page
-    assert "* b: knows springs only" in page
+    assert "* b: supports springs only" in page
     assert "| c | 20.0 | 10.0 to 30.0 | 70 | 20 to 60 | outside band: drape |" in page
     assert "What springs cannot do" in page
     paths = write_validation_page(ROWS, "newton", tmp_path)

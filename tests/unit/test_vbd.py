@@ -106,16 +106,16 @@ def test_a_single_vertex_takes_a_newton_step():
 def test_a_tolerance_ends_a_solve_at_the_first_iterate_whose_residual_is_below_it(method):
     problem = build_first_problem(build_cloth(8))
     prepared = method.prepare(problem.system)
-    yardstick = prepared.solve(problem, StopRule(1, 0.5)).initial_residual
+    initial_residual = prepared.solve(problem, StopRule(1, 0.5)).initial_residual
     residuals = [prepared.solve(problem, StopRule(k)).residual for k in range(1, 40)]
-    below = next(k for k, residual in enumerate(residuals, 1) if residual <= 0.02 * yardstick)
+    below = next(k for k, residual in enumerate(residuals, 1) if residual <= 0.02 * initial_residual)
     solution = prepared.solve(problem, StopRule(100, 0.02))
     assert (solution.num_iterations, solution.termination_reason) == (below, "converged")
     assert solution.residual == residuals[below - 1]
 
 
 @methods
-def test_the_yardstick_is_taken_at_the_current_positions_whatever_the_first_guess(method):
+def test_the_initial_residual_is_taken_at_the_current_positions_whatever_the_first_guess(method):
     found = []
     for guess in INITIAL_GUESSES:
         problem = build_first_problem(replace(build_cloth(8), initial_velocity=(1.0, 0.0, 0.0)), guess)

@@ -75,10 +75,10 @@ def test_it_becomes_a_mesh_and_what_was_cut_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"it does not end with </VTKFile>; the file was cut"):
         FileMesh(path=path).build_mesh()
     path.write_bytes(whole[: end - 200] + whole[end:])
-    with pytest.raises(InputError, match=r"an array promises \d+ bytes, and \d+ are there; the file was cut"):
+    with pytest.raises(InputError, match=r"an array declares \d+ bytes, and \d+ are there; the file was cut"):
         FileMesh(path=path).build_mesh()
     path.write_bytes(whole.replace(b"vtkZLib", b"").replace(b'type="PolyData"', b'type="ImageData"'))
-    with pytest.raises(InputError, match="holds ImageData; expected PolyData"):
+    with pytest.raises(InputError, match="contains ImageData; expected PolyData"):
         FileMesh(path=path).build_mesh()
 
 

@@ -68,7 +68,9 @@ def publish(
     from springbench.harness.experiments.archive.publication import publish_results as put_together
 
     count = put_together(results, output, print_message, license_text=license)
-    print_message(f"{output} holds {count} files; `springbench verify-archive {output}` does a tenth of its runs again")
+    print_message(
+        f"{output} contains {count} files; `springbench verify-archive {output}` does a tenth of its runs again"
+    )
 
 
 def verify_archive(
@@ -87,7 +89,7 @@ def verify_archive(
 
 
 def verify_one_archive(archive: Path, seed: int | None, *, with_user_code: bool) -> int:
-    """Verify an archive, print what holds, and return the exit code of `verify-archive`."""
+    """Verify an archive, print a verdict on each claim, and return the exit code of `verify-archive`."""
     from secrets import randbelow
     from tempfile import TemporaryDirectory
 
@@ -101,7 +103,7 @@ def verify_one_archive(archive: Path, seed: int | None, *, with_user_code: bool)
                 print_message(str(claim))
             print_message(f"{archive} is not what was published; nothing of it was run")
             return 1
-        print_message("all checksums hold")
+        print_message("all checksums match")
         found, claims = checks.load_published_runs(folder, print_message, with_user_code=with_user_code)
         runs = checks.select_runnable(found, print_message)
         chance = randbelow(10**6) if seed is None else seed
@@ -116,6 +118,10 @@ def verify_one_archive(archive: Path, seed: int | None, *, with_user_code: bool)
     states = {claim.verdict for claim in claims}
     bad, unknown = checks.ClaimVerdict.FAIL in states, checks.ClaimVerdict.INCONCLUSIVE in states or not claims
     print_message(
-        "something does not hold" if bad else "not all can be told here" if unknown else "all that was done again holds"
+        "a claim is refuted"
+        if bad
+        else "not all can be decided here"
+        if unknown
+        else "all repeated runs confirm the claims"
     )
     return 1 if bad else 3 if unknown else 0

@@ -97,8 +97,8 @@ def _read_setting(text: str) -> StepSetting:
     try:
         return parse_setting(text)
     except ValueError:
-        wanted = "substeps x iterations, such as 2x5, or substeps alone, such as 8"
-        problem = f"got {text[:40]!r}; expected {wanted}, up to {MAX_SETTING:,} each"
+        expected = "substeps x iterations, such as 2x5, or substeps alone, such as 8"
+        problem = f"got {text[:40]!r}; expected {expected}, up to {MAX_SETTING:,} each"
         raise InputError(InputMistake(problem, key="--setting")) from None
 
 

@@ -37,7 +37,7 @@ from springbench.harness.experiments.error_control.stored_trials import (
     build_trial_rows,
     format_problem_id,
     read_stored_trials,
-    select_promising_methods,
+    select_best_predicted,
 )
 from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.experiments.run_pipeline import save_positions
@@ -163,7 +163,7 @@ def _execute_error_control(
     if sentence := _describe_dissipation(best, error_target, energies):
         print_message(sentence)
     measured = _verify_error(error_target, error, path.positions[-1], results, print_message) if verify else None
-    label = f"{config.stem}-{error_target.size}-asked-{error:g}-{error_target.t_end:g}"
+    label = f"{config.stem}-{error_target.size}-error-{error:g}-{error_target.t_end:g}"
     row = _build_row(config.stem, error_target, error, answer, status) | {"error": measured}
     if error_target.has_contact:
         bound = answer.reference_trial.error_estimated
@@ -194,7 +194,7 @@ def _execute_error_control(
 
 
 def _describe_dissipation(trial: Trial, error_target: ErrorTarget, energies: StepDissipation) -> str:
-    """Describe where the energy of the motion went; empty where it is unknown or none was provided."""
+    """Describe the energy balance of the motion; empty where it is unknown or none was provided."""
     if not energies.provided_energy or energies.dissipation_integrator is None:
         return ""
     name = trial.method.solver if trial.method.integrator == "substepping" else trial.method.integrator
@@ -213,7 +213,7 @@ def _search_method(
 
     Raises RunFailed.
     """
-    nearest, pairs = select_promising_methods(stored_trials, error)
+    nearest, pairs = select_best_predicted(stored_trials, error)
     if not pairs:
         return search_cheapest_method(error_target, error, growth, print_message)
     names = ", ".join(format_method_name(integrator, solver.name) for integrator, solver in pairs)

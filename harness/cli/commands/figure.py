@@ -33,7 +33,9 @@ def figure(
     from springbench.harness.report.figures.figure_kinds import find_figure_kind as find
     from springbench.harness.report.figures.figure_options import parse_figure_options
 
-    wanted = parse_figure_options(width, formats, size, panels, has_title=not without_title, is_transparent=transparent)
+    options = parse_figure_options(
+        width, formats, size, panels, has_title=not without_title, is_transparent=transparent
+    )
     found = find(kind)
     if not results.is_dir():
         raise InputError(InputMistake(f"is no folder; expected one with {found.required_rows}", results))
@@ -43,7 +45,7 @@ def figure(
 
     show_activity("drawing")
     folder = output or results / "figures"
-    made = make_figure(kind, found, results, lambda table: find_stale_runs(results, table), folder, wanted)
+    made = make_figure(kind, found, results, lambda table: find_stale_runs(results, table), folder, options)
     across, up = made.size_mm
     print_message(f"{across:g} mm x {up:.0f} mm: {', '.join(made.panel_names)}")
     if made.other_panel_count:

@@ -100,7 +100,7 @@ def _print_runs(config: Path, results: Path) -> None:
         lines.append((p.files.rows_path.stem[-12:], *what, *values, state))
     for line in format_plain_table(lines):
         print(line)
-    print(f"states are those on this machine, {describe_machine().machine_id:.6}; settings hold on any")
+    print(f"states are those on this machine, {describe_machine().machine_id:.6}; settings are for any")
 
 
 def collect_varied_settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
@@ -113,12 +113,12 @@ def collect_varied_settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
     """
     from springbench.harness.config.run_options import RUN_OPTIONS
 
-    alike: dict[tuple[str, int, str], list[RunSpec]] = {}
+    groups: dict[tuple[str, int, str], list[RunSpec]] = {}
     for run in runs:
-        alike.setdefault((run.scene_name, run.size, run.solver.name), []).append(run)
+        groups.setdefault((run.scene_name, run.size, run.solver.name), []).append(run)
 
     def differ(value: Callable[[RunSpec], Any]) -> bool:
-        return any(len({repr(value(run)) for run in group}) > 1 for group in alike.values())
+        return any(len({repr(value(run)) for run in group}) > 1 for group in groups.values())
 
     values: dict[str, Callable[[RunSpec], Any]] = {name: attrgetter(name) for name in RUN_OPTIONS}
     columns = {name: value for name, value in values.items() if name in _FIXED_COLUMNS or differ(value)}

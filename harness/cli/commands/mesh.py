@@ -56,7 +56,7 @@ def mesh(
 
 
 def _load_source(file: Path, options: dict[str, Any]) -> tuple[FileMesh, MeshSupport | None]:
-    """Load a mesh file, or that of a scene with what holds it; options override the keys of the scene."""
+    """Load a mesh file, or that of a scene with its supports; options override the keys of the scene."""
     from springbench.harness.scenes.mesh.file_mesh import FileMesh
 
     if file.suffix.lower() not in _SCENE_SUFFIXES:

@@ -92,7 +92,7 @@ def recommend(
         CandidatePoint(method.work_spec.solver.name, method.error, method.seconds_per_simulated_second, str(method))
         for method in found.measured_methods
     ]
-    aim = f"Ways to an error of {100 * error:g} %" if error else f"Ways to spend {budget} a frame"
+    aim = f"Methods for an error of {100 * error:g} %" if error else f"Methods for {budget} a frame"
     title = f"{aim}: {scene.stem} {found.best_method.work_spec.case.size or ''}".rstrip()
     folder = results / f"recommend-{scene.stem}" / "pictures"
     t_end = found.best_method.work_spec.t_end
@@ -112,7 +112,7 @@ def parse_duration(text: str, option: str) -> float:
 
     Args:
         text: number and unit: us, ms or s.
-        option: option that it comes from, for the message.
+        option: the option whose value it is, for the message.
 
     Raises:
         InputError: it is no number above 0 with such a unit.

@@ -13,7 +13,7 @@ _BRACKET = re.compile(r"\s*\[((?:default: |required|[x\d.]+<=|x>)[^\]]*)\]$")
 
 _INTRODUCTION = """# Commands
 
-For everybody who runs springbench: each command with its arguments, its options and their defaults.
+For users of the command line: each command with its arguments, its options and their defaults.
 
 Exit codes: 0 success; 1 a failed run, or a regression; 2 a mistake in the input; 3 a test that cannot decide; 130
 stopped by Ctrl-C. `springbench COMMAND --help` prints the same."""

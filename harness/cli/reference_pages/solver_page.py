@@ -16,7 +16,7 @@ from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_
 
 _INTRODUCTION = """# Solvers
 
-For everybody who chooses or compares solvers: the update, the cost and the source of each method, and its parameters.
+For users who choose or compare solvers: the update, the cost and the source of each method, and its parameters.
 
 A solve is a solve with the factor of Q, a pass visits each spring once. [Notation](../explanation/notation.md) defines
 the letters, and [choosing a solver](../howto/choose-a-solver.md) says which method wins where. A method that is no

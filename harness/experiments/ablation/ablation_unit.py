@@ -202,7 +202,7 @@ def _measure_reference_errors(
                 simulate_motion(scene, load_target(SOLVERS[REFERENCE_SOLVER])(), settings, stride=every),
             )
             found.append(row | {"status": "ok"} | compute_motion_difference(full.scene, coarser, finer))
-        except Exception as error:  # the better solver may fail in any way: then the error is not known
+        except Exception as error:  # the better solver may fail with any exception: then the error is not known
             columns = build_failure_columns(error)
             found += [
                 {"kind": "error", "name": n, "status": "failed", "reason": columns["reason"]}

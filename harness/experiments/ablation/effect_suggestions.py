@@ -1,6 +1,6 @@
 """Suggest effects that a scene does not list although its motion indicates them.
 
-Each comes with the evidence.
+Each states its evidence.
 
 The class of an effect defines the evidence for it (`springbench.harness.scenes.effects.effect_interface.SceneEffect`).
 """

@@ -68,7 +68,7 @@ class EffectUnit(ABC):
             found = self.measure_rows(tick)
         except InputError:
             raise
-        except Exception as error:  # a solver may fail in any way
+        except Exception as error:  # a solver may fail with any exception
             columns = build_failure_columns(error)
             found = self.build_failure_rows(columns["status"], columns["reason"])
         return self._write_rows(found)

@@ -81,11 +81,11 @@ DEFAULT_T_END = 1.0
 SEARCH_TIME = 60.0
 """Default limit for the wall time of all measurements together [s]."""
 BUDGET_REFERENCE_ERROR = 1e-3
-"""Relative error that the reference must resolve where a wall time is given: people who have one accept a percent."""
+"""Relative error that the reference must resolve where a wall time is given: a percent suffices there."""
 CONTACT_BUDGET_ERROR = 0.02
 """The same with contact, whose errors at a frame's time step are some percent, and whose reference is less accurate."""
 BUDGET_RANGE = 2.0
-"""Multiple of a given wall time up to which methods are measured, to tell what more time would buy."""
+"""Multiple of a given wall time up to which methods are measured, to show what more time would yield."""
 FIXED_ITERATIONS, FEWER_ITERATIONS = 50, [2, 5, 10, 20]
 """Iterations of methods without a tolerance; those that are tried too where a wall time is given."""
 ENGINE_SUBSTEPS = [1, 2, 4, 8, 16, 32, 64, 128]
@@ -179,7 +179,7 @@ def _load_solver(name: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class RecommendationGoal:
-    """What a method must keep to: one of error and wall time is given.
+    """Limit on a method's error or wall time; one of them is given.
 
     Attributes:
         max_error: relative error at the end.
@@ -203,7 +203,7 @@ class RecommendationGoal:
     def select_methods(
         self, methods: Sequence[MeasuredMethod], frame: float, factor: float = 1.0
     ) -> list[MeasuredMethod]:
-        """Return the methods that keep to the goal, the best one first.
+        """Return the methods within the goal's limit, the best one first.
 
         Args:
             methods: measured methods, the cheapest first.
@@ -274,10 +274,10 @@ class MethodRecommendation:
     """Result of a recommendation.
 
     Attributes:
-        goal: what the method must keep to.
+        goal: limit on the method.
         frame: time step of the scene [s].
         measured_methods: all measured methods, cheapest first.
-        best_method: the best of those that keep to the goal.
+        best_method: the best of those within the goal's limit.
         checked_method: a repeated measurement of it.
     """
 
@@ -349,7 +349,7 @@ def recommend_method(
 
     Raises:
         InputError: an option is invalid.
-        RunFailed: no method keeps to the goal.
+        RunFailed: no method reaches the goal.
     """
     options = {
         "--error": goal.max_error,
@@ -483,7 +483,7 @@ def _build_valid_study(
     """Build the study; its mistakes are those of options. Raises InputError."""
     try:
         return build_study(path, scene, size, candidates, t_end, time_limit)
-    except InputError as refused:  # the studies are ours; what is wrong came with an option
+    except InputError as refused:  # the studies are ours; the mistake is in an option
         raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
 
 
@@ -732,27 +732,27 @@ def _explain_no_method(
     t_end: float,
     summary: SearchSummary[Any] | None,
 ) -> str:
-    """Explain why no method keeps to the goal, and suggest what to change."""
-    wanted = f"keeps to an error of {goal.reference_error:g} over {t_end:g} s"
+    """Explain why no method reaches the goal, and suggest what to change."""
+    condition = f"reaches an error of {goal.reference_error:g} over {t_end:g} s"
     if goal.frame_seconds is not None:
-        wanted = f"takes at most {1e3 * goal.frame_seconds:g} ms for a frame of {frame:.6g} s"
+        condition = f"takes at most {1e3 * goal.frame_seconds:g} ms for a frame of {frame:.6g} s"
     if summary and not summary.is_complete:
         return (
-            f"nothing that was measured {wanted}, and settings remain "
-            f"({summary}): the same command with a larger --search-time goes on where this one ended"
+            f"nothing that was measured {condition}, and settings remain "
+            f"({summary}): the same command with a larger --search-time resumes where this one ended"
         )
     if methods and goal.frame_seconds is not None:
         cheapest = methods[0]
         return (
-            f"nothing that was measured {wanted}; the cheapest is {cheapest}, "
-            f"{1e3 * frame * cheapest.seconds_per_simulated_second:.3g} ms: ask for a larger --budget or a smaller "
+            f"nothing that was measured {condition}; the cheapest is {cheapest}, "
+            f"{1e3 * frame * cheapest.seconds_per_simulated_second:.3g} ms: use a larger --budget or a smaller "
             "--size"
         )
     if methods:
         nearest = min(methods, key=lambda method: method.error)
         return (
-            f"nothing that was measured {wanted}; the nearest is {nearest}, "
-            f"which errs by {nearest.error:.2g}: ask for a larger --error or a shorter --t-end"
+            f"nothing that was measured {condition}; the nearest is {nearest}, "
+            f"which errs by {nearest.error:.2g}: use a larger --error or a shorter --t-end"
         )
     reasons = {row["reason"] for row in failed_rows}
     return f"no error over {t_end:g} s could be measured: {'; '.join(sorted(reasons)) or 'nothing was simulated'}"

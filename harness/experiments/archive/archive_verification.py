@@ -117,9 +117,9 @@ ResultRow = dict[str, Any]
 class ClaimVerdict(Enum):
     """Verdict on a published claim: pass, fail or inconclusive."""
 
-    PASS = "holds"
-    FAIL = "does not hold"
-    INCONCLUSIVE = "cannot tell"
+    PASS = "confirmed"
+    FAIL = "refuted"
+    INCONCLUSIVE = "undecided"
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,17 +160,19 @@ class PublishedRun:
 @contextmanager
 def unpack_archive(archive: Path) -> Generator[Path]:
     """Unpack an archive to a temporary folder. Raises InputError for a damaged or oversized archive."""
-    wanted = "expected an archive that `springbench publish` wrote (.zip)"
+    expected = "expected an archive that `springbench publish` wrote (.zip)"
     if not archive.is_file():  # a device or a pipe would be read for ever
-        raise InputError(InputMistake(f"is {'no plain file' if archive.exists() else 'not there'}; {wanted}", archive))
+        raise InputError(
+            InputMistake(f"is {'no plain file' if archive.exists() else 'not there'}; {expected}", archive)
+        )
     with TemporaryDirectory() as scratch:
         try:
             with zipfile.ZipFile(archive) as packed:
                 if why := _explain_excess(packed.infolist(), archive.stat().st_size, shutil.disk_usage(scratch).free):
-                    raise InputError(InputMistake(f"{why}; {wanted}", archive))
+                    raise InputError(InputMistake(f"{why}; {expected}", archive))
                 packed.extractall(scratch)  # names that lead out of the folder are made to stay in it
         except (*_DAMAGED_ARCHIVE_ERRORS, OSError) as error:
-            problem = explain_unreadable_file(archive) or f"cannot be unpacked ({error}); {wanted}"
+            problem = explain_unreadable_file(archive) or f"cannot be unpacked ({error}); {expected}"
             raise InputError(InputMistake(problem, archive)) from error
         yield Path(scratch)
 
@@ -197,7 +199,7 @@ def _explain_excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> s
     """
     unpacked = sum(info.file_size for info in files)
     if len(files) > _MAX_FILES:
-        return f"holds {len(files):,} files, and at most {_MAX_FILES:,} are unpacked"
+        return f"contains {len(files):,} files, and at most {_MAX_FILES:,} are unpacked"
     if unpacked > free:
         return f"takes {unpacked:,} bytes unpacked; there are {free:,}"
     if unpacked > _MAX_COMPRESSION_RATIO * size or sum(info.compress_size for info in files) > size:
@@ -215,7 +217,7 @@ def verify_checksums(folder: Path) -> list[VerifiedClaim]:
     sums = folder / CHECKSUM_FILE
     if not sums.is_file() or sums.stat().st_size > _MAX_CHECKSUM_BYTES:
         raise InputError(
-            InputMistake(f"holds no {CHECKSUM_FILE}; expected an archive that `springbench publish` wrote", folder)
+            InputMistake(f"contains no {CHECKSUM_FILE}; expected an archive that `springbench publish` wrote", folder)
         )
     lines = [line.partition("  ") for line in os.fsdecode(sums.read_bytes()).splitlines()]
     stated = {name: digest for digest, _, name in lines if name}
@@ -256,7 +258,7 @@ def load_published_runs(
         found = [PublishedRun(by_run[name], spec) for name, spec in specs.items() if spec]
         claims += [claim for one in found if (claim := _verify_options(one))]
         if unknown := len(specs) - len(found):
-            why = "the config asks for none such" if config else "there is no config"
+            why = "the config expands to no such run" if config else "there is no config"
             claims.append(
                 VerifiedClaim(f"{unknown} of {len(specs)} runs of {sweep.name}", ClaimVerdict.INCONCLUSIVE, why)
             )
@@ -342,10 +344,10 @@ def _verify_options(published_run: PublishedRun) -> VerifiedClaim | None:
     left_out = {"threads", *read_solver_metadata(published_run.run.solver.name)}  # of the machine, and of the code
     if published_run.run.error_target is not None:
         left_out |= {"integrator", "time_step", "residual_rtol", "max_iterations", "initial_guess"}  # are chosen
-    asked_for = {
+    requested = {
         name: value for name, value in build_specification_columns(published_run.run).items() if name not in left_out
     }
-    wrong = _find_differences([(row, asked_for) for row in published_run.rows], asked_for)
+    wrong = _find_differences([(row, requested) for row in published_run.rows], requested)
     return (
         VerifiedClaim(f"{published_run.title}, names and options", ClaimVerdict.FAIL, _format_differences(wrong))
         if wrong

@@ -51,7 +51,7 @@ def compact_results(results: Path, print_message: Callable[[str], None], *, min_
     """
     folders = [folder for table in TABLE_FOLDERS for folder in row_store.find_row_folders(results, table)]
     if not folders:
-        raise InputError(InputMistake("holds no rows; expected a folder of results, or that of a sweep", results))
+        raise InputError(InputMistake("contains no rows; expected a folder of results, or that of a sweep", results))
     count = 0
     for folder in folders:
         with folder_locks.lock_folder_exclusive(folder.parent):
@@ -96,7 +96,7 @@ def _compact_folder(folder: Path, max_modified_time: float, print_message: Calla
     _sync_folder(packed.parent)
     for unit in whole:
         unit.unlink()
-    print_message(f"{folder}: {len(whole)} units packed into {packed.name}, which holds {len(file_paths)}")
+    print_message(f"{folder}: {len(whole)} units packed into {packed.name}, which contains {len(file_paths)}")
     return len(whole)
 
 

@@ -148,7 +148,7 @@ def _is_config(path: Path) -> bool:
 def _list_required_files(config: Path) -> list[Path]:
     """Return a config and the files that it names, without running its code."""
     files = {config}
-    with suppress(InputError):  # a config of another kind, or one that was changed; it goes along all the same
+    with suppress(InputError):  # a config of another kind, or one that was changed; it is published all the same
         sweep = load_config(config, imports_code=False)
         plugins = select_plugins(sweep.reports)
         for run in sweep.list_runs():
@@ -256,7 +256,7 @@ def _build_crate_metadata(
         "name": f"springbench results: {title}",
         "description": "Measurements of implicit time stepping of mass-spring systems, with what made them",
         "datePublished": datetime.now(UTC).isoformat(timespec="seconds"),
-        "license": license_text or "not stated; ask those who published it",
+        "license": license_text or "not stated; request it from the publisher",
         "hasPart": [{"@id": file["@id"]} for file in files],
         "mentions": [{"@id": "#runs"}],
     }

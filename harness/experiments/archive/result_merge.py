@@ -4,8 +4,8 @@
 
 Units are identified by content, so that none is lost or duplicated.
 
-A run on two machines has two ids, so both keep their rows. Where a unit was measured twice with different rows, the
-newer rows keep its name. The others are named by their content, `<unit>~<digest>`. Rows are copied file by file with
+A run on two machines has two ids, so the rows of both remain. Where a unit was measured twice with different rows, the
+newer rows have its name. The others are named by their content, `<unit>~<digest>`. Rows are copied file by file with
 pyarrow, and compared with the original before they replace a file. Runs that should have ended at the same positions
 and did not are reported.
 """
@@ -65,7 +65,7 @@ def list_sweep_folders(results: Path) -> list[Path]:
     found = {folder.parent for table in TABLE_FOLDERS for folder in row_store.find_row_folders(results, table)}
     found = {folder for folder in found if not any(part.startswith(".") for part in folder.relative_to(results).parts)}
     if not found:
-        raise InputError(InputMistake("holds no rows; expected a folder of results, or that of a sweep", results))
+        raise InputError(InputMistake("contains no rows; expected a folder of results, or that of a sweep", results))
     return sorted(found)
 
 
@@ -86,11 +86,11 @@ def merge_results(sources: Sequence[Path], target: Path, print_message: Callable
     for source in sources:
         if target.resolve().is_relative_to(source.resolve()) or source.resolve().is_relative_to(target.resolve()):
             raise InputError(
-                InputMistake(f"and {source} lie in each other; expected a folder beside them", target, key="--output")
+                InputMistake(f"and {source} lie in each other; expected a folder next to them", target, key="--output")
             )
     places = {(source, folder.relative_to(source)) for source in sources for folder in list_sweep_folders(source)}
     if len({place == Path() for _, place in places}) > 1:
-        raise InputError("merge: one folder is that of a sweep, another holds several; expected folders of one kind")
+        raise InputError("merge: one folder is that of a sweep, another contains several; expected folders of one kind")
     written = known = 0
     for place in {place for _, place in places}:  # all that do not fit are refused before anything is written
         for table in TABLE_FOLDERS:

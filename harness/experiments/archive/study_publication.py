@@ -80,7 +80,7 @@ def write_study(
     }
     if not found:
         raise InputError(
-            InputMistake("holds no rows; expected the folder of one sweep, such as results/hard", parts[0])
+            InputMistake("contains no rows; expected the folder of one sweep, such as results/hard", parts[0])
         )
     is_timed = any(_is_timed(rows) for rows in found.values())
     folder = published / config.stem
@@ -212,7 +212,7 @@ def _read_measurements(path: Path) -> pa.Table:
     try:
         table = pq.read_table(path, partitioning=None)
     except (pa.ArrowException, OSError) as error:
-        problem = explain_unreadable_file(path) or f"holds no table ({error}); expected a Parquet file"
+        problem = explain_unreadable_file(path) or f"contains no table ({error}); expected a Parquet file"
         raise InputError(InputMistake(problem, path)) from error
     return table.select([name for name in table.column_names if name != row_store.FILE_COLUMN])
 

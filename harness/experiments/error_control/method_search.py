@@ -164,7 +164,7 @@ class SearchResult:
     def build_status_columns(self, balances: Mapping[int, EnergyGain]) -> dict[str, str | None]:
         """Return `status` and `reason` of the best trial, whose energy may have grown without a source."""
         if growth := EnergyGrowth.from_balances(balances):
-            reason = f"{growth}: {self.best_trial.method} does not follow the motion; ask for a smaller error"
+            reason = f"{growth}: {self.best_trial.method} does not follow the motion; use a smaller error"
             return {"status": "energy-growth", "reason": reason}
         return {"status": "ok", "reason": self.note or None}
 
@@ -298,8 +298,8 @@ class _MethodSearch:
             )
         best, note = self._find_first_reaching(graded, closer)
         besides = perf_counter() - began - best.trajectory.wall_seconds
-        promised = tuple((one, self._predict_cost(one)) for one in graded)
-        return SearchResult(best, promised, tolerance, closer, besides, note)
+        predicted = tuple((one, self._predict_cost(one)) for one in graded)
+        return SearchResult(best, predicted, tolerance, closer, besides, note)
 
     @staticmethod
     def _integrate_motion(method: Method, setting: float, time_limit: float = inf) -> Trial:
@@ -560,9 +560,9 @@ class _MethodSearch:
             else f" with {nearest.trajectory.num_accepted_steps} steps"
         )
         return RunFailed(
-            f"no steps keep to an error of {self._max_error:g}: {nearest.method} came nearest and reached "
+            f"no step size reaches an error of {self._max_error:g}: {nearest.method} was nearest with "
             f"{nearest.error_estimated:.1g}{at}, and shorter ones come no nearer; "
-            "ask for a larger --error or a shorter "
+            "use a larger --error or a shorter "
             "--t-end"
         )
 

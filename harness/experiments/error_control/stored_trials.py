@@ -46,12 +46,12 @@ def read_stored_trials(folder: Path, error_target: ErrorTarget) -> list[ResultRo
         "machine_id": machine_info.describe_machine().machine_id,
         "source_fingerprint": machine_info.hash_sources(),
     }
-    units = [unit for unit in row_store.list_units(folder) if "-asked-" in unit.name]
+    units = [unit for unit in row_store.list_units(folder) if "-error-" in unit.name]
     found = parquet_rows.read_rows(units, ACCURACY_SCHEMA).to_pylist() if units else []
     return [row for row in found if row["kind"] == "method" and here.items() <= row.items()]
 
 
-def select_promising_methods(
+def select_best_predicted(
     stored_trials: Sequence[ResultRow], error: float
 ) -> tuple[float, list[tuple[str, SolverSpec]]]:
     """Return the stored error nearest to `error`, and the methods cheap at it.
@@ -92,14 +92,14 @@ def build_trial_rows(search_result: SearchResult, stored_trials: Iterable[Result
             "kind": "method",
             "status": "ok",
             "parameters": "{}",
-            "predicted_seconds": promised,
+            "predicted_seconds": predicted,
             "solver": one.method.solver,
             **one.columns,
             "num_iterations": one.trajectory.num_iterations,
             "seconds": [one.trajectory.wall_seconds],
             "cpu_seconds": one.trajectory.cpu_seconds,
         }
-        for one, promised in search_result.trials
+        for one, predicted in search_result.trials
     ]
     again = {(row["integrator"], row["solver"]) for row in made}
     trial_rows = [

@@ -94,7 +94,7 @@ class ProgramFingerprint:
       iterations: number of iterations of local-global that fits best; None for the minimum.
       closest: mistakes, closest first; empty where a correct program explains the submission.
       mistake: the mistake that is named; None where there is none.
-      alike: names of mistakes that the scene cannot tell from the named one.
+      alike: names of mistakes that are indistinguishable from the named one in this scene.
       invisible: names of mistakes that have no effect on this scene.
     """
 

@@ -170,9 +170,9 @@ class SceneGrader:
         minima = sum(one.is_minimum for one in steps)
         reached = f"{minima} of {len(steps)} steps minimise their objective, the median residual is {residual:.1e}"
         if fingerprint and (mistake := fingerprint.mistake):
-            alike = f"; so would: {', '.join(fingerprint.alike)}" if fingerprint.alike else ""
+            equivalents = f"; so would: {', '.join(fingerprint.alike)}" if fingerprint.alike else ""
             words = f"{mistake.name}. The program {mistake.description}; this explains {format_fit(mistake.fit)} of the"
-            return MISTAKEN, f"{words} deviation{alike}. See: {mistake.remedy}."
+            return MISTAKEN, f"{words} deviation{equivalents}. See: {mistake.remedy}."
         converged = all(one.is_minimum for one in steps)
         if fingerprint and not fingerprint.is_correct:
             words = f"no correct program and no known mistake predicts the steps; {reached}"

@@ -33,23 +33,25 @@ def compare_matrix_file(matrices: LocalGlobalMatrices, path: Path) -> str:
     if not path.is_file():
         raise InputError(InputMistake("there is no such file", path))
     try:
-        came: Any = sandbox.call_in_sandbox(_read_matrix, path, limits=_LIMITS)
+        received: Any = sandbox.call_in_sandbox(_read_matrix, path, limits=_LIMITS)
     except sandbox.SandboxError as error:
         raise InputError(InputMistake(f"cannot be read as a Matrix Market file: {error}", path)) from None
     expected = getattr(matrices, name)
-    if came.shape != expected.shape:
-        raise InputError(InputMistake(f"has the shape {came.shape}; {name} of the scene has {expected.shape}", path))
-    zeros = int((came.data == 0).sum()) if isinstance(came, coo_array) else 0
+    if received.shape != expected.shape:
+        raise InputError(
+            InputMistake(f"has the shape {received.shape}; {name} of the scene has {expected.shape}", path)
+        )
+    zeros = int((received.data == 0).sum()) if isinstance(received, coo_array) else 0
     stored = f"; {zeros} stored entries are zero, which a sparse matrix leaves out" if zeros else ""
     if name in ("A", "C"):  # springs and pins may have another order, and springs another orientation
-        is_equal = np.abs(_square(came) - _square(expected)).max() <= MATRIX_RTOL
+        is_equal = np.abs(_square(received) - _square(expected)).max() <= MATRIX_RTOL
         equal = f"equal to {name} of the scene, up to the order of its rows"
         return f"{path}: {equal if is_equal else f'not {name} of the scene'}{stored}"
-    if name == "d" and _has_same_rows(_to_dense(came), expected):
+    if name == "d" and _has_same_rows(_to_dense(received), expected):
         return f"{path}: equal to d of the scene, up to the order and the sign of its rows"
     variants = {"": expected, **_list_mistakes(matrices, name)}
     right = _to_dense(expected)
-    found, nonzero = _to_dense(came), np.abs(right[right != 0.0])
+    found, nonzero = _to_dense(received), np.abs(right[right != 0.0])
     usual = float(np.median(nonzero)) if nonzero.size else 1.0  # not the largest, which is the weight of a pin
     for words, variant in variants.items():
         other = _to_dense(variant)
@@ -88,9 +90,9 @@ def _read_matrix(path: Path) -> Any:
     found = found if isinstance(found, np.ndarray) else coo_array(found)
     values: Any = found if isinstance(found, np.ndarray) else found.data
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"it holds values of type {values.dtype}; expected real numbers")
+        raise ValueError(f"it contains values of type {values.dtype}; expected real numbers")
     if not np.isfinite(values).all():
-        raise ValueError("it holds numbers that are not finite")
+        raise ValueError("it contains numbers that are not finite")
     return found
 
 
@@ -100,13 +102,13 @@ def _square(matrix: Any) -> Any:
     return x.T @ x
 
 
-def _has_same_rows(came: Any, expected: Any) -> bool:
+def _has_same_rows(received: Any, expected: Any) -> bool:
     """Return whether rows (m, 3) are equal in another order and with other signs."""
     tolerance = MATRIX_RTOL * float(np.abs(expected).max(initial=0.0))
-    trees = [cKDTree(np.concatenate([rows, -rows])) for rows in (came, expected) if np.isfinite(rows).all()]
+    trees = [cKDTree(np.concatenate([rows, -rows])) for rows in (received, expected) if np.isfinite(rows).all()]
     if len(trees) < 2:
         return False
-    rows = np.concatenate([came, expected])
+    rows = np.concatenate([received, expected])
     first, second = (tree.query_ball_point(rows, tolerance, return_length=True) for tree in trees)
     return np.array_equal(first, second)
 

@@ -358,7 +358,7 @@ MISTAKES: tuple[ProgramMistake, ...] = (
     ProgramMistake(
         "pins with the wrong sign",
         "adds the penalty of the pins with the wrong sign",
-        "the derivative of w/2 |C p - C p_rest|^2 is w C'C p - w C'C p_rest; its second part goes to the other side",
+        "the derivative of w/2 |C p - C p_rest|^2 is w C'C p - w C'C p_rest; its second part belongs to the other side",
         (_scale(side_weight=-1.0), _scale(system_weight=-1.0)),
     ),
     ProgramMistake(

@@ -178,7 +178,7 @@ def _describe_uncertainty(trajectory: SelfConvergedTrajectory, k: int) -> str:
         "implicit Euler and BDF2 have other limits" if trajectory.has_disagreement else "--budget allows shorter steps"
     )
     return (
-        f"after {trajectory.times[k]:.3g} s steps of {trajectory.step:.2g} s know the motion with contact to "
+        f"after {trajectory.times[k]:.3g} s steps of {trajectory.step:.2g} s resolve the motion with contact to "
         f"{100.0 * float(trajectory.disagreement[k]):.2g} % of the displacement only ({why})"
     )
 
@@ -188,6 +188,6 @@ def _make_deadline(until: float) -> Any:
 
     def check(motion: int, reached: float) -> None:
         if time.monotonic() > until:
-            raise RunFailed(f"the integration takes too long; it came to {reached:.3g} s (--budget allows more)")
+            raise RunFailed(f"the integration takes too long; it reached {reached:.3g} s (--budget allows more)")
 
     return check

@@ -144,8 +144,8 @@ def _to_frames(values: NDArray[np.float64], n: int, path: Path) -> NDArray[np.fl
         return values.reshape(-1, n, 3)
     if values.shape == (n, 3):
         return values[None]
-    wanted = f"(frames, {n}, 3) or (frames, {3 * n})"
-    raise InputError(InputMistake(f"its array has the shape {values.shape}; expected {wanted}", path))
+    expectation = f"(frames, {n}, 3) or (frames, {3 * n})"
+    raise InputError(InputMistake(f"its array has the shape {values.shape}; expected {expectation}", path))
 
 
 def _read_table(path: Path, n: int, array: str) -> PositionSequence:
@@ -187,8 +187,8 @@ def _read_table(path: Path, n: int, array: str) -> PositionSequence:
     leading = {name: table[:, names.index(name)] for name in ("frame", "time") if name in names}
     coordinates = [column for column in range(table.shape[1]) if not (names and names[column] in leading)]
     if len(coordinates) != 3 * n:
-        wanted = f"one line a frame of {3 * n} numbers, or the columns frame, vertex, x, y, z"
-        raise InputError(InputMistake(f"has {len(coordinates)} columns; expected {wanted}", path, numbers[0]))
+        expectation = f"one line a frame of {3 * n} numbers, or the columns frame, vertex, x, y, z"
+        raise InputError(InputMistake(f"has {len(coordinates)} columns; expected {expectation}", path, numbers[0]))
     frames = _to_whole_numbers(leading["frame"], "frame", path) if "frame" in leading else None
     times = _to_times(leading["time"], path) if "time" in leading else None
     return PositionSequence(path, table[:, coordinates].reshape(-1, n, 3), frames, times)

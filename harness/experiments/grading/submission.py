@@ -185,12 +185,12 @@ def _check_times(scene: Scene, read: PositionSequence, first_frame: int) -> None
     """Raise InputError where the stated times are not those of the scene's steps."""
     if read.times is None:
         return
-    wanted = np.array([scene.compute_time(first_frame + k) for k in range(len(read.times))])
+    expected = np.array([scene.compute_time(first_frame + k) for k in range(len(read.times))])
     dt = scene.system.time_step
-    wrong = np.abs(read.times - wanted) > TIME_TOLERANCE * dt * np.maximum(1, np.arange(len(wanted)))
+    wrong = np.abs(read.times - expected) > TIME_TOLERANCE * dt * np.maximum(1, np.arange(len(expected)))
     if wrong.any():
         k = int(np.argmax(wrong))
-        problem = f"states the time {read.times[k]:g} s for frame {first_frame + k}; the scene's is {wanted[k]:g} s"
+        problem = f"states the time {read.times[k]:g} s for frame {first_frame + k}; the scene's is {expected[k]:g} s"
         raise InputError(
             InputMistake(f"{problem} (time_step {dt:g} s). Give the positions at the scene's steps", read.source)
         )
@@ -207,8 +207,8 @@ def _choose_match(
     """Return the vertex order, and add a sentence about it."""
     n = len(scene.mesh.rest_positions)
     if rest is not None:
-        wanted = scene.mesh.rest_positions
-        found = _match_vertices(wanted, rest, MATCH_FRACTION * _measure_size(wanted))
+        expected = scene.mesh.rest_positions
+        found = _match_vertices(expected, rest, MATCH_FRACTION * _measure_size(expected))
         if found is None:
             raise InputError(InputMistake(_describe_unmatched(scene.mesh.rest_positions, rest), read.source))
         notes.append(f"vertices: matched by the rest positions given; {_describe_match(found)}")
@@ -244,19 +244,19 @@ def _describe_match(match: VertexMatch) -> str:
     return order + axes
 
 
-def _match_vertices(wanted: Positions, came: Positions, tolerance: float) -> VertexMatch | None:
+def _match_vertices(expected: Positions, submitted: Positions, tolerance: float) -> VertexMatch | None:
     """Match vertices by position, one to one, within a tolerance [m]; None where that is impossible.
 
     The scene's order and usual axes are preferred, then other orders, then other axes.
     """
-    n = len(wanted)
-    if not np.isfinite(came).all():
+    n = len(expected)
+    if not np.isfinite(submitted).all():
         return None
     for axes in AXES:
-        there = came[:, axes]
-        if float(np.max(np.abs(wanted - there))) <= tolerance:
+        there = submitted[:, axes]
+        if float(np.max(np.abs(expected - there))) <= tolerance:
             return VertexMatch(np.arange(n), axes)
-        distance, vertices = cKDTree(there).query(wanted)
+        distance, vertices = cKDTree(there).query(expected)
         if float(np.max(distance)) <= tolerance and len(np.unique(vertices)) == n:
             return VertexMatch(np.asarray(vertices, np.int64), axes)
     return None
@@ -267,8 +267,8 @@ def _measure_size(p: Positions) -> float:
     return float(np.linalg.norm(np.ptp(p, axis=0))) or 1.0
 
 
-def _describe_unmatched(wanted: Positions, came: Positions) -> str:
-    distance, _ = cKDTree(came).query(wanted)
+def _describe_unmatched(expected: Positions, submitted: Positions) -> str:
+    distance, _ = cKDTree(submitted).query(expected)
     distance = np.asarray(distance, float)
     vertex = int(np.argmax(distance))
     return (

@@ -115,7 +115,7 @@ class CppBaseline:
 
     def _build_error(self) -> RunFailed:
         code = self._process.returncode
-        return RunFailed(f"the yardstick ended with {code}: {EXIT_MESSAGES.get(code, 'out of memory or killed')}")
+        return RunFailed(f"the C++ baseline ended with {code}: {EXIT_MESSAGES.get(code, 'out of memory or killed')}")
 
 
 def write_problem(path: Path, problem: StepProblem, springs: Springs) -> None:

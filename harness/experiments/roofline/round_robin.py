@@ -3,7 +3,7 @@
 Disturbances thus affect all candidates alike.
 
 Each candidate is first prepared (round 0, cold), then prepared again, then timed in the sweep's number of rounds. Final
-positions are compared, and only candidates that agree keep their times. A candidate that would take too long, as
+positions are compared, and only candidates that agree get times. A candidate that would take too long, as
 predicted from its smaller sizes, is skipped with a row that states so.
 """
 
@@ -72,12 +72,12 @@ def measure_round_robin(
         for candidate in candidates:
             cleanup.callback(_release_quietly, candidate)
             rows[candidate] = []
-            wanted = predict_seconds(
+            expected = predict_seconds(
                 past_timings.get(format_candidate_name(candidate.run), ()), counts["vertices"], candidate.run
             )
-            if wanted > budget:
+            if expected > budget:
                 reason = (
-                    f"would take {wanted:.0f} s by its smaller sizes; the budget of each candidate is {budget:.0f} s"
+                    f"would take {expected:.0f} s by its smaller sizes; the budget of each candidate is {budget:.0f} s"
                 )
                 rows[candidate].append({"phase": "run", "status": "skipped", "reason": reason})
             else:

@@ -146,4 +146,4 @@ def _multiply_adds(typingctx: Any, start: Any, repeats: Any) -> tuple[Any, Calla
 
 _multiply_add_chains: Any = intrinsic(
     _multiply_adds
-)  # Numba passes the first argument itself, which type checkers do not know
+)  # Numba passes the first argument itself, which no type checker sees

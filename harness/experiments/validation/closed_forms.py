@@ -43,7 +43,7 @@ from springbench.harness.scenes.mesh.network_mesh import NetworkMesh
 from springbench.solvers.model.step_problem import Positions, Solver
 
 _TAUT = EtherDragEffect(decay_rate=2.0)
-"""Drag on the way to rest, which does not change the state of rest."""
+"""Drag until rest is reached, which does not change the state of rest."""
 SAFETY_FACTOR = 1.25
 """Factor on the error estimated from two refinements of known order (Roache 1994, grid convergence index)."""
 ROUNDOFF_FRACTION = 1e-7
@@ -256,12 +256,12 @@ def hang_strip(
     h = length / num_cells
     x = h * np.arange(-1 if clamped else 0, num_cells + 1)
     mesh = build_sheet(np.asarray(x, np.float64), np.array([0.0, h]))
-    held = np.flatnonzero(mesh.rest_positions[:, 0] < 0.5 * h)
+    fixed = np.flatnonzero(mesh.rest_positions[:, 0] < 0.5 * h)
     effects: list[Any] = [
         SpringsEffect(stretch=stretch, shear=0.5 * stretch),
         GravityEffect(),
         _TAUT,
-        PinsEffect(indices=tuple(held.tolist()), weight="exact"),
+        PinsEffect(indices=tuple(fixed.tolist()), weight="exact"),
     ]
     if rigidity:
         effects.append(BendingEffect(stiffness=rigidity))

@@ -22,7 +22,7 @@ GRAVITY = 9.81
 STEP_RULE = StopRule(5000, 1e-11)
 """Every step is solved until round-off or this reduction of the residual, so that solvers add no error of their own."""
 REST_STEP, MAX_REST_FRAMES = 0.1, 400
-"""Time step [s] on the way to rest, which implicit Euler damps strongly, and the maximum number of steps."""
+"""Time step [s] until rest is reached, which implicit Euler damps strongly, and the maximum number of steps."""
 REST_MOTION = 1e-10
 """Displacement in a step, relative to the mesh's size, below which a scene counts as at rest."""
 

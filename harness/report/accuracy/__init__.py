@@ -1,1 +1,1 @@
-"""The rows of `springbench accuracy`: what they hold, and what follows from them."""
+"""The rows of `springbench accuracy`: their content, and what follows from them."""

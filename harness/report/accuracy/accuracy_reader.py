@@ -49,7 +49,7 @@ def read_accuracy(
     """
     units = row_store.list_units(folder / "accuracy") if files is None else sorted(files)
     if not units:
-        raise InputError(InputMistake("holds no accuracy rows; run `springbench accuracy CONFIG` first", folder))
+        raise InputError(InputMistake("contains no accuracy rows; run `springbench accuracy CONFIG` first", folder))
     kinds: dict[str, list[_ResultRow]] = defaultdict(list)
     # Columns that older rows and published ones do not have.
     missing = dict.fromkeys(
@@ -103,7 +103,7 @@ def _build_snapshots(kinds: dict[str, list[_ResultRow]], study: str) -> dict[str
         if not known:
             doubt = "no minimum is known; gaps refer to the lowest energy that a solver reached"
         elif seen < energies[0] - noise:
-            doubt = "a solver went below the lowest minimum that is certified; gaps refer to what it reached"
+            doubt = "a solver's energy is below the lowest certified minimum; gaps refer to that energy"
         if doubt and seen < (energies or [np.inf])[0] - noise:
             energies.insert(0, seen)
             names.insert(0, "")

@@ -62,7 +62,7 @@ def meshes_with_engines(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]
 def pareto_fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
     """Return the Pareto front of each program's settings in time and error.
 
-    The cheapest setting comes first, and so do the own methods.
+    The cheapest setting is first, and so are the own methods.
     """
     by_program: dict[str, list[WorkPoint]] = {OWN_PROGRAM: []}
     for work in works:

@@ -141,7 +141,7 @@ def select_long_curves(table: AccuracyData) -> list[ConvergenceCurve]:
 def _select_curtain_curves(table: AccuracyData, side: int, k: float) -> list[ConvergenceCurve]:
     """Select the curves of one curtain, with a stiffness tolerance of 10 %.
 
-    The tolerance allows for different ways to count pins, and still separates all stiffnesses.
+    The tolerance allows for different counts of pins, and still separates all stiffnesses.
     """
     return [
         c

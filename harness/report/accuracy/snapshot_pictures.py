@@ -11,7 +11,7 @@ from springbench.harness.report.accuracy.accuracy_data import AccuracyData, Conv
 def draw_snapshot_meshes(table: AccuracyData, results: Path, folder: Path) -> dict[str, Path]:
     """Draw the mesh of each problem from its closest recorded solve.
 
-    This is the solve that came closest to the minimum.
+    This is the solve with the smallest gap to the minimum.
 
     Args:
         table: data of an accuracy measurement.
@@ -22,7 +22,7 @@ def draw_snapshot_meshes(table: AccuracyData, results: Path, folder: Path) -> di
     if opengl_probe.find_opengl_problem() is not None:
         return {}
     from springbench.harness.recording.recording_reader import (
-        read_replay,  # slow to load, and most results hold no recordings
+        read_replay,  # slow to load, and most results contain no recordings
     )
     from springbench.harness.report.run_picture import draw_run_picture
 

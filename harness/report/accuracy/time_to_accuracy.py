@@ -134,8 +134,8 @@ def describe_crossings(race: Iterable[ConvergenceCurve]) -> list[str]:
         elif leader not in times or times[best].upper < times[leader].lower:
             known = leader in times
             other = f" against {format_duration(times[leader].seconds)}" if known else ", which does not reach it"
-            who = f"from {format_gap(target)} on {best.label} is faster than {leader.label}"
-            sentences.append(f"{who}: {format_duration(times[best].seconds)}{other}")
+            comparison = f"from {format_gap(target)} on {best.label} is faster than {leader.label}"
+            sentences.append(f"{comparison}: {format_duration(times[best].seconds)}{other}")
             leader = best
     return sentences
 

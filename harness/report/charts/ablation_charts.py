@@ -66,7 +66,7 @@ def build_effect_chart(
     rows = [row for some in found.values() for row in some]
     return ChartDescription(
         title="What each effect costs and changes",
-        note="CPU time of a step that goes where the effect is left out, with its 95 % interval, and how far that "
+        note="CPU time of a step that is saved where the effect is left out, with its 95 % interval, and how far that "
         "moves some vertex. An effect is called for where it moves more than the scene is wrong by anyway.",
         frames=[_build_effect_frame(name, some, newest_fingerprint) for name, some in found.items()],
         x=(
@@ -182,7 +182,7 @@ def _is_stale(row: ResultRow, newest_fingerprint: str | None) -> bool:
 def _build_overhead_map(here: Sequence[ResultRow], newest_fingerprint: str | None) -> CellMap:
     """Build the overhead map with effects in rows and solvers in columns.
 
-    The most expensive effect comes first, and all effects together come last.
+    The most expensive effect is first, and all effects together are last.
     """
     known = [row for row in here if row["status"] == "ok"]
     paid = {row["name"]: [r["overhead_ratio"] for r in known if r["name"] == row["name"]] for row in here}

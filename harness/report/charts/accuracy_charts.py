@@ -50,7 +50,7 @@ from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assig
 
 ACCURACY_COMMAND = "springbench accuracy CONFIG --rerun"
 COST_LABEL = "wall time a simulated second"
-ERROR_LABEL = "error of the positions, relative to the way from the start"
+ERROR_LABEL = "error of the positions, relative to the distance from the start"
 
 _MIN_ERROR = 1e-16
 """Smaller errors are drawn here: double precision resolves none below."""
@@ -219,7 +219,7 @@ def build_time_chart(table: AccuracyData, newest_fingerprint: str | None = None)
     gaps = AxisScale("energy gap to be reached", "names", place_names=tuple(map(format_power, GAP_TARGETS)))
     return ChartDescription(
         title="Time to accuracy",
-        note="Median over the rounds and over the steps of the mesh; where a line ends the solver goes no further.",
+        note="Median over the rounds and over the steps of the mesh; no gap below the end of a line is reached.",
         frames=frames,
         x=(ChartAxis("target", gaps),),
         y=tuple(ChartAxis(name, AxisScale("wall time", "log", "time"), name, words) for name, words in names.items()),

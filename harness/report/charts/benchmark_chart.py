@@ -15,7 +15,7 @@ RATIO_CHART, TIME_CHART = "gates", "gate-times"
 """Names of the charts of ratios to a baseline and of minimum times."""
 
 _CHART_WORDS = {
-    RATIO_CHART: ("Gates by commit", AxisScale("times its yardstick", "linear", "plain")),
+    RATIO_CHART: ("Gates by commit", AxisScale("times its baseline", "linear", "plain")),
     TIME_CHART: ("Least times by commit", AxisScale("least time", "linear", "time")),
 }
 _CHART_NOTE = (

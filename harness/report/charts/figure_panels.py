@@ -174,6 +174,10 @@ def describe_stale_cells(cells: Sequence[MapCell]) -> list[str]:
 class CellMap:
     """Coloured cells in rows and columns.
 
+    Matplotlib draws one (`report.figures.panel_drawing`). On the results page it is an HTML table of the same
+    data (`site/static/map.js`): headers, focus and arrow keys then work with a screen reader, and Plotly's heat map has
+    none.
+
     Attributes:
         group, name, subject, title, notes, machine_words: see `CurvePlot`.
         cells: cells, by rows.

@@ -26,7 +26,7 @@ _AXES = (
     ),
     ChartAxis(
         "speedup",
-        AxisScale("times faster than the yardstick in C++", "linear", "plain"),
+        AxisScale("times faster than the C++ baseline", "linear", "plain"),
         "speedup",
         is_on_sheets=False,
     ),
@@ -65,14 +65,14 @@ def build_speed_chart(
                 title="",
                 series=[*_build_series(here, styles, [is_stale(one) for one in here])],
                 notes=[
-                    f"Medians over the rounds, candidates in turns{load}.",
+                    f"Medians over the rounds, candidates interleaved{load}.",
                     *([STALE_NOTE] if newest_fingerprint is None and any(map(is_stale, here)) else []),
                 ],
             )
         )
     return ChartDescription(
         title="Speed and its limits",
-        note="A limit is what the machine reads or computes at most, measured in turns with the solvers; the yardstick "
+        note="A limit is what the machine reads or computes at most, interleaved with the solvers; the baseline "
         "is the same method in C++ with Eigen.",
         frames=frames,
         x=(ChartAxis("vertices", AxisScale("vertices", "sizes", "plain")),),

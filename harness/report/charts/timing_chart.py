@@ -207,7 +207,7 @@ def _describe_failures(here: Sequence[RunTimes], names: Mapping[str, str]) -> li
             reason = f", {shorten_words(' '.join(run.reason.split()), _REASON_LETTERS)}" if run.reason else ""
             causes.setdefault(run.status + reason, []).append(f"{names[run.run_id]} {run.size or ''}".rstrip())
     scene, more = here[0].scene, len(causes) - _MAX_FAILURE_NOTES
-    notes = [f"× Failed on {scene} ({cause}): {', '.join(who)}." for cause, who in causes.items()]
+    notes = [f"× Failed on {scene} ({cause}): {', '.join(labels)}." for cause, labels in causes.items()]
     return [*notes[:_MAX_FAILURE_NOTES], *([f"Runs of {scene} failed for {more} more reasons."] if more > 0 else [])]
 
 

@@ -15,8 +15,9 @@ from springbench.harness.report.charts.figure_panels import CellMap, CellOutcome
 from springbench.harness.report.number_format import format_count, format_quantity
 
 _WINNER_NOTE = (
-    "Columns: k dt²/m at dt = 1/30 s; rows: error of the positions at the end, relative to the way from the start. "
-    "Figures: how many times as much processor time the next family takes; · where it reaches no such error."
+    "Columns: k dt²/m at dt = 1/30 s; rows: error of the positions at the end, relative to the distance "
+    "from the start. Figures: how many times as much processor time the next family takes; · where it reaches no such "
+    "error."
 )
 _STALE_NOTE = "Dot: measured by other code than the others."
 _NO_WINNER_COLOUR = "#e9e7e2"
@@ -49,7 +50,7 @@ def build_winner_chart(table: AccuracyData, newest_fingerprint: str | None = Non
         for vertices in dict.fromkeys(cell.vertices for cell in found if len(styles) > 1)
     ]
     return ChartDescription(
-        title="The cheapest way to an error",
+        title="The cheapest method family for an error",
         note=" ".join(notes),
         maps=maps,
         machine_words=", ".join(table.machine_words),

@@ -99,9 +99,9 @@ class _EndLabels:
         """Move the labels to the heights of their curve ends, and apart."""
         ax = self._ax
         _, points = frame_size_points(ax)
-        wanted = [ax.transAxes.inverted().transform(ax.transData.transform(end))[1] * points for end in self._ends]
-        order = np.argsort(wanted)
-        at = spread_positions([wanted[k] for k in order], self._gap, points)
+        heights = [ax.transAxes.inverted().transform(ax.transData.transform(end))[1] * points for end in self._ends]
+        order = np.argsort(heights)
+        at = spread_positions([heights[k] for k in order], self._gap, points)
         label_position = self._label_position()
         for k, height in zip(order, at, strict=True):
             self._names[k].set_position((label_position, height / points))

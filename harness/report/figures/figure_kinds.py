@@ -135,7 +135,9 @@ FIGURE_KINDS: dict[str, FigureKind] = {
         (("alone",), ("over-1",)),
     ),
     "winners": FigureKind(
-        "The cheapest way to an error", f"{_ACCURACY_ROWS}, by two families", _list_accuracy_panels("winners")
+        "The cheapest method family for an error",
+        f"{_ACCURACY_ROWS}, by two families",
+        _list_accuracy_panels("winners"),
     ),
     "engines": FigureKind(
         "Outside engines compared with springbench", f"{_ACCURACY_ROWS}, with engines", _list_accuracy_panels("engines")

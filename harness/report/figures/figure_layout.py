@@ -123,8 +123,8 @@ LAYOUT_DPI = 100
 
 
 def _choose_column_count(panels: Sequence[FigurePanel], options: FigureOptions) -> int:
-    wanted = _PICTURE_WIDTH if isinstance(panels[0], MeshPicture) else _PANEL_WIDTH
-    abreast = max(1, int(options.width_mm * 8.0 / options.font_size / wanted))
+    expected = _PICTURE_WIDTH if isinstance(panels[0], MeshPicture) else _PANEL_WIDTH
+    abreast = max(1, int(options.width_mm * 8.0 / options.font_size / expected))
     rows = -(-len(panels) // abreast)
     return -(-len(panels) // rows)
 
@@ -135,11 +135,11 @@ def _compute_row_heights(
     """Compute the height of each row of panels [inches]."""
     width = options.width_mm / MILLIMETRES_PER_INCH / columns
     room = _MAX_HEIGHT_RATIO * options.width_mm / MILLIMETRES_PER_INCH / -(-len(panels) // columns)
-    wanted = [
+    expected = [
         _compute_panel_height(panel, len(head), width, room, options)
         for panel, head in zip(panels, title_lines, strict=True)
     ]
-    return [max(wanted[k : k + columns]) for k in range(0, len(wanted), columns)]
+    return [max(expected[k : k + columns]) for k in range(0, len(expected), columns)]
 
 
 def _compute_panel_height(panel: FigurePanel, head: int, width: float, room: float, options: FigureOptions) -> float:

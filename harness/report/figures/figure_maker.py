@@ -53,7 +53,7 @@ def make_figure(
     """
     entries = kind.list_panels(results, find_stale)
     if not entries:
-        raise InputError(InputMistake(f"holds nothing to draw as {name}; expected {kind.required_rows}", results))
+        raise InputError(InputMistake(f"contains nothing to draw as {name}; expected {kind.required_rows}", results))
     usual = [one for one in kind.default_panels if any(set(one) <= set(known.name_parts) for known in entries)]
     picked = panel_selection.select_entries(entries, options.selectors or usual)
     panels = kind.prepare_panels(picked)

@@ -66,8 +66,8 @@ def parse_figure_options(
     """
     mistakes: list[InputMistake] = []
     millimetres = _parse_length(width, mistakes)
-    wanted = tuple(dict.fromkeys(word.strip().lower() for word in formats.split(",") if word.strip()))
-    for word in wanted or ("",):
+    expected = tuple(dict.fromkeys(word.strip().lower() for word in formats.split(",") if word.strip()))
+    for word in expected or ("",):
         if word not in FIGURE_FORMATS:
             mistakes.append(
                 InputMistake(f"got {word!r}; expected {suggest_name(word, FIGURE_FORMATS)}", key="--format")
@@ -80,7 +80,7 @@ def parse_figure_options(
     if mistakes:
         raise InputError(mistakes)
     selectors = tuple(tuple(part for part in one.split(":") if part) for one in panels.split(",") if one.strip(" :"))
-    return FigureOptions(millimetres, wanted, font_size, selectors, has_title, is_transparent)
+    return FigureOptions(millimetres, expected, font_size, selectors, has_title, is_transparent)
 
 
 def _parse_length(words: str, mistakes: list[InputMistake]) -> float:
@@ -92,6 +92,6 @@ def _parse_length(words: str, mistakes: list[InputMistake]) -> float:
         return 0.0
     length = float(found[1]) * _MILLIMETRES_PER_UNIT[found[2]]
     if not _MIN_WIDTH <= length <= _MAX_WIDTH:
-        wanted = f"got {words}; expected from {_MIN_WIDTH:g}mm to {_MAX_WIDTH:g}mm"
-        mistakes.append(InputMistake(wanted, key="--width"))
+        expected = f"got {words}; expected from {_MIN_WIDTH:g}mm to {_MAX_WIDTH:g}mm"
+        mistakes.append(InputMistake(expected, key="--width"))
     return length

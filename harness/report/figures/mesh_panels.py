@@ -121,7 +121,7 @@ def _find_recorded_runs(folder: Path) -> list[_RecordedRun]:
         for path in [*(folder / "recordings").glob(f"*-{one.run_id}.rrd")][:1]
     ]
     if not there:
-        raise InputError(InputMistake("holds no recordings; run a sweep with `record: true`", folder))
+        raise InputError(InputMistake("contains no recordings; run a sweep with `record: true`", folder))
     return there
 
 
@@ -131,7 +131,7 @@ def _build_picture(
     replay = _read_cached_replay(path)
     frames = find_drawable_frames(replay)
     if not len(frames):
-        raise InputError(InputMistake("holds no frame whose positions are finite; choose another run", path))
+        raise InputError(InputMistake("contains no frame whose positions are finite; choose another run", path))
     frame = int(frames[-1])
     lost = f", the last that is finite, of {len(replay.frames)}" if frame + 1 < len(replay.frames) else ""
     points = points_to_frame(replay, [frame])

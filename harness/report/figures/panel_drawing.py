@@ -112,7 +112,7 @@ def _draw_curve(ax: Axes, series: CurveSeries, options: FigureOptions) -> None:
                 **marker_style(look, options.mark_scale * series.marker_scale, is_stale=hollow),
             )
             if series.is_stepped:
-                marks.set_markevery((0.1, 0.3))  # a step is no measurement: marks but tell the curves apart
+                marks.set_markevery((0.1, 0.3))  # a step is no measurement: its marks only distinguish the curves
             elif many:
                 marks.set_markevery(0.14)
 
@@ -186,7 +186,7 @@ def draw_cell_map(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
     """Draw the cells of a map with row and column names.
 
     Row names are at the left, column names above. Cells measured by other code have a dot in the corner, unless that
-    holds for all.
+    applies to all.
 
     Args:
         ax: axes.

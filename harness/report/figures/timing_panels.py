@@ -30,10 +30,10 @@ def read_sweep_rows(folder: Path) -> pa.Table:
     """
     units = row_store.list_units(folder / "rows")
     if not units:
-        raise InputError(InputMistake("holds no rows of runs; expected those of `springbench run CONFIG`", folder))
+        raise InputError(InputMistake("contains no rows of runs; expected those of `springbench run CONFIG`", folder))
     table = parquet_rows.read_rows(units, required_columns=_REQUIRED_COLUMNS)
     if speed_figures.has_machine_limits(table):
-        raise InputError(InputMistake("holds rows of `springbench roofline`; ask for the kind speed", folder))
+        raise InputError(InputMistake("contains rows of `springbench roofline`; draw the kind `speed`", folder))
     return table
 
 
@@ -56,6 +56,6 @@ def speed_panels(folder: Path) -> list[PanelEntry]:
     table = parquet_rows.read_rows(units, required_columns=_REQUIRED_COLUMNS) if units else None
     if table is None or not speed_figures.has_machine_limits(table):
         raise InputError(
-            InputMistake("holds no speed report; expected the rows of `springbench roofline CONFIG`", folder)
+            InputMistake("contains no speed report; expected the rows of `springbench roofline CONFIG`", folder)
         )
     return entries_from_panels(select_curve_plots(build_speed_chart(speed_figures.compute_speed_figures(table))))

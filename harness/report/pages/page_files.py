@@ -38,7 +38,7 @@ def render_pages(root: Path) -> list[RenderedPage]:
     """Render all templates of a checkout. Raises InputError for a mistake in one, or without a published set."""
     templates = find_templates(root)
     if not templates:
-        raise InputError(InputMistake("holds no templates of pages; expected the root of a checkout", root))
+        raise InputError(InputMistake("contains no templates of pages; expected the root of a checkout", root))
     queries = PublishedQueries(root / PUBLISHED_FOLDER)
     return [render_page(template, queries) for template in templates]
 

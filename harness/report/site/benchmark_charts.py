@@ -75,5 +75,5 @@ def _describe_changes(gate_histories: Sequence[BenchmarkHistory]) -> Iterable[Ch
         return
     words = f"{still} of {len(gate_histories)} gates show no change beyond noise."
     if few := len(gate_histories) - len(known):
-        words = f"{words[:-1]}; {few} have fewer than the {MIN_RESULTS} results that it takes to tell."
+        words = f"{words[:-1]}; {few} have fewer than the {MIN_RESULTS} results that a verdict needs."
     yield {"text": words}

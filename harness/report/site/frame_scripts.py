@@ -54,7 +54,7 @@ def write_frame_scripts(folder: SweepFolder, table: pa.Table, data: Path, run_id
     sql = f"""
         with steps as (
             select run_id, frame, {inner} from rows_of
-            where phase = 'step' and frame is not null and run_id in (select unnest($wanted)) group by run_id, frame
+            where phase = 'step' and frame is not null and run_id in (select unnest($requested)) group by run_id, frame
         ) select run_id, to_json({{'frame': list(frame order by frame), {outer}}}) from steps group by run_id"""
-    for run, value in query_table(sql, table, {"wanted": list(run_ids)}):
+    for run, value in query_table(sql, table, {"requested": list(run_ids)}):
         data_scripts.write_json_script(data_scripts.script_path(data / "runs", run), f"{folder.slug}/runs/{run}", value)

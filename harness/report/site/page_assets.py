@@ -1,6 +1,6 @@
 """Static files of the results page: scripts, style, and Plotly's script.
 
-Plotly's script comes from the installed package.
+Plotly's script is that of the installed package.
 """
 
 from __future__ import annotations

@@ -78,5 +78,5 @@ def find_folders(results: Path) -> list[SweepFolder]:
     found |= {path.parent.parent for depth in ("", "*/") for path in results.glob(depth + _BENCHMARK_GLOB)}
     seen = [path for path in found if not any(part.startswith(".") for part in path.relative_to(results).parts)]
     if not seen:
-        raise InputError(InputMistake("holds no rows; run a sweep first, or name a folder of results", results))
+        raise InputError(InputMistake("contains no rows; run a sweep first, or name a folder of results", results))
     return [locate_folder(path, results) for path in sorted(seen)]

@@ -128,7 +128,7 @@ def _build_section(
     try:
         return read(folder, data_folder, with_recordings, print_message)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        problem = f"holds rows of the kind {kind} that do not fit together ({type(error).__name__}: {error})"
+        problem = f"contains rows of the kind {kind} that do not fit together ({type(error).__name__}: {error})"
         raise InputError(InputMistake(f"{problem}; take them out of the results", folder.path)) from error
 
 

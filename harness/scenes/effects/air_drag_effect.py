@@ -59,7 +59,7 @@ class AirDragEffect(ConfigModel):
         if observed.is_driven or observed.is_damped or len(v) < 8:
             return ""
         most = float(_compute_kinetic_energy(mass, v).max())
-        if not observed.has_pins:  # what nothing holds may fly, fall or slide on as a whole
+        if not observed.has_pins:  # a body without supports may fly, fall or slide as a whole
             v = v - np.einsum("i,fix->fx", mass / mass.sum(), v)[:, None]
         late = float(_compute_kinetic_energy(mass, v[-len(v) // 4 :]).mean())
         if not most or late <= MIN_ENERGY_FRACTION * most:

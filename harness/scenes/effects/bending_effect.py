@@ -135,7 +135,7 @@ def _find_hinges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.empty((0, 4), np.int64)
     rolled = np.concatenate([np.roll(triangles, -k, axis=1) for k in range(3)])  # an edge, then the corner across
     ends = np.sort(rolled[:, :2], axis=1)
-    code = ends[:, 0] * (int(triangles.max()) + 1) + ends[:, 1]  # one number for an edge, whichever end comes first
+    code = ends[:, 0] * (int(triangles.max()) + 1) + ends[:, 1]  # one number for an edge, for both orders of its ends
     order = np.argsort(code, kind="stable")
     twice = np.flatnonzero(code[order][1:] == code[order][:-1])
     first, second = rolled[order[twice]], rolled[order[twice + 1]]

@@ -30,7 +30,7 @@ _MARGIN_FRACTION = 0.1
 
 
 class ContactEffect(ConfigModel):
-    """Keeps the vertices of the mesh outside of obstacles; thin obstacles cannot be tunnelled within a step.
+    """Prevents vertices of the mesh from entering obstacles; thin obstacles cannot be tunnelled within a step.
 
     The stiffness k of contact follows from the penetration tolerance. A vertex that arrives with the speed v ends at
     most v dt Q_ii / k deep, where Q_ii is the resistance of inertia and springs: k_i = 4 Q_ii max(1, v dt / tolerance).
@@ -42,7 +42,7 @@ class ContactEffect(ConfigModel):
     obstacles: tuple[AnyObstacle, ...] = Field(min_length=1)
     """Obstacles that the vertices collide with."""
     min_distance: Annotated[PositiveFloat, Field(le=1e9)] = 0.005
-    """Distance [m] that vertices keep from an obstacle's surface; shorter than every spring at rest."""
+    """Minimum distance [m] of vertices from an obstacle's surface; shorter than every spring at rest."""
     friction: NonNegativeFloat = 0.0
     """Coulomb's friction coefficient mu, both static and kinetic."""
     penetration_tolerance: PositiveFloat | None = None
@@ -102,7 +102,7 @@ class ContactEffect(ConfigModel):
             for pin in pins:
                 if met := find_first_violation(obstacle, given.motion, pin.targets, pin.motion, limit):
                     time, distance = met
-                    self._raise_penetration(mesh, f"pins hold vertex {{}} at {time:g} s", k, distance, pin.vertices)
+                    self._raise_penetration(mesh, f"pins fix vertex {{}} at {time:g} s", k, distance, pin.vertices)
             self._raise_penetration(
                 mesh, "vertex {} starts", k, obstacle.signed_distance(start, 0.0), np.arange(len(start))
             )
@@ -117,14 +117,14 @@ class ContactEffect(ConfigModel):
                     )
 
     def _raise_penetration(
-        self, mesh: Mesh, who: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]
+        self, mesh: Mesh, subject: str, k: int, distance: NDArray[np.float64], vertices: NDArray[np.int64]
     ) -> None:
         near = np.flatnonzero(distance < self.min_distance - self.max_penetration)
         if len(near):
             worst = near[distance[near].argmin()]
             vertex = f"{vertices[worst]}{mesh.format_file_numbers(int(vertices[worst]))}"
             raise InputError(
-                f"contact: {who.format(vertex)} {distance[worst]:.3g} m from the surface of obstacles[{k}] "
+                f"contact: {subject.format(vertex)} {distance[worst]:.3g} m from the surface of obstacles[{k}] "
                 f"({self.obstacles[k].kind}), which is nearer than the min_distance of {self.min_distance:g} m; move "
                 "one of them" + (" (negative distances are inside)" if distance[worst] < 0.0 else "")
             )

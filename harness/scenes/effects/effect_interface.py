@@ -19,7 +19,7 @@ from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.integrators import has_split_filters
 from springbench.solvers.model.step_problem import Energy, LengthConstraints, Positions
 
-if TYPE_CHECKING:  # for those who have any
+if TYPE_CHECKING:
     from springbench.harness.scenes.edge_triangle_intersections import IntersectionCheck
 
 
@@ -212,11 +212,13 @@ def build_length_constraints(
     r = rest.rest_length
     if len(none := np.flatnonzero(r == 0.0)):
         i, j = rest.edges[none[0]]
-        problem = f"the spring {i}-{j} has no length at rest, and none that could be kept; give a stiffness in figures"
+        problem = (
+            f"the spring {i}-{j} has no length at rest, and so no length to constrain; give a stiffness in figures"
+        )
         raise InputError(problem)
     lengths = LengthConstraints(rest.edges, min_ratio * r, max_ratio * r, rest.rest_direction)
     return EffectContribution(
-        length_constraints=(lengths,), end_of_step_reasons=("keeps lengths as they are at the end of a step",)
+        length_constraints=(lengths,), end_of_step_reasons=("corrects lengths at the end of a step",)
     )
 
 

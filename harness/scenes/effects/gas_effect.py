@@ -46,7 +46,7 @@ def _require_closed_surface(sides: NDArray[np.int64], mesh: Mesh) -> None:
     if (count > 1).any():
         i, j = divmod(int(code[count > 1][0]), n)
         raise InputError(
-            f"gas: two triangles go the same way along the edge from vertex {i} to {j}"
+            f"gas: two triangles traverse the edge in the same direction, from vertex {i} to {j}"
             f"{mesh.format_file_numbers(i, j)}; let all triangles face outwards"
         )
     alone = ~np.isin(forth, back)

@@ -129,13 +129,13 @@ class SelfContactEffect(ConfigModel):
             f"{MIN_DISTANCE_FRACTION:g} mean rest lengths at "
             f"{observed.compute_frame_time(at):.2f} s, two come as close as "
             f"{closest / observed.mean_spring_length:.2g}; contact with obstacles "
-            "does not keep them apart"
+            "does not separate them"
         )
 
 
 def _find_close_pairs(p: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
     """Find pairs of vertices (k, 2) closer than `reach` [m]."""
-    from scipy.spatial import KDTree  # for those who look
+    from scipy.spatial import KDTree  # imported where it is used
 
     return KDTree(p).query_pairs(reach, output_type="ndarray").astype(np.int64)
 

@@ -49,5 +49,5 @@ def trace_boundary_loops(points: NDArray[np.float64], triangles: IndexArray) -> 
     rounded = {int(x[0]): float(f"{length[of[x[0]]]:.{_COMPARED_DIGITS}g}") for x in found}
     found.sort(key=lambda x: (-rounded[int(x[0])], int(x[0])))
     by_surface = groupby(sorted(found, key=lambda x: int(surface[x[0]])), key=lambda x: int(surface[x[0]]))
-    rims = {int(next(of_one)[0]) for _, of_one in by_surface}  # sorting keeps the order: the longest is first
+    rims = {int(next(of_one)[0]) for _, of_one in by_surface}  # sorting is stable: the longest is first
     return [BoundaryLoop(x, float(length[of[x[0]]]), int(x[0]) not in rims) for x in found]

@@ -70,8 +70,8 @@ class FileMesh(SpringValueKeys):
     """Distance [m], after scaling, up to which vertices become one, the first of them; 0 joins those in one place. By
     default none are joined."""
     unused: UnusedRule | None = None
-    """Vertices without a face, line or tetrahedron; by default dropped from Gmsh files, which contain points of the
-    geometry, and kept in others."""
+    """Vertices without a face, line or tetrahedron; by default dropped, from Gmsh files alone, which contain points of
+    the geometry."""
     faces: FaceRule = "strict"
     """Faces that name a vertex twice or have no area. `strict`: the former are errors, and the latter stay;
     `drop-degenerate`: repeated corners are joined, and faces without area are dropped."""

@@ -1,7 +1,7 @@
 """Signs that a mesh file was cut before its end, by format.
 
 A reader that fails on such a file reports a symptom: a shape, a decoding error. Some readers accept it, and VTK
-fills what is missing with arbitrary numbers. The checks count what the head of the file promises, or look for its end
+fills what is missing with arbitrary numbers. The checks count what the head of the file declares, or look for its end
 marker.
 """
 
@@ -153,7 +153,7 @@ def _find_cut_vtk(content: bytes) -> str:
             else:
                 raise KeyError(name)
             if not scan.skip_values(count, kind, len(words) - used):
-                return f"its section {name} promises {count:,} numbers, and fewer follow"
+                return f"its section {name} declares {count:,} numbers, and fewer follow"
         except (IndexError, KeyError, ValueError):
             if scan.place >= len(content):
                 return f"it ends at the head of its section {name[:40]}"

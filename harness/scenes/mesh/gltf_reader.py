@@ -64,7 +64,7 @@ def _split_container(content: bytes) -> tuple[dict[str, Any], bytes]:
         return json.loads(content.decode("utf-8-sig")), b""
     _, _, length = struct.unpack_from("<4sII", content)
     if length > len(content):
-        raise ValueError(f"its head promises {length:,} bytes, and {len(content):,} are there; the file was cut")
+        raise ValueError(f"its head declares {length:,} bytes, and {len(content):,} are there; the file was cut")
     chunks, at = dict[int, bytes](), 12
     while at + 8 <= length:
         size, kind = struct.unpack_from("<II", content, at)
@@ -91,10 +91,10 @@ def _read_buffer(buffer: dict[str, Any], binary: bytes, folder: Path) -> bytes:
     else:
         file = folder / unquote(uri)
         if not file.is_file():
-            raise ValueError(f"its buffer {uri[:80]!r} is not in its folder; keep the files together")
+            raise ValueError(f"its buffer {uri[:80]!r} is not in its folder; move the files together")
         content = file.read_bytes()
     if len(content) < buffer["byteLength"]:
-        raise ValueError(f"a buffer promises {buffer['byteLength']:,} bytes, and {len(content):,} are there")
+        raise ValueError(f"a buffer declares {buffer['byteLength']:,} bytes, and {len(content):,} are there")
     return content
 
 

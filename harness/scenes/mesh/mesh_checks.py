@@ -97,19 +97,19 @@ def build_edge_table(triangles: IndexArray) -> EdgeTable:
 
 
 class MeshSupport(NamedTuple):
-    """What holds a mesh: vertices (q,) with pins or attachments, and pairs (k, 2) that effects join."""
+    """Supports of a mesh: vertices (q,) with pins or attachments, and pairs (k, 2) that effects join."""
 
     fixed_vertices: IndexArray = NO_VERTICES
     joined_pairs: IndexArray = NO_PAIRS
 
 
 def check_parts(num_vertices: int, pairs: IndexArray, support: MeshSupport | None = None) -> list[MeshFinding]:
-    """Check for connected parts that nothing holds.
+    """Check for connected parts without a support.
 
     Args:
         num_vertices: number of vertices.
         pairs: edges (m, 2).
-        support: what holds the mesh; None if that is unknown.
+        support: supports of the mesh; None if they are unknown.
     """
     joined = pairs if support is None else np.concatenate([pairs, support.joined_pairs])
     part = find_connected_parts(num_vertices, joined)
@@ -125,7 +125,7 @@ def check_parts(num_vertices: int, pairs: IndexArray, support: MeshSupport | Non
     if not len(loose):
         return []
     vertices = np.flatnonzero(np.isin(part, loose) & used)
-    problem = f"parts that nothing holds: {len(loose):,} of {len(parts):,}, with {len(vertices):,} vertices"
+    problem = f"parts without a support: {len(loose):,} of {len(parts):,}, with {len(vertices):,} vertices"
     fix = "they fall; pin them, or join them by `weld` or sewing"
     return [MeshFinding("loose-parts", len(loose), problem, fix, vertices=vertices)]
 
@@ -178,7 +178,7 @@ def find_near_vertices(points: PointArray, pairs: IndexArray) -> tuple[IndexArra
     place = points[used]
     target = find_weld_targets(place, 0.0)
     same, first = np.flatnonzero(target != np.arange(len(used))), np.flatnonzero(target == np.arange(len(used)))
-    tree: Any = cKDTree(place[first])  # one for each place: a place may hold a thousand vertices
+    tree: Any = cKDTree(place[first])  # one for each place: a place may have a thousand vertices
     lists: list[list[int]] = tree.query_ball_point(place[first], radius[first]).tolist()
     i = np.repeat(first, [len(some) for some in lists])
     j = first[np.array([one for some in lists for one in some], np.int64)]

@@ -177,7 +177,7 @@ def _read_with_meshio(path: Path) -> _MeshioMesh:
             return cast(_MeshioMesh, meshio.read(path))
     except SystemExit:
         reason = "; ".join(filter(None, map(str.strip, output.getvalue().splitlines())))
-        raise ValueError(reason or f"it does not hold what a {path.suffix} file begins with") from None
+        raise ValueError(reason or f"it does not contain what a {path.suffix} file begins with") from None
 
 
 def _tag_ungrouped_entities(read_entities: Callable[..., Any]) -> Callable[..., Any]:

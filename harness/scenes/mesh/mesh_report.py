@@ -112,7 +112,7 @@ def build_mesh_report(source: FileMesh, support: MeshSupport | None = None) -> M
 
     Args:
         source: the file, with the changes of its cells that a scene requests.
-        support: what holds the mesh in a scene; None without a scene.
+        support: supports of the mesh in a scene; None without a scene.
 
     Raises:
         InputError: for a file that cannot be read.

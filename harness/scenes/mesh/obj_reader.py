@@ -156,7 +156,7 @@ class _ObjReader:
                 raise ValueError(f"{word[:40]!r} is no vertex; expected v, v/vt, v//vn or v/vt/vn, counted from 1")
             corners.append(index - 1 if index > 0 else len(self.points) + index)
             if corners[-1] < 0:
-                raise ValueError(f"vertex {index} lies before the first; only {len(self.points)} came so far")
+                raise ValueError(f"vertex {index} lies before the first; only {len(self.points)} are listed before it")
         return corners
 
     def build_cells(self) -> MeshCells:

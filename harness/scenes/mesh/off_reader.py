@@ -27,7 +27,7 @@ def read_off(content: bytes) -> PolygonContent:
         raise ValueError("it does not begin with OFF and the numbers of vertices and faces")
     n, f = int(rows[0][0]), int(rows[0][1])
     if len(rows) <= n + f:
-        what = f"its head promises {n:,} vertices and {f:,} faces, and {len(rows) - 1:,} lines follow"
+        what = f"its head declares {n:,} vertices and {f:,} faces, and {len(rows) - 1:,} lines follow"
         raise ValueError(f"{what}; the file was cut")
     points = np.array([[float(word) for word in row[:3]] for row in rows[1 : n + 1]], np.float64)
     faces = [[float(word) for word in row[1 : 1 + int(row[0])]] for row in rows[n + 1 : n + f + 1]]

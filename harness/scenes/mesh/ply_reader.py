@@ -72,16 +72,16 @@ def read_ply(content: bytes) -> PolygonContent:
     )
     columns, faces = dict[str, FloatArray](), dict[int, tuple[IndexArray, IndexArray]]()
     for element in elements:
-        wanted = _find_corner_property(element) if element.name == "face" else ""
-        found = rows_of(element, wanted)
+        expected = _find_corner_property(element) if element.name == "face" else ""
+        found = rows_of(element, expected)
         if element.name == "vertex":
             columns = found.columns
-        elif wanted:
+        elif expected:
             faces = group_by_corner_count(found.lists)
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
     if not faces and any(element.name == "tristrips" for element in elements):
-        raise ValueError("it holds triangle strips (tristrips); save it with faces instead")
+        raise ValueError("it contains triangle strips (tristrips); save it with faces instead")
     points = np.column_stack([columns.pop(axis) for axis in "xyz"])
     return PolygonContent(
         points, columns, faces, _find_first_face_line(content, start, elements) if form == "ascii" else 0
@@ -162,7 +162,7 @@ class _ElementRows(NamedTuple):
 
 def _make_truncation_error(element: PlyElement) -> ValueError:
     return ValueError(
-        f"its head promises {element.num_rows:,} rows of {element.name}, and fewer follow; the file was cut"
+        f"its head declares {element.num_rows:,} rows of {element.name}, and fewer follow; the file was cut"
     )
 
 
@@ -178,7 +178,7 @@ class _TextBody:
                 raise ValueError("something behind its head is no number") from None
         self._position = 0
 
-    def read_rows(self, element: PlyElement, wanted: str) -> _ElementRows:
+    def read_rows(self, element: PlyElement, expected: str) -> _ElementRows:
         """Read the next rows; raise ValueError on failure."""
         n, properties, begun = element.num_rows, element.properties, self._position
         if not n or not properties:
@@ -197,9 +197,9 @@ class _TextBody:
             ):
                 self._position = begun + n * width
                 columns = {one.name: table[:, places[one.name]] for one in properties if not one.length_type}
-                first = places.get(wanted, 0)
-                return _ElementRows(columns, table[:, first + 1 : first + 1 + int(table[0, first])] if wanted else [])
-        return self._read_unequal_rows(element, wanted, begun)
+                first = places.get(expected, 0)
+                return _ElementRows(columns, table[:, first + 1 : first + 1 + int(table[0, first])] if expected else [])
+        return self._read_unequal_rows(element, expected, begun)
 
     def _locate_properties(self, element: PlyElement) -> tuple[dict[str, int], int]:
         """Locate the properties of the row that starts here, and the end of the row."""
@@ -219,7 +219,7 @@ class _TextBody:
             raise ValueError(f"a list of its {element.name} has the length {value:g}; expected a whole number")
         return int(value)
 
-    def _read_unequal_rows(self, element: PlyElement, wanted: str, begun: int) -> _ElementRows:
+    def _read_unequal_rows(self, element: PlyElement, expected: str, begun: int) -> _ElementRows:
         lists, columns = (
             list[FloatArray](),
             {one.name: list[float]() for one in element.properties if not one.length_type},
@@ -229,8 +229,8 @@ class _TextBody:
             places, end = self._locate_properties(element)
             for name, column in columns.items():
                 column.append(float(self._values[self._position + places[name]]))
-            if wanted:
-                first = self._position + places[wanted]
+            if expected:
+                first = self._position + places[expected]
                 lists.append(self._values[first + 1 : first + 1 + int(self._values[first])])
             self._position = end
         return _ElementRows({name: np.array(column) for name, column in columns.items()}, lists)
@@ -242,7 +242,7 @@ class _BinaryBody:
     def __init__(self, content: bytes, start: int, order: str) -> None:
         self._content, self._position, self._order = content, start, order
 
-    def read_rows(self, element: PlyElement, wanted: str) -> _ElementRows:
+    def read_rows(self, element: PlyElement, expected: str) -> _ElementRows:
         """Read the next rows; raise ValueError on failure."""
         n, properties, begun = element.num_rows, element.properties, self._position
         if not n or not properties:
@@ -269,9 +269,11 @@ class _BinaryBody:
                 columns = {
                     one.name: _to_floats(table[f"{i}"]) for i, one in enumerate(properties) if not one.length_type
                 }
-                lists = [_to_floats(table[f"{i}"]) for i, one in enumerate(properties) if wanted and one.name == wanted]
+                lists = [
+                    _to_floats(table[f"{i}"]) for i, one in enumerate(properties) if expected and one.name == expected
+                ]
                 return _ElementRows(columns, lists[0] if lists else [])
-        return self._read_unequal_rows(element, wanted, begun)
+        return self._read_unequal_rows(element, expected, begun)
 
     def _parse_length(self, element: PlyElement, one: PlyProperty) -> int:
         """Read the length of the list that starts here, and advance past it."""
@@ -289,7 +291,7 @@ class _BinaryBody:
             raise _make_truncation_error(element)
         return np.frombuffer(self._content, dtype, count, begun)
 
-    def _read_unequal_rows(self, element: PlyElement, wanted: str, begun: int) -> _ElementRows:
+    def _read_unequal_rows(self, element: PlyElement, expected: str, begun: int) -> _ElementRows:
         lists, columns = (
             list[FloatArray](),
             {one.name: list[float]() for one in element.properties if not one.length_type},
@@ -301,7 +303,7 @@ class _BinaryBody:
                     columns[one.name].append(float(self._read_values(element, one.type, 1)[0]))
                     continue
                 values = self._read_values(element, one.type, self._parse_length(element, one))
-                if one.name == wanted:
+                if one.name == expected:
                     lists.append(_to_floats(values))
         return _ElementRows({name: np.array(column) for name, column in columns.items()}, lists)
 

@@ -133,11 +133,11 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
     rest, groups = cells.points, list(cells.polygons.values())
     pairs = sum(len(g) * (g.shape[1] if spring_rule == "edges" else g.shape[1] ** 2 // 2) for g in groups)
     if not len(rest) or not (pairs or len(cells.segments) or len(cells.tetrahedra)):
-        raise InputError(InputMistake("holds no vertices or no cells (faces, lines, tetrahedra); was it cut?", path))
+        raise InputError(InputMistake("contains no vertices or no cells (faces, lines, tetrahedra); was it cut?", path))
     if len(rest) > MAX_VERTICES or pairs > _MAX_PAIRS:
         raise InputError(
             InputMistake(
-                f"holds {len(rest):,} vertices and about {pairs:,} pairs on faces; "
+                f"contains {len(rest):,} vertices and about {pairs:,} pairs on faces; "
                 f"at most {MAX_VERTICES:,} and {_MAX_PAIRS:,} are allowed",
                 path,
             )
@@ -170,7 +170,7 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
     else:
         dimension, weights = 1, lump_lengths(rest, springs[STRETCH])
     if not weights.any():
-        raise InputError(InputMistake("holds cells without any size: all their vertices coincide or line up", path))
+        raise InputError(InputMistake("contains cells without any size: all their vertices coincide or line up", path))
 
     i, j = springs[STRETCH].T
     return assemble_mesh(
@@ -266,12 +266,12 @@ def _distribute_areas(surface: FaceTriangulation, springs: Mapping[str, IndexArr
 
 def _sum_by_pair(springs: IndexArray, pairs: IndexArray, values: PointArray, num_vertices: int) -> PointArray:
     """Sum values of pairs (p, 2) to the springs (m, 2) of these vertices, (m,); other pairs are ignored."""
-    codes, wanted = (np.sort(some, axis=1) @ [num_vertices, 1] for some in (springs, pairs))
+    codes, expected = (np.sort(some, axis=1) @ [num_vertices, 1] for some in (springs, pairs))
     order = np.argsort(codes, kind="stable")
     if not len(order):
         return np.empty(0)
-    found = order[np.minimum(np.searchsorted(codes, wanted, sorter=order), len(order) - 1)]
-    valid = codes[found] == wanted
+    found = order[np.minimum(np.searchsorted(codes, expected, sorter=order), len(order) - 1)]
+    valid = codes[found] == expected
     return np.bincount(found[valid], values[valid], minlength=len(springs)).astype(np.float64, copy=False)
 
 

@@ -198,8 +198,8 @@ def _require(is_valid: NDArray[np.bool_], problem: str, key: str, values: NDArra
     """Raise InputError for the first spring that is not valid."""
     if not is_valid.all():
         spring = int(np.argmin(is_valid))
-        came = "" if values is None else f"{values[spring]:g} "
-        raise _make_value_error(f"of spring {spring}, {came}{problem}", key)
+        got = "" if values is None else f"{values[spring]:g} "
+        raise _make_value_error(f"of spring {spring}, {got}{problem}", key)
 
 
 def _make_value_error(problem: str, key: str) -> InputError:

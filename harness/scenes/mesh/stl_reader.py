@@ -1,7 +1,7 @@
 """Reader of STL files, text or binary: triangles whose corners in one place are one vertex, in order of appearance.
 
-Binary files may begin with `solid` too; their size, and the absence of facets in words, tell them apart. Bytes behind
-the promised triangles are ignored.
+Binary files may begin with `solid` too; their size, and the absence of facets in words, distinguish them. Bytes behind
+the declared triangles are ignored.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def read_stl(content: bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
             raise ValueError(f"it has {len(words)} vertices; expected three for each triangle")
         corners = np.array([[float(word) for word in row] for row in words], np.float64).reshape(-1, 3)
     else:
-        count = _count_promised(content)
+        count = _count_declared(content)
         triangles = np.frombuffer(content, _TRIANGLE, count, HEAD_BYTES) if count else np.empty(0, _TRIANGLE)
         corners = triangles["corners"].reshape(-1, 3)
     if not len(corners):
@@ -48,15 +48,15 @@ def find_cut_stl(content: bytes) -> str:
     """Describe what a truncated STL file lacks; empty for a complete one."""
     if _is_text(content):
         return "it has no endsolid" if len(_END.findall(content)) < len(_SOLID.findall(content)) else ""
-    promised = _count_promised(content)
+    declared = _count_declared(content)
     found = max(0, len(content) - HEAD_BYTES) // TRIANGLE_BYTES
-    return f"its head promises {promised:,} triangles, and {found:,} follow" if found < promised else ""
+    return f"its head declares {declared:,} triangles, and {found:,} follow" if found < declared else ""
 
 
 def _is_text(content: bytes) -> bool:
-    has_size = len(content) == HEAD_BYTES + TRIANGLE_BYTES * _count_promised(content)
+    has_size = len(content) == HEAD_BYTES + TRIANGLE_BYTES * _count_declared(content)
     return bool(_SOLID.match(content)) and not has_size and bool(_FACET.search(content))
 
 
-def _count_promised(content: bytes) -> int:
+def _count_declared(content: bytes) -> int:
     return int.from_bytes(content[HEAD_BYTES - 4 : HEAD_BYTES], "little")

@@ -66,7 +66,7 @@ def read_vtp(content: bytes) -> VtpContent:
         root = ElementTree.fromstring(content)
         arrays = _DataArrays(root, b"", raw=False)
     if root.get("type") != "PolyData":
-        raise ValueError(f"holds {root.get('type')}; expected PolyData")
+        raise ValueError(f"contains {root.get('type')}; expected PolyData")
     pieces = [_read_piece(piece, arrays) for piece in root.iter("Piece")]
     first = np.cumsum([0, *(len(piece.points) for piece in pieces)]).tolist()
     moved = list(zip(first, pieces, strict=False))
@@ -134,7 +134,7 @@ class _DataArrays:
         if (kind := array.get("type", "")) not in _NUMPY_TYPES:
             raise ValueError(f"has numbers of type {kind!r}; expected one of {', '.join(_NUMPY_TYPES)}")
         dtype, form = np.dtype(self._order + _NUMPY_TYPES[kind]), array.get("format", "ascii")
-        text = "".join([array.text or "", *(child.tail or "" for child in array)])  # children tell of its range
+        text = "".join([array.text or "", *(child.tail or "" for child in array)])  # children state its range
         if form == "ascii":
             return np.array(text.split(), dtype)
         if form == "appended":
@@ -171,5 +171,5 @@ def _read_bytes(source: bytes, at: int, count: int, *, raw: bool) -> tuple[bytes
     part = source[at:end]
     found = part if raw else base64.b64decode(part)[:count]
     if len(found) < count:
-        raise ValueError(f"an array promises {count} bytes, and {len(found)} are there; the file was cut")
+        raise ValueError(f"an array declares {count} bytes, and {len(found)} are there; the file was cut")
     return found, end

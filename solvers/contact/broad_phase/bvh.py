@@ -113,10 +113,10 @@ def find_candidate_pairs(one: BVH, other: BVH, x: FloatArray, y: FloatArray, que
         begin = end = _build_node_aabbs(one, other, x, y)
     else:
         begin, end = _build_node_aabbs(one, other, x, x), _build_node_aabbs(one, other, y, y)
-    room, ways = _CANDIDATES_PER_PRIMITIVE * len(one.primitives) + 64, allocate_traversal_stack()
+    room, traversal_stack = _CANDIDATES_PER_PRIMITIVE * len(one.primitives) + 64, allocate_traversal_stack()
     while True:
         out = np.empty((room, 2), np.int64)
-        count = traverse_trees(one, other, begin, end, query, one is other, ways, out)
+        count = traverse_trees(one, other, begin, end, query, one is other, traversal_stack, out)
         if count <= room:
             return out[:count]
         room = count
@@ -198,8 +198,8 @@ def traverse_trees(one, other, begin, end, query, is_same_tree, stack, out):
             if each > 1:
                 left = overlap_mask(boxes, there, node, low, high, lower, upper, query)
                 if is_same_tree:
-                    left &= -1 << max(0, (first_of_eight - first) // each)  # nothing that comes before these eight
-                for slot in range(7, -1, -1):  # the first one comes out first
+                    left &= -1 << max(0, (first_of_eight - first) // each)  # nothing before these eight
+                for slot in range(7, -1, -1):  # the first one is popped first
                     if left >> slot & 1:
                         stack[top, 0], stack[top, 1], stack[top, 2] = (
                             8 * node + 1 + slot,

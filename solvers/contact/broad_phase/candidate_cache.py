@@ -139,7 +139,7 @@ class CachedCandidates(NamedTuple):
             displacements: maximum relative displacements of p and of q with respect to `positions` [m].
 
         Returns:
-            The entry, or None if gaps may close on the way or a pair may be active at q.
+            The entry, or None if gaps may close on the path or a pair may be active at q.
         """
         if _stays_inactive(source, self.radius, displacements):
             return self
@@ -207,7 +207,7 @@ def find_candidates(source: CandidateSource, caches: list[CachedCandidates], p: 
 def find_collision_free_step_size(
     source: CandidateSource, caches: list[CachedCandidates], p: Positions, displacement: Positions
 ) -> float:
-    """Return the largest step size up to 1 that keeps all gaps open.
+    """Return the largest step size up to 1 at which all gaps stay open.
 
     Args:
         source: the primitives.
@@ -251,7 +251,7 @@ def find_collision_free_step_size(
             and 2.0 * (_max_displacement_from_mean(one.positions, p) + fast) <= one.radius - closed
         ):
             return ccd.collision_free_step_size(one.candidates, x, along, most, *scratch)
-    for edges in (False, True):  # edges are looked up along what points leave of the way
+    for edges in (False, True):  # edges are queried along the part of the path that points leave
         limits = CollisionQuery(closed + rounded, closed, MIN_GAP_FRACTION, 2.0 * most * fast)
         near = source.find_ccd_candidates(x, x + most * along, limits, edges)
         most = ccd.collision_free_step_size(near, x, along, most, *scratch)
@@ -270,6 +270,6 @@ def _roundoff_margin(p: Positions) -> float:
 
 def _max_displacement_from_mean(p: Positions, q: Positions) -> float:
     """Return the largest displacement [m] of a vertex from p to q, (n, 3) each, relative to the mean displacement."""
-    way = q - p
-    way -= way.mean(axis=0)
-    return float(np.sqrt(np.einsum("ij,ij->i", way, way)).max(initial=0.0))
+    shift = q - p
+    shift -= shift.mean(axis=0)
+    return float(np.sqrt(np.einsum("ij,ij->i", shift, shift)).max(initial=0.0))

@@ -91,19 +91,22 @@ def compute_rest_relations(rest_clusters, first, count, out):
             gather_rows(rest_clusters.normal, x, at, end, 0),
         )
         u1, u2 = gather_rows(rest_clusters.t1, x, at, end, 1), gather_rows(rest_clusters.t2, x, at, end, 1)
-        way = subtract3(
+        axis = subtract3(
             gather_rows(rest_clusters.centre, x, at, end, 1), gather_rows(rest_clusters.centre, x, at, end, 0)
         )
         mine, other = (
             gather_rows(rest_clusters.extents, x, at, end, 0),
             gather_rows(rest_clusters.extents, x, at, end, 1),
         )
-        for slot, v in enumerate((way, u1, u2)):
+        for slot, v in enumerate((axis, u1, u2)):
             store_packet(dot3(t1, v), out.relative_pose, 2 * slot * k + at)
             store_packet(dot3(t2, v), out.relative_pose, (2 * slot + 1) * k + at)
         store_packet(other[0], out.relative_pose, 6 * k + at)
         off = (
-            sqrt_packet(dot3(n, way) * dot3(n, way)) + _norm2(dot3(n, u1), dot3(n, u2)) * other[0] + mine[1] + other[1]
+            sqrt_packet(dot3(n, axis) * dot3(n, axis))
+            + _norm2(dot3(n, u1), dot3(n, u2)) * other[0]
+            + mine[1]
+            + other[1]
         )
         store_packet(off, out.relative_pose, 7 * k + at)
 

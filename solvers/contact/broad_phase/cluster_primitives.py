@@ -96,7 +96,7 @@ def _add_cluster_pair(one, a, other, b, x, y, query, start_aabbs, end_aabbs, out
         mine = overlap_mask(start_aabbs, end_aabbs, len(start_aabbs) - 1, low, high, lower, upper, query) & (
             (1 << min(8, last - first)) - 1
         )
-        while mine != 0:  # what comes near anything there
+        while mine != 0:  # primitives near any other there
             slot = lowest_set_bit(mine)
             mine &= mine - 1
             count = _add_primitive_candidates(

@@ -1,7 +1,7 @@
 """Axis-aligned bounding boxes (AABB) of primitives, and tests of which may violate distance limits during a motion.
 
 Let a pair have the distance d at the start of a linear motion in which no two vertices move relative to each other by
-more than M. It keeps at least the distance d - M. If it comes closer than t + s d, then d < (t + M)/(1 - s), so that it
+more than M. Its distance stays at least d - M. If it comes closer than t + s d, then d < (t + M)/(1 - s), so that it
 comes closer than
 
     t + s d < (t + s M)/(1 - s)
@@ -97,7 +97,7 @@ def compute_aabb_clearance(
     clearance = float(np.linalg.norm(np.maximum(apart, 0.0)))
     begin, end = low.min(axis=0), high.max(axis=0)
     if max(float((begin[0] - end[1]).max()), float((begin[1] - end[0]).max())) > query.inflation_radius:
-        return clearance  # no way leads so near, and what no way leads to bounds no step
+        return clearance  # no path leads so near, and what no path leads to bounds no step
     wide = float(np.linalg.norm(high[0].max(axis=0) - low[0].min(axis=0)))
     wide = min(
         max(query.inflation_radius, query.min_distance + query.relative_min_distance * wide), max_inflation(query)

@@ -164,12 +164,14 @@ class HalfSpaceContact:
         p, v = (x if x.flags.carray else np.array(x, order="C") for x in (start.positions, start.velocity))
         frames = self.compute_frames(start.time) if self._static_frames is None else self._static_frames
         touched = np.empty(len(frames), np.bool_)
-        way = contact_planes.find_nearby_obstacles(p, v, self.time_step, frames, *self._activation_boxes, touched)
-        if way < 0.0:
+        travel = contact_planes.find_nearby_obstacles(p, v, self.time_step, frames, *self._activation_boxes, touched)
+        if travel < 0.0:
             return self
         lasts = start.stage_time - start.time
         when, x = lasts / self.time_step, start.normal_force_positions
-        found = [self._build_planes(p, v, self.obstacles[k], frames[k], way, when, x) for k in np.flatnonzero(touched)]
+        found = [
+            self._build_planes(p, v, self.obstacles[k], frames[k], travel, when, x) for k in np.flatnonzero(touched)
+        ]
         planes = ContactPlanes(*(np.concatenate(part) for part in zip(*found, strict=True)))
         return replace(self, active_planes=planes, smoothing_length=self.eps_v * lasts)
 
@@ -207,8 +209,10 @@ class HalfSpaceContact:
         )
         if normal_force_positions is not None:
             depth = offset - _row_dots(normal, normal_force_positions[vertices])
-        grip = self.friction * stiffness * np.maximum(0.0, depth)
-        return ContactPlanes(vertices, normal, offset, here + stage_fraction * (carried - here), stiffness, grip)
+        friction_force = self.friction * stiffness * np.maximum(0.0, depth)
+        return ContactPlanes(
+            vertices, normal, offset, here + stage_fraction * (carried - here), stiffness, friction_force
+        )
 
     def friction_gradient(self, p: Positions) -> Positions | None:
         """Return the gradient of friction alone [N], (n, 3); None without contact."""

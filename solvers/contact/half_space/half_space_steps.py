@@ -132,12 +132,12 @@ def add_half_spaces(s, i, x, d, level, gradient, block):
 
     Returns the active set as bits.
     """
-    who = 0
+    mask = 0
     for k in range(s.row_starts[i], s.row_starts[i + 1]):
         n0, n1, n2, weight = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2], s.stiffness[k]
         gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
         if s.is_two_sided or gap < 0.0 or level == _FULL_MAJORANT or gap + n0 * d[0] + n1 * d[1] + n2 * d[2] < 0.0:
-            who |= 1 << (k - s.row_starts[i])
+            mask |= 1 << (k - s.row_starts[i])
             block = _add_outer_product(block, weight, n0, n1, n2)
             force = weight * (_penetration_depth(s, gap) if level == _FULL_MAJORANT else gap)
             gradient = gradient[0] + force * n0, gradient[1] + force * n1, gradient[2] + force * n2
@@ -149,7 +149,7 @@ def add_half_spaces(s, i, x, d, level, gradient, block):
             block = a00 + weight, a01, a02, a11 + weight, a12, a22 + weight
             if level == EXACT_BLOCK and length > s.smoothing_length[k]:
                 block = _add_outer_product(block, -weight, u0 / length, u1 / length, u2 / length)
-    return gradient, block, who
+    return gradient, block, mask
 
 
 @jit_inner
@@ -231,10 +231,10 @@ def build_block_step(energy_change: Any) -> Any:
                 block = majorant
             d, definite, before = (0.0, 0.0, 0.0), True, -1
             for _ in range(_MAX_ACTIVE_SET_PASSES):
-                slope, whole, who = add_half_spaces(s, i, x, d, level, gradient, block)
-                if who == before:
+                slope, whole, mask = add_half_spaces(s, i, x, d, level, gradient, block)
+                if mask == before:
                     break
-                before = who
+                before = mask
                 d, definite = solve_block(whole, slope)
             if definite and add_half_space_change(s, i, x, d, energy_change(d, where)) <= 0.0:
                 return d
@@ -249,8 +249,8 @@ def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
     No two of them are coupled.
 
     Args:
-        add_gradient_block: function (beside, i, p, gradient, block) that adds the other energies of row i.
-        energy_change: function (beside, i, p, d) that returns their change by a step d.
+        add_gradient_block: function (others, i, p, gradient, block) that adds the other energies of row i.
+        energy_change: function (others, i, p, d) that returns their change by a step d.
     """
 
     @jit_closure

@@ -50,12 +50,14 @@ def pack_contact_planes(
         num_unknowns: number of rows that are unknowns.
         is_two_sided: whether the planes act from both sides.
     """
-    vertices, normal, offset, anchor, stiffness, grip = planes
+    vertices, normal, offset, anchor, stiffness, friction_force = planes
     rows = row[vertices]
     order = np.argsort(rows, kind="stable")
     order = order[rows[order] < num_unknowns]
     count = np.bincount(rows[order], minlength=len(row) + 2)
     near = count[spring_packets.row_offset // 4].reshape(-1, LANES).max(axis=1, initial=0) > 0
     first = np.concatenate([[0], np.cumsum(count)])
-    ordered: Any = (np.ascontiguousarray(x[order]) for x in (normal, anchor, offset, stiffness, grip, smoothing_length))
+    ordered: Any = (
+        np.ascontiguousarray(x[order]) for x in (normal, anchor, offset, stiffness, friction_force, smoothing_length)
+    )
     return HalfSpaces(first, near, *ordered, is_two_sided=is_two_sided)

@@ -6,7 +6,7 @@ vertex moves linearly from a to b, where it would end by its velocity alone. The
 is convex. Newton's method for f = R, started at a, therefore never passes the time of impact. At each iterate, the
 plane through the closest point, displaced outwards by R, separates the obstacle from a. The last one touches the first
 point of contact, or does not intersect the line at all. A vertex that ends on its outer side has not been inside the
-obstacle on the way, wherever it ends.
+obstacle on the path, wherever it ends.
 """
 
 from __future__ import annotations
@@ -67,14 +67,18 @@ def find_nearby_obstacles(p, v, dt, frames, low, high, out):
         x0, x1, x2 = min(x0, p0), min(x1, p1), min(x2, p2)
         y0, y1, y2 = max(y0, p0), max(y1, p1), max(y2, p2)
         square = max(square, v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])
-    way, found = dt * np.sqrt(square), -1.0
+    travel, found = dt * np.sqrt(square), -1.0
     for k in range(len(out)):
         out[k] = True
         for c in range(3):
             begin, end = _project_box(frames[k, 0], c, x0, x1, x2, y0, y1, y2)
-            other, last = _project_box(frames[k, 1], c, x0, x1, x2, y0, y1, y2)  # less than `way` from where they end
-            out[k] &= min(begin, other - way) <= high[k, c] + way and max(end, last + way) >= low[k, c] - way
-        found = way if out[k] else found
+            other, last = _project_box(
+                frames[k, 1], c, x0, x1, x2, y0, y1, y2
+            )  # less than `travel` from where they end
+            out[k] &= (
+                min(begin, other - travel) <= high[k, c] + travel and max(end, last + travel) >= low[k, c] - travel
+            )
+        found = travel if out[k] else found
     return found
 
 
@@ -117,15 +121,15 @@ def write_separating_plane(p, v, i, dt, frames, obstacle, margin, out, row_index
     """Return whether vertex i may reach an obstacle; if so, write its half-space to row `row_index` of `out`."""
     _, normal, offset, carried = out
     a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
-    first, second, way = frames[0], frames[1], 0.0
+    first, second, travel = frames[0], frames[1], 0.0
     for k in range(3):
         a[k] = b[k] = 0.0
         for j in range(3):
             a[k] += first[1 + k, j] * (p[i, j] - first[0, j])
             b[k] += second[1 + k, j] * (p[i, j] + dt * v[i, j] - second[0, j])
-        way += (b[k] - a[k]) ** 2
+        travel += (b[k] - a[k]) ** 2
     far = _closest_box_point(a, obstacle, c, n)
-    if not far <= obstacle.radius + margin + 2.0 * np.sqrt(way):
+    if not far <= obstacle.radius + margin + 2.0 * np.sqrt(travel):
         return False
     _find_separating_plane(a, b, obstacle, far, x, c, n)
     offset[row_index] = obstacle.radius
@@ -161,7 +165,7 @@ def _find_separating_plane(a, b, obstacle, far, x, c, n):
         steep = _directional_derivative(a, b, n)
         if steep < 0.0:
             begin, far, slope = s, there, steep
-        else:  # past the nearest point of the way: the obstacle is not met
+        else:  # past the nearest point of the path: the obstacle is not reached
             end = s
     for k in range(3):
         x[k] = a[k] + begin * (b[k] - a[k])

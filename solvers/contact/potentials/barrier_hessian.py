@@ -202,45 +202,48 @@ def compute_hessian_weights(collisions, k, p, negative_fraction, scratch):
     if collisions.mollifier_threshold[k] > 0.0:
         m, m1, m2 = edge_edge_mollifier(compute_edge_cross_product(p, x).c, collisions.mollifier_threshold[k])
     across = f1 / d
-    lag, hold = _orthogonalise_columns(p, x, kind, c, z0, z1, z2, first, second)
+    tangent_1, tangent_2 = _orthogonalise_columns(p, x, kind, c, z0, z1, z2, first, second)
     n0, n1, n2 = z0 / d, z1 / d, z2 / d
     for i in range(many):
         g[3 * i], g[3 * i + 1], g[3 * i + 2] = c[i] * n0, c[i] * n1, c[i] * n2
     along, side = m * (f2 - negative_fraction * across), negative_fraction * m * across
-    lag, hold = m * across * lag, m * across * hold
-    mixed, bent = 0.0, 0.0
+    tangent_1, tangent_2 = m * across * tangent_1, m * across * tangent_2
+    mixed, outer = 0.0, 0.0
     if m1 != 0.0:
-        mixed, bent, share = compute_mollifier_hessian_weights(
+        mixed, outer, share = compute_mollifier_hessian_weights(
             compute_edge_cross_product(p, x), (m, m1, m2), (f, f1, f2), negative_fraction, dc
         )
         along += share
     else:
         dc[:] = 0.0
-    if lag == 0.0:
+    if tangent_1 == 0.0:
         first[:] = 0.0
-    if hold == 0.0:
+    if tangent_2 == 0.0:
         second[:] = 0.0
-    return HessianWeights(along, mixed, bent, lag, hold, side, 2.0 * f * m1)
+    return HessianWeights(along, mixed, outer, tangent_1, tangent_2, side, 2.0 * f * m1)
 
 
 @jit_inner
 def compute_row_weights(terms, scratch, r):
     """Return the factors of g, m, b1 and b2 in row r of the block."""
     g, dc = scratch[_G, r], scratch[_DC, r]
-    lag, hold = terms.first_tangent * scratch[_FIRST_TANGENT, r], terms.second_tangent * scratch[_SECOND_TANGENT, r]
+    tangent_1, tangent_2 = (
+        terms.first_tangent * scratch[_FIRST_TANGENT, r],
+        terms.second_tangent * scratch[_SECOND_TANGENT, r],
+    )
     return (
         terms.normal * g + terms.mollifier_cross * dc,
         terms.mollifier_cross * g + terms.mollifier_outer * dc,
-        lag,
-        hold,
+        tangent_1,
+        tangent_2,
     )
 
 
 @jit_inner
 def combine_row_terms(weights, g, dc, first, second):
     """Return one entry of the row, or a packet of eight consecutive ones."""
-    along, mixed, lag, hold = weights
-    return (along * g + mixed * dc) - (lag * first + hold * second)
+    along, mixed, tangent_1, tangent_2 = weights
+    return (along * g + mixed * dc) - (tangent_1 * first + tangent_2 * second)
 
 
 @jit_inner

@@ -3,8 +3,8 @@
     L_JJ L_JJ' = F_JJ,   L_BJ = F_BJ L_JJ^-T,   update: F_BB - L_BJ L_BJ'
 
 Columns are processed from left to right, one tile at a time. The product of the columns to the left is subtracted, then
-the tile is divided by its own triangle. Blocks of PANEL_DEPTH columns and ROW_BLOCK_HEIGHT rows keep the factors of the
-products in cache. The products of an entry are subtracted in the order of columns, whatever these two sizes are.
+the tile is divided by its own triangle. Blocks of PANEL_DEPTH columns and ROW_BLOCK_HEIGHT rows let the factors of the
+products stay in cache. The products of an entry are subtracted in the order of columns, whatever these two sizes are.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def amalgamate_supernodes(parent, count):
         if into[s] == s:
             name[s] = num_supernodes
             num_supernodes += 1
-    for s in range(len(tree) - 1, -1, -1):  # a node's name is that of the one it went into
+    for s in range(len(tree) - 1, -1, -1):  # a node's name is that of the one it was merged into
         name[s] = name[into[s]]
     merged = np.full(num_supernodes, -1, np.int32)
     cost = np.empty(num_supernodes)

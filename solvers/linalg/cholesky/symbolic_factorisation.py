@@ -115,7 +115,7 @@ def analyse_with_order(
     group_start = np.searchsorted(group[by_number], np.arange(NUM_SUBTREE_GROUPS + 2))
 
     node = number[of_column]
-    column = np.argsort(node, kind="stable")  # within a node the columns keep their order
+    column = np.argsort(node, kind="stable")  # within a node the order of the columns is unchanged
     width = np.bincount(node, minlength=len(tree)).astype(np.int32)
     first = np.zeros(len(tree) + 1, np.int32)
     np.cumsum((width + COLUMN_LANES - 1) // COLUMN_LANES * COLUMN_LANES, out=first[1:])

@@ -13,7 +13,7 @@
 
 using Vector = double __attribute__((vector_size(32)));
 
-constexpr int MAX_COLUMNS = 4;  // as many as registers hold, with their sums
+constexpr int MAX_COLUMNS = 4;  // as many as fit into registers, with their sums
 
 struct Spring {
     int i, j;

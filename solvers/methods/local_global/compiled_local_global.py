@@ -58,7 +58,7 @@ class CompiledLocalGlobal:
         """
         if without_vertex_contact(system) is not system:
             from springbench.solvers.methods.local_global.half_space_contact import (
-                prepare_with_half_spaces,  # for those who need it
+                prepare_with_half_spaces,  # imported where it is used
             )
 
             return prepare_with_half_spaces(self, system)

@@ -92,12 +92,12 @@ class _FixedPointState(SolverState):
         return True
 
     def _check_iterate(self, found: Any) -> Positions:
-        wanted = self._correction.shape
-        if isinstance(found, np.ndarray) and found.shape == wanted and found.dtype == np.float64:
+        expected = self._correction.shape
+        if isinstance(found, np.ndarray) and found.shape == expected and found.dtype == np.float64:
             return found
-        came = f"{found.dtype} of shape {found.shape}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
+        got = f"{found.dtype} of shape {found.shape}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
         line = source_line_of(self._ready.next_iterate)
-        raise PluginContractError(f"{line}: `next_iterate` gave {came}; expected float64 of shape {wanted}")
+        raise PluginContractError(f"{line}: `next_iterate` gave {got}; expected float64 of shape {expected}")
 
     def residual(self) -> float:
         """Return |Q^-1 grad g|_Q of the previous iterate."""

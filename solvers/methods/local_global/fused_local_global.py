@@ -72,7 +72,7 @@ def compile_iterations(
         return "iterations through Python: this linear solver is called from there"
     parts = decompose_energies(base.system)
     if parts.unsupported_energies:
-        return f"iterations through Python: the kernels do not know {', '.join(parts.unsupported_energies)}"
+        return f"iterations through Python: the kernels do not support {', '.join(parts.unsupported_energies)}"
     if parts.has_cancellation:
         return "iterations through Python: the stiffnesses between some vertices cancel"
     return PreparedCompiledLocalGlobal.from_schedule(
@@ -229,7 +229,7 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         allowed, used = numba.get_num_threads(), self.num_threads() or 1
         if used == allowed:
             return f"{self.base.description}{beyond}"
-        why = "the system is too small for a second thread to pay" if used == 1 else f"its factor comes in {used} parts"
+        why = "the system is too small for a second thread to pay" if used == 1 else f"its factor is in {used} parts"
         return f"{self.base.description}{beyond}; {used} of {allowed} threads: {why}"
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:

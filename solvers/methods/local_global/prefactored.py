@@ -192,7 +192,7 @@ def require_only_springs(system: System, solver: str) -> Springs:
     """Return the system's springs as one energy; raise Unsupported if it has another energy."""
     others = {type(energy).__name__ for energy in system.energies if not isinstance(energy, Springs)}
     if others:
-        raise Unsupported(f"{solver}: knows springs only; the scene has {', '.join(sorted(others))} as well")
+        raise Unsupported(f"{solver}: supports springs only; the scene has {', '.join(sorted(others))} as well")
     return Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
 
 

@@ -76,7 +76,7 @@ def prepare_newton_cg(
     """
     if preconditioner != "schwarz":
         raise Unsupported(
-            f"newton-cg, device: cuda: knows preconditioner: schwarz, not {preconditioner}; take that, or device: cpu"
+            f"newton-cg, device: cuda: supports preconditioner: schwarz, not {preconditioner}; use that, or device: cpu"
         )
     require_known_energies("newton-cg", system)
     metric = ResidualMetric(system)

@@ -159,25 +159,25 @@ def sweep_friction(planes, smoothing_length, matrix, p, gradient, sweeps):
         gradient: gradient at p (n, 3) [N] including friction's own part; updated.
         sweeps: number of sweeps.
     """
-    vertices, normal, _, anchor, _, grip = planes
+    vertices, normal, _, anchor, _, friction_force = planes
     number, starts, columns, entries, diagonal = matrix
     for _ in range(sweeps):
-        for e in range(len(grip)):
+        for e in range(len(friction_force)):
             i = vertices[e]
             f = number[i]
-            if grip[e] <= 0.0 or f < 0:
+            if friction_force[e] <= 0.0 or f < 0:
                 continue
             n0, n1, n2, q = normal[e, 0], normal[e, 1], normal[e, 2], diagonal[f]
             u0, u1, u2 = project_tangentially(
                 p[i, 0] - anchor[e, 0], p[i, 1] - anchor[e, 1], p[i, 2] - anchor[e, 2], n0, n1, n2
             )
             g0, g1, g2 = project_tangentially(gradient[i, 0], gradient[i, 1], gradient[i, 2], n0, n1, n2)
-            weight = friction_stiffness(grip[e], np.sqrt(u0 * u0 + u1 * u1 + u2 * u2), smoothing_length)
+            weight = friction_stiffness(friction_force[e], np.sqrt(u0 * u0 + u1 * u1 + u2 * u2), smoothing_length)
             v0, v1, v2 = u0 - (g0 - weight * u0) / q, u1 - (g1 - weight * u1) / q, u2 - (g2 - weight * u2) / q
             length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
-            factor = friction_proximal_factor(grip[e], q, length, smoothing_length)
+            factor = friction_proximal_factor(friction_force[e], q, length, smoothing_length)
             d0, d1, d2 = factor * v0 - u0, factor * v1 - u1, factor * v2 - u2
-            after = friction_stiffness(grip[e], factor * length, smoothing_length)
+            after = friction_stiffness(friction_force[e], factor * length, smoothing_length)
             p[i, 0], p[i, 1], p[i, 2] = p[i, 0] + d0, p[i, 1] + d1, p[i, 2] + d2
             gradient[i, 0] += after * factor * v0 - weight * u0
             gradient[i, 1] += after * factor * v1 - weight * u1

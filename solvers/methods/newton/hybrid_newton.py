@@ -22,13 +22,13 @@ last steps. A method that was not yet measured is credited with the decrease tha
 last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it
 has no Cholesky factor, predicted tensions follow, and the exact method is tried again after a cost that doubles with
 each attempt that decreases the objective less than the others did meanwhile. A step of the exact method delivers if the
-Hessian is unmodified and the decrease agrees with the quadratic model; then the next step promises more than any other
-method, and the exact method continues until a step does not deliver. An indefinite Hessian gets the smallest multiple
-of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
-(`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
-when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of
-springs, entries and operations of the factors and from the factorisations made. Equal solves so make equal decisions
-and have bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them.
+Hessian is unmodified and the decrease agrees with the quadratic model; then the next step is predicted to gain more
+than any other method, and the exact method continues until a step does not deliver. An indefinite Hessian gets the
+smallest multiple of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative
+stiffness (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per
+factorisation when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the
+numbers of springs, entries and operations of the factors and from the factorisations made. Equal solves so make equal
+decisions and have bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them.
 
 If a point that satisfies the tolerance has an indefinite Hessian, the step leaves along a direction of negative
 curvature: symmetric initial guesses lead to saddles.
@@ -449,7 +449,7 @@ class _Approach:
         self._trial_cost = _FIRST_PATIENCE * method.newton_cost  # spent by the others until the exact method is tried
 
     def iterate_points(self) -> Iterator[DescentPoint]:
-        """Yield the points of the method that promises most, up to a stalled one or an escape from a saddle."""
+        """Yield points of the method with the largest predicted gain, until one stalls or escapes from a saddle."""
         while True:
             point = self._escape() if self._control.must_escape else None
             if point is None:
@@ -490,7 +490,7 @@ class _Approach:
         return max(self._gains, key=lambda name: self._gains[name])
 
     def _run_lbfgs(self) -> DescentPoint:
-        """Do rounds of L-BFGS until another method promises more, or the limits are reached."""
+        """Do rounds of L-BFGS until another method is predicted to gain more, or the limits are reached."""
         rounds, step, limits = self._rounds, self._step, self._control.limits
         if self._run is None:
             self._run = self._method.start_lbfgs(step, self._point.positions)

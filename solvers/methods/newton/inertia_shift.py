@@ -29,7 +29,7 @@ class InertiaShift:
     """The shift in one solve.
 
     Attributes:
-        value: the multiple s; infinite for a Hessian that is made positive definite in another way.
+        value: the multiple s; infinite for a Hessian that is made positive definite by another method.
         can_reduce: whether the quadratic model was accurate in the last step, so that a smaller value is tried.
     """
 

@@ -73,8 +73,8 @@ def probe_negative_curvature(
     if found is None:
         return None
     x, curvature = found
-    way = float(np.abs(at.positions - step.problem.current_positions).max(initial=0.0)) or 1.0
-    return backtracking_line_search(step, at, x, initial_step=way, directional_curvature=curvature)
+    scale = float(np.abs(at.positions - step.problem.current_positions).max(initial=0.0)) or 1.0
+    return backtracking_line_search(step, at, x, initial_step=scale, directional_curvature=curvature)
 
 
 @lru_cache(maxsize=1)

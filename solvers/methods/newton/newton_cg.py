@@ -48,7 +48,7 @@ _MAX_ETA, _MIN_ETA = 0.5, 1e-10
 
 _MAX_ETA_IN_CONTACT = 1e-4
 """Upper bound of eta with active contacts: sticking friction acts within 1e-8 m, and a direction with a small error on
-that scale leads to where another quadratic model holds."""
+that scale leads to where another quadratic model is valid."""
 
 _MAX_CG_ITERATIONS = 1000
 """Maximum number of conjugate gradient iterations: the stiffest springs need it for a few digits."""

@@ -223,7 +223,9 @@ def make_friction_search(metric: ResidualMetric) -> FrictionGaussSeidel | None:
     if not any(is_vertex_contact(energy) for energy in energies) or any(
         is_barrier_energy(energy) for energy in energies
     ):
-        return None  # its sweeps know of no bounds
-    from springbench.solvers.methods.newton.friction_gauss_seidel import FrictionGaussSeidel  # for those who need it
+        return None  # its sweeps have no bounds
+    from springbench.solvers.methods.newton.friction_gauss_seidel import (
+        FrictionGaussSeidel,
+    )  # imported where it is used
 
     return FrictionGaussSeidel(metric)

@@ -211,12 +211,12 @@ class MgpbdState(SolverState):
         solving = PreconditionedSolve(A, VCycle(A, self._prolongation), self.dual_residual, _CG_RTOL)
         self.num_cg_iterations = solving.solve(_MAX_CG_ITERATIONS)
         change = solving.x
-        way = made.vertex_compliance[:, None] * (
+        direction = made.vertex_compliance[:, None] * (
             made.incidence_matrix.T @ ((made.root_stiffness * change)[:, None] * self._directions)
         )
         length = 1.0
         while length >= _MIN_STEP_LENGTH:
-            p, tension = self.positions - length * way, self.scaled_tension + length * change
+            p, tension = self.positions - length * direction, self.scaled_tension + length * change
             stretched, unit = made.scaled_constraints(p)
             misfit = stretched - tension
             if ordered_norm(misfit) < before:

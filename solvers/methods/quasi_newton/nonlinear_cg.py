@@ -11,7 +11,7 @@ reset to -z: a local-global iteration. A step without sufficient decrease is hal
 collision-free. With active surface contacts, P = S Q S replaces Q
 (`springbench.solvers.iteration.preconditioners`). Contact of
 single vertices is not supported: it activates abruptly and friction sticks within 1e-8 m, so no quadratic model
-holds for a step along d. Landing sheets took 340 to 2,600 iterations where L-BFGS took 23 to 135.
+is valid for a step along d. Landing sheets took 340 to 2,600 iterations where L-BFGS took 23 to 135.
 """
 
 from __future__ import annotations

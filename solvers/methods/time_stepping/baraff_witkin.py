@@ -66,7 +66,7 @@ class BaraffWitkin:
             )
         if met := next((e for e in system.energies if is_vertex_contact(e) or is_barrier_energy(e)), None):
             raise Unsupported(
-                f"baraff-witkin: linearises at the step's start, where it cannot know of what is touched in the step; "
+                f"baraff-witkin: linearises at the step's start, where contacts that begin in the step are unknown; "
                 f"the scene has {type(met).__name__}; take a solver that minimises"
             )
         objective = FixedObjective(system)

@@ -75,7 +75,7 @@ class ExplicitForces:
                 energy.add_projection(load, load)
             elif not isinstance(energy, Springs):
                 raise Unsupported(
-                    f"{solver}: knows springs, bending and drag on vertices; the scene has {type(energy).__name__} "
+                    f"{solver}: supports springs, bending and drag on vertices; the scene has {type(energy).__name__} "
                     "as well"
                 )
         form = QuadraticForm.from_matrix(csr_array(reduce(add, forms))) if forms else QuadraticForm.empty_form()

@@ -85,8 +85,8 @@ class ExplicitTableau:
             tolerance: error tolerance [m].
         """
         return (
-            f"the error of {tolerance:.3g} m was not kept within {tried:.0f} steps, the last of {h:.3g} s: after "
-            f"{reached:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off is larger; ask for a "
+            f"the error of {tolerance:.3g} m was not reached within {tried:.0f} steps, the last of {h:.3g} s: after "
+            f"{reached:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off is larger; use a "
             "larger error"
         )
 

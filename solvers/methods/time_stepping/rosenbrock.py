@@ -95,7 +95,7 @@ class _RosenbrockSolver:
             elif is_lagged(energy) or is_barrier_energy(energy):
                 raise Unsupported(
                     f"{self.solver_name}: needs the exact derivatives of all forces, "
-                    "and knows energies of the positions "
+                    "and supports energies of the positions "
                     f"alone and drag on vertices; the scene has {type(energy).__name__} as well"
                 )
             else:
@@ -279,10 +279,10 @@ class PreparedRosenbrock(IterativeSolver):
                 h = length * compute_rejection_factor(control, ratio)
             if h < _MIN_STEP_FRACTION * frame or accepted + rejected >= _MAX_STEPS:
                 raise RuntimeError(
-                    f"the error of {self.error_tolerance:.3g} m was not kept within "
+                    f"the error of {self.error_tolerance:.3g} m was not reached within "
                     f"{accepted + rejected} steps, the last of "
                     f"{h:.3g} s: after {t:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off "
-                    "is larger; ask for a larger error"
+                    "is larger; use a larger error"
                 )
         return p, v, AdaptiveStepStats(accepted, rejected, h, t)
 

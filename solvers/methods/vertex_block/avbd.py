@@ -111,9 +111,9 @@ class AugmentedVertexBlockDescent:
             ("warm_start_decay", 0, 1),
             ("error_stabilisation", 0, 1),
         ):
-            if not least <= (came := getattr(self, name)) <= most:
-                wanted = f"from {least} to {most}" if most == 1 else f"at least {least}"
-                raise ValueError(f"{name}: should be {wanted}, not {came}")
+            if not least <= (got := getattr(self, name)) <= most:
+                expected = f"from {least} to {most}" if most == 1 else f"at least {least}"
+                raise ValueError(f"{name}: should be {expected}, not {got}")
         VertexBlockDescent(self.spectral_radius)
 
     def prepare(self, system: System) -> PreparedSolver:

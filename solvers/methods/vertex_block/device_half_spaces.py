@@ -82,9 +82,11 @@ class DeviceHalfSpaces:
         slots = max(1, many * num_free)
         near: Any = stream.allocate_zeros(max(1, num_free), np.bool_)
         normal, anchor = (stream.allocate_zeros((slots, 3), np.float64) for _ in range(2))
-        offset, stiffness, grip, slip = (stream.allocate_zeros(slots, np.float64) for _ in range(4))
+        offset, stiffness, friction_force, slip = (stream.allocate_zeros(slots, np.float64) for _ in range(4))
         first = up(many * np.arange(num_free + 1))
-        self.half_spaces = HalfSpaces(first, near, normal, anchor, offset, stiffness, grip, slip, is_two_sided=False)
+        self.half_spaces = HalfSpaces(
+            first, near, normal, anchor, offset, stiffness, friction_force, slip, is_two_sided=False
+        )
         given, one = self.half_spaces, stream.allocate_zeros(1, np.int64)
         self._found = separating_planes.SeparatingPlanes(one, given.normal, given.offset, given.friction_anchor)
         self._max_squared_speed, self._frames = stream.allocate_zeros(1, np.float64), up(self._obstacle_frames(0.0))
@@ -139,13 +141,13 @@ def build_half_spaces(vertex, p, v, dt, when, square, frames, bodies, found, rou
     """
     work = cuda.local.array((5, 3), np.float64)
     i, many = cuda.grid(1), bodies.spectral_radius.shape[0]
-    way = dt * math.sqrt(square[0])
+    travel = dt * math.sqrt(square[0])
     while i < spaces.has_half_space.shape[0]:
         spaces.has_half_space[i] = False
         x = vertex[i]
         for o in range(many):
             k, body = many * i + o, _Rounded(bodies.low[o], bodies.high[o], bodies.spectral_radius[o])
-            if _plane(p, v, x, dt, frames[o], body, bodies.force_margin[o] + way, found, k, work):
+            if _plane(p, v, x, dt, frames[o], body, bodies.force_margin[o] + travel, found, k, work):
                 before, lagged, taken, stiffness = 0.0, 0.0, 0.0, bodies.stiffness[o, i]
                 for c in range(3):
                     n, here, carried = spaces.normal[k, c], p[x, c], spaces.friction_anchor[k, c]

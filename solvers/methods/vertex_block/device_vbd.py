@@ -279,13 +279,13 @@ class DeviceSweepState(DeviceSolverState):
                     self._half_spaces.half_spaces,
                 )
 
-    def _sum_objective(self, u: Any, num_requested: int, sums: Any) -> None:
+    def _sum_objective(self, u: Any, condition: int, sums: Any) -> None:
         made = self._prepared
         lanes = made.device_lanes
         self._launch_kernel(
             self._kernels.sum_objective, len(lanes.lane_row), *lanes.single_type_arguments, lanes.padding_row,
             lanes.padding_end_row, made.vertex_blocks.num_free, made.anchor_stiffness,
-            self._force, u, num_requested, self._control, sums,
+            self._force, u, condition, self._control, sums,
         )  # fmt: skip
         if self._half_spaces:
             press, over = self._half_space_kernels.evaluate_penalty, self._half_spaces.launch_shape
@@ -293,7 +293,7 @@ class DeviceSweepState(DeviceSolverState):
                 self._half_spaces.half_spaces,
                 self._reference,
                 u,
-                num_requested,
+                condition,
                 self._control,
                 blocks(len(lanes.lane_row)),
                 sums,

@@ -4,8 +4,8 @@ A colour is one launch, a vertex one thread: no two vertices of a colour are nei
 no other thread reads in this launch. Sums are computed per block, in block order, and then by one block in a tree, so
 they are bitwise reproducible. The extrapolation is decided on the device, in `control`, without synchronisation:
 
-    OMEGA of the last iteration, KNOWN the objective there (nan if unknown), WEIGHT of this iteration's
-    extrapolation, TAKEN whether it was accepted, ASKED whether the objective before it is needed
+    OMEGA of the last iteration, OBJECTIVE there (nan if unknown), EXTRAPOLATION: weight of this iteration's,
+    IS_ACCEPTED: whether it was accepted, IS_REQUESTED: whether the objective before it is needed
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
     @cuda.jit
     def level(
         own, start, neighbour, kind, weights, spring, direction, arrows,
-        padding_row, far, free, anchor_stiffness, force, u, num_requested, control, sums,
+        padding_row, far, free, anchor_stiffness, force, u, condition, control, sums,
     ):  # fmt: skip
         """Write the objective at the reference plus u, minus that at the reference, to `sums` [J], one per block.
 
@@ -227,13 +227,13 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
 
         Args:
             free: number of rows, from the first one, that may move.
-            num_requested: index in `control`; the kernel runs if that entry is positive (ASKED), or above one (WEIGHT).
+            condition: index in `control`; the kernel runs if IS_REQUESTED is positive, or EXTRAPOLATION above one.
         """
         shared_sums = cuda.shared.array(THREADS, float64)
         t, inside = cuda.grid(1), cuda.threadIdx.x
-        if num_requested == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
+        if condition == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
             return
-        if num_requested == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
+        if condition == EXTRAPOLATION and not control[EXTRAPOLATION] > 1.0:
             return
         total = float64(0.0)
         if t < len(own) and own[t] != padding_row:
@@ -259,7 +259,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
                 else:
                     longer = ((d0 + v0) * w0 + (d1 + v1) * w1 + (d2 + v2) * w2) / (was + length)
                     turned = (moved - along * longer) / (was + length)
-                share = 0.5 if j < free else 1.0  # the other end adds the other half, if it is anybody's
+                share = 0.5 if j < free else 1.0  # the other end adds the other half, if there is one
                 energy += share * (0.5 * k * moved - pull * turned)
             total = energy
         shared_sums[inside] = total

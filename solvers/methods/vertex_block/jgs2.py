@@ -263,8 +263,8 @@ class _Jgs2Iteration:
         )
         f = len(self._free_vertices)
         alone = VertexPatches(np.arange(f + 1), np.arange(f), np.tile(np.eye(3), (f, 1, 1)))
-        ways = (patches, alone) if len(patches.patch_vertices) > f else (alone,)
-        self._patch_variants = [(way, PatchScratch.from_patches(way)) for way in ways]
+        variants = (patches, alone) if len(patches.patch_vertices) > f else (alone,)
+        self._patch_variants = [(variant, PatchScratch.from_patches(variant)) for variant in variants]
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points after `start`."""
@@ -290,8 +290,8 @@ class _Jgs2Iteration:
     def _next_point(self, step: StepObjective, at: DescentPoint) -> DescentPoint | None:
         """Return the next point, None if round-off prevents descent."""
         hessian, turns = step.hessian(at.positions).assemble_clamped(), self._rotations.compute_rotations(at.positions)
-        for way in self._patch_variants:
-            direction = self._compute_direction(hessian, turns, at, *way)
+        for variant in self._patch_variants:
+            direction = self._compute_direction(hessian, turns, at, *variant)
             if -inner_product(at.gradient, direction) > self._metric.energy_roundoff(at.positions):
                 found = backtracking_line_search(step, at, direction)
                 if found is not None:

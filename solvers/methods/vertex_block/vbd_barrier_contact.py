@@ -154,8 +154,13 @@ class BarrierVbdState(SolverState):
         w = 4.0 / (4.0 - self._squared * before) if before > 1.0 else 2.0 / (2.0 - self._squared) if before else 1.0
         self._factor = w
         if w > 1.0:
-            way = self._step.apply_exact_pins(self._previous_positions + w * (q - self._previous_positions)) - q
-            if self._step.max_step_size(q, way) == 1.0 and self._step.objective_change(q, q + way)[0] <= 0.0:
-                return q + way
+            displacement = (
+                self._step.apply_exact_pins(self._previous_positions + w * (q - self._previous_positions)) - q
+            )
+            if (
+                self._step.max_step_size(q, displacement) == 1.0
+                and self._step.objective_change(q, q + displacement)[0] <= 0.0
+            ):
+                return q + displacement
             self._factor = 0.0
         return q

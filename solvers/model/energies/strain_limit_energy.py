@@ -91,7 +91,7 @@ def _energy_change(numbers, e, z0, z1, z2, s0, s1, s2):
     before, after = np.sqrt(before), np.sqrt(after)
     one, other = length_excess(numbers, e, before), length_excess(numbers, e, after)
     longer = other - one
-    if one * other > 0.0:  # the same limit: the difference of the lengths, which keeps its digits
+    if one * other > 0.0:  # the same limit: the difference of the lengths, which loses no digits
         longer = (s0 * (z0 + t0) + s1 * (z1 + t1) + s2 * (z2 + t2)) / (before + after)
     return 0.5 * numbers[e, 0] * longer * (one + other)
 

@@ -46,11 +46,11 @@ window.springbench = (() => {
     return `#${view}${words ? `?${words}` : ""}`;
   }
   // Change parameters of this view; step: whether to add an entry to the browser's history.
-  let kept = {}, soon;
+  let pending = {}, soon;
   function change(changes, step = false) {
     const { view, query } = where();
-    const next = address(view, { ...Object.fromEntries(query), ...kept, ...changes });
-    kept = {};
+    const next = address(view, { ...Object.fromEntries(query), ...pending, ...changes });
+    pending = {};
     if (next === location.hash) return;
     if (step) location.hash = next;
     else location.replace(next);
@@ -58,13 +58,13 @@ window.springbench = (() => {
 
   // Update parameters of the current display, such as the rotation of a mesh: nothing is redrawn. Updates are throttled,
   // because browsers limit their rate.
-  function keep(changes) {
+  function replaceLater(changes) {
     const from = where().view;
-    Object.assign(kept, changes);
+    Object.assign(pending, changes);
     clearTimeout(soon);
     soon = setTimeout(() => {
-      const { view, query } = where(), next = address(view, { ...Object.fromEntries(query), ...kept });
-      kept = {};
+      const { view, query } = where(), next = address(view, { ...Object.fromEntries(query), ...pending });
+      pending = {};
       if (view !== from || next === location.hash) return;
       history.replaceState(null, "", next);
       if (document.documentElement.dataset.ready) document.documentElement.dataset.ready = next;
@@ -92,7 +92,7 @@ window.springbench = (() => {
 
   // Show a message that screen readers announce, and that disappears by itself.
   let until;
-  function tell(words) {
+  function announce(words) {
     const box = document.getElementById("status");
     box.textContent = words;
     box.classList.remove("hidden");
@@ -110,7 +110,7 @@ window.springbench = (() => {
       document.execCommand("copy");
       box.remove();
     }
-    tell("copied");
+    announce("copied");
   }
 
   function save(name, words, type) {
@@ -124,5 +124,5 @@ window.springbench = (() => {
     return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   };
 
-  return { give, script, data, link, own, where, address, change, keep, element, put, tell, copy, save, isDark, views: {} };
+  return { give, script, data, link, own, where, address, change, replaceLater, element, put, announce, copy, save, isDark, views: {} };
 })();

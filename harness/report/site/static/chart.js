@@ -1,7 +1,7 @@
 // Line and point charts for all plots: by Plotly, with a custom legend, tooltip and keyboard control.
 "use strict";
 springbench.chart = (() => {
-  const { element, script, own, number, percent, time, colour, glyph, keep, where } = springbench;
+  const { element, script, own, number, percent, time, colour, glyph, replaceLater, where } = springbench;
   const tip = element("div.tip", { hidden: true, role: "tooltip" });
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const at = (item, column, k) => (Array.isArray(item[column]) ? item[column][k] : item[column]);
@@ -85,8 +85,8 @@ springbench.chart = (() => {
   // The visible range of the axes as a URL parameter, such as "x:0,2;y:-3,1"; empty if everything is visible.
   const zoomed = layout => Object.keys(layout).filter(key => /^[xy]axis\d*$/.test(key) && layout[key].autorange === false && layout[key].range)
     .map(key => `${key.replace("axis", "")}:${layout[key].range.map(v => Number(Number(v).toPrecision(5))).join(",")}`).join(";");
-  function zoom(layout, asked) {
-    for (const part of (asked || "").split(";")) {
+  function zoom(layout, requested) {
+    for (const part of (requested || "").split(";")) {
       const [, axis, low, high] = /^([xy]\d*):([-\d.e+]+),([-\d.e+]+)$/.exec(part) || [], of = axis && layout[axis.replace(/^[xy]/, "$&axis")];
       if (of) Object.assign(of, { range: [Number(low), Number(high)], autorange: false });
     }
@@ -144,7 +144,7 @@ springbench.chart = (() => {
     plot.removeAllListeners("plotly_unhover");
     plot.removeAllListeners("plotly_click");
     plot.removeAllListeners("plotly_relayout");
-    plot.on("plotly_relayout", () => keep({ [zoomKey]: zoomed(plot.layout) }));
+    plot.on("plotly_relayout", () => replaceLater({ [zoomKey]: zoomed(plot.layout) }));
     plot.on("plotly_hover", ({ points: [p], event }) => {
       if (!p.data.meta) return;
       const box = plot.getBoundingClientRect();
@@ -178,7 +178,7 @@ springbench.chart = (() => {
         }
         const full = plot._fullData[curve], box = plot.getBoundingClientRect(), axes = [plot._fullLayout[full.xaxis.replace("x", "xaxis")], plot._fullLayout[full.yaxis.replace("y", "yaxis")]];
         show(axes[0]._offset + axes[0].d2p(one.x[k]) + box.left, axes[1]._offset + axes[1].d2p(one.y[k]) + box.top, describePoint(chart, one.meta.item, k));
-        springbench.tell(`${one.name}: ${figure(one.x[k], x.format)}, ${figure(one.y[k], y.format)}`);
+        springbench.announce(`${one.name}: ${figure(one.x[k], x.format)}, ${figure(one.y[k], y.format)}`);
       } else return;
       event.preventDefault();
     };

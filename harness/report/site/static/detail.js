@@ -21,7 +21,7 @@ Object.assign(springbench, (() => {
 
   // A recording: replayed in the page if it is among the page's scripts, otherwise offered as a file.
   function replay(id, file, name, words) {
-    if (!file) return element("p.muted", {}, "No recording was kept.");
+    if (!file) return element("p.muted", {}, "No recording was made.");
     const box = element("div.replays");
     if (name) {
       box.append(element("button.strong", { type: "button", onclick: () => springbench.replay(id, name, { title: words, file }) }, "Replay"),
@@ -37,7 +37,7 @@ Object.assign(springbench, (() => {
     const given = Object.entries(JSON.parse(row.parameters || "{}"));
     return list([
       ["mesh", `${number(row.vertices, 6)} vertices, ${number(row.springs, 6)} springs`], ["integrator", row.integrator], ["time step", row.time_step && step(row.time_step)],
-      ["first guess", row.initial_guess], ["iterations at most", row.max_iterations], ["tolerance", row.residual_rtol === 0 ? "auto" : row.residual_rtol], ["error asked", row.error_requested], ["estimated", row.error_estimated],
+      ["first guess", row.initial_guess], ["iterations at most", row.max_iterations], ["tolerance", row.residual_rtol === 0 ? "auto" : row.residual_rtol], ["error requested", row.error_requested], ["estimated", row.error_estimated],
       ["threads", row.threads], ["frames, rounds", row.frames && `${row.frames}, ${row.rounds}`], ...given.map(([name, value]) => [name, String(value)]),
     ]);
   }
@@ -76,7 +76,7 @@ Object.assign(springbench, (() => {
       src && element("a.shot", { href: src }, element("img", { src, alt: `The run's last frame and earlier ones: ${title(row)}` })),
       replay(row.run_id, recording(row), row.replay && `site/data/${encodeURIComponent(row.slug)}/recordings/${encodeURIComponent(row.unit)}.js`, title(row)),
       element("h3", {}, "Measured"), figures(row) || element("p.muted", {}, "Nothing: see its status."),
-      element("h3", {}, "Asked"), settings(row),
+      element("h3", {}, "Settings"), settings(row),
       element("h3", {}, "Do it again"), code(command(row), "Command that repeats the run"),
       source && element("h3", {}, "Method"), method(source),
       element("h3", {}, "Made by"), list([

@@ -1,14 +1,15 @@
-// Cell maps as tables: coloured by outcome; arrow keys move between the cells. Maps with the same columns share a table.
+// Cell maps as tables, from the JSON of their `CellMap`; a table has headers, focus and arrow keys, a heat map of Plotly none.
+// Maps with the same columns share a table.
 "use strict";
 springbench.maps = (chart, sweep) => {
   const { element, own, address } = springbench;
   const dark = hex => [1, 3, 5].reduce((sum, k, i) => sum + [0.2126, 0.7152, 0.0722][i] * (parseInt(hex.slice(k, k + 2), 16) / 255) ** 2.2, 0) < 0.18;
-  const tell = element("p", { role: "status" }, "Point at a cell, or go there by arrow keys, for what is known about it.");
+  const status = element("p", { role: "status" }, "Point at a cell, or go there by arrow keys, for what is known about it.");
 
   function button(map, cell) {
     const [row, column, number, text, reason, run, stale] = cell, outcome = map.outcomes[number];
     const words = [`${map.title ? `${map.title}, ` : ""}${row}, ${column}: ${outcome.label}.`, reason, stale && "Measured by other code than the newest rows."].filter(Boolean).join(" ");
-    const read = () => { tell.textContent = words; };
+    const read = () => { status.textContent = words; };
     return element("td", {}, element(`button${stale ? ".stale" : ""}`, {
       type: "button", tabIndex: -1, title: words, "aria-label": words, onmouseenter: read, onfocus: read,
       style: `background:${outcome.color};color:${dark(outcome.color) ? "#ffffff" : "#16181b"}`,
@@ -56,5 +57,5 @@ springbench.maps = (chart, sweep) => {
   const counts = new Map(), outcomes = new Map(chart.maps.flatMap(map => map.outcomes.map(one => [one.label, one])));
   for (const map of chart.maps) for (const cell of map.cells) counts.set(map.outcomes[cell[2]].label, (counts.get(map.outcomes[cell[2]].label) || 0) + 1);
   const key = element("ul.key", {}, ...[...outcomes.values()].filter(one => counts.has(one.label)).map(one => element("li", { title: one.description }, element("span", { style: `background:${one.color}` }), `${one.label} (${counts.get(one.label)})`)));
-  return chart.maps.length ? [key, tell, element("div.maps", {}, ...groups.map(table))] : [];
+  return chart.maps.length ? [key, status, element("div.maps", {}, ...groups.map(table))] : [];
 };

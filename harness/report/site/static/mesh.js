@@ -1,7 +1,7 @@
 // Meshes on a canvas, rotated by dragging or by arrow keys, coloured by a number at each vertex; and iterates of solves.
 "use strict";
 Object.assign(springbench, (() => {
-  const { element, put, data, link, own, number, keep, where } = springbench;
+  const { element, put, data, link, own, number, replaceLater, where } = springbench;
   // From near to far: a colour map that is readable in grey as well (viridis).
   const RAMP = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
   const ramp = t => {
@@ -18,8 +18,8 @@ Object.assign(springbench, (() => {
     const low = [1e30, 1e30, 1e30], high = [-1e30, -1e30, -1e30];
     for (let i = 0; i < points.length; i++) { low[i % 3] = Math.min(low[i % 3], points[i]); high[i % 3] = Math.max(high[i % 3], points[i]); }
     const middle = low.map((v, c) => (v + high[c]) / 2), size = low.map((v, c) => high[c] - v), radius = Math.hypot(...size) / 2 || 1;
-    const turned = (where().query.get("turn") || "").split(",").map(Number), asked = turned.length === 2 && turned.every(Number.isFinite);
-    const [turn, tilt] = asked ? turned : [size[1] <= size[0] ? -0.45 : 0.9, 0.35];
+    const turned = (where().query.get("turn") || "").split(",").map(Number), isStored = turned.length === 2 && turned.every(Number.isFinite);
+    const [turn, tilt] = isStored ? turned : [size[1] <= size[0] ? -0.45 : 0.9, 0.35];
     return { middle, radius, turn, tilt, seen: new Set() };
   }
 
@@ -70,7 +70,7 @@ Object.assign(springbench, (() => {
         ink.stroke();
       }
     }
-    const turn = (across, up) => { view.turn += across; view.tilt = Math.max(-1.5, Math.min(1.5, view.tilt + up)); for (const one of view.seen) one(); keep({ turn: `${view.turn.toFixed(2)},${view.tilt.toFixed(2)}` }); };
+    const turn = (across, up) => { view.turn += across; view.tilt = Math.max(-1.5, Math.min(1.5, view.tilt + up)); for (const one of view.seen) one(); replaceLater({ turn: `${view.turn.toFixed(2)},${view.tilt.toFixed(2)}` }); };
     view.seen.add(paint);
     canvas.onpointerdown = event => { from = [event.clientX, event.clientY]; canvas.setPointerCapture(event.pointerId); };
     canvas.onpointermove = event => {
@@ -106,7 +106,7 @@ Object.assign(springbench, (() => {
           file && element("h3", {}, `Recording of ${item.label}'s solve`), file && springbench.replayBox(item.recording_path, file, replay && link("site/data/", `${sweep.slug}/${replay}.js`), `${item.label}: ${item.description}`),
           element("p.muted", {}, `Made by code ${springbench.commit(made.commit)} on ${made.cpu || "an unknown machine"}${sweep.provenance.length > 1 && !item.provenance ? `, and by ${sweep.provenance.length - 1} more (see the overview)` : ""}.`)),
         item.mesh_picture && element("figure", {}, element("a", { href: link(sweep.relative_url, item.mesh_picture.path) }, element("img", { src: link(sweep.relative_url, item.mesh_picture.path), alt: `The step's mesh, by ${item.mesh_picture.reference_label}` })),
-          element("figcaption", {}, `Not this point: the mesh where ${item.mesh_picture.reference_label} came nearest the minimum of this step.`))));
+          element("figcaption", {}, `Not this point: the mesh where ${item.mesh_picture.reference_label} was nearest to the minimum of this step.`))));
     await scrubber(scrub, sweep, item, k);
   }
 
@@ -134,9 +134,9 @@ Object.assign(springbench, (() => {
       words.textContent = `${item.label}, iteration ${found.iterations[j]}: the vertex furthest away is ${number(most)} m from the reference.`;
       slider.setAttribute("aria-valuetext", `iteration ${found.iterations[j]}`);
     };
-    slider.oninput = () => { show(); keep({ at: found.iterations[Number(slider.value)] }); };
-    const wanted = where().query.has("at") ? Number(where().query.get("at")) : at ?? found.iterations.at(-1);
-    slider.value = found.iterations.reduce((b, v, j) => (Math.abs(v - wanted) < Math.abs(found.iterations[b] - wanted) ? j : b), 0);
+    slider.oninput = () => { show(); replaceLater({ at: found.iterations[Number(slider.value)] }); };
+    const target = where().query.has("at") ? Number(where().query.get("at")) : at ?? found.iterations.at(-1);
+    slider.value = found.iterations.reduce((b, v, j) => (Math.abs(v - target) < Math.abs(found.iterations[b] - target) ? j : b), 0);
     box.append(words, slider, element("div.scrub", {}, element("figure", {}, left.canvas, element("figcaption", {}, `the iterate of ${item.label}, by its distance from the reference`), scaleBox(`${number(found.min_distance)} m`, `${number(found.max_distance)} m or more`)),
       element("figure", {}, right.canvas, element("figcaption", {}, `the reference: the last iterate of ${found.reference.reference_label}, ${number(found.reference.distance)} m from the certified minimum`))));
     right.show(best);

@@ -28,7 +28,7 @@
         `${m.machine_id ? ` · machine ${m.machine_id.slice(0, 6)}` : ""} · ${day(m.first_started_at) === day(m.last_started_at) ? day(m.last_started_at) : `${day(m.first_started_at)} to ${day(m.last_started_at)}`}`)));
   }
 
-  function way(sweep, finding) {
+  function linkOf(sweep, finding) {
     if (finding.plot) return address("plots", { sweep: sweep.slug, plot: finding.plot, ...finding.filter });
     if (finding.filter) return address("runs", { sweep: sweep.slug, ...finding.filter });
     if (finding.runs?.length > 1) return address("compare", { sel: finding.runs.map(id => `${sweep.slug}/${id}`).join(",") });
@@ -39,7 +39,7 @@
   function findings(sweep) {
     const some = sweep.findings, list = element("ul.findings");
     const line = finding => {
-      const one = way(sweep, finding), run = finding.runs?.length > 1 && address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${finding.runs[0]}` });
+      const one = linkOf(sweep, finding), run = finding.runs?.length > 1 && address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${finding.runs[0]}` });
       return element("li", {}, finding.text.replace(/\|/g, " "), one && " ",
         run && element("a", { href: run }, "the run"), run && ", ",
         one && element("a", { href: one }, finding.plot === "hard" ? "the map" : finding.plot ? "the plot" : finding.runs?.length > 1 ? "compare" : "show"));
@@ -53,12 +53,12 @@
   function failures(sweep) {
     if (!sweep.failures.length) return [];
     const rows = sweep.failures.map(cause => {
-      const who = some => some.slice(0, 4).map(([name, n]) => (n > 1 ? `${name} (${count(n)})` : name)).join(", ")
+      const names = some => some.slice(0, 4).map(([name, n]) => (n > 1 ? `${name} (${count(n)})` : name)).join(", ")
         + (some.length > 4 ? ` and ${some.length - 4} more` : "");
       const link = cause.run_id && address("runs", { sweep: sweep.slug, status: cause.status, run: `${sweep.slug}/${cause.run_id}` });
       return element("tr", {}, element("td.num", {}, count(cause.count)), element("td", {}, state(cause.status)),
         element("td.reason", {}, cause.reason, cause.has_varied_reasons && element("span.muted", {}, " and the like"), link && " ", link && element("a", { href: link }, "show")),
-        element("td", {}, who(cause.solvers)), element("td", {}, who(cause.scenes)));
+        element("td", {}, names(cause.solvers)), element("td", {}, names(cause.scenes)));
     });
     const head = ["runs", "status", "cause", "solvers", "where"].map((words, k) => element(k ? "th" : "th.num", { scope: "col" }, words));
     return [element("h3", {}, "What did not succeed"), element("div.scroll", { tabIndex: 0, role: "region", "aria-label": "What did not succeed" },

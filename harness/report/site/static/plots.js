@@ -17,7 +17,7 @@
       const sweep = sweeps.find(one => one.slug === next.get("sweep")) || sweeps[0], plots = sweep.plots;
       const plot = plots.find(one => one.id === next.get("plot")) || plots.find(one => one.id === "convergence") || plots[0];
       const drawn = [...next].filter(([key]) => !["point", "at", "turn"].includes(key)).join("&") + sweep.slug + plot.id;
-      const anew = last.split("\n")[1] !== `${sweep.slug}/${plot.id}`;
+      const isNew = last.split("\n")[1] !== `${sweep.slug}/${plot.id}`;
       if (drawn !== last.split("\n")[0]) {
         last = `${drawn}\n${sweep.slug}/${plot.id}`;
         const chart = await data(`${sweep.slug}/${plot.id}`);
@@ -29,8 +29,8 @@
         top.replaceChildren(element("label.field", {}, element("span", {}, "Results"), element("select", { onchange: event => { location.hash = address("plots", { sweep: event.target.value }); } },
           ...sweeps.map(one => element("option", { value: one.slug, selected: one === sweep }, one.name)))));
         tabs.replaceChildren(...plots.map(one => element("a", { href: address("plots", { sweep: sweep.slug, plot: one.id }), "aria-current": one === plot && "page" }, one.title)));
-        if (anew) maps.replaceChildren(...(chart.maps ? springbench.maps(chart, sweep) : []));
-        if (chart.items.length) await drawChart(sweep, plot, chart, next, anew);
+        if (isNew) maps.replaceChildren(...(chart.maps ? springbench.maps(chart, sweep) : []));
+        if (chart.items.length) await drawChart(sweep, plot, chart, next, isNew);
         else {
           choice.replaceChildren();
           body.replaceChildren();
@@ -40,11 +40,11 @@
       await showPoint(sweep, next.get("point") || "", `${next.get("at")} ${next.get("turn")}`);
     }
 
-    async function drawChart(sweep, plot, chart, next, anew) {
+    async function drawChart(sweep, plot, chart, next, isNew) {
       const distinct = key => [...new Set(chart.items.map(item => item[key]))], chosen = {};
       for (const key of chart.filters) {
-        const names = distinct(key), asked = next.get(key);
-        chosen[key] = names.includes(asked) || asked === "all" ? asked : names[0];
+        const names = distinct(key), requested = next.get(key);
+        chosen[key] = names.includes(requested) || requested === "all" ? requested : names[0];
       }
       const one = (axes, name) => axes.find(a => a.column === name) || axes[0], x = one(chart.x, next.get("x")), y = one(chart.y, next.get("y"));
       const items = chart.items.filter(item => chart.filters.every(key => chosen[key] === "all" || item[key] === chosen[key]));
@@ -52,7 +52,7 @@
       note.textContent = [note.textContent, ...notes].join(" ");
       const hidden = new Set((next.get("off") || "").split("~").filter(Boolean)), labels = [...new Set(items.map(item => item.label))];
       const words = { problem: "Step", scene: "Scene", gap: "To a gap of", curve: "Of the paper", solver: "Solver", benchmark: "Benchmark" };
-      const plotBox = anew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one, plus and minus zoom, Home shows all.` }) : current.plotBox;
+      const plotBox = isNew || !current ? element("div.plot", { tabIndex: 0, role: "group", "aria-label": `Plot: ${chart.title}. Arrow keys go through its points, Enter opens one, plus and minus zoom, Home shows all.` }) : current.plotBox;
       const names = element("ul.legend", { "aria-label": "Solvers" }, ...springbench.chart.legend(labels, chart, items, hidden, off => change({ off: [...off].join("~") })));
       choice.replaceChildren(...chart.filters.filter(key => distinct(key).length > 1).map(key => pick(words[key] || key, key, distinct(key), chosen[key])),
         ...(chart.y.length > 1 ? [pick("Shown", "y", chart.y.map(a => a.column), y.column, name => one(chart.y, name).title)] : []),
@@ -69,12 +69,12 @@
       await redraw();
     }
 
-    async function showPoint(sweep, asked, how) {
-      if (`${asked} ${how}` === pointed) return;
-      const another = asked !== pointed.split(" ")[0];
-      pointed = `${asked} ${how}`;
+    async function showPoint(sweep, requested, how) {
+      if (`${requested} ${how}` === pointed) return;
+      const another = requested !== pointed.split(" ")[0];
+      pointed = `${requested} ${how}`;
       point.replaceChildren();
-      const [number, k] = asked.split(".").map(Number), item = asked && current?.chart.items[number];
+      const [number, k] = requested.split(".").map(Number), item = requested && current?.chart.items[number];
       point.hidden = !item;
       if (!item) return;
       const close = () => { change({ point: "", at: "", turn: "" }); current.plotBox.focus(); };

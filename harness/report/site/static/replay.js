@@ -43,7 +43,7 @@ window.springbench ??= {};
       element("button", head, { type: "button", textContent: "Close" }).addEventListener("click", () => dialog.close());
       element("div", dialog, { className: "stage" });
       dialog.setAttribute("aria-labelledby", "replay-title");
-      dialog.addEventListener("close", () => dialog.open || stop()); // it comes late: another may be open by then
+      dialog.addEventListener("close", () => dialog.open || stop()); // it is late: another may be open by then
     }
     dialog.querySelector("h2").textContent = title;
     dialog.querySelector(".stage").replaceChildren();

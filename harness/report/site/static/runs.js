@@ -18,7 +18,7 @@
     { id: "sweep", width: "minmax(96px, 1fr)", spare: 5, title: "Results", show: row => row.sweep },
     { id: "scene", width: "minmax(120px, 2fr)", title: "Scene", show: row => row.scene },
     { id: "size", width: "58px", title: "Size", numeric: true, show: row => row.size || "–" },
-    { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.who", { title: row.citation }, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
+    { id: "solver", width: "minmax(150px, 2fr)", title: "Solver", meaning: "and the options in which its runs differ", show: row => element("span.solver", { title: row.citation }, glyph(row.mark), row.solver, row.options && element("span.options", {}, row.options)) },
     { id: "status", width: "minmax(118px, 1fr)", title: "Status", show: row => element("span", {}, state(row.status), row.staleness && " ", marked(row)) },
     { id: "outcome", width: "minmax(116px, 1fr)", title: "Judged", show: row => (row.outcome ? state(row.outcome) : "–") },
     { id: "termination_reason", width: "92px", spare: 3, title: "Stopped by", meaning: "what ended the last step's iterations", show: row => words(row, "termination_reason") || "–" },
@@ -42,10 +42,10 @@
       const most = query.get(`max-${key}`);
       if (most && !(row[key] !== null && row[key] <= Number(most) / (key === "max_strain" ? 100 : 1))) return false;
     }
-    const wanted = (query.get("q") || "").toLowerCase();
-    if (!wanted) return true;
+    const words = (query.get("q") || "").toLowerCase();
+    if (!words) return true;
     const all = `${row.scene} ${row.size} ${row.label} ${row.integrator} ${row.reason || ""} ${row.run_id} ${row.parameters}`.toLowerCase();
-    return wanted.split(/\s+/).every(word => all.includes(word));
+    return words.split(/\s+/).every(word => all.includes(word));
   }
 
   function sorted(rows, by) {
@@ -54,7 +54,7 @@
     return [...rows].sort((a, b) => {
       const x = a[key], y = b[key];
       if (x === y) return 0;
-      if (x === null || x === undefined) return 1;  // what is not known comes last, whichever way
+      if (x === null || x === undefined) return 1;  // unknown values are last, in either direction
       if (y === null || y === undefined) return -1;
       return sign * (typeof x === "number" ? x - y : String(x).localeCompare(String(y)));
     });
@@ -110,14 +110,14 @@
     const panel = element("aside.panel", { hidden: true, "aria-label": "Run", tabIndex: -1 });
     content.append(element("div.runs", {}, element("div.left", {}, element("h1.unseen", {}, "Runs"), filters,
       element("div.toolbar", {}, total, by, downloads), note, table.grid, chosen), panel));
-    let opened = null, asked = null;
+    let opened = null, requested = null;
 
     async function update(next) {
       const filter = [...next].filter(([key]) => key !== "sel" && key !== "run").join("&");
       now = next;
       const changes = {};
-      if (asked !== filter) {
-        asked = filter;
+      if (requested !== filter) {
+        requested = filter;
         const sort = next.get("sort") || "";
         shown = sorted(all.filter(row => fits(row, next)), sort);
         changes.rows = shown;

@@ -28,10 +28,10 @@ springbench.table = ({ columns, onOpen, onSelect, onSort }) => {
     }, ...cells);
   }
 
-  function paint(anew = false) {
+  function paint(isNew = false) {
     const from = Math.max(0, Math.floor((grid.scrollTop - head.offsetHeight) / high) - AROUND);
     const to = Math.min(rows.length, Math.ceil((grid.scrollTop + grid.clientHeight) / high) + AROUND);
-    if (!anew && from === first && to === last) return;
+    if (!isNew && from === first && to === last) return;
     [first, last] = [from, to];
     body.replaceChildren(...rows.slice(from, to).map((row, k) => line(row, from + k)));
     mark();

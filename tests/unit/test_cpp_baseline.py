@@ -1,4 +1,4 @@
-"""The yardstick in C++: it takes the same steps as ours where it can be built, and says why where it cannot."""
+"""The baseline in C++: it takes the same steps as ours where it can be built, and says why where it cannot."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ with open(sys.argv[2], "wb") as file:
 
 @pytest.fixture
 def echo(tmp_path: Path) -> Path:
-    """A program that speaks as the yardstick does, for a cloth of 16 vertices, and ends badly above 100 iterations."""
+    """A program that speaks as the baseline does, for a cloth of 16 vertices, and ends badly above 100 iterations."""
     program = tmp_path / "echo"
     program.write_text(ECHO)
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
@@ -45,7 +45,7 @@ def test_without_a_compiler_it_is_unsupported(tmp_path: Path, monkeypatch: pytes
 
 def test_what_the_compiler_says_is_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     compiler = tmp_path / "compiler"
-    compiler.write_text("#!/bin/sh\necho 'yardstick.cpp:17: fatal error: Eigen/Sparse: No such file' >&2\nexit 1\n")
+    compiler.write_text("#!/bin/sh\necho 'baseline.cpp:17: fatal error: Eigen/Sparse: No such file' >&2\nexit 1\n")
     compiler.chmod(0o755)
     monkeypatch.setenv("CXX", str(compiler))
     with pytest.raises(Unsupported, match=r"Eigen/Sparse: No such file.*libeigen3-dev"):
