@@ -27,6 +27,7 @@ from springbench.solvers.contact.geometry.distance import (
     subtract3,
 )
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.model.system_matrix_assembly import compute_row_starts
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -55,16 +56,11 @@ class SurfaceAdjacency(NamedTuple):
         corners = np.concatenate([np.roll(triangles, -k, axis=1) for k in range(3)])
         by_edge, by_triangle = (np.argsort(one[:, 0], kind="stable") for one in (ends, corners))
         return cls(
-            _first_entries(ends[:, 0], num_vertices),
+            compute_row_starts(ends[:, 0], num_vertices),
             np.ascontiguousarray(ends[by_edge, 1]),
-            _first_entries(corners[:, 0], num_vertices),
+            compute_row_starts(corners[:, 0], num_vertices),
             np.ascontiguousarray(corners[by_triangle, 1:]),
         )
-
-
-def _first_entries(owners: IndexArray, num_owners: int) -> IndexArray:
-    """Return the first entry of each owner (n + 1,) among entries sorted by their owners (k,)."""
-    return np.concatenate([[0], np.cumsum(np.bincount(owners, minlength=num_owners))]).astype(np.int64)
 
 
 @jit_inner

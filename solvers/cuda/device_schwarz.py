@@ -24,6 +24,7 @@ from springbench.solvers.cuda.schwarz_kernels import (
     write_edge_blocks,
 )
 from springbench.solvers.linalg import additive_schwarz
+from springbench.solvers.model.system_matrix_assembly import compute_row_starts
 
 THREADS_PER_SUBDOMAIN = 1 if cuda_device.is_simulated() else 96
 """Threads per subdomain; see `sums` for the simulator's value."""
@@ -69,7 +70,7 @@ def build_levels(network: DeviceNetwork, anchor_stiffness: NDArray[np.float64]) 
         across = np.flatnonzero(ends[:, 0] != ends[:, 1])
         low, high = np.sort(ends[across], axis=1).T
         keys, which = np.unique(low * (nodes + 1) + high, return_inverse=True)
-        first = np.concatenate([[0], np.cumsum(np.bincount(which, minlength=len(keys)))])
+        first = compute_row_starts(which, len(keys))
         finer = across[np.argsort(which, kind="stable")]
         ends = np.column_stack(np.divmod(keys, nodes + 1))
         anchor_stiffness = np.add.reduceat(anchor_stiffness, np.arange(0, n, additive_schwarz.SUBDOMAIN_SIZE))

@@ -178,6 +178,19 @@ def diagonal_matrix(values: FloatArray) -> scipy.sparse.csr_array:
     return drop_zeros(scipy.sparse.csr_array(scipy.sparse.dia_array((values[None, :], np.array([0])), shape=(n, n))))
 
 
+def compute_row_starts(rows: NDArray[np.int64], num_rows: int) -> NDArray[np.int64]:
+    """Return the start of each row among entries that are sorted by row, as in compressed sparse rows.
+
+    Args:
+        rows: row of each entry (k,), in any order.
+        num_rows: number of rows, n; at least the largest row + 1.
+
+    Returns:
+        Starts (n + 1,); the last one is k.
+    """
+    return np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=num_rows))])
+
+
 def drop_zeros(matrix: scipy.sparse.csr_array | scipy.sparse.csc_array) -> scipy.sparse.csr_array:
     """Return the matrix with duplicates summed, columns sorted and explicit zeros dropped."""
     matrix = scipy.sparse.csr_array(matrix)

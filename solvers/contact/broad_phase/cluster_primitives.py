@@ -15,6 +15,7 @@ from springbench.solvers.contact.geometry.aabb import (
     store_aabbs,
 )
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.model.system_matrix_assembly import compute_row_starts
 from springbench.solvers.simd.float64x8 import lowest_set_bit
 
 
@@ -37,7 +38,7 @@ class ClusterPrimitives(NamedTuple):
             num_clusters: number of clusters.
         """
         owner = vertex_cluster[corners].min(axis=1)
-        starts = np.append(0, np.cumsum(np.bincount(owner, minlength=num_clusters)))
+        starts = compute_row_starts(owner, num_clusters)
         return cls(np.ascontiguousarray(corners[np.argsort(owner, kind="stable")]), starts)
 
     def cluster_vertices(self) -> IndexArray:

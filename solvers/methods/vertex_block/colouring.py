@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.solvers.jit.kernel_compilation import jit_kernel
-from springbench.solvers.model.system_matrix_assembly import signed_incidence_matrix_sparse
+from springbench.solvers.model.system_matrix_assembly import compute_row_starts, signed_incidence_matrix_sparse
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ def _colour_rows(groups: csr_array, items: csr_array) -> Colouring:
         np.asarray(x, np.int64) for x in (groups.indptr, groups.indices, items.indptr, items.indices)
     )
     _assign_first_free_colours(pointers, columns, back, rows, colour, taken)
-    start = np.concatenate([[0], np.cumsum(np.bincount(colour))]) if count else np.zeros(1, np.int64)
+    start = compute_row_starts(colour, int(colour.max(initial=-1)) + 1)
     return Colouring(np.argsort(colour, kind="stable"), start)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.jit.kernel_compilation import jit_closure, jit_inlined_closure, jit_kernel
 from springbench.solvers.model.energies.element_energies import ElementLaw, Elements
+from springbench.solvers.model.system_matrix_assembly import compute_row_starts
 
 
 class IncidentElements(NamedTuple):
@@ -59,7 +60,7 @@ class IncidentElements(NamedTuple):
         element, slot = element[order], slot[order]
         others = (slot[:, None] + np.arange(1, width)) % width
         none, c = np.empty((0, 0)), elements.coefficients
-        first = np.concatenate([[0], np.cumsum(np.bincount(at[element, slot], minlength=rows))]).astype(np.uint32)
+        first = compute_row_starts(at[element, slot], rows).astype(np.uint32)
         places, weights = (4 * at[element[:, None], others]).astype(np.uint32), c[element[:, None], others]
         own, element = c[element, slot], element.astype(np.uint32)
         made = cls(first, element, own, places, weights, none, none, at.astype(np.uint32), c, none)

@@ -9,7 +9,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 from springbench.solvers.model.step_problem import Positions
-from springbench.solvers.model.system_matrix_assembly import diagonal_matrix, drop_zeros, signed_incidence_matrix_sparse
+from springbench.solvers.model.system_matrix_assembly import (
+    compute_row_starts,
+    diagonal_matrix,
+    drop_zeros,
+    signed_incidence_matrix_sparse,
+)
 
 ZERO_LENGTH = 1e-140
 """Lengths [m] up to this value count as zero, because their squares underflow."""
@@ -76,8 +81,9 @@ class EdgeEnergy:
         rows, columns = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
         blocks = np.concatenate([H, H, -H, -H])
         order = np.lexsort((columns, rows))
-        indptr = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])
-        whole = scipy.sparse.bsr_array((blocks[order], columns[order], indptr), shape=(3 * n, 3 * n))
+        whole = scipy.sparse.bsr_array(
+            (blocks[order], columns[order], compute_row_starts(rows, n)), shape=(3 * n, 3 * n)
+        )
         return drop_zeros(scipy.sparse.csr_array(scipy.sparse.coo_array(whole)))
 
 
