@@ -44,13 +44,22 @@ number of iterations either."""
 
 @runtime_checkable
 class FrictionEnergy(Energy, Protocol):
-    """An energy whose friction depends on `Start.pressed`."""
+    """An energy whose friction depends on `StepStart.normal_force_positions`."""
 
     friction: float
     friction_iterations: int
 
     def friction_gradient(self, p: Positions) -> Positions | None:
         """Return the gradient of friction alone [N] at p (n, 3); None where it is zero."""
+        ...
+
+
+class FrictionSolver(PreparedSolver, Protocol):
+    """A prepared solver that may evaluate friction itself, with the normal forces of each iterate."""
+
+    @property
+    def has_own_friction(self) -> bool:
+        """Whether it does so, for its system; a step is then solved once."""
         ...
 
 
@@ -89,7 +98,7 @@ def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: St
     """
     solution = prepared.solve(problem, stop)
     rounds = _max_friction_iterations(problem.system)
-    if not rounds or getattr(prepared, "has_own_friction", False):
+    if not rounds or evaluates_friction(prepared):
         return FrictionSolve(problem, solution, (solution.num_iterations,), None)
     counts, guess = [solution.num_iterations], problem.initial_guess
     earlier = deque[_Round](maxlen=PERIOD)
@@ -107,6 +116,15 @@ def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: St
         earlier.append(_Round(x, acting))
         problem, solution = following, prepared.solve(following, stop)
         counts.append(solution.num_iterations)
+
+
+def evaluates_friction(prepared: PreparedSolver) -> bool:
+    """Return whether a prepared solver evaluates friction itself."""
+    return _is_friction_solver(prepared) and prepared.has_own_friction
+
+
+def _is_friction_solver(prepared: PreparedSolver) -> TypeGuard[FrictionSolver]:
+    return hasattr(prepared, "has_own_friction")
 
 
 def has_friction(energy: Energy) -> TypeGuard[FrictionEnergy]:

@@ -18,6 +18,7 @@ from itertools import islice
 from typing import Protocol
 
 import numpy as np
+from springbench.solvers.contact.lagged_friction import evaluates_friction
 from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size, without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solution, StepProblem, StopRule, System
 
@@ -76,7 +77,7 @@ class IdleContactSolver:
     @property
     def has_own_friction(self) -> bool:
         """Whether the method with contact evaluates friction itself, see `solve_with_friction`."""
-        return getattr(self.with_contact, "has_own_friction", False)
+        return evaluates_friction(self.with_contact)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)] at p (n, 3) [m], with contact."""
