@@ -39,7 +39,8 @@ REFERENCE_STOP_RULE = StopRule(500, 1e-12)
 _MAX_ROUNDOFF_RATIO = 4.0 * REFERENCE_STOP_RULE.roundoff_floor
 """Largest ratio of the gradient to its rounding bound at which a step that reaches the iteration limit has converged.
 
-Near contacts iterates stagnate at ratios up to 16."""
+Measured, not derived: near contacts iterates stagnate at ratios up to 16, twice the floor. The bound of a barrier is
+its Hessian times the rounding of the positions, which is of first order; a bound of higher orders is not known."""
 
 Arrays = Mapping[str, NDArray[Any]]
 

@@ -372,12 +372,10 @@ def recommend_method(
     )
     store = open_reference_store(results)
     candidates = StudyCandidates.from_goal(goal, engine)
-    planned: tuple[AccuracyPlan, float] = isolated(
+    planned: tuple[AccuracyPlan, RecommendationGoal, float] = isolated(
         partial(_plan_study, path, scene, size, goal, candidates, t_end, time_limit, store)
     )
-    study, reference_error = planned
-    if reference_error and goal.max_error is None:
-        goal = goal.loosen_for_contact()
+    study, goal, reference_error = planned
     if goal.max_error and reference_error:
         goal = replace(goal, max_error=goal.max_error - reference_error)
         print_message(
@@ -453,12 +451,17 @@ def _plan_study(
     time_limit: float,
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
-) -> tuple[AccuracyPlan, float]:
-    """Compute the reference of a study, and return the study and the bound on the error of a self-converged reference.
+) -> tuple[AccuracyPlan, RecommendationGoal, float]:
+    """Compute the reference of a study.
 
-    The bound is 0 without contact. Raises InputError, RunFailed.
+    Returns:
+        The study, the goal, which is looser with contact, and the bound on the error of a self-converged reference: 0
+        without contact.
+
+    Raises:
+        InputError: the scene or a candidate is invalid.
+        RunFailed: the motion has no reference.
     """
-    max_error = goal.reference_error
     print_message("estimating how far ahead the motion can be predicted")
     if t_end is not None:
         _build_valid_study(path, scene, size, candidates, t_end, time_limit)
@@ -468,13 +471,13 @@ def _plan_study(
     if touches:
         print_message(describe_self_convergence(scene.path.stem))
         candidates = candidates.restrict_to_contact()
-        max_error = goal.loosen_for_contact().reference_error
-        t_end = _find_contact_t_end(scene, size, max_error, t_end, reference_store, print_message)
+        goal = goal.loosen_for_contact()
+        t_end = _find_contact_t_end(scene, size, goal.reference_error, t_end, reference_store, print_message)
     elif t_end is None:
-        t_end = find_default_t_end(path, scene, size, max_error, reference_store, print_message)
+        t_end = find_default_t_end(path, scene, size, goal.reference_error, reference_store, print_message)
     study = _build_valid_study(path, scene, size, candidates, t_end, time_limit)
-    trajectory = _compute_reference(scene, size, max_error, t_end, reference_store, print_message)
-    return study, trajectory.get_error_bound(-1) if touches else 0.0
+    trajectory = _compute_reference(scene, size, goal.reference_error, t_end, reference_store, print_message)
+    return study, goal, trajectory.get_error_bound(-1) if touches else 0.0
 
 
 def _build_valid_study(
