@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels import objective_kernels, spring_hessian
 from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
+from springbench.solvers.linalg.cholesky.block_cholesky import FactorisationCount
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.barrier_energy import is_barrier_energy
 from springbench.solvers.model.energies.element_energies import ElementLaw, Elements
@@ -84,6 +85,7 @@ class FixedObjective:
         others = {k: e for k, e in enumerate(system.energies) if not isinstance(e, Springs)}
         if others:
             self._classify_energies(others)
+        self._factorisation_count = FactorisationCount()
         self._extended_matrix: BlockMatrix | None = None
         self._extended_blocks: tuple[NDArray[np.int64], NDArray[np.int64]] = (
             np.empty(0, np.int64),
@@ -163,9 +165,8 @@ class FixedObjective:
         return pairs[:count, 0], pairs[:count, 1]
 
     def _build_matrix(self, graph: csr_array, i: NDArray[np.int64], j: NDArray[np.int64]) -> BlockMatrix:
-        return BlockMatrix.from_graph(
-            self.system, self.objective_terms, self.quadratic_form, self.free_index, graph, i, j
-        )
+        terms, count = self.objective_terms, self._factorisation_count
+        return BlockMatrix.from_graph(self.system, terms, self.quadratic_form, self.free_index, graph, i, j, count)
 
     def matrix_with_blocks(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> BlockMatrix:
         """Return a matrix that also has blocks (i, j) of free vertices."""

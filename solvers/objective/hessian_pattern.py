@@ -2,8 +2,8 @@
 
 The pattern covers springs, projective energies and elements, which are known before the first step. If another energy
 needs more blocks, a step extends the pattern (`springbench.solvers.objective.step_matrix`). The last extended one is
-cached for
-steps that need exactly that pattern, so that a result depends on its problem only, not on earlier ones.
+cached for steps that need exactly that pattern, so that a result depends on its problem only, not on earlier ones. The
+matrices of a system count their factorisations together.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scipy.sparse import coo_array, csr_array
 from springbench.solvers.kernels import quadratic_form_kernels, spring_hessian
 from springbench.solvers.kernels.objective_kernels import ObjectiveTerms
 from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
-from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
+from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky, FactorisationCount
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.step_problem import System
 
@@ -33,6 +33,7 @@ class BlockMatrix:
         quadratic_form: QuadraticForm | None,
         free_index: IndexArray,
         graph: csr_array,
+        count: FactorisationCount,
     ) -> None:
         """Analyse a block pattern.
 
@@ -42,11 +43,12 @@ class BlockMatrix:
             quadratic_form: quadratic form of the system, or None.
             free_index: index of each vertex among the free ones (n,), or -1.
             graph: pattern of the blocks (f, f), sorted, with a diagonal.
+            count: the count to which its factorisations are added.
         """
         self.graph, self._free_index, self._num_free = graph, free_index, len(system.free_vertices)
         self._objective_terms, self._quadratic_form = terms, quadratic_form
         self.values = np.empty((graph.nnz, 3, 3))
-        self.factor = BlockCholesky(graph)
+        self.factor = BlockCholesky(graph, count=count)
         self.block_indices = spring_hessian.BlockIndices.from_graph(system, terms.edges, graph)
         rows = np.repeat(np.arange(len(graph.indptr) - 1), np.diff(graph.indptr))
         self._block_keys = rows * self._num_free + graph.indices
@@ -64,6 +66,7 @@ class BlockMatrix:
         graph: csr_array,
         i: IndexArray,
         j: IndexArray,
+        count: FactorisationCount,
     ) -> BlockMatrix:
         """Return a matrix with the blocks of a graph and additional ones.
 
@@ -72,7 +75,8 @@ class BlockMatrix:
         i, j = i[(i >= 0) & (j >= 0)], j[(i >= 0) & (j >= 0)]
         ones = np.ones(2 * len(i))
         more = csr_array(coo_array((ones, (np.append(i, j), np.append(j, i))), shape=graph.shape))
-        return cls(system, terms, quadratic_form, free_index, system_matrix_assembly.drop_zeros(abs(graph) + more))
+        graph = system_matrix_assembly.drop_zeros(abs(graph) + more)
+        return cls(system, terms, quadratic_form, free_index, graph, count)
 
     @property
     def block_coordinates(self) -> tuple[IndexArray, IndexArray]:

@@ -183,6 +183,18 @@ def test_a_failed_factorisation_counts_by_the_operations_before_it_fails():
     assert graph.num_factorisations == least + 1.0
 
 
+def test_factorisations_of_an_extended_pattern_are_counted_with_the_others():
+    """A step extends the pattern where contact needs more blocks; costs of methods count them all."""
+    objective = FixedObjective(stiff(1.0).system)
+    base, n = objective.hessian_matrix, len(objective.system.free_vertices)
+    extended = objective.matrix_with_blocks(*np.triu_indices(n, 1))
+    assert extended.graph.nnz == n * n > base.graph.nnz
+    blocks = np.zeros((extended.graph.nnz, 3, 3))
+    blocks[extended.graph.indices == np.repeat(np.arange(n), n)] = np.eye(3)
+    assert extended.factor.factorise(blocks)
+    assert base.factor.num_factorisations == 1.0
+
+
 def test_the_shift_approaches_the_smallest_one_that_has_a_factor():
     """Where the model is accurate, a smaller shift is tried; a failed attempt brings the next one closer."""
     shift, smallest, attempts = InertiaShift(0.0, 1e3), 1.7, list[float]()

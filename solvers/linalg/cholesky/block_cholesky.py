@@ -8,6 +8,7 @@ factorisation is a regular result and no error: H is not positive definite.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba
@@ -47,6 +48,17 @@ class _Workspace(NamedTuple):
     run_stages: TypedKernel
 
 
+@dataclass(slots=True)
+class FactorisationCount:
+    """Number of factorisations so far, of one matrix or of several that share it.
+
+    Attributes:
+        total: sum over all factorisations; one that fails counts by the operations before it fails.
+    """
+
+    total: float = 0.0
+
+
 class BlockCholesky:
     """Cholesky factorisation of H for one pattern of blocks.
 
@@ -56,18 +68,25 @@ class BlockCholesky:
     Attributes:
         nonzeros: entries of L, including the diagonal.
         flops: multiplications and additions of a factorisation, without padding.
-        num_factorisations: factorisations so far; one that fails counts by the operations before it fails.
         failed_vertex: vertex with the first pivot that was not positive in the last factorisation, or -1.
         fronts, panels: structure and entries of L, see `block_multifrontal`.
     """
 
-    def __init__(self, graph: csr_array, *, block_size: int = 3, symbolic_factor: SymbolicFactor | None = None) -> None:
+    def __init__(
+        self,
+        graph: csr_array,
+        *,
+        block_size: int = 3,
+        symbolic_factor: SymbolicFactor | None = None,
+        count: FactorisationCount | None = None,
+    ) -> None:
         """Analyse a graph.
 
         Args:
             graph: pattern (n, n), symmetric, with an entry for each block including the diagonal.
             block_size: rows of a block, d.
             symbolic_factor: the symbolic factor, if it is known.
+            count: the count to which factorisations are added; by default one of its own.
 
         Raises:
             Unsupported: if the factor does not fit in memory.
@@ -81,7 +100,7 @@ class BlockCholesky:
         self._flops = w * (w * w / 3.0 + w * h + h * h)
         self._update_sizes = (round_up_columns(d * below) + 1) * round_up_rows(d * below)
         self.flops = float(self._flops.sum())
-        self.num_factorisations, self.failed_vertex = 0.0, -1
+        self._count, self.failed_vertex = count or FactorisationCount(), -1
         schedule, updates = self._plan(1)
         needs, free = 8.0 * (f.panel_start[-1] + updates), memory.compute_memory_limit()
         if needs > free:
@@ -93,6 +112,11 @@ class BlockCholesky:
         self.panels = np.zeros(f.panel_start[-1] + TILE_ROWS)
         self._no_values, self._no_vectors = np.empty((0, d, d)), np.empty((0, d))
         self._workspaces = {1: self._allocate(schedule, updates, 1)}
+
+    @property
+    def num_factorisations(self) -> float:
+        """Factorisations so far, of this pattern and of those with the same count."""
+        return self._count.total
 
     def _plan(self, threads: int) -> tuple[FactorisationSchedule, int]:
         """Return the schedule for a number of threads, and the entries of its updates."""
@@ -141,7 +165,7 @@ class BlockCholesky:
         if failed >= 0:
             self.failed_vertex = int(scratch.failed_vertices[np.argmin(scratch.failures)])
         done = 1.0 if failed < 0 else float(self._flops[:failed].sum()) / self.flops
-        self.num_factorisations += max(_MIN_FACTORISATION, done)
+        self._count.total += max(_MIN_FACTORISATION, done)
         return failed < 0
 
     def solve(self, b: NDArray[np.float64]) -> NDArray[np.float64]:

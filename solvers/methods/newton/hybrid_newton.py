@@ -335,8 +335,7 @@ class _MeasuredRule(ShiftScheduleRule):
         if self._name == "shift":
             self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
         if self._level:
-            made = self._factor.num_factorisations - self._before
-            self._gains[self._name] = fall / (made or 1.0)  # a Hessian of another pattern has a factor of its own
+            self._gains[self._name] = fall / (self._factor.num_factorisations - self._before)
         self.is_delivered = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
 
 
