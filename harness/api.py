@@ -280,7 +280,7 @@ def run_config(
 
     if isinstance(config, Mapping):
         if not name:
-            raise InputError("a sweep that is a mapping needs a name: run({...}, name='mine')")
+            raise InputError("a sweep that is a mapping needs a name: run_config({...}, name='mine')")
         path = Path(folder) / f"{name}.yaml"
         sweep = config_loader.build_sweep_from_document(ConfigDocument(path, _to_plain_data(config)))
     else:
@@ -342,7 +342,13 @@ def _to_dataframe(table: Any) -> Any:
 
 
 class RunRecording(RecordingReplay):
-    """A finished run, read from its recording, of which a notebook displays the picture."""
+    """A finished run, read from its recording, of which a notebook displays the picture.
+
+    Example:
+        >>> path = sorted(Path("results/small/recordings").glob("chain-5-newton-*.rrd"))[0]
+        >>> len(springbench.open_recording(path).times)
+        3
+    """
 
     __slots__ = ()
 
@@ -400,7 +406,12 @@ def view_recording(path: str | Path, *, width: int | Literal["auto"] = "auto", h
 
 @dataclass(frozen=True, slots=True)
 class PngImage:
-    """A PNG image that a notebook displays; content: bytes of the file."""
+    """A PNG image that a notebook displays; content: bytes of the file.
+
+    Example:
+        >>> springbench.PngImage(b"...").save("picture.png").name
+        'picture.png'
+    """
 
     content: bytes
 

@@ -9,18 +9,36 @@ from pathlib import Path
 
 
 class SpringbenchError(Exception):
-    """Base of the errors that the command line reports without a traceback."""
+    """Base of the errors that the command line reports without a traceback.
+
+    Example:
+        >>> try:
+        ...     springbench.load_scene("no-such-scene.yaml")
+        ... except springbench.SpringbenchError as error:
+        ...     error.exit_code
+        2
+    """
 
     exit_code = 1
 
 
 class RunFailed(SpringbenchError):
-    """A run ended without a result."""
+    """A run ended without a result.
+
+    Example:
+        >>> springbench.RunFailed("step 3: the positions are not finite").exit_code
+        1
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class InputMistake:
-    """One mistake in an input: its problem with a remedy, file, line and key."""
+    """One mistake in an input: its problem with a remedy, file, line and key.
+
+    Example:
+        >>> print(springbench.InputMistake("got -1; expected a number above 0", Path("scene.yaml"), 3, "mass"))
+        scene.yaml:3: mass: got -1; expected a number above 0
+    """
 
     problem: str
     file: Path | None = None
@@ -33,7 +51,14 @@ class InputMistake:
 
 
 class InputError(SpringbenchError):
-    """All mistakes in the user's input."""
+    """All mistakes in the user's input.
+
+    Example:
+        >>> mistakes = [springbench.InputMistake("is missing", key=key) for key in ("mass", "frames")]
+        >>> print(springbench.InputError(mistakes))
+        mass: is missing
+        frames: is missing
+    """
 
     exit_code = 2
 

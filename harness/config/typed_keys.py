@@ -33,7 +33,13 @@ NumberOrText = float | str
 
 
 class SceneKeys(TypedDict, total=False):
-    """Keys of a scene except its mesh and effects, as in `springbench.harness.scenes.scene_spec.SceneFields`."""
+    """Keys of a scene except its mesh and effects, as in `springbench.harness.scenes.scene_spec.SceneFields`.
+
+    Example:
+        >>> keys: springbench.SceneKeys = {"mass": 1.0, "time_step": 1 / 30, "frames": 30, "default_size": 5}
+        >>> springbench.make_scene(mesh={"kind": "chain"}, **keys).frames
+        30
+    """
 
     description: str
     mass: float | None
@@ -49,7 +55,13 @@ class SceneKeys(TypedDict, total=False):
 
 
 class OptionKeys(TypedDict, total=False):
-    """Options of a sweep, as in `springbench.harness.config.sweep_config.SweepOptions`."""
+    """Options of a sweep, as in `springbench.harness.config.sweep_config.SweepOptions`.
+
+    Example:
+        >>> options: springbench.OptionKeys = {"max_iterations": [10, 20], "frames": 2}
+        >>> sorted(options)
+        ['frames', 'max_iterations']
+    """
 
     max_iterations: OneOrSequence[int]
     rtol: OneOrSequence[float | Literal["auto"] | None]
@@ -72,7 +84,13 @@ class OptionKeys(TypedDict, total=False):
 
 class SweepKeys(TypedDict, total=False):
     """Keys of a sweep, as in `springbench.harness.config.sweep_config.SweepConfig`; a solver with parameters is a
-    mapping."""
+    mapping.
+
+    Example:
+        >>> sweep: springbench.SweepKeys = {"scenes": ["chain.yaml"], "sizes": [5], "solvers": ["sparse", "newton"]}
+        >>> sorted(sweep)
+        ['scenes', 'sizes', 'solvers']
+    """
 
     description: str
     scenes: Required[Sequence[str]]

@@ -22,7 +22,18 @@ Vector3 = tuple[float, float, float]
 
 
 class ConfigModel(BaseModel):
-    """A frozen pydantic model that rejects unknown keys, infinities and NaN."""
+    """A frozen pydantic model that rejects unknown keys, infinities and NaN.
+
+    Example:
+        >>> class Drag(springbench.ConfigModel):
+        ...     coefficient: float
+        >>> Drag(coefficient=0.1)
+        Drag(coefficient=0.1)
+        >>> Drag(coefficient=0.1, density=1.2)
+        Traceback (most recent call last):
+        pydantic_core._pydantic_core.ValidationError: 1 validation error for Drag
+        ...
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False, allow_inf_nan=False)
 

@@ -64,6 +64,27 @@ class SolverState(ABC):
         positions: the iterate (n, 3) [m], which the next iteration may overwrite.
         velocity: velocity at the end of the step (n, 3) [m/s], for a method that computes its own.
         start_residual: residual at the initial guess [J^(1/2)], if the method computes it at the start.
+
+    Example:
+        >>> class Descent(springbench.SolverState):
+        ...     def __init__(self, problem, p):
+        ...         self.problem, self.positions = problem, p
+        ...     def step_state(self):
+        ...         inertia = self.problem.system.inertia_diagonal[:, None]
+        ...         self.positions = self.positions - self.problem.gradient(self.positions) / inertia
+        ...         return True
+
+        >>> import numpy as np
+        >>> system, p = springbench.System(np.array([1.0]), time_step=0.5), np.zeros((1, 3))
+        >>> start = springbench.StepStart(p, 0.0 * p, 0.0, p, system.velocity_rate)
+        >>> weight = np.array([[0.0, -8.0, 0.0]])
+        >>> problem = springbench.StepProblem(system, p, weight, np.empty((0, 3)), p, p, start)
+
+        >>> state = Descent(problem, p)
+        >>> state.run_unchecked(3)
+        3
+        >>> state.positions.tolist()
+        [[0.0, -2.0, 0.0]]
     """
 
     positions: Positions
@@ -131,6 +152,29 @@ class IterativeSolver(ABC):
         supports_length_constraints: whether length constraints are supported; if not, `iterates` and `solve` raise
             Unsupported for a system that has any.
         can_leave_saddles: whether a solve that ends at a saddle may start again from a lower point.
+
+    Example:
+        >>> class Descent(springbench.SolverState):
+        ...     def __init__(self, problem, p):
+        ...         self.problem, self.positions = problem, p
+        ...     def step_state(self):
+        ...         inertia = self.problem.system.inertia_diagonal[:, None]
+        ...         self.positions = self.positions - self.problem.gradient(self.positions) / inertia
+        ...         return True
+
+        >>> class PreparedDescent(springbench.IterativeSolver):
+        ...     description, stats, residual_iterate = "", {}, "none"
+        ...     def init_state(self, problem, initial_guess):
+        ...         return Descent(problem, initial_guess)
+
+        >>> import numpy as np
+        >>> system, p = springbench.System(np.array([1.0]), time_step=0.5), np.zeros((1, 3))
+        >>> start = springbench.StepStart(p, 0.0 * p, 0.0, p, system.velocity_rate)
+        >>> weight = np.array([[0.0, -8.0, 0.0]])
+        >>> problem = springbench.StepProblem(system, p, weight, np.empty((0, 3)), p, p, start)
+
+        >>> PreparedDescent().solve(problem, springbench.StopRule(3)).num_iterations
+        3
     """
 
     residual_iterate: ClassVar[ResidualIterate] = "returned"
@@ -144,7 +188,12 @@ class IterativeSolver(ABC):
 
     @abstractmethod
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m], which is not modified."""
+        """Start a solve.
+
+        Args:
+            problem: the step.
+            initial_guess: positions (n, 3) [m], which are not modified.
+        """
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """Yield the iterates from the initial guess; the next one may overwrite a yielded array."""
@@ -157,6 +206,13 @@ class IterativeSolver(ABC):
         """Iterate until `stop` terminates the solve or no step decreases the objective.
 
         Without a tolerance only the last residual is computed.
+
+        Args:
+            problem: the step.
+            stop: the criteria that terminate the solve.
+
+        Raises:
+            Unsupported: the system has length constraints, which the method does not support.
         """
         run = self._initial_state(problem)
         limits, initial_residual, close = iteration_limit(stop.max_iterations), float("nan"), False
@@ -258,9 +314,11 @@ class IterativeSolver(ABC):
         return count, residual, ended
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual [J^(1/2)] at p (n, 3) [m].
+        """Return the residual [J^(1/2)]; it costs one iteration if it belongs to the previous iterate.
 
-        It costs one iteration if it belongs to the previous iterate.
+        Args:
+            problem: the step.
+            p: positions (n, 3) [m].
         """
         if self.residual_iterate == "none":
             return float("nan")

@@ -20,6 +20,11 @@ class Citation:
         year: year of publication.
         title: title of the publication.
         doi: identifier without the address of the registry; empty if there is none.
+
+    Example:
+        >>> authors = "Hestenes, Magnus R. and Stiefel, Eduard"
+        >>> springbench.Citation(authors, 1952, "Methods of conjugate gradients for solving linear systems").year
+        1952
     """
 
     authors: str
@@ -44,6 +49,10 @@ class SolverInfo:
         package_name: the distribution that the method is an interface to, whose version is part of its rows.
         formula: the update of an iteration in one line, in the symbols of configs/explanation/notation.md.
         cost: the work of an iteration: solves with the factor of Q, passes over the springs, factorisations.
+
+    Example:
+        >>> springbench.SolverInfo("descent", formula="p' = p - t grad g(p)", cost="a pass over the springs").family
+        'descent'
     """
 
     family: str

@@ -62,7 +62,12 @@ class PluginContractError(Exception):
 
 
 class Unsupported(Exception):
-    """An error for a system that a solver cannot minimise; the message states the part and the reason."""
+    """An error for a system that a solver cannot minimise; the message states the part and the reason.
+
+    Example:
+        >>> str(springbench.Unsupported("mine: supports springs only; the scene has Bending"))
+        'mine: supports springs only; the scene has Bending'
+    """
 
 
 class NotPositiveDefinite(Exception):
@@ -72,6 +77,10 @@ class NotPositiveDefinite(Exception):
 
     Attributes:
         vertices: the vertices that the message names.
+
+    Example:
+        >>> springbench.NotPositiveDefinite("vertex 3 has no mass, spring or pin", vertices=[3]).vertices
+        (3,)
     """
 
     def __init__(self, message: str = "", vertices: Sequence[int] = ()) -> None:
@@ -80,14 +89,35 @@ class NotPositiveDefinite(Exception):
 
 
 class Energy(Protocol):
-    """A potential energy [J] as a function of the positions [m]."""
+    """A potential energy [J] as a function of the positions [m].
+
+    Example:
+        >>> import numpy as np
+        >>> from scipy.sparse import csr_array
+        >>> class Weight:
+        ...     def value(self, p):
+        ...         return 9.81 * float(p[:, 1].sum())
+        ...     def add_gradient(self, p, out):
+        ...         out[:, 1] += 9.81
+        ...     def hessian(self, p):
+        ...         return csr_array((p.size, p.size))
+        >>> gradient = np.zeros((1, 3))
+        >>> Weight().add_gradient(np.ones((1, 3)), gradient)
+        >>> gradient.tolist()
+        [[0.0, 9.81, 0.0]]
+    """
 
     def value(self, p: Positions) -> float:
         """Return the energy [J] at p, shape (n, 3)."""
         ...
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N], shape (n, 3), to `out`."""
+        """Add the gradient to `out`.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: the sum of gradients (n, 3) [N].
+        """
         ...
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
@@ -97,14 +127,37 @@ class Energy(Protocol):
 
 @runtime_checkable
 class ProjectiveEnergy(Energy, Protocol):
-    """A projective energy min over d of sum_e w_e/2 |(A p)_e - d_e|^2, each d_e on a manifold (Bouaziz et al. 2014)."""
+    """A projective energy min over d of sum_e w_e/2 |(A p)_e - d_e|^2, each d_e on a manifold (Bouaziz et al. 2014).
+
+    Example:
+        >>> import numpy as np
+        >>> from scipy.sparse import eye_array
+        >>> class Tethers:  # w/2 |p_i|^2 of each vertex: d is zero
+        ...     def value(self, p):
+        ...         return 50.0 * float((p * p).sum())
+        ...     def add_gradient(self, p, out):
+        ...         out += 100.0 * p
+        ...     def hessian(self, p):
+        ...         return 100.0 * eye_array(p.size, format="csr")
+        ...     def stiffness_matrix(self, n):
+        ...         return 100.0 * eye_array(n, format="csr")
+        ...     def add_projection(self, p, out):
+        ...         return
+        >>> isinstance(Tethers(), springbench.ProjectiveEnergy)
+        True
+    """
 
     def stiffness_matrix(self, n: int) -> scipy.sparse.csr_array:
         """Return the contribution A'KA [N/m] of the energy to the system matrix, shape (n, n)."""
         ...
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """Add A'K d(p) [N], shape (n, 3), the contribution to the right-hand side, to `out`."""
+        """Add the contribution A'K d(p) to the right-hand side.
+
+        Args:
+            p: positions (n, 3) [m], from which d is found.
+            out: the right-hand side (n, 3) [N].
+        """
         ...
 
 
@@ -121,6 +174,11 @@ class System:
         velocity_factor: the integrator's ratio of the velocity to the change of the stage, in units of 1/dt; None for
             sqrt(c).
         length_constraints: length constraints that are satisfied exactly.
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.System(mass=np.array([2.0, 2.0]), time_step=0.5).inertia_diagonal.tolist()
+        [8.0, 8.0]
     """
 
     mass: NDArray[np.float64]
@@ -184,6 +242,13 @@ class StepStart:
             of the step.
         pattern_positions: an iterate of x (n, 3) [m] near which the Hessian's pattern is determined; None for the start
             of the solve.
+
+    Example:
+        >>> import numpy as np
+        >>> p, v = np.zeros((1, 3)), np.ones((1, 3))
+        >>> start = springbench.StepStart(p, v, time=0.0, velocity_origin=p, velocity_rate=2.0)
+        >>> start.velocity_at(p + 1.0).tolist()
+        [[2.0, 2.0, 2.0]]
     """
 
     positions: Positions
@@ -239,6 +304,18 @@ class StepProblem:
             residual here.
         initial_guess: initial guess of the iteration (n, 3) [m].
         step_start: state at the start of the step.
+
+    Example:
+        >>> import numpy as np
+        >>> system, p = springbench.System(np.array([1.0]), time_step=0.5), np.zeros((1, 3))
+        >>> start = springbench.StepStart(p, 0.0 * p, 0.0, p, system.velocity_rate)
+        >>> weight = np.array([[0.0, -8.0, 0.0]])
+        >>> problem = springbench.StepProblem(system, p, weight, np.empty((0, 3)), p, p, start)
+
+        >>> problem.gradient(p).tolist()
+        [[0.0, 8.0, 0.0]]
+        >>> problem.value(np.array([[0.0, -2.0, 0.0]]))  # the minimum: 4 N/m * 2 m is the weight
+        -8.0
     """
 
     system: System
@@ -303,6 +380,10 @@ class StopRule:
         roundoff_floor: a gradient is round-off if at each unpinned vertex it is at most this factor times the bound of
             `springbench.solvers.model.rounding_bound`; 0 disables the criterion.
         atol: absolute tolerance [J^(1/2)].
+
+    Example:
+        >>> springbench.StopRule(max_iterations=200, rtol=1e-6)
+        StopRule(max_iterations=200, rtol=1e-06, roundoff_floor=8.0, atol=0.0)
     """
 
     max_iterations: int = 50
@@ -328,6 +409,13 @@ class Solution:
         warm_start: warm start of the next solve, of any shape.
         solver_phases: iterations and counted cost of each method that a solve switched between, by the order of use;
             None for a solver of one method.
+
+    Example:
+        >>> scene = springbench.load_scene("configs/scenes/chain.yaml")
+        >>> simulation = springbench.Simulation(scene, "sparse", size=3)
+        >>> positions = simulation.step()
+        >>> simulation.last_step.solution.positions.shape
+        (3, 3)
     """
 
     positions: Positions
@@ -342,7 +430,26 @@ class Solution:
 
 
 class PreparedSolver(Protocol):
-    """A solver after the setup for one system: factorisation, colouring and compilation."""
+    """A solver after the setup for one system: factorisation, colouring and compilation.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Damped(springbench.FixedPointSolver):
+        ...     share: float = 0.5
+        ...     def next_iterate(self, p, before, correction):
+        ...         return p - self.share * correction
+
+        >>> import numpy as np
+        >>> system, p = springbench.System(np.array([1.0]), time_step=0.5), np.zeros((1, 3))
+        >>> start = springbench.StepStart(p, 0.0 * p, 0.0, p, system.velocity_rate)
+        >>> weight = np.array([[0.0, -8.0, 0.0]])
+        >>> problem = springbench.StepProblem(system, p, weight, np.empty((0, 3)), p, p, start)
+
+        >>> prepared = Damped(1.0).prepare(system)
+        >>> prepared.solve(problem, springbench.StopRule(2)).positions.tolist()
+        [[0.0, -2.0, 0.0]]
+    """
 
     @property
     def description(self) -> str:
@@ -359,13 +466,25 @@ class PreparedSolver(Protocol):
         ...
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Compute the iterates on the fast path until `stop` terminates them."""
+        """Compute the iterates on the fast path.
+
+        Args:
+            problem: the step; its arrays are not modified.
+            stop: the criteria that terminate the iteration.
+
+        Returns:
+            The iterate that `iterates` yields at the same count, with counts and residuals.
+        """
         ...
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return |Q^-1 grad g|_Q [J^(1/2)] at p (n, 3) [m], or nan if it is not defined.
+        """Return the residual |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices; nan if it is not defined.
 
         The evaluation may cost an iteration.
+
+        Args:
+            problem: the step.
+            p: positions (n, 3) [m].
         """
         ...
 
@@ -383,6 +502,18 @@ class Solver(Protocol):
         is_minimiser: whether the iterates converge to a minimum of the step's objective; other methods are scored by
             their trajectories.
         is_monotone: whether the objective increases in no iteration, except by round-off.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Damped(springbench.FixedPointSolver):
+        ...     share: float = 0.5
+        ...     def next_iterate(self, p, before, correction):
+        ...         return p - self.share * correction
+
+        >>> scene = springbench.load_scene("configs/scenes/chain.yaml")
+        >>> springbench.Simulation(scene, Damped(), size=3).step().shape
+        (3, 3)
     """
 
     is_minimiser: ClassVar[bool]

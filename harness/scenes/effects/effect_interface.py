@@ -24,7 +24,14 @@ if TYPE_CHECKING:
 
 
 class ForceFunction(Protocol):
-    """External force, added to the right-hand side once per step."""
+    """External force, added to the right-hand side once per step.
+
+    Example:
+        >>> import numpy as np
+        >>> drag: springbench.ForceFunction = lambda p, v, t: -0.1 * v
+        >>> drag(np.zeros((1, 3)), np.ones((1, 3)), 0.0).tolist()
+        [[-0.1, -0.1, -0.1]]
+    """
 
     def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
         """Return the force [N].
@@ -41,7 +48,14 @@ class ForceFunction(Protocol):
 
 
 class VelocityFilter(Protocol):
-    """Modification of the velocity at the start of a step."""
+    """Modification of the velocity at the start of a step.
+
+    Example:
+        >>> import numpy as np
+        >>> halve: springbench.VelocityFilter = lambda v: 0.5 * v
+        >>> halve(np.ones((1, 3))).tolist()
+        [[0.5, 0.5, 0.5]]
+    """
 
     def __call__(self, v: Positions) -> Positions:
         """Return the modified velocity (n, 3) [m/s]."""
@@ -62,6 +76,11 @@ class PinGroup:
 
     Attributes:
         motion: motion of the targets, None if they are fixed.
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.PinGroup(np.array([0]), targets=np.zeros((1, 3)), weight=np.inf).weight
+        inf
     """
 
     vertices: NDArray[np.int64]
@@ -80,7 +99,21 @@ class SceneCheck(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EffectContribution:
-    """Contributions of an effect to the step problem, by kind of term."""
+    """Contributions of an effect to the step problem, by kind of term.
+
+    Attributes:
+        energies: potentials, minimised in each step.
+        forces: forces, evaluated once per step.
+        pins: pinned vertices.
+        velocity_filters: changes of the velocity at the start of a step.
+        derived_energies: functions of the energies of the scene's other effects.
+        length_constraints: lengths that are satisfied exactly.
+        scene_checks: requirements on the start and the pins.
+
+    Example:
+        >>> springbench.EffectContribution(forces=(lambda p, v, t: -0.1 * v,)).is_empty
+        False
+    """
 
     energies: tuple[Energy, ...] = field(default=())
     forces: tuple[ForceFunction, ...] = field(default=())
@@ -124,6 +157,18 @@ class SceneEffect(Protocol):
     energy from any motion; `is_baseline_effect`, True if the baseline scenes of the effects' cost contain it, so it has
     no cost of its own; and `find_evidence(observed: ObservedMotion) -> str`, a class method that returns the evidence
     in the motion of a scene that the effect is missing, or "".
+
+    Example:
+        >>> class Drag(springbench.ConfigModel):
+        ...     kind: str = "drag"
+        ...     coefficient: float
+        ...     def build_contribution(self, mesh, mass, time_step):
+        ...         return springbench.EffectContribution(forces=(lambda p, v, t: -self.coefficient * v,))
+        >>> scene = springbench.make_scene(
+        ...     mesh={"kind": "chain"}, mass=1.0, time_step=1 / 30, frames=30, effects=[Drag(coefficient=0.1)]
+        ... )
+        >>> scene.effects[0].coefficient
+        0.1
     """
 
     @property

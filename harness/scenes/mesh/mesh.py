@@ -47,6 +47,17 @@ class Mesh:
         spring_areas: area [m^2] that each spring represents, (m,), volume [m^3] in solids; None if unknown.
         file_numbers: number of each vertex in the mesh's file, (n,); None if there is none.
         spring_properties: stiffness, rest lengths and kinds of the springs if the mesh states them, else None.
+
+    Example:
+        >>> import numpy as np
+        >>> mesh = springbench.assemble_mesh(
+        ...     rest_positions=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]]),
+        ...     springs={"stretch": np.array([[0, 1], [1, 2]])},
+        ...     parts={"start": [0]},
+        ... )
+
+        >>> mesh.rest_lengths.tolist(), mesh.parts["start"].tolist()
+        ([1.0, 2.0], [0])
     """
 
     rest_positions: NDArray[np.float64]

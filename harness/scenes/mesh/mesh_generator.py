@@ -24,7 +24,23 @@ LengthMetres = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
 class MeshGenerator(ConfigModel):
-    """Parameters of a family of meshes that differ only in their size."""
+    """Parameters of a family of meshes that differ only in their size.
+
+    Example:
+        >>> import numpy as np
+        >>> class Line(springbench.MeshGenerator):
+        ...     kind: str = "line"
+        ...     SIZE_MEANING, SPRINGS_PER_VERTEX = "vertices", 1
+        ...     def count_vertices(self, size):
+        ...         return size
+        ...     def generate_mesh(self, size):
+        ...         i, rest = np.arange(size), np.zeros((size, 3))
+        ...         rest[:, 0] = i
+        ...         springs = {"stretch": np.stack([i[:-1], i[1:]], axis=1)}
+        ...         return springbench.assemble_mesh(rest_positions=rest, springs=springs, resolution=size)
+        >>> Line().build_mesh(4).springs.tolist()
+        [[0, 1], [1, 2], [2, 3]]
+    """
 
     MIN_SIZE: ClassVar[int] = 2
     """Smallest valid size."""

@@ -153,10 +153,32 @@ def assemble_mesh(
     """Assemble a mesh from springs by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
 
     Args:
-        vertex_weights: proportional to the vertex masses; by default half the length of the springs of each.
-        spacing: by default the mean spring length.
+        rest_positions: (n, 3) [m].
+        springs: springs of each family, (k, 2) vertex indices.
+        triangles: (f, 3) vertex indices; by default none.
+        vertex_weights: (n,), proportional to the vertex masses; by default half the length of the springs of each.
+        dimension: 1 chain and truss, 2 cloth, 3 solid.
+        spacing: typical rest length [m]; by default the mean spring length.
+        resolution: mesh size, usually vertices per side.
+        parts: named sets of vertices.
+        vertex_areas: (n,) [m^2] if they are not thirds of the triangles.
+        spring_areas: (m,) [m^2], in the order of the springs; volumes [m^3] in solids.
+        file_numbers: (n,), number of each vertex in the mesh's file.
+        attributes: vertex attributes, each (n,).
 
-    The other arguments are attributes of `Mesh`.
+    Returns:
+        The mesh, whose springs are in the order of their families.
+
+    Example:
+        >>> import numpy as np
+        >>> mesh = springbench.assemble_mesh(
+        ...     rest_positions=np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [3.0, 0.0, 0.0]]),
+        ...     springs={"stretch": np.array([[0, 1], [1, 2]])},
+        ...     parts={"start": [0]},
+        ... )
+
+        >>> mesh.mass_fractions.tolist()
+        [0.16666666666666666, 0.5, 0.3333333333333333]
     """
     blocks = [springs.get(family, NO_PAIRS) for family in (STRETCH, SHEAR, BEND)]
     pairs = np.concatenate(blocks)

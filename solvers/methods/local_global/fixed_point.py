@@ -25,7 +25,19 @@ from springbench.solvers.model.step_problem import PluginContractError, Position
 
 
 class FixedPointSolver(ABC):
-    """The base of such a solver, a frozen dataclass of its parameters."""
+    """The base of such a solver, a frozen dataclass of its parameters.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass(frozen=True)
+        ... class Damped(springbench.FixedPointSolver):
+        ...     share: float = 0.5
+        ...     def next_iterate(self, p, before, correction):
+        ...         return p - self.share * correction
+
+        >>> Damped(0.75)
+        Damped(share=0.75)
+    """
 
     is_minimiser: ClassVar[bool] = True
     is_monotone: ClassVar[bool] = False
