@@ -5,8 +5,8 @@
 
 Three processes: the client, which is the command as it is; Dask's scheduler; and all workers, as coroutines. A run's
 own process is left out, with what it measures: in its place stands `Dummy`, which writes rows as a run does. All else
-is the real code. Workers do not see the client's folder, so rows travel by the scheduler; what each keeps on its own
-disk is kept in memory, for a thousand machines have as many disks. It ends after so many seconds where it is then, and
+is the real code. Workers do not see the client's folder, so rows travel by the scheduler; what each stores on its own
+disk is in memory, for a thousand machines have as many disks. It ends after so many seconds where it is then, and
 goes on from there when it is given the same folder again.
 """
 
@@ -50,14 +50,14 @@ MESH_SIZES = range(3, 23)
 MAX_CONFIG_RUNS = 10_000
 """Runs of a config."""
 THREAD_COUNT, FRAME_COUNT = 4, 3
-"""Threads that all workers share, and steps that a run tells of."""
+"""Threads that all workers share, and steps that a run reports."""
 
 DASK_CONFIG = {"distributed.worker.profile.enabled": False, "distributed.admin.system-monitor.interval": "1h"}
 """What Dask looks at in each worker by itself; here it would be looked at in one process a thousand times."""
 
 
 class ProcessUsage(NamedTuple):
-    """What a process took: MiB at most, seconds of CPU, and messages that came, and bytes that came
+    """What a process took: MiB at most, seconds of CPU, and messages received, and bytes received
     and went."""
 
     peak_mib: float
@@ -183,7 +183,7 @@ class ProgressCounter(SilentDisplay):
 
 
 def _build_runs(folder: Path, part: int) -> list[RunSpec]:
-    """The runs of a config, of which several make the sweep: none may ask for more than `MOST`."""
+    """The runs of a config, of which several make the sweep: none may request more than `MOST`."""
     each = MAX_CONFIG_RUNS // len(SOLVER_NAMES) // len(MESH_SIZES)
     options = {
         "max_iterations": list(range(1 + each * part, 1 + each * (part + 1))),

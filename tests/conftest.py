@@ -27,7 +27,7 @@ os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache_dir("kernels")))
 _LOCK_FOLDER = tempfile.TemporaryDirectory(prefix="springbench-locks-")
 os.environ["SPRINGBENCH_LOCKS"] = _LOCK_FOLDER.name
 
-# Of an app, all whose commands hundreds of tests invoke, Typer's runner makes Click's anew each time, in 40 ms.
+# Of an app, all whose commands hundreds of tests invoke, Typer's runner makes Click's again each time, in 40 ms.
 _TYPER_TESTING: Any = typer.testing
 _TYPER_TESTING._get_command = functools.cache(_TYPER_TESTING._get_command)
 
@@ -45,9 +45,9 @@ _KERNEL_FREE_PREFIXES = (
     *("kill_and_resume", "page.py", "accuracy.py", "bare_", "stale", "damaged", "full_disk", "plugins", "hostile"),
     *("regress", "pytest_plugin", "abba"),
 )
-"""Files that need few of them: what runs beside it, so that no kernel is compiled twice at once. The first ones start
+"""Files that need few of them: what runs meanwhile, so that no kernel is compiled twice at once. The first ones start
 workers, which are forks of this process as long as no thread of Numba or Rerun runs in it, and else import everything
-anew. Long ones follow, which should not be the last."""
+again. Long ones follow, which should not be the last."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -62,7 +62,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Files go to the test runner's processes in this order, which its `--no-loadscope-reorder` keeps."""
+    """Files go to the test runner's processes in this order, which its `--no-loadscope-reorder` preserves."""
     compiles = config.option.markexpr != "slow"
 
     def order(item: pytest.Item) -> int:
@@ -89,7 +89,7 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_finish() -> None:
-    """What is there now stays: collections of garbage, automatic or asked for, need not look at it again."""
+    """What is there now stays: collections of garbage, automatic or requested, need not look at it again."""
     gc.collect()
     gc.freeze()
 

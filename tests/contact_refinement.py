@@ -1,6 +1,6 @@
 """How contact converges as its thickness shrinks and as its barrier stiffens: `python -m tests.contact_refinement`.
 
-A sheet of 1 m that is held at its corners sinks onto a ball; range and thickness are the same. What is told is how far
+A sheet of 1 m that is pinned at its corners sinks onto a ball; range and thickness are the same. Printed is how far
 vertices are from where half the thickness, or sixteen times the stiffness, has them, as the root of the mean of
 squares: the first is of order 1 (halved), the second of order 1/2 (a quarter), since a barrier rises by the third power
 of what is gone of its range.

@@ -71,7 +71,7 @@ def render_figure(figure: Figure) -> Image.Image:
 
 
 def tile_figures(figures: Sequence[Figure], size: tuple[int, int]) -> Image.Image:
-    """All figures below and beside each other."""
+    """All figures in one image."""
     whole = Image.new("RGB", size, "white")
     x = y = 0
     for picture in map(render_figure, figures):

@@ -1,4 +1,4 @@
-"""Which knot a rope is tied in, told by a number that no motion changes unless the rope passes through itself."""
+"""Which knot a rope is tied in, by a number that no motion changes unless the rope passes through itself."""
 
 from __future__ import annotations
 

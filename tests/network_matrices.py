@@ -1,4 +1,4 @@
-"""Matrices of spring networks for the tests of linear solvers: Q = A'KA + diag(held) [N/m]."""
+"""Matrices of spring networks for the tests of linear solvers: Q = A'KA + diag(anchors) [N/m]."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ SPRING_STIFFNESS, TIME_STEP = 1e5, 1 / 30
 
 
 def network_matrix(springs, stiffness, vertex_stiffness) -> csr_array:
-    """A'KA + diag(held) of springs (m, 2), their stiffness (m,) or one for all, and what holds each vertex (n,)."""
+    """A'KA + diag(anchors) of springs (m, 2), their stiffness (m,) or one for all, and anchors (n,)."""
     ends = np.asarray(springs, np.int64).reshape(-1, 2)
     A = signed_incidence_matrix_sparse(ends, len(vertex_stiffness))
     k = np.broadcast_to(np.asarray(stiffness, float), len(ends))
@@ -31,7 +31,7 @@ def grid_springs(*shape: int) -> np.ndarray:
 
 
 def grid_matrix(*shape: int, stiffness=SPRING_STIFFNESS) -> csr_array:
-    """A grid of mass 1 in all at dt = 1/30, two corners held by 1e10: a sheet of two numbers, a solid of three."""
+    """A grid of mass 1 in all at dt = 1/30, two corners pinned by 1e10: a sheet of two numbers, a solid of three."""
     n = int(np.prod(shape))
     diagonal = np.full(n, 1.0 / n / TIME_STEP**2)
     diagonal[[0, shape[-1] - 1]] += 1e10

@@ -1,4 +1,4 @@
-"""A solver as the README tells people to write one, in a file of its own outside the tree, and what it may do wrong."""
+"""A solver as the how-to page describes one, in a file of its own outside the tree, and what it may do wrong."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ _MODULE_NUMBERS = count()
 
 @dataclass(frozen=True)
 class PluginSweep:
-    """A folder with a solver and a sweep that asks for it. solver, sweep: their files."""
+    """A folder with a solver and a sweep that uses it. solver, sweep: their files."""
 
     solver_path: Path
     sweep_path: Path

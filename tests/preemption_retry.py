@@ -14,7 +14,7 @@ def retry_if_preempted(
     run: Callable[[], tuple[list[dict[str, Any]], RunResult]],
 ) -> tuple[list[dict[str, Any]], RunResult]:
     """What a run gives, rows first, once it was not interrupted, or failed: where much time was lost, clocks may
-    differ by as much, and a lie about them is told by the mark alone. Raises AssertionError for a machine too busy."""
+    differ by as much, and only the mark shows a false report. Raises AssertionError for a machine too busy."""
     for _ in range(MAX_ATTEMPTS):
         found = run()
         if not any(row.get("preempted") for row in found[0]):

@@ -1,4 +1,4 @@
-"""What is told of an experiment's progress, for tests."""
+"""A display that records an experiment's progress, for tests."""
 
 from __future__ import annotations
 

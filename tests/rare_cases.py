@@ -9,9 +9,9 @@ import pytest
 
 
 def mark_rare_cases(cases: Iterable[Any], frequent_cases: Sequence[Any]) -> list[Any]:
-    """The cases, tuples of several parameters among them, all but the kept ones marked as long.
+    """The cases, tuples of several parameters among them, all but the selected ones marked as long.
 
-    Raises ValueError for one that is kept and is no case.
+    Raises ValueError for a selected one that is no case.
     """
     cases = list(cases)
     if unknown := [case for case in frequent_cases if case not in cases]:

@@ -46,7 +46,7 @@ frames: 2
 default_size: 4
 effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, parts: [top_corners]}]
 """
-"""A scene's file: a small cloth held at two corners, for two steps."""
+"""A scene's file: a small cloth pinned at two corners, for two steps."""
 
 
 def build_test_scene(
@@ -71,7 +71,7 @@ def build_test_scene(
 
 
 def build_cloth(size: int, weight: float | str = 1e10, stretch: float = 300.0) -> Scene:
-    """A level cloth that falls, held at two corners."""
+    """A level cloth that falls, pinned at two corners."""
     pins = PinsEffect.model_validate({"parts": ["top_corners"], "weight": weight})
     return build_test_scene(
         GridMesh(), SpringsEffect(stretch=stretch, shear=stretch / 5), GravityEffect(), pins, size=size
@@ -159,7 +159,7 @@ def build_step_start(system: System, target: Positions, current: Positions) -> S
 
 
 def make_read_only(problem: StepProblem) -> StepProblem:
-    """The same problem; whoever writes to one of its arrays raises."""
+    """The same problem; writing to one of its arrays raises."""
     arrays = [
         problem.inertial_target,
         problem.external_force,
@@ -213,4 +213,4 @@ def single_stage_integrator(scene: Scene) -> SingleStageIntegrator:
 
 
 THREAD_COUNT = min(len(os.sched_getaffinity(0)), int(os.environ.get("NUMBA_NUM_THREADS") or 1024))
-"""How many Numba has: to ask it would start them, and a process in which they run is not forked."""
+"""How many Numba has: a query would start them, and a process in which they run is not forked."""

@@ -1,5 +1,5 @@
 """What takes long enough to be left to the CI: `slow.txt` names it, and a run of all tests finds it; `KINDS` are what
-nobody would call slow once all is compiled, and what a first run on a fresh machine would wait for.
+no one would call slow once all is compiled, and what a first run on a fresh machine would wait for.
 
     pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.3      on an idle machine, with all kernels compiled
 

@@ -1,16 +1,16 @@
-"""What a sweep takes beside its timed passes, and what a second core saves; on an idle machine.
+"""Overhead of a sweep over its timed passes, and what a second core saves; on an idle machine.
 
     python -m tests.sweep_overhead short [RUNS]        500 runs of five solvers, sizes 8 to 16, if left out
-    python -m tests.sweep_overhead isolation [RUNS]    the same by one worker, and in the process that asks
+    python -m tests.sweep_overhead isolation [RUNS]    the same by one worker, and in the calling process
     python -m tests.sweep_overhead cores [CASES]       10 cases of configs/hard.yaml by five solvers, judged and drawn
 
-`short` prints what each run takes beside its timed passes, of the wall's time and of all processes' CPU, and the memory
-of the process that asks for them, when half of the runs have ended and when all have. `isolation` prints what of it a
+`short` prints what each run takes over its timed passes, of the wall's time and of all processes' CPU, and the memory
+of the calling process, when half of the runs have ended and when all have. `isolation` prints what of it a
 worker adds, which is the fixed cost of isolation (process, messages, locks), and its share of the sweep: the rest is
-what runs ask for, a second pass, its judging, and rows. `cores` does a sweep by one worker and by two and prints
+what runs request, a second pass, its judging, and rows. `cores` does a sweep by one worker and by two and prints
 
     t = timed / wall            of one worker: the share that two may not do side by side
-    speed-up / (1 / (t + (1 - t) / 2))          .9 is wanted
+    speed-up / (1 / (t + (1 - t) / 2))          .9 is the target
 
 What is timed is what `springbench.harness.experiments.run_pipeline` does while it has the machine for itself:
 preparing, the pass that warms
@@ -47,7 +47,7 @@ SHORT_OPTIONS = {"frames": 10, "rounds": 2, "record": False, "pictures": False}
 class SweepCost(NamedTuple):
     """Seconds of a sweep: by the wall, and of CPU in all its processes; and both of what is timed.
 
-    mib_halfway, mib_last: the memory [MiB] of the process that asks, when half of the runs have ended, and all.
+    mib_halfway, mib_last: the memory [MiB] of the calling process, when half of the runs have ended, and all.
     """
 
     wall_seconds: float
@@ -133,7 +133,7 @@ def _build_short_runs(count: int, folder: Path) -> list[RunSpec]:
 
 
 def _untimed_cost(cost: SweepCost, count: int) -> dict[str, float]:
-    """What a run takes beside its timed passes, in milliseconds."""
+    """What a run takes in addition to its timed passes, in milliseconds."""
     other = {
         "wall_ms_beside": cost.wall_seconds - cost.timed_seconds,
         "cpu_ms_beside": cost.cpu_seconds - cost.timed_cpu_seconds,
@@ -142,7 +142,7 @@ def _untimed_cost(cost: SweepCost, count: int) -> dict[str, float]:
 
 
 def measure_short_runs(count: int, folder: Path) -> dict[str, Any]:
-    """What so many short runs take beside their timed passes, a run in milliseconds."""
+    """What n short runs take in addition to their timed passes, a run in milliseconds."""
     took = run_timed_sweep(_build_short_runs(count, folder), folder / "all", None)
     return took._asdict() | {"runs": count, "cores": len(os.sched_getaffinity(0))} | _untimed_cost(took, count)
 
@@ -183,7 +183,7 @@ MEASUREMENT_COMMANDS = {
     "isolation": (measure_isolation, 500),
     "cores": (measure_cores, 10),
 }
-"""By name, and how many of what is asked for."""
+"""By name, and the number of each."""
 
 if __name__ == "__main__":
     (what, usual), asked = MEASUREMENT_COMMANDS[sys.argv[1]], sys.argv[2:]

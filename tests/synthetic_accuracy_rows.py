@@ -1,4 +1,4 @@
-"""Rows of an accuracy measurement that nobody made: methods that converge at known rates and take known times."""
+"""Rows of an invented accuracy measurement: methods that converge at known rates and take known times."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def build_curve_rows(
     minimum_index: int = 0,
     **more: Any,
 ) -> Iterator[dict[str, Any]]:
-    """The rows of a solve: of preparing, then each iterate that is kept, down to round-off."""
+    """The rows of a solve: of preparing, then each iterate that is recorded, down to round-off."""
     method = SYNTHETIC_METHODS[solver]
     row = build_shared_columns(
         scene, size, solver=solver, parameters="{}", problem_digest=f"{scene}-{size}-{snapshot}", snapshot=snapshot

@@ -1,4 +1,4 @@
-"""Stored results of gates that nobody measured: their noise and their changes are known."""
+"""Invented results of gates: their noise and their changes are known."""
 
 from __future__ import annotations
 

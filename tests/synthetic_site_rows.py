@@ -1,4 +1,4 @@
-"""Results that nobody measured, of as many runs as wanted: what the page shows of them is known."""
+"""Invented results, of any number of runs: what the page shows of them is known."""
 
 from __future__ import annotations
 

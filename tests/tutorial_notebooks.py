@@ -1,6 +1,6 @@
 """Tutorials: pages with code and its outputs, and the notebooks that are made of them.
 
-A page is the source. A fence `python` is a cell; the fence `text` that follows it holds what it prints. Outputs in a
+A page is the source. A fence `python` is a cell; the fence `text` that follows it contains what it prints. Outputs in a
 fence `text measured` depend on the machine: they are written, and not compared.
 
     python -m tests.tutorial_notebooks [PAGE ...]      executes pages, and writes their outputs and notebooks

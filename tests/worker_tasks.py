@@ -79,7 +79,7 @@ def start_daemon_thread(tick: ProgressCallback) -> int:
 
 
 def flood_stderr(tick: ProgressCallback) -> str:
-    """More than any pipe holds."""
+    """More than any pipe buffers."""
     for _ in range(5000):
         print("x" * 99, file=sys.stderr)
         tick("chatting")
@@ -117,7 +117,7 @@ def time_logging(tick: ProgressCallback) -> float:
 
 
 def start_orphans(how: str, tick: ProgressCallback) -> int:
-    """Start a process that outlives this one, unless somebody ends it; its number."""
+    """Start a process that outlives this one, unless another process ends it; its number."""
     import subprocess
 
     if how == "a child":

@@ -54,7 +54,7 @@ def test_a_command_without_pictures_imports_neither_plotting_nor_recording(
         arguments = [*arguments, "--results", str(tmp_path)]
         (tmp_path / "sweep" / "rows").mkdir(parents=True)
         write_rows(tmp_path / "sweep" / "rows" / "run.parquet", [{"run_id": "run", "size": 4}])
-        loads(arguments, tmp_path)  # the first time it asks solvers for their parameters, and keeps them
+        loads(arguments, tmp_path)  # the first time it reads the parameters of solvers, and caches them
     loaded = loads(arguments, tmp_path)
     assert not without & set(loaded)
     # A module takes a third of a millisecond at the least: there are 188 to help, 700 to list, 1,950 with pictures.

@@ -1,4 +1,4 @@
-"""Where is it? Questions of a reader who knows the field, each answered by the names of folders and files alone.
+"""Where is it? Questions of a reader from the field, each answered by the names of folders and files alone.
 
 An answer is at most two choices away from the listing of a package: a folder, then a file. The file defines the
 function or class that does it.

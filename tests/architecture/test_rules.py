@@ -21,7 +21,7 @@ def ruff(*arguments: str, text: str | None = None) -> list[tuple[str, str]]:
 
 
 def import_contracts(tree: Path) -> str:
-    """Output of the import linter for the package in a folder, empty if all contracts are kept."""
+    """Output of the import linter for the package in a folder, empty if all contracts are satisfied."""
     command = [BIN / "lint-imports", "--no-cache", "--no-logo"]
     environment = {"PYTHONPATH": str(tree / ".src")}
     result = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""What the project's folder holds, and what its files may not say."""
+"""The content of the project's folder, and what its files may not say."""
 
 import re
 import subprocess

@@ -147,6 +147,24 @@ def test_no_text_of_the_product_uses_a_word_of_the_dialect(package: str) -> None
     assert not found
 
 
+def find_docstrings(tree: ast.Module) -> Iterator[str]:
+    """Yield the docstrings of a module and of all that it defines, however deep."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            yield ast.get_docstring(node) or ""
+
+
+def test_docstrings_of_tests_use_the_terms_of_the_field() -> None:
+    texts = [
+        (path, text)
+        for path in sorted((ROOT / "tests").rglob("*.py"))
+        for text in find_docstrings(ast.parse(path.read_text()))
+    ]
+    assert not {
+        f"{path.name}: {text}" for path, text in texts if TEXT_DIALECT & set(re.findall(r"[a-z_]+", text.lower()))
+    }
+
+
 def test_each_allowed_text_is_still_there() -> None:
     texts = {text for one in parse_sources() for _, text in find_texts(one.tree, one.text)}
     assert set(ALLOWED_TEXTS) <= texts

@@ -90,7 +90,7 @@ def row(module: str) -> int:
 
 
 def carries_specification(value: object, depth: int = 3) -> bool:
-    """Return whether a value is the specification of a run or a part of it, or holds one."""
+    """Return whether a value is the specification of a run or a part of it, or contains one."""
     if isinstance(value, (RunSpec, SceneSpec, SolverSpec)):
         return True
     if not depth or isinstance(value, str):

@@ -1,4 +1,4 @@
-"""Gates on what accuracy costs: the hybrid up to an accuracy, beside local-global.
+"""Gates on what accuracy costs: the hybrid up to an accuracy, compared with local-global.
 
     gap         of a frozen step, (g - g*)/(g0 - g*), g* of the lowest minimum known
     stationary  the largest entry of its gradient over that at the current positions, at a minimum
@@ -7,7 +7,7 @@
 Local-global is SciPy's (`sparse`), and in some gates the compiled one (`numba`). On the steps it goes on to the same
 error, or does the 50 iterations that are the default; the simulations take as many steps of implicit Euler, of 50
 iterations each, as it takes to the same error. Where that is more than a gate has the patience for, its ratio is too
-large, which no goal gains by.
+large, from which no gate gains.
 """
 
 from __future__ import annotations
@@ -117,13 +117,13 @@ _GOAL: Any = {
     "budget": 600.0,  # some of the programs take seconds, and the ratios lie far from their limits:
     "error": 0.05,  # nine turns that agree decide
 }
-"""What gates of goals have in common."""
+"""Parts that gates of accuracy have in common."""
 
 
 def step_gates(
     name: str, step: Callable[[], Scored], error: float, iterations: int | None = None, **limits: float
 ) -> Iterator[Gate]:
-    """The hybrid up to an error, beside local-global: `iterations` of it, or up to the same error.
+    """The hybrid up to an error, compared with local-global: `iterations` of it, or up to the same error.
 
     limits: of the ratio, by local-global's backend.
     """
@@ -145,13 +145,13 @@ def step_gates(
             candidate=candidate,
             baseline=lambda backend=backend: baseline(backend),
             limit=limit,
-            why=f"a goal: the hybrid to {error:g} beside {iterations or 'as good'} iterations of {backend}",
+            why=f"a target: the hybrid to {error:g} beside {iterations or 'as good'} iterations of {backend}",
             **_GOAL,
         )
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class TimeStepping:
     """To simulate: a solver and when it stops, an integrator, and its steps a second."""
 
     solver: str
@@ -164,25 +164,27 @@ SIZE, SECONDS = 9, 0.5
 """Of the scenes that are simulated."""
 
 
-def simulated(name: str, way: Way) -> Work:
+def simulated(name: str, chosen: TimeStepping) -> Work:
     """The whole simulation; the last positions [m]."""
-    built = build_exact_scene(scene(name).with_time_step(1.0 / way.steps), SIZE, way.integrator)
-    prepared, frames = prepare(built, load_target(SOLVERS[way.solver])()), round(SECONDS * way.steps)
+    built = build_exact_scene(scene(name).with_time_step(1.0 / chosen.steps), SIZE, chosen.integrator)
+    prepared, frames = prepare(built, load_target(SOLVERS[chosen.solver])()), round(SECONDS * chosen.steps)
 
     def work() -> Positions:
         p = built.mesh.rest_positions
-        for step in simulate_scene(built, prepared, way.stop, initial_guess="previous", frames=frames):
+        for step in simulate_scene(built, prepared, chosen.stop, initial_guess="previous", frames=frames):
             p = step.positions
         return p
 
     return work
 
 
-def trajectory_gates(name: str, error: float, best: Way, **limits: float) -> Iterator[Gate]:
-    """The cheapest way to a total error that is known, beside implicit Euler with 50 iterations; limits: as above."""
+def trajectory_gates(name: str, error: float, best: TimeStepping, **limits: float) -> Iterator[Gate]:
+    """The cheapest method for a known total error, against implicit Euler with 50 iterations; limits: as above."""
 
-    def wrong(way: Way) -> float:
-        return STORE.load_trajectory(scene(name), SIZE, [SECONDS], error=error).measure_error(0, simulated(name, way)())
+    def wrong(chosen: TimeStepping) -> float:
+        return STORE.load_trajectory(scene(name), SIZE, [SECONDS], error=error).measure_error(
+            0, simulated(name, chosen)()
+        )
 
     def candidate() -> Work:
         assert wrong(best) <= error, f"{best} errs by more than {error:g}"
@@ -190,9 +192,9 @@ def trajectory_gates(name: str, error: float, best: Way, **limits: float) -> Ite
 
     def baseline(backend: str) -> Work:
         # 30 steps a second and on, a fifth more each time; half of them are whole numbers, for half a second.
-        euler = (Way("numba", STOP, "implicit-euler", 2 * round(15 * 1.2**k)) for k in count())
-        way = next(way for way in euler if way.steps >= STEPS or wrong(way) <= error)
-        return simulated(name, Way(backend, STOP, way.integrator, way.steps))
+        euler = (TimeStepping("numba", STOP, "implicit-euler", 2 * round(15 * 1.2**k)) for k in count())
+        chosen = next(chosen for chosen in euler if chosen.steps >= STEPS or wrong(chosen) <= error)
+        return simulated(name, TimeStepping(backend, STOP, chosen.integrator, chosen.steps))
 
     for backend, limit in limits.items():
         yield Gate(
@@ -200,7 +202,7 @@ def trajectory_gates(name: str, error: float, best: Way, **limits: float) -> Ite
             candidate=candidate,
             baseline=lambda backend=backend: baseline(backend),
             limit=limit,
-            why=f"a goal: a total error of {error:g} in so much of the time of implicit Euler with {backend}",
+            why=f"a target: a total error of {error:g} in so much of the time of implicit Euler with {backend}",
             **_GOAL,
         )
 
@@ -221,10 +223,10 @@ ACCURACY = (
     # 2 s a step, where 50 iterations take 50 ms.
     *step_gates("flag-frame-1", lambda: stationary(flag(), 1), 1e-6, iterations=50, sparse=40.0),
     *step_gates("flag-frame-2", lambda: stationary(flag(), 2), 1e-6, iterations=50, sparse=40.0),
-    *trajectory_gates("chain", 0.1, Way("lbfgs", StopRule(500, 1e-3), "midpoint", 60), sparse=1 / 10),
-    *trajectory_gates("chain", 0.01, Way("numba", StopRule(500, 1e-3), "midpoint", 480), sparse=1 / 30),
-    *trajectory_gates("net", 0.1, Way("lbfgs", StopRule(500, 1e-2), "bdf2", 30), sparse=1 / 10),
-    *trajectory_gates("net", 0.01, Way("numba", StopRule(500, 1e-3), "midpoint", 240), sparse=1 / 30),
-    *trajectory_gates("hanging-cloth", 0.1, Way("lbfgs", StopRule(500, 1e-1), "midpoint", 30), sparse=1 / 10),
-    *trajectory_gates("hanging-cloth", 0.01, Way("numba", StopRule(500, 1e-3), "midpoint", 60), sparse=1 / 30),
+    *trajectory_gates("chain", 0.1, TimeStepping("lbfgs", StopRule(500, 1e-3), "midpoint", 60), sparse=1 / 10),
+    *trajectory_gates("chain", 0.01, TimeStepping("numba", StopRule(500, 1e-3), "midpoint", 480), sparse=1 / 30),
+    *trajectory_gates("net", 0.1, TimeStepping("lbfgs", StopRule(500, 1e-2), "bdf2", 30), sparse=1 / 10),
+    *trajectory_gates("net", 0.01, TimeStepping("numba", StopRule(500, 1e-3), "midpoint", 240), sparse=1 / 30),
+    *trajectory_gates("hanging-cloth", 0.1, TimeStepping("lbfgs", StopRule(500, 1e-1), "midpoint", 30), sparse=1 / 10),
+    *trajectory_gates("hanging-cloth", 0.01, TimeStepping("numba", StopRule(500, 1e-3), "midpoint", 60), sparse=1 / 30),
 )

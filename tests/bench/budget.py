@@ -157,7 +157,7 @@ class Answer(NamedTuple):
 
 
 def answer(question: Question, rounds: int, search_time: float, results: Path) -> Answer:
-    """Ask the question, and measure the fixed choices."""
+    """Recommend a method, and measure the fixed choices."""
     path, budget, t_end = SCENES / f"{question.scene}.yaml", question.budget, question.t_end
     scene, store = load_scene(path), open_reference_store(results)
     options = {"size": question.size or None, "t_end": t_end, "time_limit": 5.0, "search_time": search_time}

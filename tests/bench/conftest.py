@@ -1,6 +1,6 @@
 """`pytest tests/bench --benchmark-only` runs the short gates, prints their ratios and stores their times.
 
-They are stored under results/bench. `--all-gates` runs all gates, `-k accuracy` the goals of accuracy alone."""
+They are stored under results/bench. `--all-gates` runs all gates, `-k accuracy` those of accuracy alone."""
 
 import os
 from time import monotonic
@@ -85,7 +85,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 
 def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:
-    # What is stored may be published: it tells of the machine's kind and not whose it is, and holds
+    # What is stored may be published: it names the machine's kind and not its owner, and contains
     # nothing that changes from one run to the next, so that two files compare.
     del machine_info["node"]
     machine_info["cpu"] = {key: machine_info["cpu"].get(key) for key in ("brand_raw", "arch", "count")}
@@ -100,7 +100,7 @@ def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Without timing, goals of accuracy have nothing to say: what they solve takes seconds, and nothing is compared."""
+    """Without timing, gates of accuracy are deselected: their solves take seconds, and nothing is compared."""
     if config.option.benchmark_disable and not config.option.benchmark_enable:
         idle = [item for item in items if item.name.startswith("test_the_gate_holds[accuracy-")]
         config.hook.pytest_deselected(items=idle)

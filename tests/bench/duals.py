@@ -1,4 +1,4 @@
-"""XPBD and MGPBD beside each other, where papers measure them: in the dual.
+"""XPBD compared with MGPBD, where papers measure them: in the dual.
 
     python -m tests.bench.duals [--setup] [--publish results/published/duals] [PROBLEM ...]
 
@@ -98,7 +98,7 @@ def cube(size: int, modulus: float) -> StepProblem:
 
 
 def chain() -> StepProblem:
-    """The first step of a chain that is held at both ends."""
+    """The first step of a chain that is pinned at both ends."""
     pins = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
     return build_first_problem(
         build_test_scene(ChainMesh(length=2.0), SpringsEffect(stretch=1e4), GravityEffect(), pins, size=3000)
@@ -165,7 +165,7 @@ def measure_courses(name: str) -> list[dict[str, Any]]:
     """Measure a problem: a row for each method, with its iterations to LEVELS and its distance from the minimum."""
     stated = PROBLEMS[name]()
     minimum = NewtonSolver().prepare(stated.system).solve(stated, StopRule(2000, 1e-9)).positions
-    way = float(np.abs(minimum - stated.current_positions).max())
+    displacement = float(np.abs(minimum - stated.current_positions).max())
     found = {
         "xpbd": course(xpbd(stated), MOST["xpbd"]),
         "mgpbd": course(mgpbd(stated, MultigridXpbd()), MOST["mgpbd"]),
@@ -180,7 +180,7 @@ def measure_courses(name: str) -> list[dict[str, Any]]:
             "method": method,
             **{f"iterations_to_{level:g}".replace("-", "_"): k for level, k in zip(LEVELS, counts, strict=True)},
             "stalled_misfit": one.misfits[STALL - 1] if len(one.misfits) >= STALL else None,
-            "end_error": float(np.abs(one.end - minimum).max() / way),
+            "end_error": float(np.abs(one.end - minimum).max() / displacement),
             "linear_iterations": float(np.mean(one.linear)),
             "reaches_first_level": counts[0] is not None,
             "cpu_seconds": one.seconds[(counts[0] or len(one.seconds)) - 1],

@@ -51,7 +51,7 @@ LIMITS = {
     "lbfgs": (1.05, 1.6, 1.6, 1.02, 3.0),
     "vbd": (1.1, 1.5, 2.0, 1.1, 4.0),
 }
-"""The goals, by solver and by kind of effect."""
+"""Largest ratios, by solver and by kind of effect."""
 
 GATES = {
     "newton": (1.5, 2.0, 4.0, 1.3, 5.0),

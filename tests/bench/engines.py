@@ -1,11 +1,11 @@
-"""Outside engines beside ours, by what no trajectory tells: what is left of the step's residual, drift and stability.
+"""Outside engines compared with ours, by what no trajectory shows: remaining residuals, drift and stability.
 
     python -m tests.bench.engines [SCENE ...] [--size 9] [--frames 30] [--substeps 4 16 64 256]
 
 Scenes without drag: all energy that goes, or comes, is the method's. A cell is `residual / drift`. The residual is
 |Q^-1 grad g|_Q of implicit Euler's step problem at the answer, over its value at the step's start, the median over the
-frames: 0 for whoever minimises it. The drift is that of kinetic, elastic and gravitational energy, over the largest
-kinetic one. A dash: positions are not finite, or farther away than ten times the mesh's size.
+frames: 0 for a method that minimises it. The drift is that of kinetic, elastic and gravitational energy, over the
+largest kinetic one. A dash: positions are not finite, or farther away than ten times the mesh's size.
 An engine that cannot express the scene, or is not installed, has `refused`; a run's row says why.
 """
 

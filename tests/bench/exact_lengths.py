@@ -1,4 +1,4 @@
-"""What augmented vertex block descent keeps of lengths in few iterations (Giles, Diaz and Yuksel 2025).
+"""Length errors of augmented vertex block descent in few iterations (Giles, Diaz and Yuksel 2025).
 
     python -m tests.bench.exact_lengths [--publish results/published/exact-lengths]
 

@@ -8,7 +8,7 @@ The steps, the first guesses and the methods are those of an accuracy config. An
 (g - g*)/(g0 - g*), g* of the lowest minimum known, or an error, the largest distance of a vertex from its place in that
 minimum over the largest there at the step's start, and is reached with the first iterate that has it. A first pass
 grades all iterates; then all that may be the fastest take turns in one process, round after round, with a clock of the
-thread's own processor time, and no one looks at what they find. The interval holds 95 % of the ratios of rounds that
+thread's own processor time, and their results are not used. The interval contains 95 % of the ratios of rounds that
 were drawn with replacement. A ratio whose interval reaches above the first of LIMITS is marked by >, where the step
 takes so long that it counts; `inf` is one that is not reached. `configs/fastest.yaml` has other steps than
 `configs/accuracy.yaml`, and by those of `configs/unseen.yaml` nothing of any solver was chosen.
@@ -92,7 +92,7 @@ def steps(config: Path, only: str) -> Iterator[tuple[SnapshotEvaluation, list[Cu
 
 
 def grading(step: SnapshotEvaluation, problem: StepProblem, measure: str) -> Callable[[Positions], float]:
-    """What tells the gap or the error of positions."""
+    """Function that returns the gap or the error of positions."""
     lowest, system = step.known_minima.lowest_minimum, problem.system
     if measure == "error":
         start = compute_vertex_distances(system, problem.current_positions, lowest.positions)[0]
@@ -140,7 +140,7 @@ def timed(prepared: PreparedSolver, problem: StepProblem, stamps: Sequence[int])
 
 
 def raced(racers: Sequence[Racer], problem: StepProblem, rounds: int) -> dict[str, dict[float, NDArray[np.float64]]]:
-    """Seconds (rounds,) to each accuracy, of each method, in turns, one way and then the other."""
+    """Seconds (rounds,) to each accuracy, of each method, interleaved, in one order and then in the other."""
     times: dict[str, dict[float, list[float]]] = {one.name: {target: [] for target in one.needs} for one in racers}
     for turn in range(-1, rounds):  # the first one warms up
         for one in racers if turn % 2 else racers[::-1]:

@@ -1,7 +1,7 @@
 """The gates: what must stay how fast against what. A new gate is one entry of `GATES`.
 
-All work runs with one thread of Numba and one of BLAS, so that CPU times of the process tell how long it takes, and
-another program on the machine hardly moves them. Recordings are written by a thread of their own beside the solver's:
+All work runs with one thread of Numba and one of BLAS, so that CPU times of the process are its durations, and
+another program on the machine hardly moves them. Recordings are written by a thread of their own next to the solver's:
 what counts there is how long one waits, the wall time.
 """
 
@@ -44,10 +44,10 @@ class Gate:
     limit: of time of the candidate / time of the baseline, which must hold on every machine; what becomes slower
     below it `springbench regress --baseline` finds; why: where the limit comes from; guards: the exact gates, tests of
     `test_exact.py`, that see on any machine what would make the candidate slow; clock: what time is, cpu or wall;
-    goal: what the ratio is to become where it is not yet: the limit then keeps what has been reached; tolerance: the
-    largest difference of the two answers, in their size, None where each maker makes sure of its own; budget: seconds
-    until the gate cannot tell, --paired-benchmark-budget where it has none; error: the probability of a wrong answer;
-    short: whether every run of the CI takes it.
+    goal: what the ratio is to become where it is not yet: the limit then preserves what has been reached; tolerance:
+    the largest difference of the two answers, in their size, None where each maker makes sure of its own; budget:
+    seconds until the gate is undecided, --paired-benchmark-budget where it has none; error: the probability of a wrong
+    answer; short: whether every run of the CI takes it.
     """
 
     name: str

@@ -1,17 +1,17 @@
-"""A step of four layers that all touch, by our solvers beside a Newton-IPC with ipctk, in turns on one thread.
+"""A step of four layers that all touch, by our solvers and a Newton-IPC with ipctk, interleaved on one thread.
 
     python -m tests.bench.newton_ipc [--sizes 24 64] [--rounds 3] [--publish results/published/newton-ipc]
 
 A cloth folded into four layers (`tests.bench.pairs`), at rest as folded, is thrown at 0.1 m/s onto its lowest layer,
-which is held: one step of 1/30 s, to a residual |Q^-1 grad g|_Q of a thousandth of that at its start. Told is how many
-times as long Newton-IPC takes, by CPU times, in the middle, and the least and the most of the rounds; how long our step
-is in steps of the same solver without contact; and of what Newton-IPC's time is made.
+which is pinned: one step of 1/30 s, to a residual |Q^-1 grad g|_Q of a thousandth of that at its start. Printed is how
+many times as long Newton-IPC takes, by CPU times, in the middle, and the least and the most of the rounds; how long our
+step is in steps of the same solver without contact; and of what Newton-IPC's time is made.
 
-Newton-IPC is that of Li et al. 2020 (algorithm 1): the Hessian of springs and of the barrier clamped element by
-element and factorised, steps no longer than additive CCD lets them be, halved until the objective falls, pairs looked
-up anew at each point. Pairs, values, derivatives and CCD are ipctk's; inertia, springs, the matrix of 3 x 3 blocks, its
-factor, the line search and the residual are ours, the same for both. ipctk's barrier is one of squared distances; in
-the middle of the range it pushes as ours does. What both prepare once, and compile, is not timed.
+Newton-IPC is that of Li et al. 2020 (algorithm 1): the Hessian of springs and of the barrier clamped element by element
+and factorised, steps no longer than additive CCD lets them be, halved until the objective falls, pairs looked up again
+at each point. Pairs, values, derivatives and CCD are ipctk's; inertia, springs, the matrix of 3 x 3 blocks, its factor,
+the line search and the residual are ours, the same for both. ipctk's barrier is one of squared distances; in the middle
+of the range it pushes as ours does. What both prepare once, and compile, is not timed.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ STIFFNESS = 0.1
 
 
 def stated(made: Folded, contact: Energy) -> StepProblem:
-    """The step. Vertices of the lowest layer are held exactly."""
+    """The step. Vertices of the lowest layer are pinned exactly."""
     mesh, p = made.mesh, made.p
     springs = Springs.from_rest_shape(p, mesh.springs, np.full(len(mesh.springs), STRETCH))
     lowest = np.flatnonzero(p[:, 1] < 0.5 * made.dhat)
@@ -85,7 +85,7 @@ class Blocks(NamedTuple):
     values: NDArray[np.float64]
 
     def add(self, places: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-        """Add them to blocks, at places (b, 4) of a row and a column with each of both; -1 where one is held."""
+        """Add them to blocks, at places (b, 4) of a row and a column with each of both; -1 where one is pinned."""
         free = places[:, 1] >= 0
         values[places[free, 1]] += self.values[free]
 
@@ -100,7 +100,7 @@ class Found(NamedTuple):
 
 
 class Ipctk:
-    """ipctk's barrier, as an energy that no step passes through. What it found at the last two points it keeps.
+    """ipctk's barrier, as an energy that no step passes through. It caches what it found at the last two points.
 
     neighbours: as of ours, whose matrix this has; spent: CPU time [s] by what it went into.
     """
@@ -193,7 +193,7 @@ Solved = tuple[Positions, int]
 
 
 def newton_ipc(problem: StepProblem) -> Callable[[], Solved]:
-    """A solve by Newton-IPC, whose tolerance holds where it ends."""
+    """A solve by Newton-IPC, whose tolerance is satisfied where it ends."""
     metric, whole = ResidualMetric(problem.system), FixedObjective(problem.system)
     assert whole.hessian_matrix.factor.nonzeros  # analysed now, as what ours prepare
 

@@ -1,12 +1,12 @@
-"""Contact by pairs beside ipctk, in turns on one thread: cloth folded into four layers that all touch.
+"""Contact by pairs compared with ipctk, interleaved on one thread: cloth folded into four layers that all touch.
 
     python -m tests.bench.pairs [--sizes 64 128] [--rounds 5] [--publish results/published/pairs]
 
-Gaps are 4 mm at 64 vertices a side and go with the spacing; they are felt up to 5/4 of that. Told is how many times as
-long ipctk takes, by CPU times: in the middle, and the least and the most of the rounds. Both have the same pairs in
+Gaps are 4 mm at 64 vertices a side and go with the spacing; they are felt up to 5/4 of that. Printed is how many times
+as long ipctk takes, by CPU times: in the middle, and the least and the most of the rounds. Both have the same pairs in
 range, and count closest points that several of them have in common once. ipctk comes with the extra `dev`.
 
-    value + gradient        with the pairs looked up anew; and with those that a solver's iteration still has
+    value + gradient        with the pairs searched again; and with those that a solver's iteration still has
     Hessian                 clamped, with the pairs given: blocks, and of ipctk the matrix
     candidates + safe step  of a step that closes gaps: LBVH and additive CCD
 """
@@ -143,7 +143,7 @@ def seconds(work: Callable[[], object]) -> float:
 
 
 def main() -> None:
-    """Time and tell."""
+    """Measure the times and print them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128])
     parser.add_argument("--rounds", type=int, default=5)

@@ -27,7 +27,7 @@ def refuse_energy(bundles, shares, number, x, right, out):
 
 
 def energy(bundles, number, x, measure):
-    """Half of each spring's k |v|^2, and what holds each vertex."""
+    """Half of each spring's k |v|^2, and the anchor of each vertex."""
     own, neighbour, kinds, weights = (
         bundles.row_offset,
         bundles.neighbour_offset,
@@ -142,7 +142,7 @@ def add_forward(panel, offset, index, at, count, x, x_row, y, y_row, numbers, qu
 
 
 def set_backward(square, start, own, panel, offset, index, at, below, y, x_row, quads):
-    """y = S y + W'y of a panel: S y by way of the rows' fourth numbers, one axis at a time."""
+    """y = S y + W'y of a panel: S y through the rows' fourth numbers, one axis at a time."""
     width, zero = 4 * quads, y[0] * 0
     for c in range(3):
         for j in range(width):

@@ -1,13 +1,13 @@
-"""Primal and dual descent beside each other, by ratios of stiffness and of mass (Macklin, Erleben and Mueller 2020).
+"""Primal compared with dual descent, by ratios of stiffness and of mass (Macklin, Erleben and Mueller 2020).
 
     python -m tests.bench.primal_dual [--publish results/published/primal-dual]
 
-A chain of 17 vertices that hangs straight, its first step: every second spring of 1,000 N/m is so many times as
-stiff, or the last vertex of a chain of 100,000 N/m is so many times as heavy. Primal methods change positions vertex
-by vertex: `vbd`, Gauss and Seidel's way, with and without its acceleration, and Jacobi's (`jgs2`, `neighbour_rings:
-0`). Dual ones change the tensions of springs: `xpbd`, Gauss and Seidel's way. A cell is how many iterations it takes
-until every vertex is within a thousandth of the step's way of where it ends; a dash: not within 100,000. The line
-stays straight, so what XPBD tends to is the minimum.
+A chain of 17 vertices that hangs straight, its first step: every second spring of 1,000 N/m is so many times as stiff,
+or the last vertex of a chain of 100,000 N/m is so many times as heavy. Primal methods change positions vertex by
+vertex: `vbd`, by Gauss and Seidel, with and without its acceleration, and Jacobi's (`jgs2`, `neighbour_rings: 0`). Dual
+ones change the tensions of springs: `xpbd`, by Gauss and Seidel. A cell is how many iterations it takes until every
+vertex is within a thousandth of the step's displacement of where it ends; a dash: not within 100,000. The line stays
+straight, so what XPBD tends to is the minimum.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ METHODS: dict[str, Solver] = {
     "dual, Gauss-Seidel: xpbd": Xpbd(),
 }
 LEVEL, MOST = 1e-3, 100_000
-"""Where the step should end over its way, and iterations at most."""
+"""Distance from the end over the step's displacement, and iterations at most."""
 
 
 def hanging(stiffness: float, stiffer: float = 1.0, heavier: float = 1.0) -> StepProblem:
@@ -69,11 +69,11 @@ def hanging(stiffness: float, stiffer: float = 1.0, heavier: float = 1.0) -> Ste
 
 
 def iterations(solver: Solver, stated: StepProblem) -> int | None:
-    """How many until all vertices are as near to the minimum as is asked."""
+    """Iterations until all vertices are within the requested distance of the minimum."""
     end = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200, 1e-12)).positions
-    way = float(np.abs(end - stated.current_positions).max())
+    displacement = float(np.abs(end - stated.current_positions).max())
     for k, p in enumerate(islice(solver.prepare(stated.system).iterates(stated), MOST), 1):
-        if np.abs(p - end).max() <= LEVEL * way:
+        if np.abs(p - end).max() <= LEVEL * displacement:
             return k
     return None
 

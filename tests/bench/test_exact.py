@@ -1,7 +1,7 @@
 """Gates on counts, which no noise can move: entries of matrices, iterations, flops, bytes, allocations, instructions.
 They run in every test run, and each timed gate names those that guard it.
 
-A number that changes with a new library or a better method is stored anew here, in the commit that changes it.
+A number that changes with a new library or a better method is stored again here, in the commit that changes it.
 """
 
 import gc

@@ -1,4 +1,4 @@
-"""What is written for vector registers is measured beside plain Numba: `python -m tests.bench.vectors`."""
+"""What is written for vector registers is compared with plain Numba: `python -m tests.bench.vectors`."""
 
 from pathlib import Path
 

@@ -62,7 +62,7 @@ ROUND_OFF = 1e-5
 class Case:
     """A kernel with the arguments of a call, and what takes the place of which names in it and in what it calls.
 
-    found: which of the arguments hold what it finds, beside what it returns; they are set back before a comparison.
+    found: which of the arguments are outputs, in addition to what it returns; they are set back before a comparison.
     """
 
     what: str

@@ -1,4 +1,4 @@
-"""A command line attempted on hostile input, in a process with limits; what came of it."""
+"""A command line attempted on hostile input, in a process with limits, and its outcome."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hostile configs: what each file holds, what the answer must name, and the line where there is one."""
+"""Hostile configs: what each file contains, what the answer must name, and the line where there is one."""
 
 from __future__ import annotations
 

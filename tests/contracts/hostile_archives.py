@@ -1,4 +1,4 @@
-"""Archives and folders of results as somebody may send them: damaged, made up, or made to harm."""
+"""Archives and folders of results as a stranger may send them: damaged, made up, or made to harm."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Content = dict[str, bytes]
 
 
 def good_results(folder: Path) -> None:
-    """Results of a sweep whose rows have the id of the run for which its config asks, and its config."""
+    """Results of a sweep whose rows have the id of the run that its config requests, and its config."""
     (folder / "cloth.yaml").write_text(scene())
     (folder / "sweep.yaml").write_text(SWEEP)
     (folder / "results" / "sweep" / "rows").mkdir(parents=True)
@@ -166,7 +166,7 @@ CHANGES: dict[str, Callable[[Content], None]] = {
     "threads of 2**62": rewritten(threads=2**62),
     "a time step of NaN": rewritten(time_step=float("nan")),
     "a tolerance of infinity": rewritten(residual_rtol=float("inf")),
-    "an error asked for of -1": rewritten(error_requested=-1.0),
+    "a requested error of -1": rewritten(error_requested=-1.0),
     "parameters that are no JSON": rewritten(parameters="{" * 10_000),
     "a solver of markup": rewritten(solver="[bold]\x1b[2J<script>\n"),
     "a scene of 10 MB": rewritten(scene="x" * 10_000_000),

@@ -1,4 +1,4 @@
-"""Hostile mesh files: heads alone, counts that are not kept, cuts, odd numbers and indices, other things."""
+"""Hostile mesh files: heads alone, counts that are wrong, cuts, odd numbers and indices, other things."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ MESHES: dict[str, bytes] = {
     "head.su2": b"NDIME= 3\n",
     "head.xdmf": b"<Xdmf>",
     "head.obj": b"v",
-    # Counts that the file does not keep.
+    # Counts that the file does not match.
     "claims-1e9-faces.ply": ply(BINARY, faces="1000000000", body=POINTS),
     "claims-1e12-points.ply": ply(BINARY, vertices="1000000000000", body=POINTS),
     "claims-1e30-points.ply": ply(BINARY, vertices="1" + "0" * 30, body=POINTS),

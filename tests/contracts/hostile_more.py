@@ -1,6 +1,6 @@
 """More hostile input: JSON scenes, stored benchmarks, queries, command lines, and results.
 
-Each case: what the files hold or the command line is, the exit code, and what the answer must name.
+Each case: what the files contain or the command line is, the exit code, and what the answer must name.
 """
 
 from __future__ import annotations

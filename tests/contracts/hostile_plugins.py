@@ -1,4 +1,4 @@
-"""Code of others that misbehaves while it is imported, bound, run or asked for a report: what it does, what is said."""
+"""Code of others that misbehaves while it is imported, bound, run or used for a report: what it does, what is said."""
 
 from __future__ import annotations
 

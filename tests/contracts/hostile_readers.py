@@ -1,6 +1,6 @@
-"""Hostile files for each reader: what each holds, and words of the answer; cases by the reader and the file's name.
+"""Hostile files for each reader: what each contains, and words of the answer; cases by the reader and the file's name.
 
-Mesh files are named by a scene; other cases are a scene of their own, which may name files of `BESIDE`.
+Mesh files are named by a scene; other cases are a scene of their own, which may name files of `OTHER_FILES`.
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ CONFIGS: dict[str, tuple[str | bytes, str]] = {
     "colons-for-ever.yaml": ("a: " * 50_000, "colon"),
     "an-at-sign.yaml": (scene(description="@home"), "cannot begin with '@'"),
 }
-BESIDE = {
+OTHER_FILES = {
     "includes.inp": "*INCLUDE, INPUT=../outside.inp\n",
     "crossed.obj": OBJ + "f 1 3 2 4\n",
     "pointer.obj": "version https://git-lfs.github.com/spec/v1\noid sha256:0\n",

@@ -1,4 +1,4 @@
-"""Hostile rows of runs: a value for a column each, of files that somebody else may have made.
+"""Hostile rows of runs: a value for a column each, of files from strangers.
 
 LEFT_OUT must not fit their columns, and their files are named; SHOWN must, and the page bears them.
 """
@@ -72,7 +72,7 @@ LEFT_OUT: dict[str, tuple[str, Any]] = {
     "a step of NaN": ("time_step", float("nan")),
     "a tolerance of NaN": ("residual_rtol", float("nan")),
     "a tolerance of infinity": ("residual_rtol", float("inf")),
-    "an error asked of NaN": ("error_requested", float("nan")),
+    "a requested error of NaN": ("error_requested", float("nan")),
     "negative seconds": ("seconds", -1.0),
     "seconds of NaN": ("seconds", float("nan")),
     "seconds of infinity": ("seconds", float("inf")),

@@ -72,7 +72,7 @@ def arrays(*roots: object) -> int:
 
 
 def _referents(one: object) -> Iterable[object]:
-    """What an object holds; of a function what it closes over, and not the globals of its module."""
+    """Objects that an object refers to; of a function what it closes over, and not the globals of its module."""
     if hasattr(one, "__code__"):
         return [cell.cell_contents for cell in getattr(one, "__closure__", None) or ()]
     return gc.get_referents(one)
@@ -81,7 +81,7 @@ def _referents(one: object) -> Iterable[object]:
 def bound(*effects: SceneEffect) -> tuple[Scene, PreparedSolver]:
     pins = PinsEffect(parts=("top_corners",))
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), pins, *effects, size=SIDE)
-    made = replace(made, build_coarser=None)  # a recipe, which holds what the effects were described by
+    made = replace(made, build_coarser=None)  # a recipe, which contains what the effects were described by
     return made, prepare(made, SparseLocalGlobal())
 
 

@@ -1,4 +1,4 @@
-"""An accuracy config becomes rows: what they hold, what is done twice (nothing), and what a failure leaves."""
+"""An accuracy config becomes rows: their content, what is done twice (nothing), and what a failure leaves."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ TIMES = (
     "commit",
     "source_fingerprint",
 )
-"""Columns that tell how long something took, and when and by which state of the code it was done."""
+"""Columns that state how long something took, and when and by which state of the code it was done."""
 
 
 class Home:

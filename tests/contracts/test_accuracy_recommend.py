@@ -1,4 +1,4 @@
-"""Recommendations: the cheapest way to an error, from what was measured, checked by one more simulation."""
+"""Recommendations: the cheapest method for an error, from what was measured, checked by one more simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scheduler and workers as processes of their own: whoever is killed, no run is lost."""
+"""A scheduler and workers as processes of their own: whichever is killed, no run is lost."""
 
 from __future__ import annotations
 

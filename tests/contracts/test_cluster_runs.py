@@ -154,7 +154,7 @@ TELL = (
     "import os, time; [open({told!r}, 'a').write(f'{{os.getpid()}} {{stop.iterations}}\\n')]; "
     f"until = time.perf_counter() + {SOLVE}; any(time.perf_counter() > until for _ in iter(int, 1))"
 )
-"""A solver that tells which process does which run: each has its own number of iterations."""
+"""A solver that shows which process does which run: each has its own number of iterations."""
 
 
 def all_but_times(table: pa.Table) -> list[str]:

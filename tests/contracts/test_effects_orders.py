@@ -1,6 +1,6 @@
 """Each effect states the order up to which it is exact; here that is measured, effect by integrator.
 
-What is smooth keeps every integrator's order. What begins and ends within steps has order 1.
+With smooth effects every integrator has its order. What begins and ends within steps has order 1.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ CHAIN = ChainMesh()
 
 @dataclass(frozen=True)
 class Case:
-    """An effect beside others on a mesh of a size, thrown with a velocity [m/s]; steps that resolve its vibrations."""
+    """An effect next to others on a mesh of a size, thrown with a velocity [m/s]; steps that resolve its vibrations."""
 
     effects: tuple[dict[str, Any], ...]
     mesh: Any = CHAIN

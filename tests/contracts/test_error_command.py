@@ -1,4 +1,4 @@
-"""`run --error`: what cannot be asked, what a run leaves, and what it takes from rows measured before."""
+"""`run --error`: invalid requests, the files of a run, and its use of rows measured before."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors that are asked for: the ladder of steps, the growth of what cannot be known, the choice, what is refused."""
+"""Runs to an error: the ladder of steps, the growth of perturbations, the choice, invalid requests."""
 
 from __future__ import annotations
 
@@ -318,7 +318,7 @@ def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_
 
 
 def test_fixed_steps_are_no_longer_than_is_stable_and_as_short_as_the_error_requires():
-    """Of order 2: the step that a hundredth of the error asks for is a tenth."""
+    """Of order 2: the step for a hundredth of the error is a tenth."""
     even, truth = (
         FixedSubstepper(
             build_scene(SWINGING, 5, "substepping"),

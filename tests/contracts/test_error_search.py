@@ -1,4 +1,4 @@
-"""The search for the cheapest way to an error, on ways whose errors and costs are formulas of the number of steps."""
+"""The search for the cheapest method for an error, on methods with formulas of errors and costs."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Tolerant(Formula):
 
 
 def found(monkeypatch: pytest.MonkeyPatch, error: float, messages: list[str], **followers: Stepper) -> SearchResult:
-    """The answer among ways of these names, the last of which tells the errors of all."""
+    """The result among methods of these names, the last of which measures the errors of all."""
     exact = Tolerant(lambda steps: 5.0 * steps**-4.0, 0.5, 4)
     named = [Method("substepping", name, one) for name, one in {**followers, "exact": exact}.items()]
     monkeypatch.setattr(
@@ -105,7 +105,7 @@ def test_a_method_that_does_not_improve_is_followed_by_the_next(monkeypatch):
 
 
 def test_a_method_that_takes_longer_than_predicted_for_the_next_is_tried_after_it(monkeypatch):
-    """Its error falls as promised at first, and then by order a half alone."""
+    """Its error falls as predicted at first, and then by order a half alone."""
     messages = list[str]()
     late = Formula(lambda steps: 20.0 / steps**2 if steps < 40 else 0.0125 * (40 / steps) ** 0.5, 1e-4)
     answer = found(monkeypatch, 1e-3, messages, late=late, steady=Formula(lambda steps: 1.0 / steps, 3e-4))

@@ -1,4 +1,4 @@
-"""A run whose times, phases or recording say what is not so is a failed run, whoever's code said it."""
+"""A run whose times, phases or recording are wrong is a failed run, for shipped and for user code."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ sizes: [4, 8]
 solvers: [dense, sparse]
 options: {frames: 3, rounds: 2, max_iterations: 20}
 """
-"""Both solvers take the same iterates, so that all are equally accurate; which is the faster only the rows tell."""
+"""Both solvers take the same iterates, so that all are equally accurate; only the rows show which is faster."""
 
 
 def did(*words: str) -> str:

@@ -1,4 +1,4 @@
-"""A disk that is full ends a sweep at once, by its name; what is done is kept, and the next start does the rest."""
+"""A disk that is full ends a sweep at once, by its name; completed results remain, and the next start does the rest."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def config(tmp_path: Path) -> Path:
 
 
 # Full before the lock is there, in the first recording, in its rows or in the second one: which of them is the
-# libraries' own affair, and so is the page that a file system keeps for itself.
+# libraries' own affair, and so is the page that a file system reserves.
 SIZES = ["200k", *(pytest.param(size, marks=pytest.mark.long) for size in ("8k", "100k", "300k"))]
 
 

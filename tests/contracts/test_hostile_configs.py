@@ -1,4 +1,4 @@
-"""Whatever a config holds, the command line answers with the place of the mistake, exit code 2, and no file."""
+"""Whatever a config contains, the command line answers with the place of the mistake, exit code 2, and no file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def refusal(folder: Path, config: Path, *options: str, command: str = "run") -> 
 
 
 def one(lines: list[str], *needles: str) -> None:
-    """There is one message, and it names all that is asked for."""
+    """There is one message, and it names all that is required."""
     assert len(lines) == 1, lines
     assert len(lines[0]) < 1500, "a message that fits a screen"
     for needle in needles:

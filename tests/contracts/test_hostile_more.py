@@ -1,4 +1,4 @@
-"""Whatever a file or a command line holds, the answer is a message within limits, and nothing is left outside."""
+"""Whatever a file or a command line contains, the answer is a message within limits, and nothing is left outside."""
 
 from __future__ import annotations
 

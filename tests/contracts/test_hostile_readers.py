@@ -1,4 +1,4 @@
-"""Whatever a file holds that a reader is given, the answer is a message within limits, and nothing else is touched."""
+"""Whatever a file contains, a reader's answer is a message within limits, and nothing else is touched."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import pytest
 
 from tests.contracts.attempts import Outcome, attempt
 from tests.contracts.hostile import scene
-from tests.contracts.hostile_readers import ARRAYS, BESIDE, CONFIGS, MESHES, big, frames
+from tests.contracts.hostile_readers import ARRAYS, CONFIGS, MESHES, OTHER_FILES, big, frames
 
 QUICK = {"crossed.obj", "list-of-4e9.ply", "includes-what-lies-outside.inp", "a-pickle.npz", "a-colon.yaml"}
 CASES = [*MESHES, *ARRAYS, *CONFIGS]
 
 
 def outcome(folder: Path, name: str) -> Outcome:
-    """What `list` says to a case, in a folder beside a mesh that it must not read."""
+    """What `list` says to a case, in a folder next to a mesh that it must not read."""
     inside, config = folder / "inside", name
     inside.mkdir()
     (folder / "outside.inp").write_text("*NODE\n1, 0, 0, 0\n2, 1, 0, 0\n3, 0, 1, 0\n*ELEMENT, TYPE=S3\n1, 1, 2, 3\n")
-    for other, text in BESIDE.items():
+    for other, text in OTHER_FILES.items():
         (inside / other).write_text(text)
     if name not in CONFIGS:
         config = "hostile.yaml"
@@ -40,6 +40,6 @@ def test_a_hostile_file_is_refused_with_the_reason(tmp_path: Path, name: str) ->
     assert "Traceback" not in found.said
     assert found.code == 2, found.said
     assert not found.outside
-    assert any(file in found.said for file in (name, "hostile.yaml", *BESIDE))
+    assert any(file in found.said for file in (name, "hostile.yaml", *OTHER_FILES))
     assert {**MESHES, **ARRAYS, **CONFIGS}[name][1].lower() in found.said.lower()
     assert len(found.said) < 5000, "a message that fits a screen"

@@ -1,4 +1,4 @@
-"""Rows that somebody else may have made: what is invalid is named and left out, the rest is shown, none is trusted."""
+"""Rows from strangers: what is invalid is named and left out, the rest is shown, none is trusted."""
 
 from __future__ import annotations
 

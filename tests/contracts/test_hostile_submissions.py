@@ -1,4 +1,4 @@
-"""Whatever others' positions, matrices, meshes and published results hold, the answer is a message within limits."""
+"""Whatever others' positions, matrices, meshes and published results contain, the answer is a message within limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each time integrator promises at convergence: its order, and what it conserves.
+"""Properties of each time integrator at convergence: its order, and what it conserves.
 
 Order and conservation: Hairer and Wanner, Solving Ordinary Differential Equations II, sections IV.12 and V.1; Hairer,
 Lubich and Wanner, Geometric Numerical Integration, sections IV.1 and IV.2.

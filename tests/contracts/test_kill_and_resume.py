@@ -1,4 +1,4 @@
-"""A sweep that is killed and started again ends as one that nobody disturbed, and does nothing twice."""
+"""A sweep that is killed and started again ends as an undisturbed one, and does nothing twice."""
 
 import os
 import random
@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FRAMES = 8
 TIMES = ("seconds", "wall_seconds_check", "wall_seconds_sum", "cpu_seconds", "preempted", "phases_consistent")
 WRITTEN_BY = (*TIMES, *MACHINE, "started_at", "commit", "source_fingerprint")
-"""Columns that tell how long a run took, and when and by which state of the code it was done."""
+"""Columns that state how long a run took, and when and by which state of the code it was done."""
 
 CLOTH = f"""
 mesh: {{kind: grid}}

@@ -1,4 +1,4 @@
-"""A new solver and a new effect are one file each: nothing else knows any of them by name."""
+"""A new solver and a new effect are one file each: nothing else names any of them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.scene_builders import build_cloth
 ROOT = Path(__file__).resolve().parents[2]
 
 DEFAULTS = {"numba", "hybrid", "newton"}
-"""Solvers that run where nobody says which, or that judge others: all that is known by name, and in no report."""
+"""Solvers that run by default, or that verify others: all that are named in code, and in no report."""
 
 SCENE = """
 mesh: {kind: chain, length: 2.0}
@@ -63,7 +63,7 @@ work: [{t_end: 0.1, rounds: 1}]
 
 @dataclass(frozen=True)
 class Mine(SparseLocalGlobal):
-    """A method that somebody else wrote."""
+    """A method from user code."""
 
     solver_info: ClassVar[SolverInfo] = SolverInfo(
         "of my own", Citation("Noether, Emmy", 1918, "Invariante Variationsprobleme")

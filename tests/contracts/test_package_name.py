@@ -31,7 +31,7 @@ print(*springbench.Simulation(scene, "sparse").step().shape)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A scene and a script beside files that have the names of the checkout's two folders, and fail when imported."""
+    """A scene and a script next to files that have the names of the checkout's two folders, and fail when imported."""
     for name in FOLDERS:
         (tmp_path / f"{name}.py").write_text(f"raise RuntimeError('{name}.py of the user was imported')\n")
     (tmp_path / "scene.yaml").write_text(SCENE)

@@ -77,7 +77,7 @@ def browser() -> Iterator[Any]:
 
 
 class Tab:
-    """A page of the browser that keeps what it says and asks for."""
+    """A page of the browser that records its messages and requests."""
 
     def __init__(self, browser: Any, width: int = 1280, height: int = 800, scheme: str = "light") -> None:
         self.page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
@@ -98,7 +98,7 @@ class Tab:
         return self.settled()
 
     def settled(self) -> Any:
-        """The page, once it shows what its URL says: a browser tells it of a new one later."""
+        """The page, once it shows what its URL says: a browser reports a new one later."""
         self.page.wait_for_function("document.documentElement.dataset.ready === (location.hash || '#')")
         return self.page
 
@@ -137,7 +137,7 @@ SCHEMES = {390: ("light", "dark"), 1280: ("light",), 2560: ("light",)}
 def test_every_view_is_legible_and_fits(browser: Any, studies: str, width: int):
     from axe_playwright_python.base import AXE_SCRIPT
 
-    # Style sheets are no documents that a page from the file system may ask for.
+    # Style sheets are no documents that a page from the file system may request.
     rules = {"resultTypes": ["violations"], "preload": False, "runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]}
     tab = Tab(browser, width, 844 if width == 390 else 1000)
     shown = tab.open(studies, "runs?q=none")

@@ -28,7 +28,7 @@ CONVERGED = StopRule(20_000, 1e-13)
 backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 
 FREE = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), size=6)
-"""A cloth that nothing holds and nothing pulls at."""
+"""A cloth without supports and loads."""
 
 
 def moving(

@@ -1,4 +1,4 @@
-"""Somebody's own solver, effect, mesh, integrator and report: installed, or in a file beside the config."""
+"""User code: solver, effect, mesh, integrator and report, installed or in a file next to the config."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ WHEEL = {
     f"{ABOUT}/WHEEL": "Wheel-Version: 1.0\nGenerator: by hand\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
     f"{ABOUT}/entry_points.txt": ENTRIES,
 }
-"""What a wheel holds: pip installs it without a build backend, and without a network."""
+"""The content of a wheel: pip installs it without a build backend, and without a network."""
 NAMES = {"mesh": "Cord", "effect": "Hum", "solver": "Mine", "integrator": "EULER", "report": "tell"}
 INSTALLED = {"mesh": "cord", "effect": "hum", "solver": "mine", "integrator": "euler", "report": "tell"}
 WAYS = {
@@ -188,7 +188,7 @@ def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, plugin_folder: Pat
 
 @pytest.mark.long
 def test_a_fresh_environment_takes_both_packages_and_sweeps_with_them(tmp_path: Path):
-    """This project and somebody's, with all that they need, from the package index."""
+    """This project and a user's, with all that they need, from the package index."""
     venv.create(tmp_path / "fresh", with_pip=True)
     bin, env = tmp_path / "fresh" / "bin", {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     wanted = [str(ROOT), str(packed(tmp_path))]

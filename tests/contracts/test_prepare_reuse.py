@@ -93,7 +93,7 @@ def test_one_preparation_serves_all_steps_of_a_system(name, choice):
                 expected.num_iterations,
                 expected.termination_reason,
             )
-            # A residual that was not asked for is no number, and equals itself here.
+            # A residual that was not requested is no number, and equals itself here.
             np.testing.assert_array_equal(
                 [found.residual, found.initial_residual], [expected.residual, expected.initial_residual]
             )

@@ -1,4 +1,4 @@
-"""What every recording promises: exact positions, small files, whole files or none, and answers for damaged ones."""
+"""Properties of every recording: exact positions, small files, whole files or none, and answers for damaged ones."""
 
 from __future__ import annotations
 

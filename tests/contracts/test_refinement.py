@@ -40,7 +40,7 @@ def elastic_catenary(ea: float, span: float, s: np.ndarray) -> np.ndarray:
 
 
 def hanging_chain(ea: float, span: float, size: int) -> Positions:
-    """A chain whose ends are held `span` apart, at rest."""
+    """A chain whose ends are pinned `span` apart, at rest."""
     made = build_test_scene(
         ChainMesh(length=LENGTH),
         SpringsEffect(stretch=ea),
@@ -72,7 +72,7 @@ def test_a_hanging_chain_takes_the_shape_of_the_elastic_catenary(ea, span):
 
 
 def sag(size: int, **stiffness: float) -> float:
-    """How far the middle of a level cloth, held all around, hangs down [m]."""
+    """How far the middle of a level cloth, pinned all around, hangs down [m]."""
     pins = PinsEffect(parts=("boundary",), weight="exact")
     made = build_test_scene(
         GridMesh(bend_springs=True), SpringsEffect.model_validate(stiffness), GravityEffect(), pins, size=size, mass=0.5

@@ -1,4 +1,4 @@
-"""A solve on the page, in a real browser: each iterate beside the reference, coloured by its distance from it."""
+"""A solve on the page, in a real browser: each iterate next to the reference, coloured by its distance from it."""
 
 from __future__ import annotations
 

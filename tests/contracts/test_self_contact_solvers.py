@@ -52,7 +52,7 @@ APART = SelfContactEffect(min_distance=THICKNESS)
 
 
 def upside_down(*effects: SceneEffect) -> Scene:
-    """A sheet that is held at its top corners falls upwards, and onto itself."""
+    """A sheet that is pinned at its top corners falls upwards, and onto itself."""
     grid, up = GridMesh(plane="vertical", diagonals="one"), GravityEffect(acceleration=(0.0, 9.81, 0.0))
     return build_test_scene(
         grid, SpringsEffect(stretch=100.0, shear=20.0), up, PinsEffect(parts=("top_corners",)), *effects, size=7

@@ -1,4 +1,4 @@
-"""What every solver promises: the contract of `springbench.solvers.model.step_problem`, for each name in the
+"""Properties of every solver: the contract of `springbench.solvers.model.step_problem`, for each name in the
 registry."""
 
 from __future__ import annotations

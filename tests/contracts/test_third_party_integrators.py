@@ -1,4 +1,4 @@
-"""Other libraries' integrators beside ours: CVODE, where it is installed, and what a row says where it is not."""
+"""Other libraries' integrators compared with ours: CVODE, where it is installed, and the row where it is not."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def test_no_worker_stays_behind(how: signal.Signals, tmp_path: Path, monkeypatch
         process.send_signal(how)
         process.wait()
     finally:
-        process.kill()  # else its run holds the lock of timing for the tests that follow
+        process.kill()  # else its run retains the timing lock for the tests that follow
     assert process.returncode == (130 if how == signal.SIGINT else -how)
     gone, alive = psutil.wait_procs(workers, timeout=60.0)
     assert gone

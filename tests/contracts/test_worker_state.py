@@ -1,4 +1,4 @@
-"""What a worker did before leaves no trace in what is timed next, nor in the memory of the process that asks."""
+"""What a worker did before leaves no trace in what is timed next, nor in the memory of the process that starts it."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def answer(tick: ProgressCallback) -> bytes:
 
 @pytest.mark.long
 def test_the_memory_of_the_parent_process_stays_constant():
-    """64 KiB an answer: kept, the second thousand would be 64 MiB."""
+    """64 KiB an answer: if stored, the second thousand would be 64 MiB."""
     sizes = list[int]()
     for _ in range(2):
         for _ in run_tasks(2, int, [None] * 1000, lambda number: PoolTask(answer, quiet, TaskLimits())):

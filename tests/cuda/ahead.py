@@ -39,7 +39,7 @@ class Compiled(NamedTuple):
 
 
 def device_modules() -> list[str]:
-    """The modules of kernels: those of `springbench.solvers.cuda`, and `device_*` beside each method."""
+    """The modules of kernels: those of `springbench.solvers.cuda`, and `device_*` next to each method."""
     return [
         f"{package.__name__}.{name}"
         for package in (springbench.solvers.cuda, newton, position_based, vertex_block)
@@ -98,7 +98,7 @@ def compiled(kernel: Any, arguments: tuple[Any, ...]) -> Compiled:
 
 
 if __name__ == "__main__":
-    # Of functions that kernels call, Numba asks the device for what to compile; there need be none.
+    # Of functions that kernels call, Numba queries the device for what to compile; there need be none.
     dispatcher: Any = import_module("numba.cuda.dispatcher")
     dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=CAPABILITY)
     there, launches = kernels(), pickle.loads(Path(sys.argv[1]).read_bytes())

@@ -2,7 +2,7 @@
 
     NUMBA_ENABLE_CUDASIM=1 .venv/bin/python -m pytest -q -n 0 -m slow tests/cuda
 
-Without either there is nothing to ask: `tests/unit/test_device.py` has what then holds.
+Without either nothing can be tested here; `tests/unit/test_device.py` has the tests for that.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Hard cases on a device: what a method's first steps are there, beside the processor's.
+"""Hard cases on a device: what a method's first steps are there, compared with the processor's.
 
     NUMBA_ENABLE_CUDASIM=1 .venv/bin/python -m pytest -q -n 0 -s -m long tests/cuda/test_hard.py
 

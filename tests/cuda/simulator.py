@@ -1,7 +1,7 @@
 """Numba's simulator, three times as fast: of a block's threads one runs at a time, and where none waits for another all
 run in the process's own thread.
 
-As it is, it makes a thread of Python of each and asks all of them all the time whether they are done, looks through all
+As it is, it makes a thread of Python of each and polls all of them whether they are done, looks through all
 names of NumPy's arrays for an array's shape, and through all callers for a block's shared memory. What kernels are
 given and compute does not change. Threads that ought to wait for each other and do not are found out: who goes first
 changes from block to block and from turn to turn, and shared memory begins with no number.
@@ -63,7 +63,7 @@ def waits(function: Any) -> bool:
 
 
 def alone() -> None:
-    """The only thread of its block waits for nobody."""
+    """The only thread of its block waits for no other."""
 
 
 def unforeseen() -> None:
@@ -122,7 +122,7 @@ def _sizes(launched: Any) -> list[Any]:
 
 @cache
 def names_cuda(function: Any) -> bool:
-    """Whether a function asks for its thread, or anything else of it."""
+    """Whether a function reads its thread index, or anything else of it."""
     named = map(function.__globals__.get, function.__code__.co_names)
     return any(one is cuda or isinstance(one, api.FakeCUDAModule) for one in named)
 
@@ -139,7 +139,7 @@ def attribute(self: Any, name: str) -> Any:
 
 
 def shared(self: Any, shape: Any, dtype: Any) -> Any:
-    """A block's array, known by the line that asks for it."""
+    """A block's array, identified by the line that allocates it."""
     caller = sys._getframe(1)
     line = caller.f_code.co_filename, caller.f_lineno
     if line not in self._allocations:

@@ -2,7 +2,7 @@
 
     NUMBA_ENABLE_CUDASIM=1 .venv/bin/python -m pytest -q -n 0 -s -m long tests/cuda/test_ahead.py
 
-The simulator knows no types. So here it tells with which ones each kernel is launched, and another process compiles it
+The simulator has no types. So here it records with which ones each kernel is launched, and another process compiles it
 for them (`tests.cuda.ahead`). A line a kernel says what it takes of a device.
 """
 

@@ -1,5 +1,5 @@
 """Hard cases by all methods on a device, in both precisions: right, or refused by name. Some of them here; all where
-`-m long` asks, which says of each what became of it.
+`-m long` selects them; it prints the outcome of each.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SOME = {
     "effects-dashpots-1e12": ("vbd",),
     "contact-resting-block": ("newton-cg", "xpbd"),
 }
-"""A few of each kind, and the methods that are asked."""
+"""A few of each kind, and the methods that are tested."""
 
 precisions = pytest.mark.parametrize("precision", ROUND_OFF)
 

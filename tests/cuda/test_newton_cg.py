@@ -97,7 +97,7 @@ def test_sums_of_blocks_are_added_by_a_tree(monkeypatch: pytest.MonkeyPatch) -> 
     count = 3 * device_sums.THREADS_PER_BLOCK + 1
     terms = np.random.default_rng(0).normal(size=(2, count))
     given, out = cuda.to_device(terms), cuda.to_device(np.zeros(2))
-    for _ in range(2):  # whoever of the threads goes first
+    for _ in range(2):  # whichever thread is first
         device_sums.collect_sums[1, device_sums.THREADS_PER_BLOCK](2, given, count, out)
         np.testing.assert_allclose(out.copy_to_host(), terms.sum(axis=1), rtol=1e-12)
 

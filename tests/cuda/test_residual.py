@@ -1,4 +1,4 @@
-"""Residuals of what is solved on a device: the oracle's."""
+"""Residuals of solves on a device are those of the reference evaluator."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PROBLEMS: dict[str, Callable[[], StepProblem]] = {
     "chain, stiff pins": lambda: build_first_problem(SCENE_BUILDERS["chain"](1e10)),
 }
 ROUND_OFF = 1e-6
-"""Of the oracle's factor, where pins are 1e10 times as stiff as what they are left out of; 1e-9 elsewhere."""
+"""Of the reference's factor, where pins are 1e10 times as stiff as what they are left out of; 1e-9 elsewhere."""
 
 METHODS: dict[str, Callable[[], Any]] = {
     "vbd": lambda: VertexBlockDescent(device="cuda"),
@@ -41,7 +41,7 @@ METHODS: dict[str, Callable[[], Any]] = {
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("method", METHODS)
 def test_it_is_the_oracles(name: str, method: str) -> None:
-    """At the guess, and at points beside it."""
+    """At the guess, and at points near it."""
     problem = PROBLEMS[name]()
     if (method == "vbd" and "dashpots" in name) or (method != "vbd" and "sphere" in name):
         return

@@ -1,4 +1,4 @@
-"""Runs on a device: what rows tell, that timed steps copy no more than they must, and what becomes of its failures."""
+"""Runs on a device: what rows state, that timed steps copy no more than they must, and what becomes of its failures."""
 
 from __future__ import annotations
 

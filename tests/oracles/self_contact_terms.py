@@ -176,7 +176,7 @@ class ContactPairs:
 
         Args:
           friction: coefficient of friction mu.
-          grip: friction data of the pairs.
+          tangential_collisions: friction data of the pairs.
           slip: s [m].
           time: time [s].
         """

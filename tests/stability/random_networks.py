@@ -154,5 +154,5 @@ def networks(stiffest: float = 5.0, pinned: int = 2) -> st.SearchStrategy[Case]:
 
 
 def examples(count: int) -> settings:
-    """So many examples of each property and method, or what `--hypothesis-profile=search` asks for."""
+    """So many examples of each property and method, or what `--hypothesis-profile=search` requests."""
     return settings() if settings.get_current_profile_name() == "search" else settings(max_examples=count)

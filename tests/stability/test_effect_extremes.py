@@ -53,7 +53,7 @@ def runs_well(made: Scene, solver: Solver, reach: float) -> None:
     Q = assemble_system_matrix(
         made.system, [energy for energy in made.system.energies if isinstance(energy, ProjectiveEnergy)]
     )
-    # What objectives of sums of some hundred terms, and positions of order one that a solve knows to 1e-12, leave.
+    # What objectives of sums of some hundred terms, and positions of order one that a solve has to 1e-12, leave.
     round_off, displaced = 1e-12, Q.trace() * 1e-12**2
     for step in simulate_scene(made, prepare(made, solver), StopRule(30), initial_guess="previous", frames=8):
         assert np.isfinite(step.positions).all()

@@ -90,7 +90,7 @@ class OutOfMemory:
 
 @dataclass(frozen=True)
 class PastItsLimit:
-    """Symplectic Euler in one substep, where stability asks for a million: each step multiplies what it begins with."""
+    """Symplectic Euler in one substep, where stability requires a million: each step multiplies what it begins with."""
 
     is_minimiser: ClassVar[bool] = False
     is_monotone: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""What solvers say of their answers to the hard cases is true, by an oracle that shares nothing with them.
+"""What solvers report of their results of hard cases is true, by independent code.
 
 The residual |Q^-1 grad g| comes from a Q of its own, factorised by SuperLU, and the gradient of the plain formulas.
 """

@@ -34,7 +34,7 @@ from tests.scene_builders import THREAD_COUNT, rounding_scale, single_stage_inte
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 CASES = {path.stem: path for path in sorted((CONFIGS / "hard").glob("*.yaml"))}
 ALIKE = {"blanes-moan-4", "blanes-moan-6", "runge-kutta-4", "tsitouras-5", "dormand-prince-8", "avbd", "vbd-ogc"}
-"""Methods of the same code as velocity-verlet, and those that give up by themselves where no step keeps to an error:
+"""Methods of the same code as velocity-verlet, and those that give up by themselves where no step reaches an error:
 `tests/unit/test_explicit.py`; and what is vbd where no length is exact, `tests/unit/test_avbd.py`, or where no surfaces
 are in contact, `tests/unit/test_offset_contact.py`."""
 METHODS: dict[str, Solver] = {

@@ -1,4 +1,4 @@
-"""What holds of every network: random ones, small enough to shrink.
+"""Properties of every network: random ones, small enough to shrink.
 
 Positions are drawn from a normal distribution, so that no spring is without a direction: what happens there is a
 convention, and `tests.stability.test_hard_scenes` has it.
@@ -33,8 +33,8 @@ GLOBAL = ("dense", "sparse", "numba", "anderson", "chebyshev", "newton")
 """Methods whose every iterate is a global solve with all inertia in it, so that it has the right momentum; those that
 go vertex by vertex, or shorten or cut off a step, have it when they have converged."""
 STEADY = ("dense", "sparse", "numba", "chebyshev", "newton")
-"""Methods that ask of no two nearly equal numbers which is larger: round-off would answer, and an iterate more or less
-be the difference. The others are held to the same where they have converged, in `test_properties_converged`."""
+"""Methods that compare no two nearly equal numbers: round-off would decide, and an iterate more or less
+be the difference. The others are tested likewise where they have converged, in `test_properties_converged`."""
 ITERATIONS = 4
 
 VALUE, ROUNDED = 1e-12, 2e-13

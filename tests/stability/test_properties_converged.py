@@ -1,4 +1,4 @@
-"""What holds of every network once a step has converged: near its minimum, for every method that tends to one.
+"""Properties of every network once a step has converged: near its minimum, for every method that tends to one.
 
 On the way there a decision may go either way, and methods differ. Near a minimum, from where the solves below start,
 there is one answer. It is known as well as its gradient, each of whose entries is a sum of some ten forces of k times
@@ -35,14 +35,14 @@ from tests.stability.random_networks import (
 )
 
 ENOUGH = StopRule(3000)
-"""Without a tolerance: until round-off lets nothing descend any more, where a method knows that."""
+"""Without a tolerance: until round-off lets nothing descend any more, where a method detects that."""
 NEAR = 1e-3
 """How far from the minimum solves start [m]; networks are some metres large."""
 CLEAR = 1e-2
 """Of the least inertia, the smallest eigenvalue that a minimum has at least: a flatter one is hardly one."""
 
 SLOW = ("dense", "sparse", "numba", "chebyshev", "admm", "a-jacobi")
-"""Take as many iterations as k dt^2/m; `test_properties` holds each of their iterates to the same."""
+"""Take as many iterations as k dt^2/m; `test_properties` tests each of their iterates likewise."""
 SOFT = {"vbd": 0.0, "avbd": 0.0, "jgs2": 0.0}
 """Powers of ten of the stiffness number up to which a method converges in time: one vertex at a time is slow, and what
 answers to it at rest says little in networks as far out of shape as these."""
@@ -169,7 +169,7 @@ def test_angular_momentum_obeys_the_integrators_law(integrator: str, case: Case)
 @LAWFUL
 @given(case=networks(stiffest=3.0))
 def test_a_convex_energy_decays_or_stays(integrator: str, case: Case):
-    """Springs without rest length have a quadratic energy: midpoint keeps it, implicit Euler loses some in each step,
+    """Springs without rest length have a quadratic energy: midpoint conserves it, implicit Euler loses some each step,
     BDF2 has lost some in the end."""
     scene, state = case.thrown(integrator)
     springs = replace(scene.all_springs, rest_length=np.zeros(case.m))

@@ -140,12 +140,12 @@ def test_a_solve_that_may_not_leave_a_saddle_says_so(saddle: str, monkeypatch):
 
 
 def test_only_a_close_tolerance_requires_a_minimum():
-    """Far from stationary points the Hessian tells nothing."""
+    """Far from stationary points the Hessian shows nothing."""
     _, given = at_a_saddle("a chain pressed along its line", "implicit-euler")
     guess = given.initial_guess.copy()
     guess[given.system.free_vertices, 0] += 1e-3 * np.cos(
         np.arange(len(given.system.free_vertices))
-    )  # keeps to the saddle's plane
+    )  # remains in the saddle's plane
     given, prepared = replace(given, current_positions=guess, initial_guess=guess), NewtonSolver().prepare(given.system)
     coarse, close = (prepared.solve(given, StopRule(300, tolerance)) for tolerance in (1e-2, 1e-6))
     assert coarse.termination_reason == "converged"

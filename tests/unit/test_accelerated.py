@@ -24,7 +24,7 @@ methods = pytest.mark.parametrize("method", METHODS, ids=lambda method: method._
 
 
 def massless(seed: int) -> StepProblem:
-    """A random network in which one vertex has no mass: springs alone hold it."""
+    """A random network in which one vertex has no mass: springs alone determine it."""
     problem = build_random_problem(seed)
     mass = problem.system.mass.copy()
     mass[5] = 0.0
@@ -55,7 +55,7 @@ def test_the_objective_never_rises(method, name, start):
     guess = {"guess": problem.initial_guess, "one point": 0.0 * far, "far away": far}[start]
     path = iterates(method(), replace(problem, initial_guess=guess), 300)
     for before, after in pairwise(path):
-        # Four units in the last place of the terms: what the oracle itself loses in adding them.
+        # Four units in the last place of the terms: what the reference itself loses in adding them.
         assert problem.value(after) <= problem.value(before) + 4 * np.finfo(float).eps * problem.value_scale(before)
 
 
@@ -221,6 +221,6 @@ def test_lbfgs_minimises_energies_that_are_not_projective_and_never_steps_over_a
         b <= a + 4 * np.finfo(float).eps * pushed.value_scale(p)
         for a, b, p in zip(values, values[1:], path, strict=False)
     )
-    assert path[-1][:, 1].min() < -1.5  # the barrier is what holds the cloth, which without it would fall to -2.8
+    assert path[-1][:, 1].min() < -1.5  # the barrier supports the cloth, which without it would fall to -2.8
     begun = np.abs(pushed.gradient(pushed.current_positions)).max()
     assert np.abs(pushed.gradient(path[-1])).max() <= 1e-6 * begun

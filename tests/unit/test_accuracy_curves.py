@@ -1,4 +1,4 @@
-"""Curves: which iterates are graded, by which oracle, what ends them, and what their clock counts."""
+"""Curves: which iterates are evaluated, by which reference, what ends them, and what their clock counts."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PROBLEM = build_first_problem(build_cloth(6, "exact"))
 
 @cache
 def minimum() -> Positions:
-    """Found when it is first asked for: whoever only collects tests compiles nothing."""
+    """Computed on first use: collecting tests compiles nothing."""
     return refine_minimum(PROBLEM, PROBLEM.current_positions, NewtonSolver()).positions
 
 
@@ -57,7 +57,7 @@ def test_stationarity_is_the_step_of_local_global_relative_to_that_at_the_curren
         assert oracle.measure_stationarity(PROBLEM, p).stationarity == pytest.approx(step / steps[0], rel=1e-9)
     assert (
         oracle.measure_stationarity(PROBLEM, minimum()).stationarity < 1e-12
-    )  # round-off of a gradient beside 1 at the start
+    )  # round-off of a gradient of 1 at the start
 
 
 def test_distances_leave_out_what_is_pinned() -> None:
@@ -122,7 +122,7 @@ def test_a_curve_says_how_it_ended(iterate: Callable[[int], Positions], status: 
 def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> None:
     found = curve(Scripted(towards(lambda n: 1 / (1 + n)), pause=0.02), time_limit=0.05, num_rounds=1)
     assert found.status == "time-limit"
-    # Sleeping takes at least as long as asked: three iterates after the warm-up are over the limit, perhaps fewer.
+    # Sleeping takes at least the requested time: three iterates after the warm-up are over the limit, perhaps fewer.
     assert (
         convergence_curves.NUM_WARMUP_ITERATES < found.iterate_indices[-1] <= convergence_curves.NUM_WARMUP_ITERATES + 3
     )
@@ -173,7 +173,7 @@ def at_a_saddle(iterate: Callable[[int], Positions]) -> ScoredCurve:
 
 
 STARTED = replace(FLAT, current_positions=FLAT.current_positions + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]]))
-"""A step whose current positions are beside the saddle at which FLAT's are."""
+"""A step whose current positions are near the saddle at which FLAT's are."""
 
 
 def test_a_solver_that_sits_on_a_saddle_is_named_so_and_has_not_converged() -> None:

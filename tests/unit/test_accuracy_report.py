@@ -84,7 +84,7 @@ def test_a_lower_minimum_mends_all_gaps_without_a_new_run(tmp_path: Path) -> Non
 def test_an_accuracy_is_reached_at_the_first_whole_iteration_at_or_below_it(tmp_path: Path, target: float) -> None:
     reached = find_time_to_accuracy(by_solver(net(tmp_path, "numba"))["numba"], target)
     assert reached is not None
-    exact = int(np.ceil(np.log(target) / np.log(0.93)))  # the gap falls by 0.93 an iteration, between kept ones too
+    exact = int(np.ceil(np.log(target) / np.log(0.93)))  # the gap falls by 0.93 an iteration, between recorded ones too
     assert reached.iteration == exact
     assert reached.seconds == pytest.approx(COST * 100 * exact)
     # Rounds of 0.97, 1 and 1.1 times that: their quartiles.

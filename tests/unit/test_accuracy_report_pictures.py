@@ -26,7 +26,7 @@ BLINDNESS = {
 
 
 def lab(color: str, matrix: list[list[float]] = BLINDNESS["full sight"]) -> np.ndarray:
-    """Return CIELAB of a color as somebody sees it, but for its linear part near black."""
+    """Return CIELAB of a color as a viewer sees it, but for its linear part near black."""
     rgb = np.array(to_rgb(color))
     linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
     xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ np.clip(

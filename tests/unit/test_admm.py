@@ -49,7 +49,7 @@ def test_a_small_weight_takes_fewer_iterations_where_springs_hang():
 
 @pytest.mark.parametrize(("weight", "stays"), [(0.5, False), (1.0, False), (3.0, True)])
 def test_a_spring_shorter_than_the_weight_allows_has_no_fixed_point(weight, stays):
-    """A spring pressed to 2/5 of its rest length, at a minimum since inertia holds it: 1/(1 + 3) < 2/5 < 1/(1 + 1)."""
+    """A spring pressed to 2/5 of its rest length, at a minimum through inertia: 1/(1 + 3) < 2/5 < 1/(1 + 1)."""
     given = build_first_problem(build_cloth(2, "exact"))
     springs = Springs(np.array([[0, 1]]), np.ones(1), np.ones(1), np.array([[1.0, 0.0, 0.0]]))
     p = np.zeros((2, 3))

@@ -48,7 +48,7 @@ def test_solves_add_little_to_the_steps_own_error_and_do_little_besides(integrat
     away = np.linalg.norm(auto[-1].positions - converged[-1].positions) / truth.displacement[0]
     assert away <= 0.5 * own  # a tenth a step, whose signs may agree where those of the steps' own errors do not
     past = slice(6, None)
-    most = 0.8 if INTEGRATORS[integrator].order < 4 else 1.0  # an error of 7e-9 asks for all but the last digits
+    most = 0.8 if INTEGRATORS[integrator].order < 4 else 1.0  # an error of 7e-9 requires all but the last digits
     assert sum(step.num_iterations for step in auto[past]) <= most * sum(
         step.num_iterations for step in converged[past]
     )

@@ -71,7 +71,7 @@ def test_a_type_checker_finds_names_and_keys_that_do_not_exist(tmp_path: Path):
 
 
 class Mine:
-    """What somebody might give for a solver."""
+    """Arguments that a user might pass as a solver."""
 
 
 def test_a_class_in_a_sweep_is_answered_by_how_to_name_it():

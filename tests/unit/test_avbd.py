@@ -204,7 +204,7 @@ def test_a_residual_without_a_tolerance_is_that_of_the_step_too():
 
 
 def test_multipliers_of_a_hanging_chain_are_what_hangs_below():
-    """At rest they are found by hand; a length that is off by e beside that asks for its stiffness times e."""
+    """At rest they are found by hand; a length that is off by e in addition requires its stiffness times e."""
     stated = build_first_problem(chain(4, DOWN, mass=1.0))
     made = Avbd().prepare(stated.system)
     assert isinstance(made, PreparedAugmentedVertexBlockDescent)

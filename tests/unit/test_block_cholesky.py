@@ -90,7 +90,7 @@ def test_what_is_not_finite_is_not_positive_definite(value):
 
 
 def test_a_matrix_that_is_singular_within_round_off_is_not_positive_definite():
-    """Springs that nothing holds: the sum of each row is zero."""
+    """Springs without supports: the sum of each row is zero."""
     n, pairs = 20, np.stack([np.arange(19), np.arange(1, 20)], axis=1)
     laplace = np.diag(np.r_[1.0, 2.0 * np.ones(18), 1.0]) - np.eye(n, k=1) - np.eye(n, k=-1)
     A = bsr_array(csr_array(np.kron(laplace, np.eye(3))), blocksize=(3, 3))

@@ -150,7 +150,7 @@ def test_no_random_pair_comes_nearer_than_allowed_on_its_path(edges):
 
 def test_candidates_stored_between_steps_bound_them_as_well():
     """Two triangles, one above the other, which close at the bound of twice the largest displacement; the second look
-    goes by what the first has kept."""
+    uses the cache of the first."""
     rest = np.array([*TRIANGLE, *TRIANGLE], float)
     rest[3:, 2] = 1.0
     triangles, edges = np.array([[0, 1, 2], [3, 4, 5]]), np.array([[0, 1], [0, 2], [1, 2], [3, 4], [3, 5], [4, 5]])
@@ -159,7 +159,7 @@ def test_candidates_stored_between_steps_bound_them_as_well():
         d = np.zeros_like(rest)
         d[:3, 2], d[3:, 2] = 0.5 * speed, -0.5 * speed
         contact = SelfContact(CollisionMesh.from_rest_shape(rest, edges, triangles, np.ones(6), THICKNESS, 1 / 16))
-        for saved in (0.0, 0.125 / speed):  # what the last look found is kept for the next one
+        for saved in (0.0, 0.125 / speed):  # the result of the last query is cached for the next one
             contact.value(rest)
             contact.collision_free_step_size(rest, saved * d)
             step = Fraction(contact.collision_free_step_size(rest, d))

@@ -1,4 +1,4 @@
-"""Reference minima: certified by the oracle, told apart where there are several, and kept."""
+"""Reference minima: certified, distinguished where there are several, and stored."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_a_minimum_is_certified_by_the_oracle(problem):
         assert found.objective == problem.value(found.positions)
         values = np.linalg.eigvalsh(build_free_hessian(problem, found.positions).toarray())
         assert values[0] > 0.0
-        assert found.min_eigenvalue == pytest.approx(values[0], rel=1e-3)  # as the inverse iteration is told
+        assert found.min_eigenvalue == pytest.approx(values[0], rel=1e-3)  # as the inverse iteration requires
         # What round-off leaves of the gradient moves the softest vertex by the error.
         gradient = np.abs(problem.gradient(found.positions)).max()
         assert gradient <= 10 * values[-1] * np.finfo(float).eps * np.abs(found.positions).max()
@@ -279,7 +279,7 @@ def test_a_certificate_is_of_the_very_point_that_is_stored(name: str):
         "min_eigenvalue": np.linalg.eigvalsh(H)[0],
         "objective": problem.value(found.positions),
     }
-    # The step is round-off, by two factors; the eigenvalue what Lanczos is told.
+    # The step is round-off, by two factors; the eigenvalue to the tolerance of Lanczos.
     assert getattr(found, name) == pytest.approx(there[name], rel=1e-6, abs=1e-14)
 
 

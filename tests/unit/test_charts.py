@@ -1,4 +1,4 @@
-"""Charts as plain data: what a description holds, and that figures, sheets and the page draw the same."""
+"""Charts as plain data: the content of a description, and that figures, sheets and the page draw the same."""
 
 from __future__ import annotations
 

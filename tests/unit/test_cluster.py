@@ -1,4 +1,4 @@
-"""Who can do runs elsewhere is told before any is handed out, and why another cannot."""
+"""Which workers can do runs elsewhere is reported before any starts, and why another cannot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Workers:
 
 
 class Own(NamedTuple):
-    """A run with somebody's own code."""
+    """A run with user code."""
 
     plugins: tuple[PluginName, ...]
 

@@ -72,7 +72,7 @@ def test_the_local_step_is_that_of_the_energy(seed, scale):
     n, m = int(rng.integers(1, 40)), int(rng.integers(0, 200))
     _, springs = build_random_network(rng, n, m)
     p, y = scale * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
-    p[rng.random(n) < 0.2] = p[0]  # springs of no length beside others
+    p[rng.random(n) < 0.2] = p[0]  # springs of no length among others
     wanted = y.copy()
     springs.add_projection(p, wanted)
     pull = np.bincount(springs.edges.ravel(), np.repeat(springs.stiffness * springs.rest_length, 2), n)
@@ -146,7 +146,7 @@ def test_every_precision_ends_where_float64_ends(solver, name):
     problem = PROBLEMS[name]()
     wanted = iterates(SparseLocalGlobal().prepare(problem.system), problem, 6000)[-1]
     found = solver.prepare(problem.system).solve(problem, StopRule(6000)).positions
-    # What was asked of the method, of a scene of size one; rates of convergence leave less than 1e-11.
+    # The tolerance of the method, of a scene of size one; rates of convergence leave less than 1e-11.
     assert np.abs(found - wanted).max() <= 1e-9
 
 

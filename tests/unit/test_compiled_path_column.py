@@ -18,7 +18,7 @@ from tests.scene_builders import build_cloth, build_first_problem
 
 @dataclass(frozen=True)
 class Foreign:
-    """Springs by another name, which no kernel knows."""
+    """Springs by another name, which no kernel supports."""
 
     springs: Springs
 

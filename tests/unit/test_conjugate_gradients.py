@@ -178,7 +178,7 @@ def test_refuses_a_sheet_that_nothing_holds():
 def test_names_a_vertex_near_springs_that_push():
     springs = grid_springs(60, 60)
     k = np.ones(len(springs))
-    k[np.abs(springs - 1830).min(axis=1) == 0] = -0.9  # about vertex 1830, whose diagonal a mass keeps positive
+    k[np.abs(springs - 1830).min(axis=1) == 0] = -0.9  # about vertex 1830, whose diagonal is positive by a mass
     diagonal = np.full(3600, 1e-3)
     diagonal[1830] = 10.0
     with pytest.raises(NotPositiveDefinite):

@@ -1,4 +1,4 @@
-"""The trace of a solve: residuals and objectives by the oracle, over the solver's own iterates."""
+"""The trace of a solve: residuals and objectives by the reference evaluator, over the solver's own iterates."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ class Refused(Exception):
 
 @pytest.fixture
 def nvml(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """A management library that tells a clock and refuses to tell the power."""
+    """A management library that reports a clock and no power."""
 
     def refuses(*_: Any) -> float:
         raise Refused

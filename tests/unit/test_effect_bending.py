@@ -27,7 +27,7 @@ LOAD = 1e-3 * 8 * B
 
 
 def tip(segments: int, width: float, plane: str = "horizontal") -> float:
-    """How far the end of a strip of one metre sinks [m] whose first two columns of vertices are held."""
+    """How far the end of a strip of one metre sinks [m] whose first two columns of vertices are pinned."""
     h = 1.0 / segments
     pins = PinsEffect(box=BoxRegion(low=(-0.5, -1, -1), high=(-0.5 + 1.01 * h, 1, 1)), weight="exact")
     made = build_test_scene(
@@ -44,7 +44,7 @@ def tip(segments: int, width: float, plane: str = "horizontal") -> float:
 
 @pytest.mark.parametrize("width", [None, 0.125, 0.25], ids=["one cell", "an eighth", "a quarter"])
 def test_a_cantilever_tends_to_the_beam_formula(width):
-    """The beam of length L = 1 - h is clamped somewhere between the columns that are held: an error of order h."""
+    """The beam of length L = 1 - h is clamped somewhere between the columns that are pinned: an error of order h."""
     segments = (16, 32, 64)
     error = [tip(k, width or 1 / k) / (LOAD * (1 - 1 / k) ** 4 / (8 * B)) - 1 for k in segments]
     assert 0 < error[2] <= 0.05

@@ -1,4 +1,4 @@
-"""Contact against what it promises: depth at speed, Coulomb's law, rest without creep, no energy from nowhere."""
+"""Contact against its specification: depth at speed, Coulomb's law, rest without creep, no energy from nowhere."""
 
 from __future__ import annotations
 

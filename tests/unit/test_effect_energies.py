@@ -1,4 +1,4 @@
-"""Every energy of an effect against differences of itself, and what local-global asks of the projective ones."""
+"""Every energy of an effect against differences of itself, and what local-global requires of projective ones."""
 
 from __future__ import annotations
 

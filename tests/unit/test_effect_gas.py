@@ -150,7 +150,7 @@ def test_a_mesh_that_is_not_closed_is_refused(case):
 
 def swollen(size: int, pressure: float) -> StepProblem:
     """A step of a balloon. At 200 Pa it swells to more than twice its radius: there the springs soften as it grows, and
-    what keeps its volume is the gas, whose stiffness is the dense part of the Hessian."""
+    the gas preserves its volume, whose stiffness is the dense part of the Hessian."""
     made = build_test_scene(
         BalloonMesh(),
         SpringsEffect(stretch=5.0),
@@ -179,7 +179,7 @@ def test_gas_is_minimised_where_its_sparse_part_alone_has_saddles(solver):
 @pytest.mark.parametrize("at_rest", [False, True])
 @pytest.mark.parametrize("pressure", [2.0, 200.0])
 def test_a_factor_of_gas_is_that_of_its_whole_hessian(pressure, at_rest):
-    """Where the sparse part is definite, and where it is not; multiplied, solved, and told from a saddle."""
+    """Where the sparse part is definite, and where it is not; multiplied, solved, and distinguished from a saddle."""
     given = swollen(3, pressure)
     rest = NewtonSolver().prepare(given.system).solve(given, StopRule(100, 1e-12)).positions
     step, p = StepObjective(FixedObjective(given.system), given), rest if at_rest else given.current_positions

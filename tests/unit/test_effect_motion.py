@@ -155,7 +155,7 @@ def hanging(*attachments: AttachmentsEffect):
 
 def test_an_attachment_yields_by_the_weight_over_its_stiffness():
     p = compute_rest_shape(hanging(AttachmentsEffect(parts=("first",), stiffness=50.0)))
-    assert p[0, 1] == pytest.approx(-2.0 * 9.81 / 50.0, rel=1e-7)  # inertia holds with 2e-6 N/m
+    assert p[0, 1] == pytest.approx(-2.0 * 9.81 / 50.0, rel=1e-7)  # inertia has a stiffness of 2e-6 N/m
 
 
 def test_attachments_share_their_stiffness():

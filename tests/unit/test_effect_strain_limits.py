@@ -41,7 +41,7 @@ def test_no_spring_is_beyond_the_limit_when_converged():
 
 
 def test_a_chain_at_its_limit_yields_by_the_force_over_the_stiffness():
-    """The springs hold EA (l - 1), the limits EA' (l - 1.1), and both together the weight that hangs below."""
+    """The springs carry EA (l - 1), the limits EA' (l - 1.1), and both together the weight that hangs below."""
     ea, stiff, mass, size = 50.0, 5e4, 2.0, 6
     made = build_test_scene(
         ChainMesh(direction=(0.0, -1.0, 0.0)),

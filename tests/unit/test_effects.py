@@ -1,4 +1,4 @@
-"""Effects: each against its formula, and nothing at all where a scene asks for nothing."""
+"""Effects: each against its formula, and nothing at all where a scene has none."""
 
 from __future__ import annotations
 

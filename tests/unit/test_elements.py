@@ -1,4 +1,4 @@
-"""Energies compiled from the law of one element, against their own NumPy text, which stays the oracle."""
+"""Energies compiled from the law of one element, against their own NumPy text, which is the reference."""
 
 from __future__ import annotations
 

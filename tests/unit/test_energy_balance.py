@@ -104,7 +104,7 @@ def test_a_vibration_by_midpoint_has_the_energy_that_it_began_with():
 
 @pytest.mark.parametrize(("weight", "inertia"), [("exact", 0.0), (1e10, 0.2 / DT**2)])
 def test_a_pin_that_moves_does_the_work_of_its_force_along_its_displacement(weight: str | float, inertia: float):
-    """The free end follows by u = k d/(m/dt^2 + k), so that the spring pulls with k (d - u); what a penalty holds has
+    """The free end follows by u = k d/(m/dt^2 + k), so that the spring pulls with k (d - u); what a penalty pins has
     its inertia as well, m d/dt^2."""
     (found,) = balances(chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"), build_pins(weight, motion=PULL)), 1)
     pull = 50.0 * 0.2 * (1.0 - 50.0 / (1.0 / DT**2 + 50.0))

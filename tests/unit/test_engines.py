@@ -256,7 +256,7 @@ def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_num
     np.testing.assert_array_equal(stated.step_start.positions, original)
     assert (alone.residual_iterate, alone.termination_reason, alone.num_iterations) == ("none", "max-iter", 5)
     assert np.isnan([alone.residual, alone.initial_residual, prepared.residual_at(stated, original)]).all()
-    # Pins that move are at their ends, whatever came before.
+    # Pins that move are at their ends, whatever was before.
     moved = replace(stated, pin_targets=stated.pin_targets + 0.01)
     found = prepared.solve(moved, StopRule(4))
     np.testing.assert_array_equal(found.positions[scene.system.pins.vertices], moved.pin_targets)

@@ -1,4 +1,4 @@
-"""Outside engines beside ours: what is compared, and what the table of ratios says."""
+"""Outside engines compared with ours: what is compared, and what the table of ratios says."""
 
 from __future__ import annotations
 

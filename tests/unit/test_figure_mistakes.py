@@ -1,4 +1,4 @@
-"""Which panels names lead to, and what mistakes are answered with: exit code 2, what was wanted, and no file."""
+"""Which panels names lead to, and what mistakes are answered with: exit code 2, what was expected, and no file."""
 
 from __future__ import annotations
 

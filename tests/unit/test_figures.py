@@ -1,4 +1,4 @@
-"""Figures for print: what they hold, that nothing of them is small, cut or covered, and that they look as they did."""
+"""Figures for print: their content, that nothing of them is small, cut or covered, and that they look as they did."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The map of what effects add to an iteration: all solvers on one page, and what cannot be told is not told."""
+"""The map of what effects add to an iteration: all solvers on one page, and what is unknown is left out."""
 
 from __future__ import annotations
 

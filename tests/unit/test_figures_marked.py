@@ -1,4 +1,4 @@
-"""What other code measured is hollow in figures of every kind, and told in words."""
+"""Measurements of other code are hollow in figures of every kind, and named in words."""
 
 from __future__ import annotations
 

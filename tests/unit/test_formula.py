@@ -1,4 +1,4 @@
-"""Solvers of one formula: what a wrong formula is told names its file and line; their files run without `__file__`."""
+"""Solvers of one formula: a message on a wrong one names its file and line; their files run without `__file__`."""
 
 from __future__ import annotations
 

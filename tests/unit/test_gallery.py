@@ -57,7 +57,7 @@ def test_what_is_drawn_of_an_obstacle_is_its_surface(obstacle):
     assert made is not None
     points = np.asarray(made.points, np.float64)
     distance = obstacle.build_obstacle().signed_distance(points, 0.0)
-    # VTK keeps points in single precision. The balls at a capsule's ends are whole: half of each is hidden inside.
+    # VTK stores points in single precision. The balls at a capsule's ends are whole: half of each is hidden inside.
     assert distance.max() < 1e-5
     assert np.median(np.abs(distance)) < 1e-5
 

@@ -41,7 +41,7 @@ def stiff(ratio: float) -> StepProblem:
 
 @pytest.mark.parametrize("ratio", [1e6, 1e8, 1e10], ids="{:g}".format)
 def test_stiff_springs_take_less_than_half_of_newtons_factorisations(ratio, monkeypatch):
-    """Counted to a gap of 1e-4: 11 beside 39, 32 beside 138, 69 beside 617."""
+    """Counted to a gap of 1e-4: 11 and 39, 32 and 138, 69 and 617."""
     given = stiff(ratio)
     prepared = {solver: solver.prepare(given.system) for solver in (NewtonSolver(), HybridNewton())}
     ends = [p.solve(given, StopRule(3000)).positions for p in prepared.values()]
@@ -79,12 +79,12 @@ def test_a_graph_is_ordered_once(monkeypatch):
     HybridNewton().prepare(stiff(1.0).system)
     assert ordered == [1]
     HybridNewton().prepare(stiff(1.0).system)
-    assert ordered == [2]  # what is kept is kept while one solver is prepared
+    assert ordered == [2]  # the cache lives as long as the prepared solver
 
 
 @pytest.mark.parametrize("size", [0.9, 1.1])
 def test_a_path_to_a_saddle_is_left_where_curvature_is_negative(size):
-    """A net in its plane, which nothing tells up from down: pressed it bends out of it, stretched it stays."""
+    """A net in its plane, in which up and down are equivalent: pressed it bends out of it, stretched it stays."""
     given = stiff(1e4)
     flat = given.current_positions * [size, 1.0, size]
     np.testing.assert_array_equal(np.ptp(flat[:, 1]), 0.0)
@@ -231,7 +231,7 @@ def test_round_off_of_some_vertices_does_not_stop_the_others(case, frames):
 
 
 def test_no_newton_step_is_taken_where_lbfgs_is_sooner_at_the_limit():
-    """Without a limit of the residual L-BFGS gives way to Newton's method, which promises the whole rest."""
+    """Without a limit of the residual Newton's method follows L-BFGS, since it is predicted to gain the whole rest."""
     given, prepared = stiff(10.0), HybridNewton().prepare(stiff(10.0).system)
     endless = prepared.solve(given, StopRule(60)).solver_phases
     limited = prepared.solve(given, StopRule(300, 1e-3)).solver_phases

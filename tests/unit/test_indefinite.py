@@ -39,7 +39,7 @@ FIRST, SECOND = 0.4, 0.1
 
 
 def compressed() -> StepProblem:
-    """Two springs of 1 N/m along x, each from a vertex that is held to one that is free, k dt^2/m = 1/10."""
+    """Two springs of 1 N/m along x, each from a vertex that is pinned to one that is free, k dt^2/m = 1/10."""
     given = build_first_problem(build_cloth(2, "exact"))
     edges = np.array([[0, 1], [2, 3]])
     springs = Springs(edges, np.ones(2), np.ones(2), np.tile([1.0, 0.0, 0.0], (2, 1)))
@@ -138,8 +138,8 @@ def test_progressive_projection_leaves_a_definite_hessian_as_it_is():
 
 
 def test_progressive_projection_takes_the_elements_where_the_gradient_is_largest():
-    """Without the inertia that holds it, the shorter spring makes the Hessian indefinite; its force is the larger one,
-    so that the other one keeps its negative lateral part."""
+    """Without the inertia that stabilises it, the shorter spring makes the Hessian indefinite; its force is the larger
+    one, so that the other one retains its negative lateral part."""
     given = compressed()
     system = replace(given.system, mass=np.full(4, 2.0))
     step, at, diagonal = begun(replace(given, system=system))
@@ -208,5 +208,5 @@ def test_where_pairs_touch_a_hessian_becomes_exact_by_and_by():
         p = at.positions.copy()
         p[3, 0] = p[2, 0] + length
         levels.append(rule.factorise_hessian(step.hessian(p), at._replace(positions=p), diagonal))
-    # Inertia of 10 N/m holds a half of -19 N/m and of -15.7, no three quarters of them, and all of -1.5.
+    # Inertia of 10 N/m outweighs a half of -19 N/m and of -15.7, no three quarters of them, and all of -1.5.
     assert levels == [2, 2, 1, 0, 0, 0]

@@ -50,7 +50,7 @@ def motions(made: Scene, state: MotionState | None = None) -> list[Motion]:
 
 
 # What a method's recursion adds to a t^2/2 after n steps, in units of a dt^2/2: implicit Euler takes each velocity from
-# the step's end; BDF2 makes that error in its first step alone, and e_n = (4 e_(n-1) - e_(n-2)) / 3 keeps 3/2 of it.
+# the step's end; BDF2 makes that error in its first step alone, and e_n = (4 e_(n-1) - e_(n-2)) / 3 retains 3/2 of it.
 LATE = {"implicit-euler": lambda n: n, "bdf2": lambda n: 1.5 * (1.0 - 3.0**-n)}
 
 

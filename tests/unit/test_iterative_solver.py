@@ -26,7 +26,7 @@ from springbench.solvers.model.step_problem import Positions, StepProblem, StopR
 from tests.scene_builders import build_cloth, build_first_problem
 
 
-# A whole method, of the formula p <- p - D^-1 grad g(p), where D holds each vertex by twice its springs: it majorises.
+# A whole method, of the formula p <- p - D^-1 grad g(p), where D is twice the springs of each vertex: it majorises.
 @dataclass(frozen=True)
 class DiagonalDescent:
     def prepare(self, system: System) -> PreparedDiagonal:
@@ -209,7 +209,7 @@ class PreparedStepping(IterativeSolver):
         (PreparedStepping(0), StopRule(50, 1e-6), (20, "converged")),
         (PreparedStepping(30), StopRule(50, 1e-6), (30, "converged")),
         (PreparedStepping(30), StopRule(25, 1e-6), (25, "max-iter")),
-        (PreparedStepping(30), StopRule(50, 1e-3), (10, "converged")),  # so loose a tolerance asks for no minimum
+        (PreparedStepping(30), StopRule(50, 1e-3), (10, "converged")),  # so loose a tolerance requires no minimum
         (PreparedStepping(30, most=24), StopRule(50, 1e-6), (24, "stalled")),
     ],
 )

@@ -88,7 +88,7 @@ def test_responses_turn_with_the_mesh():
     R = rotations(1)[0]
     fields = ("inertial_target", "external_force", "pin_targets", "initial_guess", "current_positions")
     turned = replace(HANGING, **{name: getattr(HANGING, name) @ R.T for name in fields})
-    # Half of the digits: how springs have turned is told by a sum that is singular across the cloth.
+    # Half of the digits: how springs have turned follows from a sum that is singular across the cloth.
     np.testing.assert_allclose(first(Jgs2(), turned), first(Jgs2(), HANGING) @ R.T, rtol=0, atol=1e-8)
 
 

@@ -1,4 +1,4 @@
-"""Compiled code is kept by all that a kernel depends on: what is loaded is what would be compiled."""
+"""Compiled code is cached by all that a kernel depends on: what is loaded is what would be compiled."""
 
 from __future__ import annotations
 
@@ -266,7 +266,7 @@ def test_what_cannot_be_read_is_compiled_and_stored_again(home: Path, damage: Da
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder in which kernels are kept."""
+    """An empty folder in which kernels are cached."""
     monkeypatch.setattr(kernel_cache, "_writable_root", lambda source: tmp_path)
     return tmp_path
 

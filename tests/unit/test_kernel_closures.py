@@ -1,4 +1,4 @@
-"""Kernels that are closures: of one name, and told apart by the functions that they are made of."""
+"""Kernels that are closures: of one name, and distinguished by the functions that they are made of."""
 
 from __future__ import annotations
 

@@ -126,7 +126,7 @@ def test_the_linearised_step_is_that_of_baraff_and_witkin():
 @pytest.mark.parametrize(("name", "saved"), [("baraff-witkin", 0.01), ("ros2", 0.01), ("rodas", 0.01), ("ros3p", 0.8)])
 def test_a_stiff_spring_does_not_ring_after_one_step(name, saved):
     """One spring of 1e5 1/s along its own line, stretched by a thousandth: L-stable methods forget it at once, and
-    ROS3P keeps 0.73 of it (Lang and Verwer 2001)."""
+    ROS3P retains 0.73 of it (Lang and Verwer 2001)."""
     integrator = "implicit-euler" if name == "baraff-witkin" else "substepping"
     scene = made(SpringsEffect(stretch=1e10), HELD, integrator=integrator, time_step=1 / 30, size=2)
     state = build_initial_state(scene)

@@ -1,4 +1,4 @@
-"""`springbench list` tells runs apart, and names what ships; `--version` and `-h`."""
+"""`springbench list` distinguishes runs, and names what ships; `--version` and `-h`."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ from tests.scene_builders import (
 VALUE = 1e-13
 """Round-off of the objective relative to its magnitude: sums of some hundred terms."""
 SOLVE = 1e-9
-"""A solve with Q whose condition number, with weights of 1e4 beside stiffnesses of 1, is below 1e6."""
+"""A solve with Q whose condition number, with weights of 1e4 and stiffnesses of 1, is below 1e6."""
 
 backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 
@@ -184,13 +184,13 @@ def test_the_facts_count_what_is_stored():
     )
     facts = [backend.prepare(system).stats for backend in backends]
     assert [fact["nnz_system"] for fact in facts] == [10 + 2 * 9] * 5
-    # A tree's factor has no fill-in; a dense one has the whole triangle; cholespy does not tell.
+    # A tree's factor has no fill-in; a dense one has the whole triangle; cholespy does not report it.
     assert [fact.get("nnz_factor") for fact in facts] == [10 * 11 / 2, 10 + 9, 10 * 11 / 2, 10 + 9, None]
 
 
 @dataclass(frozen=True)
 class Well:
-    """An energy that no backend knows: |p|^2/2, without a projection."""
+    """An energy that no backend supports: |p|^2/2, without a projection."""
 
     def value(self, p: Positions) -> float:
         return 0.5 * float(np.sum(p * p))
@@ -272,4 +272,4 @@ def test_the_product_with_a_large_dense_matrix_is_the_same(monkeypatch):
     usual = iterates(DenseLocalGlobal(), problem, 10)
     monkeypatch.setattr(reference_local_global, "_LARGE_MATRIX_ENTRIES", 0)
     for one, other in zip(usual, iterates(DenseLocalGlobal(), problem, 10), strict=True):
-        np.testing.assert_allclose(other, one, rtol=0.0, atol=1e-12)  # metres, beside an extent of one
+        np.testing.assert_allclose(other, one, rtol=0.0, atol=1e-12)  # metres, for an extent of one

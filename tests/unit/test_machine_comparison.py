@@ -126,7 +126,7 @@ def test_the_limits_of_a_machine_are_measured_once_and_stored(tmp_path: Path, mo
     (saved,) = user_cache_dir("machine").iterdir()
     assert saved.stem == compute_node_id()
     for name in ("measure_copy_bandwidth", "measure_flops", "measure_step_seconds"):
-        monkeypatch.delattr(machine_calibration, name)  # what is kept is not found again
+        monkeypatch.delattr(machine_calibration, name)  # what is cached is not computed again
     monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
     assert machine_calibration.calibrate_machine(lambda said: None) == found
 

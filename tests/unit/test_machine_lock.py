@@ -35,7 +35,7 @@ def _locks_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Other(threading.Thread):
-    """Somebody else who would compute, and has begun once it is in."""
+    """Another process that would compute, and has begun once it has the lock."""
 
     def __init__(self, how: Callable[[ProgressCallback], AbstractContextManager[object]]) -> None:
         super().__init__(daemon=True)
@@ -159,7 +159,7 @@ def test_a_lock_that_may_not_be_opened_is_named(tmp_path: Path, monkeypatch: pyt
 
 
 def at_core(tick: ProgressCallback) -> tuple[list[int], set[int], float, float]:
-    """The cores that this is kept to, as told and as it is, and from when to when."""
+    """The cores that this is bound to, as reported and actual, and from when to when."""
     with reserve_cores(1, tick) as cores:
         began, end = monotonic(), monotonic() + SOON
         while monotonic() < end:

@@ -24,7 +24,7 @@ ROUND_OFF = 1e-9
 
 
 def pull(mesh: Mesh, k: np.ndarray, *, fixed: np.ndarray, moved: np.ndarray, axis: int) -> float:
-    """The force [N] that holds `moved` at 1 m along `axis` while `fixed` stays, by the linear theory.
+    """The force [N] that displaces `moved` by 1 m along `axis` while `fixed` stays, by the linear theory.
 
     K = sum_e k_e n_e n_e' over the directions n_e of the springs at rest; coordinates of no stiffness stay put.
     """

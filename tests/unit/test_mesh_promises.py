@@ -1,4 +1,4 @@
-"""What every generator promises."""
+"""Properties of the meshes of every generator."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def dual(problem: StepProblem, solver: MultigridXpbd | None = None):
 
 
 def test_one_spring_ends_where_its_force_is_that_of_inertia():
-    """k (l - r) = m/dt^2 (y - l), for a mass that inertia leads to y below where its spring is held."""
+    """k (l - r) = m/dt^2 (y - l), for a mass that inertia leads to y below where its spring is pinned."""
     k, r, m, dt, y = 500.0, 0.7, 0.3, 0.1, 1.2
     rest = np.array([[0.0, 0.0, 0.0], [0.0, -r, 0.0]])
     springs = Springs.from_rest_shape(rest, np.array([[0, 1]]), np.array([k]))

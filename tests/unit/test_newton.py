@@ -1,4 +1,4 @@
-"""Newton's methods: what all of them promise on hard cases, and what the exact one does near a minimum."""
+"""Newton's methods: properties of all of them on hard cases, and what the exact one does near a minimum."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_hard_case_ends_at_a_certified_minimum(case, solver):
             break
     assert np.isfinite(path).all()
     values = [given.value(p) for p in path]
-    # The oracle's own round-off: lengths are good to eps, energies of stiff springs to that over their strain.
+    # The reference's own round-off: lengths are good to eps, energies of stiff springs to that over their strain.
     slack = 1e-12 * max(given.value_scale(p) for p in path[1:])
     assert all(b <= a + slack for a, b in pairwise(values[1:]))
     assert is_certified(given, path[-1])

@@ -60,7 +60,7 @@ def test_the_compiled_loop_makes_the_iterates_of_the_one_that_takes_any_energy(s
     assert isinstance(plain.method, TruncatedNewtonIteration)
     plain.method.compiled_cg = None
     for p, q in islice(zip(compiled.iterates(given), plain.iterates(given), strict=False), 6):
-        # Sums in another order, which pins of 1e10 beside springs of 1e2 magnify.
+        # Sums in another order, which pins of 1e10 and springs of 1e2 magnify.
         np.testing.assert_allclose(p, q, rtol=0, atol=1e-9)
 
 

@@ -1,4 +1,4 @@
-"""Stored arrays that anybody may have written: read whole, or refused with the reason."""
+"""Stored arrays from untrusted sources: read whole, or refused with the reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The fast objective against the oracle, `StepProblem`, and the springs' own Hessian."""
+"""The fast objective against the reference, `StepProblem`, and the springs' own Hessian."""
 
 from __future__ import annotations
 

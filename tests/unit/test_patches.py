@@ -1,4 +1,4 @@
-"""Whether nothing is near on a way, told by patches and by boxes, against brute force over fast motions."""
+"""Whether nothing is near on a path, by patches and by boxes, against brute force over fast motions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Times hold what they are said to hold: each is set between what was done within it and what went on around it.
+"""Times contain what they are said to contain: each is set between what was done within it and what went on around it.
 
 A scripted solver sleeps and takes its own stamps, of the clock that the harness reads. An interval that encloses
 another one is longer, on a machine of any speed; sums of them are not compared to a share.

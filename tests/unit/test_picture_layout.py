@@ -31,7 +31,7 @@ def test_frames_of_any_shape_fill_the_page_and_do_not_meet(shape: float) -> None
     for a, b in combinations(boxes, 2):
         assert a.left + a.width <= b.left or b.left + b.width <= a.left or a.top + a.height <= b.top
     # What is seen of a scene: the largest rectangle of its shape that fits into its place. Of the page's height and
-    # the width of one column beside it, squares had a fourth, and what lies flat less.
+    # the width of one column next to it, squares had a fourth, and what lies flat less.
     seen = sum(min(box.width, box.height * shape) * min(box.height, box.width / shape) for box in boxes)
     assert seen > 0.38 * 1528 * 750
 

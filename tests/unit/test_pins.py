@@ -18,7 +18,7 @@ CONVERGED = StopRule(3000, 1e-13)
 
 
 def pinned(problem: StepProblem, vertices: list[int], weight: float, seed: int = 0) -> StepProblem:
-    """The problem with these pins, their targets beside the rest positions."""
+    """The problem with these pins, their targets away from the rest positions."""
     pins = DirichletPins(np.array(vertices, np.int64), np.full(len(vertices), weight))
     targets = problem.current_positions[vertices] + 0.1 * np.random.default_rng(seed).normal(size=(len(vertices), 3))
     return replace(problem, system=replace(problem.system, pins=pins), pin_targets=targets)

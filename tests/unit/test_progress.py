@@ -1,4 +1,4 @@
-"""The time left is told once it is known, and never from what was compiled; something is printed while nothing ends."""
+"""The time left is shown once it is known, and never from what was compiled; something is printed meanwhile."""
 
 from __future__ import annotations
 

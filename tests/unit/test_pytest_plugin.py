@@ -50,7 +50,7 @@ def session(folder: Path, test: str, *options: str) -> tuple[int, str, list[dict
         "no:cacheprovider",
     ]
     command = [sys.executable, "-m", "pytest", "-q", *plugin, f"--benchmark-json={stored}", *options]
-    # Beside other workers of one session pytest-benchmark times nothing; this session is one of its own.
+    # Next to other workers of one session pytest-benchmark times nothing; this session is one of its own.
     alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_XDIST")}
     completed = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=alone)
     found = json.loads(stored.read_text())["benchmarks"] if stored.exists() and stored.stat().st_size else []

@@ -43,7 +43,7 @@ from tests.unit.test_xpbd import Other
 EXACT = PinsEffect.model_validate({"indices": [14, 33], "weight": "exact"})
 SCENES: dict[str, Callable[[], Scene]] = {
     "bending": lambda: build_effect_cloth(BENDING_EFFECT),
-    "bending beside exact pins": lambda: build_effect_cloth(BENDING_EFFECT, EXACT),
+    "bending with exact pins": lambda: build_effect_cloth(BENDING_EFFECT, EXACT),
     "drag": lambda: build_effect_cloth(AIR_DRAG_EFFECT),
     "attachments that move": lambda: build_effect_cloth(ATTACHMENT_EFFECT),
     "all of them": lambda: build_effect_cloth(BENDING_EFFECT, AIR_DRAG_EFFECT, ATTACHMENT_EFFECT, EXACT),
@@ -139,7 +139,7 @@ def test_compiled_iterates_are_those_of_the_sparse_backend(name, linear):
     solver = CompiledLocalGlobal(linear)
     assert isinstance(solver.prepare(problem.system), PreparedCompiledLocalGlobal)
     wanted, found = (iterates(one, problem, 20)[-1] for one in (SparseLocalGlobal(), solver))
-    # Solves by pins of 1e10 N/m beside some hundred: so many of sixteen digits are lost at worst.
+    # Solves with pins of 1e10 N/m among some hundred: so many of sixteen digits are lost at worst.
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
 
 

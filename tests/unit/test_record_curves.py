@@ -10,7 +10,7 @@ from springbench.harness.recording import curve_drawing
 
 
 class Logged:
-    """A stream that keeps what is logged."""
+    """A stream that records what is logged."""
 
     def __init__(self) -> None:
         self.held: dict[str, Any] = {}

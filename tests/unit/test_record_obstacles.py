@@ -1,4 +1,4 @@
-"""Obstacles in recordings: seen where contact keeps vertices out, in each frame, and absent where there are none."""
+"""Obstacles in recordings: seen at the distance of contact, in each frame, and absent where there are none."""
 
 from __future__ import annotations
 

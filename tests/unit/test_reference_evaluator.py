@@ -1,4 +1,4 @@
-"""The oracle of stationarity: round-off is told vertex by vertex, and no part of a scene hides another."""
+"""The reference evaluator of stationarity: round-off is bounded per vertex, and no part of a scene hides another."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def case(name: str) -> tuple[Scene, StepProblem]:
 
 
 def solved(stated: StepProblem) -> Positions:
-    """Where Newton's method leads, and then Newton's steps by the oracle, to round-off."""
+    """Where Newton's method leads, and then Newton's steps by the reference, to round-off."""
     return refine_minimum(stated, stated.current_positions, NewtonSolver()).positions.copy()
 
 

@@ -186,7 +186,7 @@ def test_a_run_has_exact_counts_and_each_revision_its_own_file(repository: Path)
             fixed.append(worker.prepare_work("prepare_run", **given))
             assert worker.time_calls(2, "cpu") > 0
     assert [(h.num_frames, h.clock, h.answer.shape) for h in fixed] == [(2, "cpu", (16, 3))] * 2
-    assert fixed[0].stats == fixed[1].stats  # what is planted is beside the run's own work
+    assert fixed[0].stats == fixed[1].stats  # what is planted is in addition to the run's own work
     assert fixed[0].stats["iterations"] == 40
     assert fixed[0].stats["nnz_factor"] > 16
     assert abs(fixed[0].answer - fixed[1].answer).max() > 1e-6

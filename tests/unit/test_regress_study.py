@@ -98,7 +98,7 @@ def test_blocks_are_recorded_and_replayed(tmp_path: Path, monkeypatch: pytest.Mo
         "--injected-slowdown",
         "0.1",
     ]
-    for starts in ("2", "1"):  # what is stored already is kept
+    for starts in ("2", "1"):  # what is stored already remains
         done = CliRunner().invoke(app, [*given, "--process-pairs", starts])
         assert done.exit_code == 0, done.output
     recorded = parquet_rows.read_rows([samples], RECORD_SCHEMA).to_pylist()

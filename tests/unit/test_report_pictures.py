@@ -239,7 +239,7 @@ def test_the_view_is_from_the_side_where_most_surface_shows() -> None:
             a, e = np.radians([corner, elevation])
             towards = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
             shown[corner] = np.abs(areas @ towards).sum()
-        # The usual corner is kept unless another shows more than a twentieth more.
+        # The usual corner is chosen unless another shows more than a twentieth more.
         assert shown[azimuth] >= max(shown.values()) / 1.05
         chosen.append(abs(azimuth) < 90)
     assert sorted(chosen) == [False, True], "mirrored scenes are seen from opposite sides"

@@ -1,4 +1,4 @@
-"""Merging results: nothing is lost, nothing is doubled, and what should be equal and is not is told."""
+"""Merging results: nothing is lost, nothing is doubled, and what should be equal and is not is reported."""
 
 from pathlib import Path
 from typing import Any

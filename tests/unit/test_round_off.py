@@ -1,4 +1,4 @@
-"""The bound on a gradient's round-off: it holds against exact arithmetic, and knows nothing of what is elsewhere."""
+"""The bound on a gradient's round-off: it is valid in exact arithmetic, and independent of what is elsewhere."""
 
 from __future__ import annotations
 

@@ -371,7 +371,7 @@ def test_a_steps_matrix_has_all_blocks_while_contacts_come_and_go(keep):
         x = hessian.solve(b)
         product = (system.inertia_diagonal[:, None] + shift) * x
         contact.hessian_blocks(q, keep).add_product(x, product)
-        # Blocks of up to 1e7 N/m beside 1e6.
+        # Blocks of up to 1e7 N/m and of 1e6.
         np.testing.assert_allclose(product, b, atol=1e-12)
         matrices.add(id(hessian.assemble_clamped()))
         met.add(len(contact.hessian_blocks(q).vertices))

@@ -46,7 +46,7 @@ STATE = MotionState(NOW, BEFORE, 7)
 
 @dataclass
 class Pushed:
-    """A prepared solver that moves every vertex by one, and keeps what it was asked."""
+    """A prepared solver that moves every vertex by one, and records its arguments."""
 
     asked: list[tuple[StepProblem, StopRule]] = field(default_factory=list)
     stats: dict[str, float] = field(default_factory=dict)

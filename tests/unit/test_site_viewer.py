@@ -1,4 +1,4 @@
-"""Recordings replayed in a page: the viewer's version, what its scripts hold, and both in a real browser."""
+"""Recordings replayed in a page: the viewer's version, the content of its scripts, and both in a real browser."""
 
 from __future__ import annotations
 

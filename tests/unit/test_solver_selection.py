@@ -1,4 +1,4 @@
-"""The choice of a linear solver: by size and by exact counts, forced where asked, refused with the numbers."""
+"""The choice of a linear solver: by size and by exact counts, forced on request, refused with the numbers."""
 
 from __future__ import annotations
 

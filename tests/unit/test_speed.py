@@ -43,13 +43,13 @@ ROUNDS = 3
 
 
 def run(solver: str, **parameters: Any) -> RunSpec:
-    """A run of the scene `yardstick-cloth` under another solver's name."""
+    """A run of the report's cloth under another solver's name."""
     (made,) = load_config(SCENE, solvers=["sparse"], sizes=[4], rounds=ROUNDS, threads=1, max_iterations=50).list_runs()
     return made.replace_options(solver=SolverSpec(solver, parameters))
 
 
 class Scripted:
-    """A candidate that writes down when it is called, and does what it is told."""
+    """A candidate that records when it is called, and behaves as specified."""
 
     def __init__(self, solver: str, calls: list[str], *, at: float = 0.0, fails: Exception | None = None) -> None:
         self.run, self.calls, self.at, self.fails = run(solver), calls, at, fails
@@ -128,8 +128,8 @@ def test_less_precision_moves_nothing_that_has_converged(precision):
     problem = build_first_problem(build_cloth(8))
     rest = find_converged_problem(problem)
     assert rest is not None
-    assert np.abs(problem.gradient(rest.problem.initial_guess)).max() < 1e-6  # beside 9.81 N of weight
-    # What was asked of the method; rounding leaves 1e-13.
+    assert np.abs(problem.gradient(rest.problem.initial_guess)).max() < 1e-6  # in addition to 9.81 N of weight
+    # The tolerance of the method; rounding leaves 1e-13.
     assert compute_precision_error(rest, CompiledLocalGlobal("supernodal", precision).prepare(problem.system)) <= 1e-9
 
 
@@ -174,7 +174,7 @@ def test_the_probes_do_what_they_count():
     assert [p.name for p in found] == ["read", "triad"] * 2 + ["fma float64", "fma float32"]
     assert all(p.bytes_moved % p.working_set_bytes == 0 for p in found if p.name == "read")
     total = found[0].call()
-    # The array holds ones: every entry that was counted was read.
+    # The array contains ones: every entry that was counted was read.
     assert 8 * total == found[0].bytes_moved
     b, c, a = np.full(8, 2.0), np.full(8, 5.0), np.empty(8)
     stream_probes._triad(a, b, c, 1, 1)

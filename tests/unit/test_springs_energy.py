@@ -15,7 +15,7 @@ seeds = st.integers(0, 2**32 - 1)
 STEP = 1e-6
 """Of central differences: they are wrong by about STEP^2 and by round-off / STEP, 1e-10 of the terms both."""
 DIFFERENCE = 1e-6
-"""What is asked of them: shortest springs are about 0.1 long, which multiplies the error by up to 1e3."""
+"""Their tolerance: shortest springs are about 0.1 long, which multiplies the error by up to 1e3."""
 ROUND_OFF = 1e-12
 """A few hundred additions."""
 

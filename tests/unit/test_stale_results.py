@@ -1,4 +1,4 @@
-"""Rows of other code are never shown as today's without a word, and can be made anew."""
+"""Rows of other code are never shown as today's without a note, and can be repeated."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_a_run_depends_on_its_own_solver_and_effects_and_on_no_others(tmp_path: 
     }
     assert reached & others <= {
         str(Path(device_interface.__file__).resolve())
-    }  # which all ask whether a solver is on one
+    }  # which all query whether a solver is on one
     assert not names & {
         "effects/wind_effect.py",
         "effects/gas_effect.py",

@@ -1,4 +1,4 @@
-"""Frozen step problems: what is saved comes back to the last bit, and is taken anew where the scene has changed."""
+"""Frozen step problems: what is saved comes back to the last bit, and is taken again where the scene has changed."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def changed(**values) -> SceneSpec:
 
 
 class Refuses(NewtonSolver):
-    """A solver that must not be asked."""
+    """A solver that must not be called."""
 
     def prepare(self, system: System):
         raise AssertionError("what was found once is found again")
@@ -193,7 +193,7 @@ def test_a_problem_that_the_same_scene_states_differently_now_is_prepared_again(
     before = store.load_frames(SPEC, SIZE, [4])[4]
     monkeypatch.setitem(
         SPEC.__dict__, "effects", (SpringsEffect(stretch=120.0), *SPEC.effects[1:])
-    )  # the digest is kept
+    )  # the digest is unchanged
     after = store.load_frames(SPEC, SIZE, [4])[4]
     assert after.digest != before.digest
     fresh = ReferenceStore(tmp_path / "fresh").load_frames(SPEC, SIZE, [4])[4]

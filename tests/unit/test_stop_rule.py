@@ -88,7 +88,7 @@ def test_the_limit_ends_a_solve_that_the_tolerance_does_not(backend):
 @backends
 @pytest.mark.parametrize("offset", [0.0, 1e3], ids="{:g} m from the origin".format)
 def test_a_scene_at_rest_stops_after_one_iteration(backend, offset):
-    """Its residual is round-off, of which no fraction would ever be reached; the floor knows its size."""
+    """Its residual is round-off, of which no fraction would ever be reached; the floor is its size."""
     problem = without_motion(build_first_problem(build_cloth(12)))
     away = {
         name: getattr(problem, name) + offset
@@ -211,7 +211,7 @@ def test_another_component_does_not_change_where_the_first_one_stops(method, awa
 
 @pytest.mark.parametrize("away", [3.2e7, 1e6])
 def test_a_tolerance_far_from_the_origin_ends_where_round_off_does(away: float):
-    """Beside the same motion at the origin: as near as steps without a tolerance come, and not at a bound of sums."""
+    """Against the same motion at the origin: as near as steps without a tolerance come, and not at a bound of sums."""
     corners = PinsEffect.model_validate({"parts": ["corners"], "weight": "exact"})
     here = build_test_scene(NetMesh(), SpringsEffect(stretch=300.0), GravityEffect(), corners, size=8)
     shift = np.array([away, 0.0, 0.0])

@@ -19,7 +19,7 @@ from springbench.solvers.model.system_matrix_assembly import diagonal_matrix, dr
 
 
 def network(springs, stiffness, fixed):
-    """A'KA + diag(held) [N/m]."""
+    """A'KA + diag(anchors) [N/m]."""
     A = signed_incidence_matrix_sparse(np.asarray(springs, np.int64).reshape(-1, 2), len(fixed))
     return drop_zeros(
         A.T @ diagonal_matrix(np.asarray(stiffness, float)) @ A + diagonal_matrix(np.asarray(fixed, float))
@@ -27,7 +27,7 @@ def network(springs, stiffness, fixed):
 
 
 def sheet(n, stiffness=1e5):
-    """A grid of n x n vertices of mass 1/n^2 at dt = 1/30, sides and both diagonals, two corners held by 1e10."""
+    """A grid of n x n vertices of mass 1/n^2 at dt = 1/30, sides and both diagonals, two corners pinned by 1e10."""
     index = np.arange(n * n).reshape(n, n)
     ends = [
         (index[:, :-1], index[:, 1:]),
@@ -125,7 +125,7 @@ def test_a_correction_by_a_half_precision_factor_overshoots_by_next_to_nothing()
         factor.solve(Q @ v, out)
         growth = np.linalg.norm(out) / np.linalg.norm(v)
         v = out / np.linalg.norm(out)
-    # 1.0001 measured here and 1.0002 at 256 x 256; 1.007 where the sums of columns are not kept
+    # 1.0001 measured here and 1.0002 at 256 x 256; 1.007 where the sums of columns are not preserved
     assert growth <= 1.001
 
 

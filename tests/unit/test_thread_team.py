@@ -1,4 +1,4 @@
-"""Threads that share tasks: each is done once a phase, phases come one after the other, and nobody is waited for."""
+"""Threads that share tasks: each is done once a phase, phases come one after the other, and no thread is waited for."""
 
 from __future__ import annotations
 

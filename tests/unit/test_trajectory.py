@@ -148,7 +148,7 @@ def test_the_assignments_scenes_have_the_known_errors_of_time_stepping(name):
         *_, last = simulate_scene(
             run, prepare(run, NewtonSolver()), StopRule(100, 1e-12), initial_guess="previous", frames=30
         )
-        # All three digits that are told.
+        # All three digits that are stated.
         assert truth.measure_error(0, last.positions) == pytest.approx(wanted, rel=0.025)
 
 

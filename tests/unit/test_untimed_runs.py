@@ -26,7 +26,7 @@ effects: [{kind: springs, stretch: 10}, {kind: gravity}, {kind: self-contact}]
 
 
 def executed(folder: Path, timing: str) -> tuple[list[dict[str, Any]], list[str]]:
-    """The rows of a run, and the passes that it told of."""
+    """The rows of a run, and the passes that it reported."""
     (folder / "scene.yaml").write_text(SCENE)
     options: dict[str, Any] = {"solvers": ["newton"], "timing": timing, "record": False, "rtol": 1e-3}
     (spec,) = load_config(folder / "scene.yaml", **options).list_runs()

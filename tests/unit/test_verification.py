@@ -1,4 +1,4 @@
-"""The judge: what is stationary, what is a minimum, how far a motion is from the reference; and failures kept."""
+"""The verifier: what is stationary, what is a minimum, how far a motion is from the reference; and failures."""
 
 from __future__ import annotations
 

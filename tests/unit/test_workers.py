@@ -1,4 +1,4 @@
-"""A worker may crash, hang, swell or leave: it is told how, and the next piece is done as if nothing had been."""
+"""A worker may crash, hang, swell or leave: the reason is reported, and the next task is done as usual."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ def test_pins_that_move_do_so_evenly_in_small_steps():
     solution = XpbdSmallSteps().prepare(made.system).solve(problem, StopRule(4))
     assert solution.velocity is not None
     np.testing.assert_array_equal(solution.positions[0], goal[0])
-    # The penalty gives way by 1e-12 of what inertia asks for, some hundred times that in the last of the substeps.
+    # The penalty yields by 1e-12 of what inertia requires, some hundred times that in the last of the substeps.
     np.testing.assert_allclose(solution.positions[1], goal[1], rtol=0, atol=1e-9)
     np.testing.assert_allclose(solution.velocity, (goal - rest) / made.system.time_step, rtol=1e-7)
 
