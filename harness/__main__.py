@@ -1,4 +1,7 @@
-"""Console script: prepares the process, then imports and runs the command line."""
+"""Console script: prepares the process, then imports and runs the command line.
+
+The handler of Ctrl-C is installed before anything else is imported.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,15 @@ import os
 import sys
 from io import TextIOWrapper
 
-from springbench.harness.console import show_activity
-from springbench.harness.execution import interrupts, pandas_deferral
+from springbench.harness.execution import interrupts
 
 
 def main() -> None:
     """Run the command that the arguments name."""
     interrupts.install_handler()
     try:
+        from springbench.harness.console import show_activity
+
         _prepare_environment()
         if len(sys.argv) > 1:
             show_activity("loading")
@@ -34,6 +38,8 @@ def _prepare_environment() -> None:
 
     Exit with code 2 for an invalid one.
     """
+    from springbench.harness.execution import pandas_deferral
+
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # what a terminal cannot write is written as an escape sequence
             stream.reconfigure(errors="backslashreplace")

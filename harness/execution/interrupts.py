@@ -10,7 +10,6 @@ This applies from the first import to the last picture.
 from __future__ import annotations
 
 import atexit
-import logging
 import os
 import signal
 import sys
@@ -103,7 +102,8 @@ def _handle_interrupt(number: int, frame: FrameType | None) -> None:
             return
         frame = frame.f_back
     _deferrals, _interrupted = 0, True
-    logging.disable()  # what threads of libraries log of the workers that they lose
+    if logging := sys.modules.get("logging"):
+        logging.disable()  # what threads of libraries log of the workers that they lose
     _kill_workers()
     raise KeyboardInterrupt
 

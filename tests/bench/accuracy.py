@@ -207,8 +207,8 @@ def trajectory_gates(name: str, error: float, best: TimeStepping, **limits: floa
         )
 
 
-CLOTH, CURTAIN = scene("baseline-cloth"), scene("liu2013")
-SOFT = scene("baseline-cloth", mass=4096.0)
+CLOTH, CURTAIN = scene("yardstick-cloth"), scene("liu2013")
+SOFT = scene("yardstick-cloth", mass=4096.0)
 
 # Figures of these cloths that are known from elsewhere (after 50 iterations a gap of .77 from the current positions, of
 # .013 from the inertial target) are those of their eleventh step.

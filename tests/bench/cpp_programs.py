@@ -2,7 +2,7 @@
 
     python -m tests.bench.cpp_programs [--sizes 10 32 64 128] [--rounds 15] [--publish results/published/cpp-programs]
 
-Fifty iterations of the first step of `configs/scenes/baseline-cloth.yaml` by each, interleaved in one process on one
+Fifty iterations of the first step of `configs/scenes/yardstick-cloth.yaml` by each, interleaved in one process on one
 thread. `eigen` is the assignment's program, with Eigen's SimplicialLLT; `cholmod` is a careful one, with CHOLMOD's
 factor. Both need a C++ compiler and their libraries (Debian: libeigen3-dev, libsuitesparse-dev). `springbench roofline
 configs/speed.yaml` compares larger meshes and the limits of the machine, by wall time on an idle machine.
@@ -28,7 +28,7 @@ from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 
 from tests.bench.scripted_study import describe_moment, publish_rows
 
-SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "baseline-cloth.yaml"
+SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "yardstick-cloth.yaml"
 PROGRAMS: dict[str, Solver] = {
     **{f"numba {one}": load_target(SOLVERS["numba"])(precision=one) for one in ("float64", "float32", "float16")},
     **{name: load_target(OPTIONAL_SOLVERS[name])() for name in ("eigen", "cholmod")},

@@ -49,8 +49,8 @@ CLOTHS = {
     "cloth, 100 N/m, 24": ("hessians/cloth-100-pressed-0.yaml", 24),
     "cloth, 10,000 N/m, 24": ("hessians/cloth-1e4-pressed-0.yaml", 24),
     "cloth, 10,000 N/m, 64": ("hessians/cloth-1e4-pressed-0.yaml", 64),
-    "cloth, 100,000 N/m, 32": ("scenes/baseline-cloth.yaml", 32),
-    "cloth, 100,000 N/m, 64": ("scenes/baseline-cloth.yaml", 64),
+    "cloth, 100,000 N/m, 32": ("scenes/yardstick-cloth.yaml", 32),
+    "cloth, 100,000 N/m, 64": ("scenes/yardstick-cloth.yaml", 64),
 }
 CUBES = {"cube, 1 MPa, 11": (11, 1e6), "cube, 100 MPa, 11": (11, 1e8), "cube, 100 MPa, 16": (16, 1e8)}
 LEVELS = (1e-2, 1e-3, 1e-6)
