@@ -10,6 +10,7 @@ the interval is the gates' (see README.md). What saves less than 15 % has no pla
 from __future__ import annotations
 
 import argparse
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -17,7 +18,7 @@ from math import ceil
 from os import getloadavg
 from pathlib import Path
 from time import thread_time
-from types import FunctionType, ModuleType
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -119,6 +120,7 @@ def given(
         calls.append(arguments)
         return kernel(*arguments)
 
+    noted.overloads = defaultdict(lambda: SimpleNamespace(entry_point=noted))  # pyright: ignore[reportFunctionMemberAccess]
     setattr(module, name, noted)
     try:
         work()
@@ -128,10 +130,10 @@ def given(
 
 
 def solving(solver: str) -> Callable[[], object]:
-    """A solver's first step of the sheet of 64 x 64 vertices."""
+    """A solver's preparation and first step of the sheet of 64 x 64 vertices."""
     scene = sheet(SIZE)
-    stated, prepared = build_problem(scene, build_initial_state(scene), "previous"), prepare(solver, scene)
-    return lambda: prepared.solve(stated, STOP)
+    stated = build_problem(scene, build_initial_state(scene), "previous")
+    return lambda: prepare(solver, scene).solve(stated, STOP)
 
 
 def of_springs() -> Iterator[Case]:
@@ -174,7 +176,7 @@ def of_descent() -> Iterator[Case]:
 
 def of_dots() -> Iterator[Case]:
     """Over the vectors of L-BFGS."""
-    _, _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
+    _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
     both = {"ordered_dot": plain.dot, "ordered_dot_pair": plain.dots}
     yield Case("a step of L-BFGS", accelerated_descent.accept_trial, (window, window.correction.copy()), both, ())
 
@@ -196,8 +198,11 @@ def of_supernodal() -> Iterator[Case]:
     Q, b = system()
     panel = {"add_panel_product": plain.add_forward, "set_transposed_product": plain.set_backward}
     for precision in ("float64", "float32"):
-        factor = SupernodalCholesky(Q, precision=precision)
-        solve = given(supernodal_cholesky, "solve_from_arrays", lambda factor=factor: factor.solve(b, np.empty_like(b)))
+
+        def solve_system(precision: Any = precision) -> None:
+            SupernodalCholesky(Q, precision=precision).solve(b, np.empty_like(b))
+
+        solve = given(supernodal_cholesky, "solve_from_arrays", solve_system)
         yield Case(f"solve, {precision}", triangular_solve.solve_from_arrays, solve, panel, (10,))
 
 

@@ -225,7 +225,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
     process.send_signal(signal.SIGINT)
     _, completed = process.communicate()
     assert process.returncode == 130, completed
-    assert "the same command goes on from there" in completed
+    assert "the same command resumes from there" in completed
     assert "Traceback" not in completed
     sweep.finish()
     undisturbed = Sweep.write(tmp_path / "undisturbed", "sparse, numba", pictures=False)

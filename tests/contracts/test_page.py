@@ -170,7 +170,7 @@ def test_the_table_sorts_filters_and_says_so_in_the_url(tab: Tab, page: str):
     assert tab.view() == "#runs?sort=step"
     first = shown.locator(".body .tr").first
     assert "xpbd" in first.inner_text(), "the fastest of the smallest size"
-    assert "doi:" in first.locator(".who").get_attribute("title"), "where the solver comes from, on pointing at it"
+    assert "doi:" in first.locator("span.solver").get_attribute("title"), "the source of the solver, on pointing at it"
     shown.get_by_label("Status").select_option("unsupported")
     assert tab.rows() == sum(is_failing_run(k) for k in range(COUNT))
     shown.get_by_label("Status").select_option("ok")

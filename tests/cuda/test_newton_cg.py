@@ -74,12 +74,12 @@ def test_it_ends_where_the_processor_does() -> None:
         (
             lambda: build_first_problem(build_cloth(3, "exact")),
             "cholesky",
-            "knows preconditioner: schwarz, not cholesky",
+            "supports preconditioner: schwarz, not cholesky",
         ),
         (
             lambda: build_first_problem(build_cloth(3, "exact")),
             "block-jacobi",
-            "knows preconditioner: schwarz, not block-jacobi",
+            "supports preconditioner: schwarz, not block-jacobi",
         ),
     ],
     ids=["strain limits", "contact", "gas", "factor", "block-jacobi"],

@@ -76,12 +76,11 @@ def write_images(
         WriteError: if a file cannot be written.
     """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    paths: list[Path] = []
-    for kind in options.formats:
-        paths.append(stem.with_name(f"{stem.name}.{kind}"))
-        with matplotlib.rc_context(FIGURE_RC), atomic_write(paths[-1]) as partial:
+    paths = {kind: stem.with_name(f"{stem.name}.{kind}") for kind in options.formats}
+    for kind in sorted(paths, key="png".__eq__):  # the PNG last: its digest states that all formats are up to date
+        with matplotlib.rc_context(FIGURE_RC), atomic_write(paths[kind]) as partial:
             figure.savefig(partial, format=kind, dpi=dpi, metadata=_build_metadata(kind, title, about, sources))
-    return paths
+    return list(paths.values())
 
 
 def _build_metadata(kind: str, title: str, about: str, sources: str) -> dict[str, Any]:
