@@ -73,7 +73,7 @@ def test_a_barrier_retains_its_default_stiffness_at_other_time_steps(drop: Path)
 def test_the_horizon_is_the_longest_time_at_which_an_error_can_be_measured(
     drop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reference_store, "MAX_SECONDS", 2.0)
+    monkeypatch.setattr(reference_store, "MAX_SECONDS", 20.0)
     spec, store = load_scene(drop), ReferenceStore(tmp_path / "references")
     found, reason = store.load_contact_horizon(spec, 3, 0.2, error=0.5)
     assert 0.0 < found.times[-1] <= 0.2
