@@ -76,7 +76,7 @@ def compile_missing_kernels(solvers: Iterable[str], print_message: Callable[[str
     missing = [signature for signature in table.select_kernels(known) if is_missing(signature)]
 
     def create_task(number: int) -> PoolTask:
-        return PoolTask(partial(_compile_kernel, missing[number]), lambda event: None, TaskLimits())
+        return PoolTask(partial(_compile_kernel, missing[number]), _ignore_progress, TaskLimits())
 
     print_message(f"compiling {len(missing)} kernels on {num_processes} cores (once)")
     report = ThrottledMessages(print_message, show_activity)
@@ -87,6 +87,10 @@ def compile_missing_kernels(solvers: Iterable[str], print_message: Callable[[str
 def list_kernels(solver: str) -> list[KernelSignature]:
     """Return the kernels that a solver calls."""
     return _SignatureTable.from_file().select_kernels([solver])
+
+
+def _ignore_progress(event: object) -> None:
+    pass
 
 
 def _compile_kernel(signature: KernelSignature, tick: ProgressCallback) -> None:
