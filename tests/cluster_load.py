@@ -6,7 +6,7 @@
 Three processes: the client, which is the command as it is; Dask's scheduler; and all workers, as coroutines. A run's
 own process is left out, with what it measures: in its place stands `Dummy`, which writes rows as a run does. All else
 is the real code. Workers do not see the client's folder, so rows travel by the scheduler; what each stores on its own
-disk is in memory, for a thousand machines have as many disks. It ends after so many seconds where it is then, and
+disk is in memory, for a thousand machines have as many disks. After the given seconds it ends where it is, and
 goes on from there when it is given the same folder again.
 """
 
@@ -166,7 +166,7 @@ class TimeIsUp(Exception):
 
 
 class ProgressCounter(SilentDisplay):
-    """Prints how far it is at each tenth, and raises Over after so many seconds."""
+    """Print the progress at each tenth, and raise Over after the given seconds."""
 
     def __init__(self, runs: int, seconds: float) -> None:
         super().__init__()

@@ -263,9 +263,8 @@ def execute_on_cluster(
         WriteError: no worker can write any more.
         RunFailed: the connection to the scheduler is lost.
     """
-    token = (
-        folder / "rows" / f".{uuid4().hex}.partial"
-    )  # a worker that sees it shares the folder; it is removed as such files are
+    # A worker that sees this file shares the folder. It is removed as partial files are.
+    token = folder / "rows" / f".{uuid4().hex}.partial"
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
     threads, last_query_time = dict[str, int](), 0.0
     going: dict[Future, tuple[int, RunUnit]] = {}

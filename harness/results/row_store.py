@@ -79,7 +79,7 @@ def list_packed_units(folder: Path) -> frozenset[str]:
 
 @lru_cache(maxsize=16)
 def _read_packed_units(path: Path, *state: int) -> frozenset[str]:
-    import pyarrow as pa  # imported where it is used
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:

@@ -60,7 +60,7 @@ class CoarseLevel:
 
 def build_interpolation(sources: Positions, targets: Positions) -> csr_array:
     """Build the interpolation weights (targets, sources) between rest positions, each (n, 3) [m]."""
-    from scipy.spatial import cKDTree  # imported where it is used
+    from scipy.spatial import cKDTree
 
     tree: Any = cKDTree(sources)
     found = tree.query(targets, k=min(_NUM_NEIGHBOURS, len(sources)))

@@ -270,7 +270,7 @@ class IterativeSolver(ABC):
         if self.identifies_saddles or self.residual_iterate == "none" or system.length_constraints:
             return None
         if not self._saddle_checks or self._saddle_checks[0].system is not system:
-            from springbench.solvers.iteration.saddle_check import SaddleCheck  # imported where it is used
+            from springbench.solvers.iteration.saddle_check import SaddleCheck
             from springbench.solvers.objective.fixed_objective import FixedObjective
 
             self._saddle_checks[:] = [SaddleCheck(FixedObjective(system))]

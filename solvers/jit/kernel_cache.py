@@ -102,7 +102,7 @@ class KernelCache(_NUMBA_CACHE):
         path = self._entry_path(key)
         try:
             there, compiled = pickle.loads(path.read_bytes())
-        except Exception:  # nothing is there, or what is there cannot be read: it is compiled and written again
+        except Exception:  # absent or unreadable: the code is compiled and written again
             return None
         with suppress(OSError):
             os.utime(path.parent)

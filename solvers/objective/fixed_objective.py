@@ -94,7 +94,7 @@ class FixedObjective:
 
     def _classify_energies(self, energies: dict[int, Energy]) -> None:
         """Classify the energies that are not springs."""
-        from springbench.solvers.model.energies.quadratic_energy import Quadratic  # imported where it is used
+        from springbench.solvers.model.energies.quadratic_energy import Quadratic
 
         quadratic = {k: e for k, e in energies.items() if isinstance(e, Quadratic)}
         if quadratic:

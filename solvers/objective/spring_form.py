@@ -123,7 +123,7 @@ class SpringForm:
 
 def is_packed_edge(energy: Any) -> bool:
     """Return whether an energy has the law of strain limits or dashpots, which packets of springs evaluate."""
-    from springbench.solvers.model.energies.dashpot_energy import Dashpots  # imported where it is used
+    from springbench.solvers.model.energies.dashpot_energy import Dashpots
     from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
 
     return isinstance(energy, (StrainLimits, Dashpots)) and energy.element_law in (
@@ -140,7 +140,7 @@ def decompose_energies(system: System) -> SpringForm:
     if not others:
         return SpringForm(springs, springs, springs, springs, np.zeros(n))
     from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
-    from springbench.solvers.model.energies.dashpot_energy import Dashpots  # imported where it is used
+    from springbench.solvers.model.energies.dashpot_energy import Dashpots
     from springbench.solvers.model.energies.quadratic_energy import Quadratic
     from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
 

@@ -145,7 +145,7 @@ def step_gates(
             candidate=candidate,
             baseline=lambda backend=backend: baseline(backend),
             limit=limit,
-            why=f"a target: the hybrid to {error:g} beside {iterations or 'as good'} iterations of {backend}",
+            why=f"a target: hybrid to {error:g} against {iterations or 'equally accurate'} iterations of {backend}",
             **_GOAL,
         )
 

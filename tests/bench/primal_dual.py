@@ -2,12 +2,12 @@
 
     python -m tests.bench.primal_dual [--publish results/published/primal-dual]
 
-A chain of 17 vertices that hangs straight, its first step: every second spring of 1,000 N/m is so many times as stiff,
-or the last vertex of a chain of 100,000 N/m is so many times as heavy. Primal methods change positions vertex by
-vertex: `vbd`, by Gauss and Seidel, with and without its acceleration, and Jacobi's (`jgs2`, `neighbour_rings: 0`). Dual
-ones change the tensions of springs: `xpbd`, by Gauss and Seidel. A cell is how many iterations it takes until every
-vertex is within a thousandth of the step's displacement of where it ends; a dash: not within 100,000. The line stays
-straight, so what XPBD tends to is the minimum.
+A chain of 17 vertices that hangs straight, its first step: a ratio multiplies the stiffness of every second spring of
+1,000 N/m, or the last mass of a chain of 100,000 N/m. Primal methods change positions vertex by vertex: `vbd`, by Gauss
+and Seidel, with and without its acceleration, and Jacobi's (`jgs2`, `neighbour_rings: 0`). Dual ones change the
+tensions of springs: `xpbd`, by Gauss and Seidel. A cell is how many iterations it takes until every vertex is within a
+thousandth of the step's displacement of where it ends; a dash: not within 100,000. The line stays straight, so what
+XPBD tends to is the minimum.
 """
 
 from __future__ import annotations

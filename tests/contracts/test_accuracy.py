@@ -132,7 +132,7 @@ class Crashing(Broken):
 def test_a_solver_that_crashes_is_a_row_and_the_others_are_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The first that runs anything in this process: its workers are forks, and not started anew.
+    # The first that runs anything in this process: its workers are forks, which import nothing again.
     monkeypatch.setitem(SOLVERS, "crashing", f"{__name__}:Crashing")
     config = CONFIG.partition("work:")[0].replace("[sparse,", "[crashing,").replace("[early, peak]", "early")
     made = Home(tmp_path, config)

@@ -47,7 +47,7 @@ def chain(size: int, mesh: ChainMesh | None = None, *others: Any, **settings: An
 
 
 def heavier(stated: StepProblem, times: float) -> StepProblem:
-    """The same chain with a last vertex that is so many times as heavy."""
+    """The same chain whose last mass is multiplied by the ratio."""
     mass = stated.system.mass.copy()
     mass[-1] *= times
     force = stated.external_force * (mass / stated.system.mass)[:, None]

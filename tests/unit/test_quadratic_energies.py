@@ -139,7 +139,7 @@ def test_compiled_iterates_are_those_of_the_sparse_backend(name, linear):
     solver = CompiledLocalGlobal(linear)
     assert isinstance(solver.prepare(problem.system), PreparedCompiledLocalGlobal)
     wanted, found = (iterates(one, problem, 20)[-1] for one in (SparseLocalGlobal(), solver))
-    # Solves with pins of 1e10 N/m among some hundred: so many of sixteen digits are lost at worst.
+    # Solves with pins of 1e10 N/m among some hundred lose as many of sixteen digits at worst.
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
 
 

@@ -22,7 +22,7 @@ from tests.scene_builders import CLOTH_SCENE_YAML
 
 
 def starts(biases: tuple[float, ...] = (1.0, 1.0, 1.0), noise: float = 0.02, turns: int = 500) -> list[RecordedBlocks]:
-    """Recorded starts of the same code, whose second process is so many times as slow, on a machine with bursts."""
+    """Recorded starts of the same code, whose second process is slower by the factor, on a machine with bursts."""
     found = []
     for seed, bias in enumerate(biases):
         rng = np.random.default_rng(seed)

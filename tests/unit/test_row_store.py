@@ -24,7 +24,7 @@ COUNT = 12
 
 @pytest.fixture
 def sweep(tmp_path: Path) -> Path:
-    """A sweep of so many runs: of two schemas, one with a column of a user."""
+    """A sweep with the given number of runs, of two schemas, one with a column of a user."""
     units = write_dummy_runs(tmp_path / "sweep", COUNT)
     older = pq.read_table(units[3]).drop_columns(["stationarity_audit", "formula_check"])
     pq.write_table(older, units[3])

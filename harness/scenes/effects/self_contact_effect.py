@@ -135,7 +135,7 @@ class SelfContactEffect(ConfigModel):
 
 def _find_close_pairs(p: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
     """Find pairs of vertices (k, 2) closer than `reach` [m]."""
-    from scipy.spatial import KDTree  # imported where it is used
+    from scipy.spatial import KDTree
 
     return KDTree(p).query_pairs(reach, output_type="ndarray").astype(np.int64)
 

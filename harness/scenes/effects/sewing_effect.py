@@ -75,7 +75,7 @@ def _match_rows(mesh: Mesh, first: IndexArray, second: IndexArray) -> IndexArray
 
     Each pair occurs once.
     """
-    from scipy.spatial import cKDTree  # imported where it is used
+    from scipy.spatial import cKDTree
 
     one = np.asarray(cKDTree(mesh.rest_positions[second]).query(mesh.rest_positions[first])[1], np.int64)
     other = np.asarray(cKDTree(mesh.rest_positions[first]).query(mesh.rest_positions[second])[1], np.int64)

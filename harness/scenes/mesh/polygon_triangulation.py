@@ -155,7 +155,7 @@ def find_face_covers(
     sizes = [k for k in sorted(polygons) if k >= 3 and len(polygons[k])]
     if len(sizes) < 2:
         return []
-    from scipy.sparse import csr_array  # imported where it is used
+    from scipy.sparse import csr_array
 
     def incidence(faces: IndexArray) -> csr_array:
         ends = np.arange(len(faces) + 1) * faces.shape[1]

@@ -57,9 +57,7 @@ class CompiledLocalGlobal:
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         if without_vertex_contact(system) is not system:
-            from springbench.solvers.methods.local_global.half_space_contact import (
-                prepare_with_half_spaces,  # imported where it is used
-            )
+            from springbench.solvers.methods.local_global.half_space_contact import prepare_with_half_spaces
 
             return prepare_with_half_spaces(self, system)
         if without_barriers(system) is not system:

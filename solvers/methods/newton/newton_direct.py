@@ -224,8 +224,6 @@ def make_friction_search(metric: ResidualMetric) -> FrictionGaussSeidel | None:
         is_barrier_energy(energy) for energy in energies
     ):
         return None  # its sweeps have no bounds
-    from springbench.solvers.methods.newton.friction_gauss_seidel import (
-        FrictionGaussSeidel,
-    )  # imported where it is used
+    from springbench.solvers.methods.newton.friction_gauss_seidel import FrictionGaussSeidel
 
     return FrictionGaussSeidel(metric)

@@ -115,7 +115,7 @@ def _build_interpreted_engine(
 def _add_vertex_contact(
     scheme: AccelerationScheme, objective: FixedObjective, base: PreparedLocalGlobal, engine: AccelerationEngine
 ) -> AccelerationEngine:
-    from springbench.solvers.methods.quasi_newton.quasi_newton_contact import ContactEngine  # imported where it is used
+    from springbench.solvers.methods.quasi_newton.quasi_newton_contact import ContactEngine
 
     return ContactEngine(scheme, objective, base, engine)
 

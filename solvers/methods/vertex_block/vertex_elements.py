@@ -72,9 +72,7 @@ class VertexElements:
         """Return these energies with vertices in rows `row` (n,) of `rows`."""
         if not self.energy_indices:
             return self
-        from springbench.solvers.methods.vertex_block.incident_elements import (
-            IncidentElements,
-        )  # imported where it is used
+        from springbench.solvers.methods.vertex_block.incident_elements import IncidentElements
 
         joined = zip(self._unique_laws, self._elements_by_law(self.energies), strict=True)
         return replace(
@@ -104,7 +102,7 @@ class VertexElements:
     @property
     def element_kinds(self) -> list[ElementKind]:
         """The laws and widths of the elements, in the order of `incident_elements`."""
-        from springbench.solvers.methods.vertex_block.incident_elements import ElementKind  # imported where it is used
+        from springbench.solvers.methods.vertex_block.incident_elements import ElementKind
 
         widths = [one.vertices.shape[1] for one in self._elements_by_law(self.energies)]
         return [ElementKind(*kind) for kind in zip(self._unique_laws, widths, strict=True)]
