@@ -185,6 +185,21 @@ def _shipped_solver_styles(names: tuple[str, ...]) -> dict[str, SeriesStyle]:
     }
 
 
+def contrasting_text_colour(color: str) -> str:
+    """Return TEXT_COLOUR or white, whichever is easier to read on a colour `#rrggbb`.
+
+    Contrast and relative luminance are those of WCAG 2.1.
+    """
+    channels = (int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    linear = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels)
+    luminance = sum(weight * c for weight, c in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+    return TEXT_COLOUR if luminance > _EVEN_CONTRAST_LUMINANCE else "#ffffff"
+
+
+_EVEN_CONTRAST_LUMINANCE = 0.2195
+"""Luminance on which white and TEXT_COLOUR have the same contrast: sqrt(1.05 (L + 0.05)) - 0.05, L that of the text."""
+
+
 def shade_colour(color: str, amount: float) -> str:
     """Mix a colour #rrggbb with white, or with black if `amount` is negative."""
     end = 1.0 if amount > 0.0 else 0.0

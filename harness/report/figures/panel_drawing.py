@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.transforms import ScaledTranslation
@@ -27,7 +26,13 @@ from springbench.harness.report.charts.figure_panels import (
 )
 from springbench.harness.report.figures.axis_scales import bar_base, frame_size_points, set_axis_scales
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE, FigureOptions
-from springbench.harness.report.plot_style import MUTED_COLOUR, RULE_COLOUR, TEXT_COLOUR, SeriesStyle
+from springbench.harness.report.plot_style import (
+    MUTED_COLOUR,
+    RULE_COLOUR,
+    TEXT_COLOUR,
+    SeriesStyle,
+    contrasting_text_colour,
+)
 
 _LINE_WIDTH, _MARKER_SIZE, _MAX_MARKERS = 1.1, 3.6, 12
 """Width of curves and size of markers [points]; curves of at most this many points get a marker at each."""
@@ -235,12 +240,6 @@ def write_cell_values(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
                 fontsize=size,
                 color=contrasting_text_colour(cell.color),
             )
-
-
-def contrasting_text_colour(color: str) -> str:
-    """Return a text colour that is readable on the given colour."""
-    red, green, blue = to_rgb(color)
-    return TEXT_COLOUR if 0.3 * red + 0.6 * green + 0.1 * blue > 0.47 else "white"
 
 
 def draw_mesh_picture(ax: Axes, panel: MeshPicture, options: FigureOptions, width: float) -> None:

@@ -18,7 +18,7 @@ from springbench.harness.report.charts.chart_description import (
     ChartSeries,
 )
 from springbench.harness.report.charts.figure_panels import AxisScale, CellMap, FloatArray
-from springbench.harness.report.plot_style import STALE_NOTE
+from springbench.harness.report.plot_style import STALE_NOTE, contrasting_text_colour
 from springbench.harness.report.site.data_scripts import round_number
 from springbench.harness.report.site.plotly_styles import plotly_style
 from springbench.harness.report.site.run_table import format_references
@@ -49,7 +49,9 @@ def _describe_map(cell_map: CellMap) -> dict[str, Any]:
     labels = [outcome.label for outcome in cell_map.outcomes]
     return {
         "title": ", ".join(filter(None, (cell_map.subject, cell_map.title))),
-        "outcomes": [outcome._asdict() for outcome in cell_map.outcomes],
+        "outcomes": [
+            outcome._asdict() | {"text_color": contrasting_text_colour(outcome.color)} for outcome in cell_map.outcomes
+        ],
         "cells": [
             [one.row, one.column, labels.index(one.outcome), one.marked_text, one.reason, one.run_id, one.is_stale]
             for one in cell_map.cells

@@ -3,7 +3,6 @@
 "use strict";
 springbench.maps = (chart, sweep) => {
   const { element, own, address } = springbench;
-  const dark = hex => [1, 3, 5].reduce((sum, k, i) => sum + [0.2126, 0.7152, 0.0722][i] * (parseInt(hex.slice(k, k + 2), 16) / 255) ** 2.2, 0) < 0.18;
   const status = element("p", { role: "status" }, "Point at a cell, or go there by arrow keys, for what is known about it.");
 
   function button(map, cell) {
@@ -12,7 +11,7 @@ springbench.maps = (chart, sweep) => {
     const read = () => { status.textContent = words; };
     return element("td", {}, element(`button${stale ? ".stale" : ""}`, {
       type: "button", tabIndex: -1, title: words, "aria-label": words, onmouseenter: read, onfocus: read,
-      style: `background:${outcome.color};color:${dark(outcome.color) ? "#ffffff" : "#16181b"}`,
+      style: `background:${outcome.color};color:${outcome.text_color}`,
       onclick: () => { if (run) location.hash = address("runs", { sweep: sweep.slug, run: `${sweep.slug}/${run}` }); },
     }, text || "\u00a0"));
   }
