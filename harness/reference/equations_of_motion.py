@@ -77,7 +77,15 @@ class OdeField:
         return np.concatenate([part[self._free].ravel() for part in build_initial_state(self._scene).motion])
 
     def unpack_state(self, t: float, y: OdeState) -> tuple[Positions, Positions]:
-        """Return positions [m] and velocities [m/s] of all vertices, overwritten by the next call."""
+        """Return positions [m] and velocities [m/s] of all vertices, overwritten by the next call.
+
+        Args:
+            t: time [s], at which moving pins are placed.
+            y: state (6 f,) of the f free vertices.
+
+        Returns:
+            Positions (n, 3) and velocities (n, 3); those of pinned vertices follow from the motion of the pins.
+        """
         self._p[self._free], self._v[self._free] = y.reshape(2, -1, 3)
         if self._scene.pin_motions:
             pinned, h = self._system.pins.vertices, FINITE_DIFFERENCE_SECONDS
@@ -86,7 +94,15 @@ class OdeField:
         return self._p, self._v
 
     def __call__(self, t: float, y: OdeState) -> OdeState:
-        """Evaluate F(t, y)."""
+        """Evaluate F(t, y).
+
+        Args:
+            t: time [s].
+            y: state (6 f,): positions [m], then velocities [m/s] of the f free vertices.
+
+        Returns:
+            dy/dt (6 f,): velocities [m/s], then accelerations [m/s^2].
+        """
         p, v = self.unpack_state(t, y)
         push = np.negative(self._scene.constant_force)
         if self._springs:
@@ -113,9 +129,20 @@ class OdeField:
 
 
 def build_ode_scene(spec: SceneSpec, size: int) -> Scene:
-    """Build a scene with equations of motion; raises NotIntegrable.
+    """Build a scene with equations of motion.
 
     Velocity filters without an equation of motion are converted to forces.
+
+    Args:
+        spec: specification of the scene.
+        size: size of the scene.
+
+    Returns:
+        The scene, with all of its pins exact.
+
+    Raises:
+        InputError: the scene cannot be built.
+        NotIntegrable: the scene has no equations of motion.
     """
     scene = build_exact_scene(spec, size)
     try:

@@ -73,9 +73,14 @@ class ExactLengths:
         return replace(problem, system=self._augment_system(tension, penalty_factor))
 
     def compute_tensions(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
-        """Compute the tensions (m,) [N] at p (n, 3) [m].
+        """Compute the tensions of the exact lengths at given positions.
 
-        They are zero where an edge is within its limits.
+        Args:
+            problem: step problem, whose gradient the tensions oppose.
+            p: positions (n, 3) [m].
+
+        Returns:
+            Tensions (m,) [N], positive where an edge pulls and zero where it is within its limits.
         """
         x, k, rows = self.lengths, self._penalties, len(self._columns)
         length, n = unit_directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
@@ -113,7 +118,12 @@ class StationarityEvaluator:
         self._exact: dict[float, ExactLengths] = {}
 
     def __call__(self, problem: StepProblem, p: Positions) -> StationarityReading:
-        """Evaluate the stationarity at p, of the Lagrangian where lengths are exact."""
+        """Evaluate the stationarity at p, of the Lagrangian where lengths are exact.
+
+        Args:
+            problem: step problem; the evaluator of its system is built at the first call and used again.
+            p: positions (n, 3) [m].
+        """
         exact = self.get_exact_lengths(problem.system)
         if exact is None:
             return self._get_evaluator(problem.system).measure_stationarity(problem, p)

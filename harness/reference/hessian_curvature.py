@@ -108,7 +108,15 @@ class HessianCurvature:
 
 
 def compute_curvature(problem: StepProblem, p: Positions) -> HessianCurvature:
-    """Compute the curvature at p (n, 3) [m], with exact pins at their targets."""
+    """Compute the smallest eigenvalue of the Hessian at p, and its uncertainty.
+
+    Args:
+        problem: step problem, of whose objective the Hessian is taken.
+        p: positions (n, 3) [m], with exact pins at their targets.
+
+    Returns:
+        The curvature; its eigenvalue is infinite where no vertex is free, and nan where the Hessian is not finite.
+    """
     free, direction = problem.system.free_vertices, np.zeros_like(p)
     if not len(free):
         return HessianCurvature(np.inf, 0.0, direction, np.copy)
@@ -152,7 +160,15 @@ def step_across(
 
 
 def build_free_hessian(problem: StepProblem, p: Positions) -> SplitHessian:
-    """Assemble the objective's Hessian at p."""
+    """Assemble the objective's Hessian at p.
+
+    Args:
+        problem: step problem; inertia, penalty pins and all energies contribute.
+        p: positions (n, 3) [m].
+
+    Returns:
+        The Hessian [N/m] without the rows and columns of exactly pinned vertices.
+    """
     system = problem.system
     _, vertices, weight = system.penalty_pins
     anchor_stiffness = system.inertia_diagonal + np.bincount(vertices, weight, minlength=system.num_vertices)

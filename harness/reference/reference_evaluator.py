@@ -100,7 +100,15 @@ class ReferenceEvaluator:
         return size * self._multigrid.apply_cycle()[:, :3].astype(np.float64)
 
     def compute_residual(self, problem: StepProblem, p: Positions) -> float:
-        """Compute |Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices."""
+        """Compute |Q^-1 grad g(p)|_Q [J^(1/2)] over the unpinned vertices.
+
+        Args:
+            problem: step problem of the evaluator's system, with the objective g.
+            p: positions (n, 3) [m].
+
+        Returns:
+            The residual; infinite on overflow.
+        """
         return self.compute_energy_norm(problem.gradient(p))
 
     def compute_energy_norm(self, gradient: Positions) -> float:
@@ -117,7 +125,12 @@ class ReferenceEvaluator:
         return length if np.isfinite(length) else np.inf
 
     def bound_roundoff(self, problem: StepProblem, p: Positions) -> float:
-        """Bound the round-off of the residual [J^(1/2)] at p."""
+        """Bound the round-off of the residual [J^(1/2)] at p.
+
+        Args:
+            problem: step problem of the evaluator's system, whose gradient is rounded.
+            p: positions (n, 3) [m].
+        """
         return self._bound_roundoff(gradient_roundoff(problem, p))
 
     def _bound_roundoff(self, bound: NDArray[np.float64]) -> float:
@@ -157,7 +170,15 @@ def assemble_stiffness(system: System) -> csr_array:
 
 
 def measure_component_sizes(system: System, p: Positions) -> NDArray[np.float64]:
-    """Measure the size (n,) [m] of each vertex's component at p (n, 3) [m]."""
+    """Measure the bounding box diagonal (n,) [m] of each vertex's component.
+
+    Args:
+        system: system, in whose matrix Q vertices of one component are connected.
+        p: positions (n, 3) [m].
+
+    Raises:
+        NotPositiveDefinite: Q is not positive definite.
+    """
     return measure_graph_components(assemble_stiffness(system), p)
 
 

@@ -149,10 +149,17 @@ class ReferenceStore:
         return found
 
     def classify_minimum(self, frozen: StepSnapshot, p: Positions) -> MinimumCertificate:
-        """Find the minimum in whose basin p (n, 3) [m] is.
+        """Find the minimum in whose basin p is.
 
         A new certified minimum is added to the known ones, and becomes the reference if it is the lowest. Its index is
         `find_minima(snapshot).find_index(minimum)` where it is certified.
+
+        Args:
+            frozen: snapshot whose step problem is minimised, and under whose digest its minima are stored.
+            p: positions (n, 3) [m], from which Newton's method starts.
+
+        Returns:
+            The known minimum that equals the one found, or the end point of Newton's method where it is not certified.
         """
         found, known = refine_minimum(frozen.problem, p, self.solver), self.find_minima(frozen)
         joined = known.add_minimum(found)
@@ -340,11 +347,17 @@ class ReferenceStore:
     def require_contact_horizon(
         self, spec: SceneSpec, size: int, t_end: float, *, error: float
     ) -> SelfConvergedTrajectory:
-        """Load the motion of a scene with contact at t_end [s], by which a relative error can be measured.
+        """Load the motion of a scene with contact at one time, or fail.
+
+        Args:
+            spec: specification of the scene.
+            size: size of the scene.
+            t_end: time [s] of the motion.
+            error: relative error that is to be measured by the motion.
 
         Raises:
-          InputError: the scene cannot be built.
-          NotConverged: the error cannot be measured then; the message states until when it can.
+            InputError: the scene cannot be built.
+            NotConverged: the error cannot be measured then; the message states until when it can.
         """
         found, reason = self.load_contact_horizon(spec, size, t_end, error=error)
         if reason:

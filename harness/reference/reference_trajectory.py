@@ -75,7 +75,12 @@ class ReferenceTrajectory:
         return float(max(self.disagreement[k], self.growth[k]))
 
     def measure_error(self, k: int, p: Positions) -> float:
-        """Measure the error of p (n, 3) [m] at times[k], relative to the displacement."""
+        """Measure the error of positions at one of the times, relative to the displacement.
+
+        Args:
+            k: index of the time in `times`.
+            p: positions (n, 3) [m] at that time; pinned vertices do not count.
+        """
         return compute_position_error(p, self.positions[k], self.free_vertices) / float(self.displacement[k])
 
     def require_accuracy(self, error: float) -> None:

@@ -40,7 +40,14 @@ class AuditedSolver(DelegatingSolver):
     """A prepared solver whose solutions in some frames are audited in sequence."""
 
     def __init__(self, prepared: PreparedSolver, solver: Solver, frames: Collection[int]) -> None:
-        """Wrap a prepared solver; `frames` are counted from 1."""
+        """Wrap a prepared solver.
+
+        Args:
+            prepared: prepared solver, to which all solves are delegated.
+            solver: solver from which it was prepared; states whether it minimises.
+            frames: frames to be audited, counted from 1; ignored for a solver that takes its own substeps and does not
+                minimise.
+        """
         super().__init__(prepared)
         self._claims = is_minimiser(solver)
         own_steps = find_solver_info(type(solver), find_solver_name(solver)).is_substepping
@@ -52,7 +59,15 @@ class AuditedSolver(DelegatingSolver):
         """Column `stationarity_audit` of the row of each audited frame."""
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Return the solver's solution; raises RunFailed where its reported residual is wrong."""
+        """Return the solver's solution, audited in the chosen frames.
+
+        Args:
+            problem: step problem; a later start time than before begins the next frame.
+            stop: stop rule of the solve, whose tolerance a converged solution has to meet.
+
+        Raises:
+            RunFailed: the residual that the solver reports is wrong.
+        """
         found = self._prepared.solve(problem, stop)
         if problem.step_start.time > self._begun:  # the first unknown of the next frame
             self._done, self._begun = self._done + 1, problem.step_start.time

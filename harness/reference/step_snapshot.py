@@ -201,7 +201,16 @@ def save_snapshot(step: SimulationStep, origin: str) -> tuple[StepSnapshot, Arra
 
 
 def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
-    """Restore a saved snapshot for a scene; None where the problem has changed."""
+    """Restore a saved snapshot for a scene; None where the problem has changed.
+
+    Args:
+        arrays: arrays of `save_snapshot` by name.
+        scene: scene with exact pins, whose system the step problem gets.
+
+    Returns:
+        The snapshot; None if an array of the start of the step is missing, or if time step, masses, pins or the
+        gradient at the current positions differ from the stored ones.
+    """
     if any(f"start_{name}" not in arrays for name in _START_FIELDS):
         return None
     system = replace(scene.system, inertia_factor=float(arrays["inertia_factor"]))
@@ -223,7 +232,12 @@ def restore_snapshot(arrays: Arrays, scene: Scene) -> StepSnapshot | None:
 
 
 def is_equal_to_roundoff(found: NDArray[np.float64], expected: NDArray[np.float64]) -> bool:
-    """Return whether two arrays are equal up to processor-dependent summation order."""
+    """Return whether two arrays are equal up to processor-dependent summation order.
+
+    Args:
+        found: array that is checked; an array of another shape is unequal.
+        expected: array whose largest absolute value scales the tolerance of 1e-9.
+    """
     if found.shape != expected.shape:
         return False
     return bool(np.abs(found - expected).max(initial=0.0) <= 1e-9 * np.abs(expected).max(initial=0.0))

@@ -68,11 +68,21 @@ class StepVerifier:
         return row
 
     def measure_stationarity(self, problem: StepProblem, p: Positions) -> StationarityReading:
-        """Evaluate the stationarity at p (n, 3) [m] (`springbench.harness.reference.exact_lengths`)."""
+        """Evaluate the stationarity at p (`springbench.harness.reference.exact_lengths`).
+
+        Args:
+            problem: step problem that was solved.
+            p: positions (n, 3) [m], its solution.
+        """
         return self._stationarity(problem, p)
 
     def measure_curvature(self, problem: StepProblem, p: Positions) -> HessianCurvature:
-        """Compute the curvature of the objective, or of a Lagrangian with large penalties."""
+        """Compute the curvature of the objective, or of a Lagrangian with large penalties.
+
+        Args:
+            problem: step problem; where its lengths are exact, the Lagrangian replaces its objective.
+            p: positions (n, 3) [m], with exact pins at their targets.
+        """
         exact = self._stationarity.get_exact_lengths(problem.system)
         return compute_curvature(
             exact.build_lagrangian(problem, exact.compute_tensions(problem, p), PENALTY_FACTOR) if exact else problem, p
@@ -114,5 +124,10 @@ def _rank_reading(reading: StationarityReading) -> float:
 
 
 def is_minimum(problem: StepProblem, p: Positions) -> bool:
-    """Return whether the objective is convex at p (n, 3) [m], beyond round-off."""
+    """Return whether the objective is convex at p, beyond round-off.
+
+    Args:
+        problem: step problem with the objective.
+        p: positions (n, 3) [m], with exact pins at their targets; stationarity is not checked.
+    """
     return compute_curvature(problem, p).is_convex
