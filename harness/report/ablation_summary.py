@@ -37,7 +37,11 @@ def read_ablation(path: Path) -> list[dict[str, Any]]:
 
 
 def read_ablations(folder: Path, kind: str) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of each ablation that has rows of a kind, by the name of its file.
+    """Return the rows of each ablation that has rows of a kind, by file name.
+
+    Args:
+        folder: folder of the results, with the subfolder `ablation`.
+        kind: value of the column `kind` that an ablation must have; all of its rows are returned.
 
     Raises:
         InputError: if there are none.
@@ -51,7 +55,12 @@ def read_ablations(folder: Path, kind: str) -> dict[str, list[dict[str, Any]]]:
 
 
 def select_kind(rows: Sequence[ResultRow], kind: str) -> list[ResultRow]:
-    """Return the rows of one kind, in their order."""
+    """Return the rows of one kind, in their order.
+
+    Args:
+        rows: rows of one ablation.
+        kind: value of the column `kind`, such as "ablated" or "overhead".
+    """
     return [row for row in rows if row["kind"] == kind]
 
 

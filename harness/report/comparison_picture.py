@@ -274,7 +274,15 @@ def find_reference_run(replays: Sequence[RecordingReplay]) -> int:
 
 
 def format_distance(replay: RecordingReplay, best: RecordingReplay) -> str:
-    """Format the distance from the reference run `best`, the one closest to the minimum."""
+    """Format the largest distance of a vertex from the reference run [mean rest lengths].
+
+    Args:
+        replay: recording whose last frame is compared.
+        best: recording of the reference run, the one closest to the minimum.
+
+    Returns:
+        The distance; "reference" for that run itself, and a dash if the runs are not comparable.
+    """
     distance = _compute_distance(replay, best)
     return "reference" if replay is best else "–" if np.isnan(distance) else f"{distance:.2g}"
 

@@ -29,7 +29,12 @@ def find_drawable_frames(replay: RecordingReplay) -> NDArray[np.int64]:
 
 
 def framed_vertex_mask(replay: RecordingReplay, frames: Iterable[int]) -> NDArray[np.bool_]:
-    """Return the mask (n,) of the vertices that a camera frames in these recorded frames."""
+    """Return the mask (n,) of the vertices that a camera frames in recorded frames.
+
+    Args:
+        replay: recording, whose first frame is the start.
+        frames: indices of recorded frames, at least one; the largest displacement over them counts.
+    """
     start = replay.positions[0].astype(np.float64)
     moved = [np.linalg.norm(replay.positions[k] - start, axis=1) for k in frames]
     return find_framed_vertices(start, np.max(moved, axis=0))

@@ -96,7 +96,12 @@ def choose_view_angles(points: PointArray, areas: PointArray) -> tuple[float, fl
 
 
 def compute_area_vectors(replay: RecordingReplay, frame: int) -> PointArray:
-    """Compute half the cross product of two edges of each triangle [m^2], shape (f, 3)."""
+    """Compute half the cross product of two edges of each triangle [m^2], shape (f, 3).
+
+    Args:
+        replay: recording with triangles (f, 3).
+        frame: index of a recorded frame; -1 is the last.
+    """
     p = replay.positions[frame].astype(np.float64)
     a, b, c = (p[corner] for corner in replay.triangles.T)
     return np.cross(b - a, c - a) / 2.0
@@ -152,9 +157,11 @@ def _ground_height(points: PointArray) -> float:
 
 
 def view_aspect(points: PointArray, angles: tuple[float, float]) -> float:
-    """Return width / height of points (q, 3) [m] and their shadow.
+    """Return width / height of points and their shadow, seen from far away.
 
-    They are seen from far away at these angles.
+    Args:
+        points: points (q, 3) [m], with y up.
+        angles: azimuth and elevation [degrees] of the viewer.
     """
     whole = np.concatenate([points, _project_shadow(points, _ground_height(points))])
     across, up, _ = np.ptp(_camera_axes(angles) @ whole.astype(np.float64).T, axis=1)

@@ -38,7 +38,12 @@ def format_power(value: float) -> str:
 
 
 def shorten_words(words: str, limit: int) -> str:
-    """Shorten text to `limit` characters, with an ellipsis at the end."""
+    """Shorten text, with an ellipsis at the end.
+
+    Args:
+        words: text, unchanged if it is short enough.
+        limit: largest number of characters, the ellipsis included.
+    """
     return words if len(words) <= limit else words[: limit - 1].rstrip() + "…"
 
 

@@ -28,7 +28,15 @@ _GROUND_NORMAL_Y = 0.999
 
 
 def build_obstacle_meshes(replay: RecordingReplay, frame: int) -> list[pv.PolyData]:
-    """Build the meshes of a recording's obstacles at the time of a recorded frame."""
+    """Build the meshes of a recording's obstacles at the time of a recorded frame.
+
+    Args:
+        replay: recording, whose properties describe the obstacles.
+        frame: index of a recorded frame; -1 is the last.
+
+    Returns:
+        The meshes of the obstacles that can be drawn; empty if the recording has none.
+    """
     if OBSTACLES_PROPERTY not in replay.properties:
         return []
     from springbench.harness.scenes.surface_obstacles import parse_obstacles
@@ -46,6 +54,10 @@ def points_to_frame(replay: RecordingReplay, frames: Sequence[int]) -> NDArray[n
 
     Vertices far from all others are omitted. If the others coincide in one point, the whole mesh at its start is
     included.
+
+    Args:
+        replay: recording of mesh and obstacles.
+        frames: indices of the recorded frames that one camera shows.
     """
     near = framed_vertex_mask(replay, frames)
     points = np.concatenate(

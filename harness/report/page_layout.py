@@ -67,7 +67,13 @@ def draw_text(
 
 
 def measure_text(words: str, size: float, *, weight: str = "normal") -> float:
-    """Return the width of a line of text [pixels], in the font family of the present `matplotlib.rc_context`."""
+    """Return the width of a line of text [pixels].
+
+    Args:
+        words: text, in the font family of the present `matplotlib.rc_context`.
+        size: font size [points].
+        weight: weight of the font.
+    """
     font = FontProperties(size=size, weight=weight)
     return float(RendererAgg(1, 1, PAGE_DPI).get_text_width_height_descent(words, font, ismath=False)[0])
 
@@ -109,7 +115,13 @@ def draw_provenance(page: Figure, replays: Iterable[RecordingReplay], y: float) 
 
 
 def add_axes(page: Figure, left: float, top: float, width: float, height: float) -> Axes:
-    """Add axes in a rectangle given in pixels from the upper left corner."""
+    """Add axes in a rectangle given in pixels from the upper left corner.
+
+    Args:
+        page: figure of PAGE_WIDTH x PAGE_HEIGHT pixels.
+        left, top: upper left corner of the rectangle [pixels].
+        width, height: size of the rectangle [pixels].
+    """
     return page.add_axes(
         (left / PAGE_WIDTH, 1 - (top + height) / PAGE_HEIGHT, width / PAGE_WIDTH, height / PAGE_HEIGHT)
     )
@@ -125,7 +137,13 @@ def tick_formatter(format_value: Callable[[float], str]) -> FuncFormatter:
 
 
 def paste_picture(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:
-    """Paste a picture pixel for pixel, with its upper left corner at (left, top)."""
+    """Paste a picture pixel for pixel.
+
+    Args:
+        page: figure of PAGE_WIDTH x PAGE_HEIGHT pixels.
+        pixels: picture (height, width, 3 or 4), first row at the top.
+        left, top: upper left corner of the picture on the page [pixels].
+    """
     page.figimage(pixels, xo=left, yo=PAGE_HEIGHT - top - pixels.shape[0], origin="upper")
 
 
@@ -153,7 +171,11 @@ def save_page(page: Figure, path: Path, *, used_height: float = PAGE_HEIGHT, sou
 def draw_header(page: Figure, headline: str, facts: Sequence[str], *, max_letters: int = 56) -> None:
     """Draw the title in the upper left corner and a line of facts below.
 
-    The title is shortened to `max_letters`.
+    Args:
+        page: figure to draw on.
+        headline: title, shortened to `max_letters`.
+        facts: phrases, which dots separate.
+        max_letters: largest number of letters of the title.
     """
     draw_text(page, 40, 50, shorten_words(headline, max_letters), size=21, weight="bold")
     draw_text(page, 41, 82, "   ·   ".join(facts), size=11.5, color=MUTED_COLOUR)
@@ -215,7 +237,12 @@ _TIME_UNITS = (("s", 1.0, 1e-2), ("ms", 1e-3, 1e-3), ("µs", 1e-6, 1e-6), ("ns",
 
 
 def format_frame_time(replay: RecordingReplay, frame: int) -> str:
-    """Format the time of a recorded frame, in a unit by the last time: seconds from 0.01 s on."""
+    """Format the time of a recorded frame, in a unit chosen by the last time.
+
+    Args:
+        replay: recording, whose times [s] are written in seconds if the last one is at least 0.01 s.
+        frame: index of a recorded frame.
+    """
     last = float(np.abs(replay.times).max(initial=0.0))
     unit, seconds = next(((unit, seconds) for unit, seconds, least in _TIME_UNITS if last >= least), ("s", 1.0))
     return f"{replay.times[frame] / seconds:.2f} {unit}"

@@ -201,7 +201,12 @@ _EVEN_CONTRAST_LUMINANCE = 0.2195
 
 
 def shade_colour(color: str, amount: float) -> str:
-    """Mix a colour #rrggbb with white, or with black if `amount` is negative."""
+    """Mix a colour with white or black.
+
+    Args:
+        color: colour #rrggbb.
+        amount: share of white in (0, 1], or of black if it is negative.
+    """
     end = 1.0 if amount > 0.0 else 0.0
     parts = (int(color[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
     return "#" + "".join(f"{round(255.0 * ((1.0 - abs(amount)) * part + abs(amount) * end)):02x}" for part in parts)

@@ -49,6 +49,10 @@ class ComparedMethod(NamedTuple):
 def compare_with_published(results: Path, studies: Sequence[PublishedStudy]) -> list[ComparedMethod]:
     """Compare the rows of a folder of results with the published studies.
 
+    Args:
+        results: folder of one's own results, in which all folders of rows are read.
+        studies: published studies; those without rows of runs are ignored.
+
     Raises:
         InputError: the folder has no rows, or none on a published scene and size.
     """

@@ -23,7 +23,15 @@ def compute_spring_strain(replay: RecordingReplay, frame: int) -> NDArray[np.flo
 
 
 def compute_vertex_strain(replay: RecordingReplay, frame: int) -> NDArray[np.float64]:
-    """Return the signed strain of the most strained spring at each vertex, shape (n,)."""
+    """Return the signed strain of the most strained spring at each vertex, shape (n,).
+
+    Args:
+        replay: recording with springs and their rest lengths.
+        frame: index of a recorded frame.
+
+    Returns:
+        The strains; 0 at vertices without a spring.
+    """
     strain = np.repeat(compute_spring_strain(replay, frame), 2)
     ends = replay.springs.ravel()
     by_size = np.argsort(np.abs(strain))

@@ -25,7 +25,12 @@ class ReportFunction(Protocol):
     """A report: a function that writes files."""
 
     def __call__(self, rows: pa.Table, folder: Path) -> Iterable[Path]:
-        """Write files into the folder of a sweep's results, and return their paths."""
+        """Write files into the folder of a sweep's results, and return their paths.
+
+        Args:
+            rows: rows of the sweep.
+            folder: folder of its results.
+        """
         ...
 
 

@@ -365,7 +365,12 @@ def format_share(share: float | None) -> str:
 
 
 def map_headline(cells: Sequence[VerifiedRun], name: str) -> str:
-    """Return the headline of the map: counts of the main outcomes."""
+    """Return the headline of the map: counts of the main outcomes.
+
+    Args:
+        cells: verified runs of the map.
+        name: name of the sweep, with which the headline begins.
+    """
     of = {outcome: sum(cell.outcome == outcome for cell in cells) for outcome in RUN_OUTCOMES}
     broken = of[DIVERGED] + of[FAILED]
     return (

@@ -204,7 +204,12 @@ class SolverGroup:
 
 
 def group_by_scene(drawn: list[PictureJob], folder: Path) -> list[SolverGroup]:
-    """Group runs by scene and size; only groups of two or more runs are returned."""
+    """Group runs by scene and size; only groups of two or more runs are returned.
+
+    Args:
+        drawn: runs with a recording.
+        folder: folder of the sweep's results, where recordings and pictures of the groups are stored.
+    """
     by_scene: dict[str, list[PictureJob]] = {}
     for p in drawn:
         by_scene.setdefault(f"{p.run.scene_name}-{p.run.size}", []).append(p)

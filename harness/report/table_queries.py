@@ -27,7 +27,12 @@ def query_table(sql: str, table: pa.Table, parameters: Mapping[str, Any] | None 
 
 
 def query_records(sql: str, table: pa.Table) -> list[dict[str, Any]]:
-    """Return the rows that a query selects from `rows_of` as dictionaries by column name."""
+    """Return the rows that a query selects as dictionaries by column name.
+
+    Args:
+        sql: query, in which the table is named `rows_of`.
+        table: rows that are queried.
+    """
     with _register_table(table) as cursor:
         done = cursor.execute(sql)
         names = [column[0] for column in done.description or ()]

@@ -63,7 +63,12 @@ def _select_drawn_rows(rows: Sequence[dict[str, Any]], name: str) -> list[dict[s
 
 
 def format_validation_page(rows: Sequence[dict[str, Any]], solver: str) -> str:
-    """Format the page as Markdown."""
+    """Format the page as Markdown.
+
+    Args:
+        rows: rows of `springbench validate`; a part without rows is omitted.
+        solver: name of the solver.
+    """
     lines = [f"# Validation of `{solver}`", ""]
     for name, alt in (
         (CLOSED_FORMS_PICTURE, "Errors by refinement"),
@@ -117,7 +122,13 @@ def _format_test(row: dict[str, Any]) -> str:
 
 
 def draw_closed_forms(forms: Sequence[dict[str, Any]], solver: str, path: Path) -> None:
-    """Draw the errors of closed forms by refinement to a PNG, PAGE_WIDTH pixels wide."""
+    """Draw the errors of closed forms by refinement to a PNG, PAGE_WIDTH pixels wide.
+
+    Args:
+        forms: rows of closed forms that have errors by level.
+        solver: name of the solver, for the title.
+        path: target file.
+    """
     with plt.rc_context(PAGE_RC):
         figure = plt.figure(figsize=(PAGE_WIDTH / PAGE_DPI, PAGE_HEIGHT / PAGE_DPI), dpi=PAGE_DPI)
         count = sum(row["verdict"] == "confirmed" for row in forms)
@@ -129,7 +140,13 @@ def draw_closed_forms(forms: Sequence[dict[str, Any]], solver: str, path: Path) 
 
 
 def draw_fabrics(tests: Sequence[dict[str, Any]], solver: str, path: Path) -> None:
-    """Draw textile tests in their bands to a PNG that is read at the width of a column, 85 mm."""
+    """Draw textile tests in their bands to a PNG, a column of 85 mm wide.
+
+    Args:
+        tests: rows of textile tests, one for each fabric.
+        solver: name of the solver, for the title.
+        path: target file.
+    """
     bending, drape = (sum(is_in_band(row[key]) for row in tests) for key in ("bending_length", "drape_coefficient"))
     title = f"{solver}: of {len(tests)} fabrics {bending} bending lengths\n"
     title += f"and {drape} drape coefficients lie in their bands"

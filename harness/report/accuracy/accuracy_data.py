@@ -192,7 +192,12 @@ class WorkPoint:
 
 
 def format_stop_rule(residual_rtol: float | None, max_iterations: int) -> str:
-    """Format the stop rule of a step's iterations."""
+    """Format the stop rule of a step's iterations.
+
+    Args:
+        residual_rtol: relative tolerance of the residual; 0 where it follows from the scene, None for none.
+        max_iterations: number of iterations, which is stated only where there is no tolerance.
+    """
     if residual_rtol is None:
         return f"{max_iterations} iterations"
     return f"tolerance {residual_rtol:g}" if residual_rtol else "tolerance auto"

@@ -114,7 +114,15 @@ def write_findings(path: Path, title: str, chapters: FindingChapters, failed: li
 
 
 def write_summary(path: Path, table: AccuracyData) -> None:
-    """Write the summary as JSON."""
+    """Write the summary as JSON.
+
+    Args:
+        path: target file, overwritten.
+        table: data of an accuracy measurement.
+
+    Raises:
+        ValueError: a value of the summary is not finite.
+    """
     path.write_text(json.dumps(build_curve_summary(table), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -39,10 +39,17 @@ def list_curve_times(data: AccuracyData) -> list[MethodTimes]:
 def list_simulation_times(
     published: AccuracyData, repeated: AccuracyData
 ) -> tuple[list[MethodTimes], list[MethodTimes]]:
-    """List the times to each of `ERROR_TARGETS` of the solvers of each simulation, published and repeated.
+    """List the times to each of `ERROR_TARGETS` of the solvers of each simulation.
 
-    Both choose among the settings that both have. The published error of a setting decides what it reaches: whether
-    errors agree is compared separately.
+    Both sides choose among the settings that both have. The published error of a setting decides what it reaches:
+    whether errors agree is compared separately.
+
+    Args:
+        published: data of the published study.
+        repeated: data of its repetition.
+
+    Returns:
+        Times by round of the published and of the repeated study, in the same order.
     """
     ours, theirs = ({_build_setting(work): work for work in side.work_points} for side in (repeated, published))
     settings = [key for key in theirs if key in ours and theirs[key].round_seconds and ours[key].round_seconds]

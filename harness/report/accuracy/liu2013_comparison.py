@@ -97,7 +97,12 @@ def gap_at_iteration(curve: ConvergenceCurve, iterations: int) -> float:
 
     A curve that converged before n iterations counts with its last gap.
 
-    Returns: the gap; nan if it is unknown or the minimum is not certified.
+    Args:
+        curve: convergence of a solver.
+        iterations: n; an iterate that was not recorded has no known gap.
+
+    Returns:
+        The gap; nan if it is unknown or the minimum is not certified.
     """
     if (
         curve.problem.uncertified_reason

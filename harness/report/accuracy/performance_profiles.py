@@ -96,15 +96,27 @@ def describe_omitted_solvers(table: AccuracyData) -> list[str]:
 def cumulative_share(values: FloatArray, at: FloatArray) -> FloatArray:
     """Return the cumulative share of values at given limits.
 
-    This is the share of `values` (k,) that is at most each of `at` (m,); shape (m,).
+    Args:
+        values: values (k,), in any order; infinite ones count in k, but are within no finite limit.
+        at: limits (m,).
+
+    Returns:
+        The share (m,) of the values that is at most each limit.
     """
     return np.searchsorted(np.sort(values), at, side="right") / len(values)
 
 
 def solvable_races(table: AccuracyData, target: float) -> list[list[ConvergenceCurve]]:
-    """Return the races for which this accuracy is meaningful.
+    """Return the races for which an accuracy is meaningful.
 
     In these, some solver reaches the accuracy, but no initial guess does.
+
+    Args:
+        table: data of an accuracy measurement.
+        target: accuracy, an energy gap.
+
+    Returns:
+        Curves with the same problem and initial guess, by race.
     """
     return [r for r in group_by_start(table).values() if is_solvable(r[0].problem, target) and is_contested(r, target)]
 
@@ -112,7 +124,12 @@ def solvable_races(table: AccuracyData, target: float) -> list[list[ConvergenceC
 def median_iteration_seconds(race: Iterable[ConvergenceCurve], solver: str) -> float:
     """Return the median time of one iteration of a solver in a race [s].
 
-    The result is nan if the solver did not take part.
+    Args:
+        race: curves with the same problem and initial guess; the first timed one of the solver counts.
+        solver: name of the solver.
+
+    Returns:
+        The median over the rounds; nan if the solver did not take part or was not timed.
     """
     for curve in race:
         if curve.solver == solver and len(curve.iterations) > 1 and np.isfinite(curve.seconds).all():

@@ -37,7 +37,12 @@ def draw_snapshot_meshes(table: AccuracyData, results: Path, folder: Path) -> di
 
 
 def snapshot_picture_path(problem: SnapshotProblem, folder: Path) -> Path:
-    """Return the path of the picture of a problem's mesh."""
+    """Return the path of the picture of a problem's mesh.
+
+    Args:
+        problem: step snapshot, whose scene, size, name and digest make the file name.
+        folder: folder of the pictures.
+    """
     return folder / f"{problem.scene}-{problem.size}-{problem.snapshot}-{problem.problem_digest}.png"
 
 

@@ -82,7 +82,12 @@ def amortised_seconds(curve: ConvergenceCurve, target: float, steps: int | None 
 
 
 def is_solvable(problem: SnapshotProblem, target: float) -> bool:
-    """Return whether the minimum is certified and the accuracy is above round-off."""
+    """Return whether the minimum is certified and the accuracy is above round-off.
+
+    Args:
+        problem: step snapshot.
+        target: accuracy, an energy gap.
+    """
     return not problem.uncertified_reason and target > problem.roundoff_gap
 
 
@@ -105,7 +110,12 @@ def group_by_start(table: AccuracyData) -> dict[tuple[str, str], list[Convergenc
 
 
 def is_contested(race: Sequence[ConvergenceCurve], target: float) -> bool:
-    """Return whether a solver, but not the initial guess, reaches the accuracy."""
+    """Return whether a solver, but not the initial guess, reaches the accuracy.
+
+    Args:
+        race: curves with the same problem and initial guess.
+        target: accuracy, an energy gap.
+    """
     times = [reached for curve in race if (reached := find_time_to_accuracy(curve, target))]
     return bool(times) and all(reached.iteration > 0 for reached in times)
 
@@ -154,7 +164,13 @@ def format_duration(seconds: float) -> str:
 def median_time(curves: Sequence[ConvergenceCurve], target: float, steps: int | None = None) -> float:
     """Return the median time over a solver's solvable problems [s].
 
-    It is infinite if half of them are unsolved.
+    Args:
+        curves: convergence of one solver, by problem.
+        target: energy gap to be reached.
+        steps: number of steps over which set-up is amortised; None to omit set-up.
+
+    Returns:
+        The median, infinite if half of them are unsolved; nan if no problem is solvable.
     """
     times = [amortised_seconds(curve, target, steps) for curve in curves if is_solvable(curve.problem, target)]
     # The upper of the two middle values: a mean with infinity would hide the solved half.

@@ -68,7 +68,12 @@ def method_family(work: WorkPoint) -> str:
 def build_winner_cells(works: Iterable[WorkPoint], errors: Sequence[float] = ERROR_TARGETS) -> list[WinnerCell]:
     """Build a cell for each mesh and error.
 
-    Cells are ordered by vertices, stiffness and error; meshes without springs have none.
+    Args:
+        works: simulations; those of meshes without springs are ignored.
+        errors: largest relative errors, one for each cell of a mesh.
+
+    Returns:
+        The cells, ordered by vertices, stiffness and decreasing error; a cell is empty where nothing is so accurate.
     """
     meshes: dict[tuple[str, int, float], list[WorkPoint]] = {}
     for work in works:

@@ -74,7 +74,12 @@ def describe_cheapest_settings(works: Sequence[WorkPoint]) -> list[str]:
 
 
 def is_same_method(work: WorkPoint, base: WorkPoint | None) -> bool:
-    """Return whether it differs from the default only in the time step."""
+    """Return whether a simulation differs from the default only in the time step.
+
+    Args:
+        work: simulation.
+        base: simulation with the default setting; None, where there is none, equals nothing.
+    """
     return base is not None and (work.label, work.integrator, work.residual_rtol, work.max_iterations) == (
         base.label,
         base.integrator,

@@ -490,14 +490,27 @@ def _assign_styles(measured: Iterable[ConvergenceCurve | WorkPoint]) -> dict[str
 
 
 def is_by_other_code(one: ConvergenceCurve | WorkPoint, newest_fingerprint: str | None) -> bool:
-    """Return whether a measurement is stale, as the module states."""
+    """Return whether a measurement is stale, as the module states.
+
+    Args:
+        one: curve or simulation with the fingerprint of its code.
+        newest_fingerprint: code of the newest rows; None to compare with the current version.
+    """
     return is_stale(one) if newest_fingerprint is None else one.source_fingerprint != newest_fingerprint
 
 
 def describe_hollow_marks(
     measured: Iterable[ConvergenceCurve | WorkPoint], newest_fingerprint: str | None
 ) -> list[str]:
-    """State what hollow marks mean; the page does that by itself."""
+    """State what hollow marks mean; the page does that by itself.
+
+    Args:
+        measured: curves or simulations of a chart.
+        newest_fingerprint: code of the newest rows, as on the page; None on other charts.
+
+    Returns:
+        One note where a measurement is stale; empty on the page.
+    """
     return [STALE_NOTE] if newest_fingerprint is None and any(map(is_stale, measured)) else []
 
 

@@ -274,7 +274,12 @@ class MeshRenderer:
     """Draws a picture at a width [pixels] on a background colour, or transparently for None."""
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
-        """Return the pixels (height, width, 3 or 4)."""
+        """Return the pixels (height, width, 3 or 4).
+
+        Args:
+            width: width of the picture [pixels]; the height follows from the aspect of the panel.
+            background: colour of the background, or None for a transparent one.
+        """
         raise NotImplementedError
 
 

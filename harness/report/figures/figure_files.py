@@ -113,7 +113,17 @@ def _mesh_rows(panel: MeshPicture) -> list[CsvRow]:
 
 
 def build_script(figure: Figure, panels: Sequence[FigurePanel], name: str, options: FigureOptions) -> str:
-    """Build a script that needs only Matplotlib and the CSV file next to it."""
+    """Build a script that needs only Matplotlib and the CSV file next to it.
+
+    Args:
+        figure: drawn figure, whose size and columns the script repeats.
+        panels: panels in their order, all of one kind.
+        name: name of the files without suffix.
+        options: width and font sizes.
+
+    Returns:
+        Source of the script.
+    """
     kind = type(panels[0])
     settings = {"name": name, "width": options.width_mm, "size": options.font_size, "small": options.small_font_size}
     inches = tuple(round(float(side), 3) for side in figure.get_size_inches())

@@ -184,9 +184,17 @@ def _draw_panel(
 
 
 def wrap_words(words: str, room: float, size: float) -> list[str]:
-    """Wrap text into lines that fit into `room` [points].
+    """Wrap text into lines that fit into a width.
 
     A letter is about 0.6 of the font size wide.
+
+    Args:
+        words: text; words longer than a line are broken.
+        room: width [points].
+        size: font size [points].
+
+    Returns:
+        The lines; one empty line for empty text.
     """
     return textwrap.wrap(words, max(12, int(room / (0.58 * size))), break_long_words=True) or [""]
 

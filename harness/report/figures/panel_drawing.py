@@ -221,9 +221,14 @@ def draw_cell_map(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
 
 
 def write_cell_values(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
-    """Write the values of all cells, as large as the longest one fits; none if that is too small to read.
+    """Write the values of all cells, as large as the longest one fits.
 
-    The frame must have its final size.
+    None is written if that is too small to read.
+
+    Args:
+        ax: axes of the map, whose frame must have its final size.
+        panel: map of the cells.
+        options: the small font size, which is the largest that is used.
     """
     rows, columns = panel.row_names, panel.column_names
     longest = max((len(line) for cell in panel.cells for line in cell.marked_text.split("\n")), default=0)

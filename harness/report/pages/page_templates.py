@@ -235,5 +235,10 @@ def find_templates(root: Path) -> list[Path]:
 
 
 def index_pictures(pages: Sequence[RenderedPage], root: Path) -> Mapping[str, PagePicture]:
-    """Return the pictures of pages by their path relative to the root."""
+    """Return the pictures of pages by their path relative to the root.
+
+    Args:
+        pages: rendered pages.
+        root: folder that contains all of their pictures.
+    """
     return {picture.path.relative_to(root).as_posix(): picture for page in pages for picture in page.pictures}

@@ -22,7 +22,15 @@ ChartItem = dict[str, Any]
 
 
 def read_benchmark_files(files: Iterable[Path], print_message: PrintMessage) -> list[StoredBenchmarks]:
-    """Read stored benchmark results, with a remark on each damaged file."""
+    """Read stored benchmark results, with a remark on each damaged file.
+
+    Args:
+        files: files of pytest-benchmark.
+        print_message: prints a remark.
+
+    Returns:
+        The results of the undamaged files, in their order.
+    """
     found: list[StoredBenchmarks] = []
     for path in files:
         try:

@@ -52,6 +52,10 @@ def write_json_script(path: Path, name: str, value: str) -> Path:
 def script_path(folder: Path, name: str) -> Path:
     """Return the path of the script with this name in a folder.
 
+    Args:
+        folder: folder of the scripts.
+        name: file name without suffix.
+
     Raises:
         ValueError: if the name is not a valid file name.
     """

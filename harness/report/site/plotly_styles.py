@@ -50,6 +50,9 @@ def plotly_style(mark: SeriesStyle) -> dict[str, str]:
 def axis_choice(column: str, title: str, layout: Mapping[str, Any] = LOG_AXIS) -> dict[str, Any]:
     """Return a possible axis of a chart.
 
-    It has a column of the items, a title, and the layout for Plotly.
+    Args:
+        column: column of the items whose values the axis shows.
+        title: title of the axis.
+        layout: properties of the axis in Plotly's terms.
     """
     return {"column": column, "title": title, "axis": layout}

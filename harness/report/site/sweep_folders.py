@@ -42,7 +42,15 @@ def find_benchmark_files(folder: Path) -> list[Path]:
 
 
 def locate_folder(path: Path, results: Path) -> SweepFolder:
-    """Return a sweep's folder as the page in `results` refers to it."""
+    """Return a sweep's folder as the page in `results` refers to it.
+
+    Args:
+        path: folder of the sweep, in `results` or equal to it.
+        results: folder of the page.
+
+    Raises:
+        ValueError: `path` is not in `results`.
+    """
     parts = path.relative_to(results).parts
     up = "".join(f"{quote(os.fsencode(part), safe='')}/" for part in parts)
     name = os.fsencode("/".join(parts) or path.resolve().name).decode(errors="replace")

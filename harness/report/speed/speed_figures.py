@@ -126,7 +126,12 @@ class MachineLimits:
         return float(np.exp(cast(float, np.interp(np.log(working_set), known, rates))))
 
     def measured_flops(self, threads: int, precision: str) -> float:
-        """Return flops per second; precisions below float32 compute in float32."""
+        """Return flops per second; precisions below float32 compute in float32.
+
+        Args:
+            threads: number of threads, one that was measured.
+            precision: number format; all but float64 count as float32.
+        """
         kind = "float64" if precision == "float64" else "float32"
         return self._best[threads, f"fma {kind}"][0.0]
 
@@ -135,6 +140,14 @@ class MachineLimits:
 
         Each byte is loaded once from the location of the working set, and repeated accesses come from the fastest
         cache.
+
+        Args:
+            operations: bytes and flops of one execution.
+            threads: number of threads, one that was measured.
+            precision: number format of the arithmetic.
+
+        Returns:
+            The limit that binds, bandwidth or arithmetic, and its time [s].
         """
         again = (operations.bytes_moved - operations.working_set_bytes) / max(self._best[threads, "read"].values())
         far = operations.working_set_bytes / self.measured_bandwidth(threads, operations.working_set_bytes)
@@ -144,6 +157,14 @@ class MachineLimits:
         """Compute the time if all moved bytes are loaded from the working set.
 
         Each access is then as slow as the location of the working set.
+
+        Args:
+            operations: bytes and flops of one execution.
+            threads: number of threads, one that was measured.
+            precision: number format of the arithmetic.
+
+        Returns:
+            The limit that binds, bandwidth or arithmetic, and its time [s].
         """
         far = operations.bytes_moved / self.measured_bandwidth(threads, operations.working_set_bytes)
         return self._binding_limit(far, operations, threads, precision)
