@@ -34,7 +34,11 @@ class ConfidenceInterval(NamedTuple):
 def estimate_ratio(theirs: ArrayLike, ours: ArrayLike) -> ConfidenceInterval:
     """Estimate the ratio theirs / ours of paired times.
 
-    Both are (rounds,); the estimate is the median over the rounds.
+    The estimate is the median over the rounds.
+
+    Args:
+        theirs: times (rounds,), in any unit.
+        ours: times (rounds,) of the same rounds in the same unit.
     """
     return _bootstrap_interval((np.asarray(theirs, float) / np.asarray(ours, float),), np.median)
 
@@ -74,6 +78,10 @@ def estimate_slowdown(new: Mapping[int, float], old: Mapping[int, float]) -> Con
     """Estimate the ratio new / old of times by frame.
 
     The estimate is over the common frames, of which there is at least one.
+
+    Args:
+        new: positive times by frame, in any unit.
+        old: positive times by frame in the same unit.
     """
     frames = sorted(set(new) & set(old))
     logs = np.log([new[frame] / old[frame] for frame in frames])

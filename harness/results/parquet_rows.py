@@ -40,7 +40,17 @@ _MAX_SINGLE_READS = 8
 
 
 def write_rows(path: Path, rows: Iterable[RowValues], schema: pa.Schema = RUN_SCHEMA) -> None:
-    """Write the rows of one file durably; raise WriteError if that fails."""
+    """Write the rows of one file durably.
+
+    Args:
+        path: target file.
+        rows: mappings of column names to values.
+        schema: Arrow schema of the file; columns that a row lacks are null.
+
+    Raises:
+        ValueError: if a row has a column that the schema lacks.
+        WriteError: if the file cannot be written.
+    """
     write_durably(path, encode_rows(rows, schema))
 
 
@@ -66,6 +76,10 @@ def write_durably(path: Path, content: bytes) -> None:
     """Write a file atomically: write a temporary file, flush it to disk, and rename it.
 
     After a kill or an error the file is complete or absent.
+
+    Args:
+        path: target file, replaced if it exists.
+        content: bytes of the whole file.
 
     Raises:
         WriteError: if the file cannot be written.
@@ -158,7 +172,16 @@ def read_rows_by_file(
     """Read rows by pyarrow, file by file.
 
     This is the reference for the verification of written rows.
-    The parameters are those of `read_rows`.
+
+    Args:
+        paths: row files of the units.
+        schema: columns that the result has at least.
+        required_columns: columns without which a row is invalid.
+        promote: "permissive" allows columns of one name to differ in type.
+        with_unit_names: whether to append the column `row_store.FILE_COLUMN` with the names of the units.
+
+    Raises:
+        InputError: for all damaged, foreign or empty files, and for invalid values.
     """
     return _drop_invalid_units(
         paths, *_read_by_file(paths, schema, required_columns, promote), None, with_unit_names=with_unit_names
@@ -298,7 +321,19 @@ def read_first_rows(
 def read_first_row(
     path: Path, schema: pa.Schema = RUN_SCHEMA, *, required_columns: Sequence[str] = ()
 ) -> dict[str, Any] | str:
-    """Read the first row of a unit, or describe what is wrong with its rows."""
+    """Read the first row of a unit, or describe what is wrong with its rows.
+
+    Args:
+        path: row file of the unit, which may be packed.
+        schema: columns that the row has at least.
+        required_columns: columns of the schema without which a row is invalid.
+
+    Returns:
+        The values by column name, or the description.
+
+    Raises:
+        InputError: for a damaged packed file, or if reading exceeds the memory limit.
+    """
     with limit_read_memory([path]):
         return _read_first(path, schema, required_columns, _read_packed([path]))
 
@@ -374,7 +409,11 @@ def _count_text_bytes(column: Any) -> int:
 
 
 def is_bitwise_equal(one: pa.Table, other: pa.Table) -> bool:
-    """Return whether two tables are bitwise equal; a NaN equals itself."""
+    """Return whether two tables are bitwise equal; a NaN equals itself.
+
+    Args:
+        one, other: tables of rows; different schemas or orders of columns make them unequal.
+    """
     return one.schema.equals(other.schema) and all(
         _is_column_equal(a.combine_chunks(), b.combine_chunks())
         for a, b in zip(one.itercolumns(), other.itercolumns(), strict=True)

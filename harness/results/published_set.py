@@ -125,7 +125,15 @@ def list_studies(published: Path) -> list[PublishedStudy]:
 
 
 def find_study(published: Path, name: str) -> PublishedStudy:
-    """Find a study by its name. Raises InputError if there is none."""
+    """Find a study by its name.
+
+    Args:
+        published: folder of the published set.
+        name: name of the study, which is that of its folder.
+
+    Raises:
+        InputError: there is no such study or no published set, or a `study.json` is damaged.
+    """
     studies = {study.study_name: study for study in list_studies(published)}
     if name not in studies:
         raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, studies)}", key="STUDY"))

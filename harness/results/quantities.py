@@ -57,7 +57,12 @@ def compute_ms_per_step(seconds: Sequence[float]) -> float:
 
 
 def compute_slowdown(run: float, other: float) -> float:
-    """Compute the ratio of two runs' times from their ms a step."""
+    """Compute the ratio of two runs' times from their ms a step.
+
+    Args:
+        run: time of the run [ms].
+        other: time of the run to which it is compared [ms], positive.
+    """
     return run / other
 
 

@@ -145,6 +145,10 @@ def compare_repeated_curve(published: RunRows, repeated: RunRows) -> RunAgreemen
 
     It is close if it reaches each of `CURVE_LEVELS` after as many iterations, within the tolerances and one sample.
     What a curve that ended at its time limit did not reach is not compared: that depends on the machine.
+
+    Args:
+        published: rows of the published curve, at least one.
+        repeated: rows of the same curve in the repetition, at least one.
     """
     first = published[0]
     title = f"{first['scene']} {first['size']} {first['snapshot']} {first['solver']}"
@@ -185,11 +189,18 @@ def _find_first_iteration(curve: Mapping[int, float], level: float) -> tuple[flo
 
 
 def compare_time_ratios(published: Sequence[MethodTimes], repeated: Sequence[MethodTimes]) -> list[RunAgreement]:
-    """Compare the ratios of times of the methods that both sides have, to the same reference method.
+    """Compare ratios of times, to the same reference method, of methods on both sides.
 
     A ratio is close within the accepted interval of the published one. Outside it is undecided if the load of a machine
     delayed one of its times or more than MAX_PREEMPTED_SHARE of all, or if its own interval reaches into the accepted
     one: a busy machine also slows what it does not interrupt.
+
+    Args:
+        published: times of the published study.
+        repeated: times of its repetition.
+
+    Returns:
+        The outcomes, one for each ratio that both sides have.
     """
     common = {(one.task, one.method) for one in published} & {(one.task, one.method) for one in repeated}
     before, after = (

@@ -75,7 +75,15 @@ def find_first_violation(
 
 
 def largest_gap_radius(planes: Sequence[ConvexObstacle], time: float) -> float:
-    """Return the radius [m] of the largest ball between half-spaces, at most 1; negative if they overlap."""
+    """Return the radius [m] of the largest ball between half-spaces, at most 1.
+
+    Args:
+        planes: obstacles that occupy half-spaces, at least one.
+        time: simulated time [s], at which moving planes are placed.
+
+    Returns:
+        The radius; negative if no point lies outside of all half-spaces.
+    """
     frames = [plane.frame(time) for plane in planes]
     normals, offsets = np.array([f[2] for f in frames]), np.array([f[2] @ f[0] for f in frames])
     from scipy.optimize import linprog  # takes a quarter of a second to import

@@ -88,7 +88,16 @@ class PinTargets(Protocol):
 
 
 def require_fixed_exact_pins(effect_name: str, start: Positions, pins: Sequence[PinTargets]) -> None:
-    """Raise InputError for exact pins that move."""
+    """Raise InputError for exact pins that move.
+
+    Args:
+        effect_name: name of the effect in the message.
+        start: initial positions (n, 3) [m], from which the targets of exact pins must not differ.
+        pins: all pins of the scene; those with a finite weight may move.
+
+    Raises:
+        InputError: an exact pin moves, or does not start at its target.
+    """
     for pin in pins:
         moves = pin.motion is not None or not np.array_equal(pin.targets, start[pin.vertices])
         if np.isinf(pin.weight) and moves:
@@ -102,7 +111,18 @@ def require_fixed_exact_pins(effect_name: str, start: Positions, pins: Sequence[
 def require_intersection_free(
     effect_name: str, energy: BarrierContact, start: Positions, min_distance: float, mesh: Mesh
 ) -> None:
-    """Raise InputError if pairs start closer than `min_distance` [m], at the start (n, 3) [m]."""
+    """Raise InputError if pairs start closer than a minimum distance.
+
+    Args:
+        effect_name: name of the effect in the message.
+        energy: barrier, which finds the pairs.
+        start: initial positions (n, 3) [m].
+        min_distance: the minimum distance [m] that the message states; that of the search belongs to `energy`.
+        mesh: mesh of the scene, by which the message names vertices, edges and triangles.
+
+    Raises:
+        InputError: a pair is too close.
+    """
     if closed := energy.find_violated_pairs(start):
         near = "; ".join(
             f"{_describe_pair(x.tolist(), two, mesh)} {apart:.3g} m apart"
@@ -135,7 +155,12 @@ def _describe_primitive(x: Sequence[int], mesh: Mesh) -> str:
 
 
 def describe_intersections(intersections: list[Intersection], mesh: Mesh) -> str:
-    """Describe the first intersections in words; indices beyond the mesh are those of obstacles."""
+    """Describe the first intersections in words.
+
+    Args:
+        intersections: pairs of an edge and a triangle, each by its vertices.
+        mesh: mesh of the scene; indices beyond its vertices are those of obstacles.
+    """
     words = "; ".join(
         f"{_describe_primitive(e, mesh)} through {_describe_primitive(t, mesh)}"
         for e, t in intersections[:_MAX_NAMED_PAIRS]

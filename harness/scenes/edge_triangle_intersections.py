@@ -158,7 +158,12 @@ def _to_fractions(x: FloatArray) -> ExactPoint:
 
 
 def edge_intersects_triangle(edge: list[ExactPoint], triangle: list[ExactPoint]) -> bool:
-    """Return whether an edge (two points) and a triangle (three points) intersect, in rational arithmetic."""
+    """Return whether an edge and a triangle intersect, in rational arithmetic.
+
+    Args:
+        edge: end points, two.
+        triangle: corners, three; they may lie on a line.
+    """
     a, b = edge
     u, v, w = triangle
     above, below = _signed_volume(u, v, w, a), _signed_volume(u, v, w, b)
