@@ -57,21 +57,35 @@ class KeyFrameMotion(ConfigModel):
         return tuple(key.time for key in self.key_frames)
 
     def transform_points(self, points: Positions, time: float) -> Positions:
-        """Return the positions (q, 3) [m] of declared points at a time [s]."""
+        """Return the positions (q, 3) [m] of declared points at a time.
+
+        Args:
+            points: declared positions (q, 3) [m], before any motion.
+            time: simulated time [s].
+        """
         *offset, turn = self._interpolate_pose(time)
         arm = points - self.pivot
         return points + offset + arm @ (_rotation_matrix(self.axis, np.deg2rad(turn)) - np.eye(3)).T
 
     def invert_points(self, points: Positions, time: float) -> Positions:
-        """Return the declared positions (q, 3) [m] of points at a time [s]."""
+        """Return the declared positions (q, 3) [m] of points at a time.
+
+        Args:
+            points: positions (q, 3) [m] at that time.
+            time: simulated time [s].
+        """
         *offset, turn = self._interpolate_pose(time)
         arm = points - offset - self.pivot
         return points - offset + arm @ (_rotation_matrix(self.axis, np.deg2rad(turn)) - np.eye(3))
 
     def compute_velocity(self, points: Positions, time: float) -> Positions:
-        """Return the velocity (q, 3) [m/s] of declared points at a time [s].
+        """Return the velocity (q, 3) [m/s] of declared points at a time.
 
         At a key frame, the velocity is the limit from the right.
+
+        Args:
+            points: declared positions (q, 3) [m], before any motion.
+            time: simulated time [s].
         """
         (*offset, rise), (*_, turn) = self._interpolate_rate(time), self._interpolate_pose(time)
         arm = (points - self.pivot) @ _rotation_matrix(self.axis, np.deg2rad(turn)).T

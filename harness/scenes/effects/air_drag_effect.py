@@ -40,7 +40,13 @@ class AirDragEffect(ConfigModel):
     area times drag coefficient [kg/m]."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the drag as an energy or a filter; empty for a zero coefficient."""
+        """Return the drag as an energy or a filter; empty for a zero coefficient.
+
+        Args:
+            mesh: mesh, whose mass fractions distribute the coefficient over the vertices.
+            mass: vertex masses (n,) [kg], for quadratic drag.
+            time_step: dt [s], for quadratic drag.
+        """
         c = self.coefficient * mesh.mass_fractions
         if not c.any():
             return EffectContribution()
@@ -82,7 +88,12 @@ class QuadraticDragForce:
     is_dissipative: ClassVar[bool] = True
 
     def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
-        """Return the force (n, 3) [N] at the velocities v (n, 3) [m/s]."""
+        """Return the force (n, 3) [N].
+
+        Args:
+            p, t: positions (n, 3) [m] and time [s], on which the force does not depend.
+            v: velocities (n, 3) [m/s].
+        """
         return -np.minimum(self.c * np.linalg.norm(v, axis=1), self.limit)[:, None] * v
 
 

@@ -32,7 +32,12 @@ class AttachmentsEffect(VertexSelection):
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the springs as one energy, empty for zero stiffness.
 
-        Raise InputError if they do not fit the mesh.
+        Args:
+            mesh: mesh, on which vertices are selected; their rest positions are the anchors where none are given.
+            mass, time_step: vertex masses (n,) [kg] and dt [s], which do not matter here.
+
+        Raises:
+            InputError: the selected vertices or the number of anchors do not fit the mesh.
         """
         vertices = self.select_vertices(mesh, self.kind)
         if self.anchors and len(self.anchors) not in (1, len(vertices)):

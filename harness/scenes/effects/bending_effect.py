@@ -52,7 +52,16 @@ class BendingEffect(ConfigModel):
     per area w [N/m^2] (ASTM D1388)."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the energy, empty for zero stiffness; raise InputError if the mesh is no surface."""
+        """Return the energy, empty for zero stiffness.
+
+        Args:
+            mesh: mesh with triangles, at most two at each edge.
+            mass: vertex masses (n,) [kg], from which a bending length makes a rigidity.
+            time_step: dt [s], which does not matter here.
+
+        Raises:
+            InputError: the mesh is no surface, a triangle has no area, or a bending length is given without a mass.
+        """
         if self.stiffness == 0.0:
             return EffectContribution()
         triangles = mesh.triangles
@@ -88,7 +97,15 @@ class BendingEffect(ConfigModel):
         return self
 
     def find_rigidity(self, mesh: Mesh, mass: NDArray[np.float64]) -> float:
-        """Return the flexural rigidity [N m] of the mesh; raise InputError for a bending length without a mass."""
+        """Return the flexural rigidity [N m] of the mesh.
+
+        Args:
+            mesh: mesh, whose area at rest counts for a bending length.
+            mass: vertex masses (n,) [kg], which count for a bending length.
+
+        Raises:
+            InputError: a bending length is given, but no mass.
+        """
         if self.stiffness is not None:
             return _average_threads(self.stiffness)
         areas = lump_areas(mesh.rest_positions, mesh.triangles) if mesh.vertex_areas is None else mesh.vertex_areas
@@ -98,7 +115,15 @@ class BendingEffect(ConfigModel):
         return weight * _average_threads(self.bending_length) ** 3
 
     def list_material_values(self, mesh: Mesh, mass: NDArray[np.float64]) -> list[tuple[PlausibleRange, float]]:
-        """Return the flexural rigidity [N m], with the range of fabrics."""
+        """Return the flexural rigidity [N m], with the range of fabrics.
+
+        Args:
+            mesh: mesh, whose area at rest counts for a bending length.
+            mass: vertex masses (n,) [kg], which count for a bending length.
+
+        Raises:
+            InputError: a bending length is given, but no mass.
+        """
         plausible = BENDING_RANGE if self.bending_length is None else BENDING_LENGTH_RANGE
         return [(plausible, self.find_rigidity(mesh, mass))]
 

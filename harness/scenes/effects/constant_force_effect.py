@@ -20,5 +20,10 @@ class ConstantForceEffect(ConfigModel):
     """Force on each vertex [N]."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the force on every vertex."""
+        """Return the force on every vertex.
+
+        Args:
+            mesh, time_step: mesh and dt [s], which do not matter here.
+            mass: vertex masses (n,) [kg], of which only the number matters.
+        """
         return EffectContribution(forces=build_constant_force(np.tile(np.array(self.force), (len(mass), 1))))

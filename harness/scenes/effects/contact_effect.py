@@ -69,6 +69,11 @@ class ContactEffect(ConfigModel):
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the contact as one energy, with a stiffness from the other effects.
 
+        Args:
+            mesh: mesh, whose springs at rest must be longer than the minimum distance.
+            mass: vertex masses (n,) [kg], which resist penetration.
+            time_step: dt [s], in which a vertex may advance into an obstacle.
+
         Raises:
             InputError: if the mesh is too fine for the thickness.
         """

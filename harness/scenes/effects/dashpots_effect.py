@@ -31,7 +31,15 @@ class DashpotsEffect(ConfigModel):
     """liu2013: the mesh size for which the coefficients above are given."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the dashpots as one energy; empty if no spring is damped."""
+        """Return the dashpots as one energy; empty if no spring is damped.
+
+        Args:
+            mesh: mesh, along whose springs the dashpots act.
+            mass, time_step: vertex masses (n,) [kg] and dt [s], which do not matter here.
+
+        Raises:
+            InputError: the scaling rule or its reference size does not fit the mesh.
+        """
         shear = self.stretch if self.shear is None else self.shear
         c = compute_spring_stiffness(
             mesh,

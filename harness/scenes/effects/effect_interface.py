@@ -93,7 +93,15 @@ class SceneCheck(Protocol):
     """Requirement of an effect on the other parts of a scene."""
 
     def __call__(self, start: Positions, pins: Sequence[PinGroup]) -> None:
-        """Raise InputError if the effect is incompatible with the start (n, 3) [m] or the pins."""
+        """Raise InputError if the effect is incompatible with the start or the pins.
+
+        Args:
+            start: initial positions (n, 3) [m].
+            pins: all pins of the scene.
+
+        Raises:
+            InputError: the effect does not work with them.
+        """
         ...
 
 
@@ -233,7 +241,11 @@ class ConstantForceField:
     force: Positions
 
     def __call__(self, p: Positions, v: Positions, t: float) -> Positions:
-        """Return the force, which is the same at all times."""
+        """Return the force (n, 3) [N], which is the same at all times.
+
+        Args:
+            p, v, t: positions (n, 3) [m], velocities (n, 3) [m/s] and time [s], which do not matter here.
+        """
         return self.force
 
 

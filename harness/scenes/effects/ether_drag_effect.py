@@ -29,7 +29,13 @@ class EtherDragEffect(ConfigModel):
     """Decay rate c [1/s]; the paper's factor per step is exp(-c dt)."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return a filter that scales the velocity; empty for a zero rate."""
+        """Return a filter that scales the velocity; empty for a zero rate.
+
+        Args:
+            mesh: mesh, which does not matter here.
+            mass: vertex masses (n,) [kg], for the equivalent force.
+            time_step: dt [s], over which the velocity decays.
+        """
         if self.decay_rate == 0.0:
             return EffectContribution()
 

@@ -23,7 +23,15 @@ class GasEffect(ConfigModel):
     """Pressure p0 in the rest shape relative to the outside [Pa]."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the energy, empty for zero pressure; raise InputError if the mesh is not closed."""
+        """Return the energy, empty for zero pressure.
+
+        Args:
+            mesh: mesh, whose triangles enclose the gas; its volume at rest is that of the pressure.
+            mass, time_step: vertex masses (n,) [kg] and dt [s], which do not matter here.
+
+        Raises:
+            InputError: the mesh is not closed, or encloses no volume.
+        """
         if not self.pressure:
             return EffectContribution()
         triangles = mesh.triangles

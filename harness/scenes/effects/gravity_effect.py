@@ -21,6 +21,11 @@ class GravityEffect(ConfigModel):
     """Acceleration of gravity [m/s^2]."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the force m g on every vertex."""
+        """Return the force m g on every vertex; empty without acceleration or mass.
+
+        Args:
+            mesh, time_step: mesh and dt [s], which do not matter here.
+            mass: vertex masses m (n,) [kg].
+        """
         forces = build_constant_force(mass[:, None] * np.array(self.acceleration))
         return EffectContribution(forces=forces, exclusive_features=("gravity",) if forces else ())

@@ -25,7 +25,15 @@ class PinsEffect(VertexSelection):
     """Key frames of the motion of all pinned vertices."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the selected vertices at rest; raise InputError for parts and vertices that the mesh lacks."""
+        """Return the selected vertices, pinned to their rest positions.
+
+        Args:
+            mesh: mesh, on which vertices are selected.
+            mass, time_step: vertex masses (n,) [kg] and dt [s], which do not matter here.
+
+        Raises:
+            InputError: the mesh lacks a selected part or vertex.
+        """
         vertices = self.select_vertices(mesh, self.kind)
         weight = inf if self.weight == "exact" else float(self.weight)
         return EffectContribution(pins=(PinGroup(vertices, mesh.rest_positions[vertices], weight, self.motion),))

@@ -34,7 +34,12 @@ class RayleighEffect(ConfigModel):
     """Stiffness coefficient b [s]: damps fast modes."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the mass damping as an energy, and the damping derived from the other effects' energies."""
+        """Return the mass damping, and the damping derived from the other effects' energies.
+
+        Args:
+            mesh, time_step: mesh and dt [s], which do not matter here.
+            mass: vertex masses (n,) [kg], times which the mass coefficient is the damping [kg/s].
+        """
         damping = self.mass_coefficient * mass
         return EffectContribution(
             energies=(RayleighDamping.from_vertices(damping),) if damping.any() else (),

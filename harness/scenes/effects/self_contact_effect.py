@@ -64,6 +64,11 @@ class SelfContactEffect(ConfigModel):
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the barrier as one energy, with a stiffness from the other effects.
 
+        Args:
+            mesh: mesh, whose triangles and stretch springs collide; empty if it has none.
+            mass: vertex masses (n,) [kg], for the stiffness where none is given.
+            time_step: dt [s], for the stiffness where none is given.
+
         Raises:
             InputError: if the mesh intersects itself at rest.
         """

@@ -45,7 +45,15 @@ class SewingEffect(ConfigModel):
         return self
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the threads as one energy, empty for zero stiffness; raise InputError if the rows overlap."""
+        """Return the threads as one energy, empty for zero stiffness.
+
+        Args:
+            mesh: mesh, on which the rows are selected and whose rest positions match their vertices.
+            mass, time_step: vertex masses (n,) [kg] and dt [s], which do not matter here.
+
+        Raises:
+            InputError: the rows have a common vertex, or the mesh lacks a selected part or vertex.
+        """
         rows = (
             self.first_row.select_vertices(mesh, f"{self.kind}: first_row"),
             self.second_row.select_vertices(mesh, f"{self.kind}: second_row"),

@@ -64,7 +64,17 @@ class SpringsEffect(ConfigModel):
     """liu2013: the mesh size for which the stiffnesses above are given."""
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the springs as one energy, empty without stiffness, and the length constraints."""
+        """Return the springs as energies, and the length constraints.
+
+        Springs that only pull have an energy of their own. Kinds without springs are omitted.
+
+        Args:
+            mesh: mesh, whose springs have the rest lengths and stiffnesses that it states.
+            mass, time_step: vertex masses (n,) [kg] and dt [s], which do not matter here.
+
+        Raises:
+            InputError: the material does not fit the mesh, or a spring of infinite stiffness has no length.
+        """
         given = _require_stretch(self.find_stretch(mesh), mesh)
         if self.youngs_modulus is not None and mesh.dimension == 2:
             E, t = self.youngs_modulus, self.thickness
@@ -118,7 +128,15 @@ class SpringsEffect(ConfigModel):
         return E * t
 
     def list_material_values(self, mesh: Mesh, mass: NDArray[np.float64]) -> list[tuple[PlausibleRange, float]]:
-        """Return the membrane stiffnesses [N/m] that the effect states for a cloth, with the range of fabrics."""
+        """Return the membrane stiffnesses [N/m] of a cloth, with the range of fabrics.
+
+        Args:
+            mesh: mesh, for a stiffness that follows from Young's modulus.
+            mass: vertex masses (n,) [kg], which do not matter here.
+
+        Returns:
+            The stiffnesses that the effect states; empty for scaling rules other than continuum and area.
+        """
         if self.scaling_rule not in ("continuum", "area"):
             return []
         stretch = self.find_stretch(mesh)

@@ -46,7 +46,15 @@ class StrainLimitsEffect(ConfigModel):
         return self
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the limits as one energy, empty for zero stiffness, or as length constraints."""
+        """Return the limits as one energy, empty for zero stiffness, or as length constraints.
+
+        Args:
+            mesh: mesh, to whose rest lengths the limits are relative.
+            mass, time_step: vertex masses (n,) [kg] and dt [s], which do not matter here.
+
+        Raises:
+            InputError: the scaling rule does not fit the mesh, or an exactly limited spring has no length.
+        """
         s = 1.0 if self.stiffness == "exact" else self.stiffness
         k = compute_spring_stiffness(
             mesh, scaling_rule=self.scaling_rule, stretch=s, shear=s, bend=0.0, reference_size=self.reference_size

@@ -91,7 +91,16 @@ class WindEffect(ConfigModel):
         return self.strength * np.array(self.velocity if self.acts_on == "triangle" else self.force)
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Return the field as one force, empty for zero strength; raise InputError if triangles are missing."""
+        """Return the field as one force, empty for zero strength.
+
+        Args:
+            mesh: mesh, on whose vertices or triangles the wind acts.
+            mass: vertex masses (n,) [kg], which limit the force on triangles.
+            time_step: dt [s], in which a triangle reaches the velocity of the air at most.
+
+        Raises:
+            InputError: the wind acts on triangles, and the mesh has none.
+        """
         if not self.strength:
             return EffectContribution()
         if self.acts_on == "triangle":
