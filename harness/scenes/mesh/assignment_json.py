@@ -52,7 +52,15 @@ def read_assignment_json(path: Path) -> AssignmentJson:
 
 
 def find_key_line(path: Path, key: str) -> int | None:
-    """Return the line of a key in a file with one flat JSON object, for messages."""
+    """Return the line of a key in a file with one flat JSON object, for messages.
+
+    Args:
+        path: JSON file in UTF-8.
+        key: key as it is written in the file.
+
+    Returns:
+        The line, counted from 1; None if the file lacks the key.
+    """
     text = path.read_text(encoding="utf-8-sig")
     match = re.search(rf'"{re.escape(key)}"\s*:', text)
     return text.count("\n", 0, match.start()) + 1 if match else None

@@ -34,7 +34,12 @@ def find_boundary_loops(mesh: Mesh) -> list[BoundaryLoop]:
 
 
 def trace_boundary_loops(points: NDArray[np.float64], triangles: IndexArray) -> list[BoundaryLoop]:
-    """Trace the boundary loops of triangles (f, 3) at points (n, 3) [m], longest first."""
+    """Trace the boundary loops of triangles, longest first.
+
+    Args:
+        points: positions (n, 3) [m], from which lengths are computed.
+        triangles: vertex indices (f, 3).
+    """
     if not len(triangles):
         return []
     n = len(points)

@@ -34,7 +34,15 @@ def find_strict_truncation(suffix: str, content: bytes) -> str:
 
 
 def guess_truncation(suffix: str, content: bytes) -> str:
-    """Describe what a file that cannot be read seems to lack; empty if nothing indicates that it was cut."""
+    """Describe what a file that cannot be read seems to lack.
+
+    Args:
+        suffix: suffix of the file, lower case with the dot.
+        content: content of the file.
+
+    Returns:
+        The description; empty if nothing indicates that the file was cut.
+    """
     if what := find_strict_truncation(suffix, content):
         return what
     check = _WEAK_CHECKS.get(suffix)

@@ -120,6 +120,10 @@ def sort_unique_vertices(vertices: NDArray[np.int64], n: int) -> NDArray[np.int6
     """Return the sorted unique vertices of n.
 
     `np.unique` would load `numpy.ma`, a tenth of the time of the command `list`.
+
+    Args:
+        vertices: vertex indices below n, in any order.
+        n: number of vertices of the mesh.
     """
     there = np.zeros(n, np.bool_)
     there[vertices] = True

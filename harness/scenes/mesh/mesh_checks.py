@@ -229,7 +229,12 @@ def _round_up(value: float) -> float:
 def find_t_junctions(points: PointArray, table: EdgeTable) -> tuple[IndexArray, IndexArray]:
     """Find boundary vertices inside a boundary edge of which they are no end.
 
-    Returns: the vertices (k,), and the edges (k, 2).
+    Args:
+        points: positions (n, 3) [m].
+        table: edges of the triangles.
+
+    Returns:
+        The vertices (k,), and the edges (k, 2).
     """
     from scipy.spatial import cKDTree
 
@@ -315,7 +320,14 @@ def _find_pinched_vertices(triangles: IndexArray, table: EdgeTable) -> IndexArra
 
 
 def compute_aspect_ratios(points: PointArray, triangles: IndexArray) -> PointArray:
-    """Compute the longest side over the shortest altitude of triangles, relative to an equilateral one, (f,)."""
+    """Compute the aspect ratio of each triangle, 1 for an equilateral one, (f,).
+
+    It is the longest side over the shortest altitude, relative to that of an equilateral triangle.
+
+    Args:
+        points: positions (n, 3) [m].
+        triangles: vertex indices (f, 3); the ratio is infinite where they have no area.
+    """
     a, b, c = (points[triangles[:, k]] for k in range(3))
     doubled = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     squared = np.max([np.square(x).sum(axis=1) for x in (b - a, c - b, a - c)], axis=0)
@@ -323,7 +335,12 @@ def compute_aspect_ratios(points: PointArray, triangles: IndexArray) -> PointArr
 
 
 def check_surface(points: PointArray, triangles: IndexArray) -> list[MeshFinding]:
-    """Check triangles (f, 3) at points (n, 3) [m]: seams between panels, orientation, edges, shapes."""
+    """Check the triangles of a surface: seams between panels, orientation, edges, shapes.
+
+    Args:
+        points: positions (n, 3) [m].
+        triangles: vertex indices (f, 3); there are no findings without triangles.
+    """
     if not len(triangles):
         return []
     table = build_edge_table(triangles)
@@ -378,7 +395,12 @@ def _check_facing(points: PointArray, triangles: IndexArray, table: EdgeTable) -
 
 
 def check_edges(points: PointArray, pairs: IndexArray) -> list[MeshFinding]:
-    """Check edges (m, 2) for coincident ends and lengths far below the median."""
+    """Check edges for coincident ends and lengths far below the median.
+
+    Args:
+        points: positions (n, 3) [m]; vertices that nearly coincide without an edge are found too.
+        pairs: edges (m, 2).
+    """
     found = _check_seams(points, pairs)
     length = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
     if not len(length):
@@ -392,7 +414,14 @@ def check_edges(points: PointArray, pairs: IndexArray) -> list[MeshFinding]:
 
 
 def check_self_intersections(points: PointArray, triangles: IndexArray) -> list[MeshFinding]:
-    """Find triangles that pass through each other; joins in one place and T-junctions do not count."""
+    """Find triangles that pass through each other.
+
+    Joins in one place and T-junctions do not count.
+
+    Args:
+        points: positions (n, 3) [m].
+        triangles: vertex indices (f, 3); if there are too many, the only finding is that nothing was searched.
+    """
     from springbench.harness.scenes.edge_triangle_intersections import find_edge_triangle_intersections
 
     if not len(triangles):

@@ -182,7 +182,12 @@ def find_repeated_corners(cells: IndexArray) -> NDArray[np.bool_]:
 
 
 def find_flat_faces(points: PointArray, polygons: IndexArray) -> NDArray[np.bool_]:
-    """Return which faces (f, k), k >= 3, have no area at points (n, 3), (f,)."""
+    """Return which faces have no area, (f,).
+
+    Args:
+        points: positions (n, 3) [m].
+        polygons: corners (f, k) of faces with k >= 3 corners.
+    """
     spokes = points[polygons[:, 1:]] - points[polygons[:, :1]]
     doubled = np.linalg.norm(np.cross(spokes[:, :-1], spokes[:, 1:]), axis=2).sum(axis=1)
     sides = np.diff(spokes, axis=1)

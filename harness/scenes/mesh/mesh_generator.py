@@ -109,5 +109,10 @@ class MeshGenerator(ConfigModel):
 
 
 def count_cells(length: float, spacing: float) -> int:
-    """Return the number of cells of about `spacing` [m] in `length` [m], at least one."""
+    """Return the number of cells that divide a length, at least one.
+
+    Args:
+        length: length [m] that is divided.
+        spacing: approximate length of a cell [m], positive.
+    """
     return max(1, round(length / spacing))

@@ -150,7 +150,14 @@ def build_mesh_report(source: FileMesh, support: MeshSupport | None = None) -> M
 
 
 def find_mesh_remarks(mesh: Mesh, support: MeshSupport | None) -> list[MeshFinding]:
-    """Check a mesh that is about to be simulated; self-intersections are searched if that takes about a second."""
+    """Check a mesh that is about to be simulated.
+
+    Self-intersections are searched if that takes about a second.
+
+    Args:
+        mesh: mesh, whose springs and triangles at rest are checked.
+        support: pinned or attached vertices and joined pairs; None if they are unknown.
+    """
     points, springs = mesh.rest_positions, mesh.springs
     used = np.zeros(len(points), np.bool_)
     used[springs.ravel()] = True
@@ -165,7 +172,12 @@ def find_mesh_remarks(mesh: Mesh, support: MeshSupport | None) -> list[MeshFindi
 
 
 def format_finding(finding: MeshFinding, numbering: Mesh | MeshCells) -> str:
-    """Format a finding with its first places; vertices by their numbers in the file."""
+    """Format a finding with its first places; vertices by their numbers in the file.
+
+    Args:
+        finding: fault or remark, with its vertices, edges, triangles or faces.
+        numbering: mesh or cells of the finding; where it has no file numbers, vertices are named by their indices.
+    """
     numbers = numbering.file_numbers
 
     def name_vertices(rows: IndexArray) -> Iterator[str]:

@@ -22,6 +22,10 @@ def build_offset_pairs(index: IndexArray, *offsets: tuple[int, ...]) -> IndexArr
     """Build the pairs (v, v + offset) of a lattice, (k, 2).
 
     They are ordered by offset, then by v.
+
+    Args:
+        index: vertices of the lattice, of any dimension; pairs that leave it are omitted.
+        *offsets: index offsets, each with one component for each dimension.
     """
     pairs = [NO_PAIRS]
     for offset in offsets:
@@ -42,9 +46,11 @@ def build_lattice_triangles(index: IndexArray) -> IndexArray:
 
 
 def build_capped_triangles(rings: IndexArray, first: int, last: int) -> IndexArray:
-    """Build the triangles of a lattice of rings (r, k) with two end points.
+    """Build the triangles (f, 3) of a lattice of rings with two end points.
 
-    The last column of the rings equals the first.
+    Args:
+        rings: vertices (r, k) of r rings; the last column equals the first.
+        first, last: end points next to the first and to the last ring.
     """
     begin = np.column_stack([np.full(rings.shape[1] - 1, first), rings[0, :-1], rings[0, 1:]])
     end = np.column_stack([np.full(rings.shape[1] - 1, last), rings[-1, 1:], rings[-1, :-1]])
@@ -86,30 +92,63 @@ def fan_triangles(polygons: IndexArray) -> IndexArray:
 
 
 def lump_to_vertices(cells: IndexArray, measure: PointArray, n: int) -> PointArray:
-    """Distribute each cell's measure, (f,), equally to its corners, (f, k): vertex weights, (n,)."""
+    """Distribute the measure of each cell equally to its corners.
+
+    Args:
+        cells: corners (f, k).
+        measure: lengths, areas or volumes (f,) of the cells.
+        n: number of vertices.
+
+    Returns:
+        Weights (n,) of the vertices, in the unit of the measure; 0 at vertices without a cell.
+    """
     corners = cells.shape[1]
     weights = np.bincount(cells.ravel(), np.repeat(measure / corners, corners), minlength=n)
     return weights.astype(np.float64, copy=False)
 
 
 def lump_lengths(rest: PointArray, pairs: IndexArray) -> PointArray:
-    """Lump half the length of each spring to its vertices, (n,) [m]."""
+    """Lump half the length of each spring to its vertices, (n,) [m].
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        pairs: springs (m, 2).
+    """
     return lump_to_vertices(pairs, np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1), len(rest))
 
 
 def lump_areas(rest: PointArray, triangles: IndexArray) -> PointArray:
-    """Lump a third of the area of each triangle to its vertices (barycentric lumping), (n,) [m^2]."""
+    """Lump a third of the area of each triangle to its vertices, (n,) [m^2].
+
+    This is barycentric lumping.
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        triangles: vertex indices (f, 3).
+    """
     a, b, c = (rest[triangles[:, k]] for k in range(3))
     return lump_to_vertices(triangles, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2, len(rest))
 
 
 def lump_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArray:
-    """Lump a quarter of the volume of each tetrahedron to its vertices, (n,) [m^3]."""
+    """Lump a quarter of the volume of each tetrahedron to its vertices, (n,) [m^3].
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        tetrahedra: vertex indices (t, 4), in either orientation.
+    """
     return lump_to_vertices(tetrahedra, np.abs(compute_signed_volumes(rest, tetrahedra)), len(rest))
 
 
 def find_connected_parts(num_vertices: int, pairs: IndexArray) -> IndexArray:
-    """Return the number of the connected part of each vertex, (n,); parts are numbered by their first vertex."""
+    """Return the number of the connected part of each vertex, (n,).
+
+    Parts are numbered by their first vertex.
+
+    Args:
+        num_vertices: n; a vertex without a pair is a part.
+        pairs: connected pairs of vertices (m, 2).
+    """
     from scipy.sparse import coo_array  # imported only when parts are needed
     from scipy.sparse.csgraph import connected_components
 
@@ -118,7 +157,12 @@ def find_connected_parts(num_vertices: int, pairs: IndexArray) -> IndexArray:
 
 
 def compute_signed_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArray:
-    """Compute the volume of each tetrahedron, (t,) [m^3], positive if corner 3 sees 0, 1, 2 counter-clockwise."""
+    """Compute the signed volume of each tetrahedron, (t,) [m^3].
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        tetrahedra: vertex indices (t, 4); the volume is positive if corner 3 sees 0, 1, 2 counter-clockwise.
+    """
     a, b, c, d = (rest[tetrahedra[:, k]] for k in range(4))
     return np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6
 
