@@ -174,7 +174,7 @@ def draw_header(page: Figure, headline: str, facts: Sequence[str], *, max_letter
     Args:
         page: figure to draw on.
         headline: title, shortened to `max_letters`.
-        facts: phrases, which dots separate.
+        facts: phrases of the line, separated by dots.
         max_letters: largest number of letters of the title.
     """
     draw_text(page, 40, 50, shorten_words(headline, max_letters), size=21, weight="bold")

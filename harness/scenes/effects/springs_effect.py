@@ -136,6 +136,9 @@ class SpringsEffect(ConfigModel):
 
         Returns:
             The stiffnesses that the effect states; empty for scaling rules other than continuum and area.
+
+        Raises:
+            InputError: Young's modulus or the thickness does not fit the mesh.
         """
         if self.scaling_rule not in ("continuum", "area"):
             return []

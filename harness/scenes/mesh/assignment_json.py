@@ -52,10 +52,10 @@ def read_assignment_json(path: Path) -> AssignmentJson:
 
 
 def find_key_line(path: Path, key: str) -> int | None:
-    """Return the line of a key in a file with one flat JSON object, for messages.
+    """Return the line of a key in a JSON file, for messages.
 
     Args:
-        path: JSON file in UTF-8.
+        path: file in UTF-8 with one flat JSON object.
         key: key as it is written in the file.
 
     Returns:
