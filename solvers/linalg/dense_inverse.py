@@ -69,7 +69,12 @@ class DenseInverse:
         self._multiply_contiguous = TypedKernel(multiply_dense)
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
+        """Write Q^-1 b to `out`.
+
+        Args:
+            b: right-hand sides (n, 3), not modified.
+            out: solution (n, 3), not `b` itself.
+        """
         is_contiguous = b.flags.c_contiguous and out.flags.c_contiguous
         multiply = self._multiply_contiguous.call if is_contiguous else multiply_dense
         multiply(self.inverse_matrix, self._columns, b, out)

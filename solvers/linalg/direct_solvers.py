@@ -26,7 +26,12 @@ class LinearSolver(Protocol):
     nonzeros: int | None
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
+        """Write Q^-1 b to `out`.
+
+        Args:
+            b: right-hand sides (n, 3), not modified.
+            out: solution (n, 3), not `b` itself.
+        """
         ...
 
 
@@ -42,7 +47,12 @@ class DenseCholesky:
         self.nonzeros: int | None = len(Q) * (len(Q) + 1) // 2
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b to `out`, (n, 3) each."""
+        """Write Q^-1 b to `out`.
+
+        Args:
+            b: right-hand sides (n, 3); they are not checked for NaN or infinity.
+            out: solution (n, 3).
+        """
         out[:] = cho_solve(self._factor, b, check_finite=False)
 
 
@@ -66,7 +76,12 @@ class SparseLU:
         self.nonzeros: int | None = self._factor.L.nnz
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b to `out`, (n, 3) each."""
+        """Write Q^-1 b to `out`.
+
+        Args:
+            b: right-hand sides (n, 3), not modified.
+            out: solution (n, 3).
+        """
         out[:] = self._factor.solve(b)
 
 
@@ -92,5 +107,10 @@ class SimplicialCholesky:
             raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE) from error
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b to `out`, (n, 3) each."""
+        """Write Q^-1 b to `out`.
+
+        Args:
+            b: right-hand sides (n, 3), C-contiguous.
+            out: solution (n, 3), C-contiguous.
+        """
         self._factor.solve(b, out)

@@ -65,11 +65,21 @@ class ConjugateGradientIteration(ABC):
 
     @abstractmethod
     def update_direction(self, product: Any, previous_product: Any) -> Any:
-        """Update p, and return p'Ap."""
+        """Update p, and return p'Ap.
+
+        Args:
+            product: r'z of the iterate.
+            previous_product: r'z of the iterate before; infinite at first.
+        """
 
     @abstractmethod
     def update_iterate(self, product: Any, curvature: Any) -> Any:
-        """Update x, r and z, and return r'z."""
+        """Update x, r and z, and return r'z.
+
+        Args:
+            product: r'z before the update.
+            curvature: p'Ap of the current direction.
+        """
 
     def is_convex(self, curvature: Any) -> bool:
         """Return whether the iteration may continue along p; always if A is known to be positive definite."""
@@ -80,7 +90,15 @@ class ConjugateGradientIteration(ABC):
         """Return whether x is accurate enough."""
 
     def run_iterations(self, product: Any, max_iterations: int) -> tuple[int, int]:
-        """Iterate from the product r'z; return the number of iterations and the reason for their end."""
+        """Iterate to convergence, negative curvature or the limit.
+
+        Args:
+            product: r'z of the initial x; an array for several right-hand sides.
+            max_iterations: largest number of iterations.
+
+        Returns:
+            The number of iterations, and the reason for their end: ITERATION_LIMIT, CONVERGED or NEGATIVE_CURVATURE.
+        """
         return _run_cg_loop(self, product, max_iterations)
 
 

@@ -10,7 +10,14 @@ from springbench.solvers.platform_calls import measure_memory
 
 
 def allocate_aligned(size: int, dtype: Any = np.float64) -> NDArray[Any]:
-    """Return zeros that start at a cache line, so that no vector of that size or less crosses two lines."""
+    """Return zeros that start at a cache line.
+
+    No vector of the size of a line or less crosses two lines.
+
+    Args:
+        size: number of entries of the one-dimensional array.
+        dtype: type of an entry.
+    """
     bytes_ = np.dtype(dtype).itemsize * size
     raw = np.zeros(bytes_ + 64, np.uint8)
     begin = -raw.ctypes.data % 64

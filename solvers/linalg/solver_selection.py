@@ -202,7 +202,14 @@ def select_solver(
 
 
 def estimate_supernodal_cost(s: SymbolicFactor, precision: Precision = "float64") -> CostEstimate:
-    """Estimate the cost of a supernodal factor: its panels, and those of L and updates during factorisation."""
+    """Estimate the cost of a supernodal factor from its symbolic factorisation.
+
+    The memory includes the panels, and those of L and updates during factorisation.
+
+    Args:
+        s: symbolic factor of Q.
+        precision: precision of the stored factor; the factorisation itself is in float64.
+    """
     squares, entered = count_stored_entries(s)
     half = 2 if precision == "float16" else 4
     panels = 8 * (squares + entered)

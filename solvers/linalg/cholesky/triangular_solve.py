@@ -64,7 +64,15 @@ def _store_solution(work, order, begin, end, out):
 
 @jit_inner
 def forward_substitution(panels, index, chunks, begin, end, work):
-    """Perform the forward substitution with the chunks from `begin` to `end`."""
+    """Perform the forward substitution with the chunks from `begin` to `end`.
+
+    Args:
+        panels: W of all chunks, one after the other.
+        index: slots of the chunks' rows, `PanelLayout.row_slots`.
+        chunks: offsets and sizes of each chunk (c, 7), see `PanelLayout`.
+        begin, end: range of chunks, without `end`.
+        work: right-hand side, four numbers per slot, updated.
+    """
     for k in range(begin, end):
         offset, at, below, quads, first = chunks[k, 1], chunks[k, 2], chunks[k, 4], chunks[k, 5], chunks[k, 6]
         if quads == 4:
@@ -79,7 +87,16 @@ def forward_substitution(panels, index, chunks, begin, end, work):
 
 @jit_inner
 def backward_substitution(squares, panels, index, chunks, begin, end, work):
-    """Perform the backward substitution with the chunks from `end` down to `begin`."""
+    """Perform the backward substitution with the chunks from `end` down to `begin`.
+
+    Args:
+        squares: S of all chunks, one after the other.
+        panels: W of all chunks, one after the other.
+        index: slots of the chunks' rows, `PanelLayout.row_slots`.
+        chunks: offsets and sizes of each chunk (c, 7), see `PanelLayout`.
+        begin, end: range of chunks, the last of which, `end` - 1, is first.
+        work: result of the forward substitution, four numbers per slot, overwritten with the solution.
+    """
     for k in range(end - 1, begin - 1, -1):
         start, offset, at, own = chunks[k, 0], chunks[k, 1], chunks[k, 2], chunks[k, 3]
         below, quads, first = chunks[k, 4], chunks[k, 5], chunks[k, 6]
@@ -203,9 +220,15 @@ def solve_supernodal(factor, b, out, threads):
 
 @jit_kernel
 def solve_from_arrays(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team, b, out, threads):
-    """Solve Q out = b from Python with the fields of a `SupernodalFactor` as separate arguments.
+    """Solve Q out = b from Python, with the fields of a `SupernodalFactor` as arguments.
 
     Arrays are passed faster than a named tuple, which would take a seventh of a solve of 100 vertices.
+
+    Args:
+        squares, panels, places, chunks, spans, by_slot, by_vertex, work, team: fields of the factor in their order.
+        b: right-hand sides (n, 3).
+        out: solution (n, 3).
+        threads: number of threads, None for one.
     """
     solve_supernodal(
         SupernodalFactor(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team), b, out, threads

@@ -18,7 +18,13 @@ ROWS_PER_BLOCK = 512
 
 @cached_njit(parallel=True)
 def multiply_sparse(pointers, columns, values, x, out):
-    """Compute out = A x; A in compressed rows, x and out (n, 4)."""
+    """Compute out = A x.
+
+    Args:
+        pointers, columns, values: A in compressed rows.
+        x: factor, four numbers per column of A.
+        out: product, four numbers per row of A; column 3 is not written.
+    """
     rows = len(out)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
@@ -28,7 +34,13 @@ def multiply_sparse(pointers, columns, values, x, out):
 
 @cached_njit(parallel=True)
 def add_sparse_product(pointers, columns, values, x, out):
-    """Compute out += A x; A in compressed rows, x and out (n, 4)."""
+    """Compute out += A x.
+
+    Args:
+        pointers, columns, values: A in compressed rows.
+        x: factor, four numbers per column of A.
+        out: sum, four numbers per row of A; column 3 is not written.
+    """
     rows = len(out)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
@@ -39,7 +51,14 @@ def add_sparse_product(pointers, columns, values, x, out):
 
 @cached_njit(parallel=True)
 def compute_linear_residual(pointers, columns, values, b, x, out):
-    """Compute out = b - A x; A in compressed rows, vectors (n, 4)."""
+    """Compute out = b - A x.
+
+    Args:
+        pointers, columns, values: A in compressed rows.
+        b: right-hand sides (n, 4).
+        x: approximate solution (n, 4).
+        out: residual (n, 4); column 3 is not written.
+    """
     rows = len(out)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
@@ -50,7 +69,17 @@ def compute_linear_residual(pointers, columns, values, b, x, out):
 
 @cached_njit(parallel=True)
 def chebyshev_first_step(inverse_diagonal, scale, b, step, x):
-    """Compute step = x = scale D^-1 b, the first Chebyshev step from x = 0."""
+    """Do the first Chebyshev step from x = 0.
+
+        step = x = scale D^-1 b
+
+    Args:
+        inverse_diagonal: D^-1, inverse of the diagonal of A (n,).
+        scale: weight of the preconditioned residual.
+        b: right-hand sides (n, 4).
+        step: change of x (n, 4), overwritten.
+        x: iterate (n, 4), overwritten.
+    """
     rows = len(x)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
@@ -62,7 +91,20 @@ def chebyshev_first_step(inverse_diagonal, scale, b, step, x):
 
 @cached_njit(parallel=True)
 def chebyshev_step(pointers, columns, values, inverse_diagonal, momentum, scale, b, step, x, out):
-    """Compute step = momentum step + scale D^-1 (b - A x) and out = x + step."""
+    """Do a Chebyshev step.
+
+        step <- momentum step + scale D^-1 (b - A x),   out = x + step
+
+    Args:
+        pointers, columns, values: A in compressed rows.
+        inverse_diagonal: D^-1, inverse of the diagonal of A (n,).
+        momentum: weight of the previous step.
+        scale: weight of the preconditioned residual.
+        b: right-hand sides (n, 4).
+        step: previous change of x (n, 4), overwritten with the new one.
+        x: iterate (n, 4).
+        out: next iterate (n, 4), not `x` itself.
+    """
     rows = len(out)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):
@@ -76,7 +118,14 @@ def chebyshev_step(pointers, columns, values, inverse_diagonal, momentum, scale,
 
 @cached_njit(parallel=True)
 def multiply_sparse_and_dot(pointers, columns, values, p, out, partial_sums):
-    """Compute out = A p, and partial_sums[:, :3] = p'out of each block of rows."""
+    """Compute out = A p, and p'out of each block of rows.
+
+    Args:
+        pointers, columns, values: A in compressed rows.
+        p: search directions (n, 4).
+        out: product (n, 4); column 3 is not written.
+        partial_sums: a row per block of ROWS_PER_BLOCK rows; columns 0 to 2 get p'out of each column of p.
+    """
     rows = len(out)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         t0, t1, t2 = 0.0, 0.0, 0.0
@@ -114,7 +163,13 @@ def update_iterate_and_residual(alpha, p, image, x, r, rounded, partial_sums):
 
 @cached_njit(parallel=True)
 def dot_and_max(r, z, partial_sums):
-    """Write r'z of each block of rows, and its largest |z|, to partial_sums[:, :6], by column."""
+    """Compute r'z and the largest |z| of each block of rows, for each column.
+
+    Args:
+        r: residuals (n, 4).
+        z: preconditioned residuals (n, 4).
+        partial_sums: a row per block of ROWS_PER_BLOCK rows; columns 0 to 2 get r'z, columns 3 to 5 the largest |z|.
+    """
     rows = len(r)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for c in range(3):
@@ -127,7 +182,13 @@ def dot_and_max(r, z, partial_sums):
 
 @cached_njit(parallel=True)
 def update_direction(beta, z, p):
-    """Compute p = z + beta p."""
+    """Compute p = z + beta p.
+
+    Args:
+        beta: weight of the previous direction in each column (3,).
+        z: preconditioned residuals (n, 4).
+        p: search directions (n, 4), updated.
+    """
     rows = len(p)
     for block in prange((rows + ROWS_PER_BLOCK - 1) // ROWS_PER_BLOCK):
         for i in range(block * ROWS_PER_BLOCK, min(rows, (block + 1) * ROWS_PER_BLOCK)):

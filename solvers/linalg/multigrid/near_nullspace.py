@@ -241,13 +241,23 @@ class PreconditionedSolve(ConjugateGradientIteration):
         return _ordered_dot(self._r, self._z)
 
     def update_direction(self, product: float, previous_product: float) -> float:
-        """Update the search direction p; return p'Ap."""
+        """Update the search direction p; return p'Ap.
+
+        Args:
+            product: r'z of the iterate.
+            previous_product: r'z of the iterate before; infinite at first.
+        """
         self._p = self._z + (product / previous_product) * self._p
         self._image = self._A @ self._p
         return _ordered_dot(self._p, self._image)
 
     def update_iterate(self, product: float, curvature: float) -> float:
-        """Update x and r, and apply the preconditioner; return r'z."""
+        """Update x and r, and apply the preconditioner; return r'z.
+
+        Args:
+            product: r'z before the update.
+            curvature: p'Ap of the current direction.
+        """
         self.x += (product / curvature) * self._p
         self._r -= (product / curvature) * self._image
         return self._apply_preconditioner()

@@ -78,14 +78,29 @@ class AccelerationEngine(Protocol):
     """A factory of solves."""
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
-        """Start a solve from an initial guess (n, 3)."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         ...
 
 
 def allocate_window(
     scheme: AccelerationScheme, num_entries: int, vector_size: int, precision: Any = np.float64
 ) -> AccelerationWindow:
-    """Allocate vectors of `vector_size`, of which `num_entries` are unknown; `precision` is that of the factor."""
+    """Allocate the state of an accelerated solve.
+
+    Args:
+        scheme: acceleration scheme, which sets the size of the history.
+        num_entries: entries of a correction, of a direction and of each vector in the history.
+        vector_size: entries of a position or descent vector, of which the first `num_entries` are unknown.
+        precision: type of history, correction and direction, that of the factor.
+
+    Returns:
+        The window with all vectors zero.
+    """
     m = scheme.history_size
     now = np.zeros(1, accelerated_descent.WINDOW_STATE_DTYPE)
     now["coefficient_rule"], now["max_retries"] = scheme.coefficient_rule, scheme.max_retries

@@ -156,7 +156,12 @@ class PreparedAdmm(IterativeSolver):
         self.project_edges = TypedKernel(kernels.run_admm_local_step)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return _AdmmState(self, problem, initial_guess)
 
     def residual_scale(self, problem: StepProblem) -> float:

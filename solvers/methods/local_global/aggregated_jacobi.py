@@ -151,11 +151,21 @@ class PreparedAggregatedJacobi(IterativeSolver):
         self.stats = base.stats
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return _AggregatedJacobiState(self, problem, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual [J^(1/2)] at positions p (n, 3) [m]."""
+        """Return the residual [J^(1/2)], measured with the factor of Q.
+
+        Args:
+            problem: step whose objective is minimised.
+            p: positions (n, 3) [m].
+        """
         return self.residual_solver.build_residual(problem)(p)
 
     def residual_scale(self, problem: StepProblem) -> float:

@@ -75,7 +75,12 @@ class PreparedBarrierLocalGlobal(PreparedHalfSpaceLocalGlobal):
         return f"{self.contact_free.description}; where pairs touch, by conjugate gradients"
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Return the initial state of the iteration of a step."""
+        """Return the initial state of the iteration of a step.
+
+        Args:
+            problem: step with barrier energies.
+            initial_guess: positions without intersections (n, 3) [m], not modified.
+        """
         return _BarrierState(self, problem, initial_guess)
 
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:

@@ -55,7 +55,12 @@ class PreparedCholmod(PreparedLocalGlobal):
     """CHOLMOD local-global, prepared; iterations without residual checks stay in C++."""
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> _CholmodState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return _CholmodState(self, problem, initial_guess)
 
 

@@ -70,7 +70,16 @@ def compile_cpp(
 
 
 def load_library(source: Path, requirements: str, libraries: Sequence[str] = ()) -> ctypes.CDLL:
-    """Compile a source and load the library; raise Unsupported if that fails."""
+    """Compile a C++ source into the user's cache folder and load the library.
+
+    Args:
+        source: C++ source that defines `prepare`, `local`, `global_` and `release`.
+        requirements: requirements, in words, for the error message.
+        libraries: linker arguments, as "-lcholmod".
+
+    Raises:
+        Unsupported: there is no compiler, or the source does not compile.
+    """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench"
     made = ctypes.CDLL(str(compile_cpp(source, cache, requirements, SHARED_LIBRARY_FLAGS, libraries)))
     made.prepare.restype = ctypes.c_void_p
@@ -83,7 +92,16 @@ class CppBackend:
     nonzeros: int | None = None
 
     def __init__(self, library: ctypes.CDLL, system: System, springs: Springs) -> None:
-        """Prepare a system; raise NotPositiveDefinite if Q has no factor."""
+        """Prepare a system.
+
+        Args:
+            library: library from `load_library`.
+            system: masses, pins and time step.
+            springs: all energies of the system, as one.
+
+        Raises:
+            NotPositiveDefinite: Q has no factor.
+        """
         _, pinned, weight = system.penalty_pins
         self.library, self._num_vertices, self._num_free = library, system.num_vertices, len(system.free_vertices)
         given = [np.ascontiguousarray(part, np.int64) for part in (springs.edges, pinned, system.free_vertices)]
@@ -99,11 +117,22 @@ class CppBackend:
         weakref.finalize(self, library.release, self.handle)
 
     def apply_local_step(self, p: Positions, y: Positions, out: Positions) -> None:
-        """Write y + A'K d(p) to `out`."""
+        """Write y + A'K d(p) to `out`.
+
+        Args:
+            p: positions (n, 3) [m].
+            y: constant part of the right-hand side (n, 3) [N].
+            out: right-hand side of the global step (n, 3) [N].
+        """
         self.library.local(self.handle, ctypes.c_int64(self._num_vertices), *map(array_address, (p, y, out)))
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b to `out`, for the free rows and columns of Q."""
+        """Write Q^-1 b to `out`, for the free rows and columns of Q.
+
+        Args:
+            b: right-hand sides of the free vertices (f, 3).
+            out: solution (f, 3).
+        """
         self.library.global_(self.handle, ctypes.c_int64(self._num_free), array_address(b), array_address(out))
 
 
@@ -119,7 +148,15 @@ PreparedType = TypeVar("PreparedType", bound=PreparedLocalGlobal)
 def prepare_cpp_backend(
     kind: type[PreparedType], system: System, springs: Springs, native: CppBackend, choice: str
 ) -> PreparedType:
-    """Prepare the iteration over compiled steps; the norm and the coupling use our own matrices."""
+    """Prepare the iteration over compiled steps; the norm and the coupling use our own matrices.
+
+    Args:
+        kind: class to construct.
+        system: the system.
+        springs: all energies of the system, as one.
+        native: compiled local step and factor of the system.
+        choice: description of the linear solver.
+    """
     norm = _SystemNorm(system, springs)
     coupling = norm.pin_coupling if system.pins.exact_mask.any() else csr_array((len(system.free_vertices), 0))
     return kind(system, native.apply_local_step, native, coupling, norm, norm.unpinned_trace, {}, choice)

@@ -109,7 +109,15 @@ def schedule_inverse(factor: DenseInverse) -> EliminationSchedule:
 
 
 def allocate_vectors(dtype: Any, rows: int) -> tuple[NDArray[Any], ...]:
-    """Allocate three vectors for the iterations, and one of float64 for scratch, in rows of four."""
+    """Allocate three vectors for the iterations, and one of float64 for scratch.
+
+    Args:
+        dtype: type of the vectors for the iterations, that of the factor.
+        rows: rows of four numbers in each vector.
+
+    Returns:
+        Four arrays of zeros (4 rows,).
+    """
     return *(allocate_aligned(4 * rows, dtype) for _ in range(3)), allocate_aligned(4 * rows)
 
 

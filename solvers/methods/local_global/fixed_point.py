@@ -79,7 +79,12 @@ class PreparedFixedPoint(IterativeSolver):
         self.description, self.stats = base.description, base.stats
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return _FixedPointState(self, problem, initial_guess)
 
     def residual_scale(self, problem: StepProblem) -> float:

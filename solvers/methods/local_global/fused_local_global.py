@@ -63,9 +63,14 @@ SCHEDULE_BUILDERS: dict[type, Callable[[Any], EliminationSchedule]] = {
 def compile_iterations(
     base: PreparedLocalGlobal, *, use_corrections: bool = False
 ) -> PreparedCompiledLocalGlobal | str:
-    """Return the compiled iterations over the factor's rows, or the reason in words why they run through Python.
+    """Build the compiled iterations over the factor's rows.
 
-    `use_corrections` selects corrections for any precision of the factor.
+    Args:
+        base: prepared iteration through Python.
+        use_corrections: whether to solve for corrections with a float64 factor as well.
+
+    Returns:
+        The compiled iterations, or the reason in words why the kernels do not support the system or its factor.
     """
     order = _build_schedule(base)
     if order is None:
@@ -169,7 +174,14 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
     def from_schedule(
         cls, base: PreparedLocalGlobal, parts: SpringForm, order: EliminationSchedule, corrects: bool
     ) -> PreparedCompiledLocalGlobal:
-        """Build the iterations over a factor in blocks; use_corrections selects corrections in any case."""
+        """Build the iterations over a factor in blocks.
+
+        Args:
+            base: prepared iteration through Python.
+            parts: decomposition of the system's energies.
+            order: factor in blocks, with the order of their visits.
+            corrects: whether to solve for corrections with a float64 factor as well.
+        """
         s, pins = base.system, base.system.pins
         exact = pins.vertices[pins.exact_mask]
         padding_row = order.num_rows + len(exact)
@@ -233,7 +245,14 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         return f"{self.base.description}{beyond}; {used} of {allowed} threads: {why}"
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        It solves for corrections if coordinates exceed `max_coordinate`.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return _CompiledState(
             self if compute_max_coordinate(problem) <= self.max_coordinate else self.with_corrections,
             problem,
@@ -268,7 +287,15 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         return {"local": local, "global": lambda: self.base.solve_correction(y, out)}
 
     def step_arrays(self, problem: StepProblem, guess: Positions) -> list[Positions]:
-        """Return target, force, pin targets and guess, for the kernels."""
+        """Return the arrays of a step as the kernels read them, contiguous and writable.
+
+        Args:
+            problem: the step.
+            guess: initial guess (n, 3) [m].
+
+        Returns:
+            Inertial target (n, 3) [m], constant force (n, 3) [N], pin targets (q, 3) [m] and guess (n, 3) [m].
+        """
         given = (problem.inertial_target, self.spring_form.compute_force(problem), problem.pin_targets, guess)
         return [*map(as_kernel_array, given)]
 

@@ -54,7 +54,12 @@ class ContactFreeSolver(PreparedSolver, Protocol):
     """A prepared local-global method of a system without contact."""
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Return the initial state of the iteration of a step."""
+        """Return the initial state of the iteration of a step.
+
+        Args:
+            problem: step in which no contact is active.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         ...
 
     def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:
@@ -134,7 +139,16 @@ class ContactCorrections:
         return x, rows
 
     def solve_with_rows(self, rows: PenaltyRows, gradient: Positions, contact_free_correction: Positions) -> Positions:
-        """Return the minimiser x of the model with the given rows."""
+        """Return the minimiser x of the model with the given rows.
+
+        Args:
+            rows: contact rows of free vertices with positive stiffness.
+            gradient: gradient of the objective (n, 3) [N].
+            contact_free_correction: Q^-1 gradient (n, 3) [m].
+
+        Returns:
+            Displacement (n, 3) [m], by Woodbury's formula for few rows, else by conjugate gradients.
+        """
         if not len(rows.vertices):
             return -contact_free_correction
         return (self._solve_woodbury if len(rows.vertices) <= _MAX_WOODBURY_ROWS else self._solve_cg)(
@@ -199,14 +213,24 @@ class ContactQuadraticModel(ConjugateGradientIteration):
         return float(np.vdot(self._residual, self._z))
 
     def update_direction(self, product: float, previous_product: float) -> float:
-        """Update the search direction; return its curvature."""
+        """Update the search direction p; return its curvature p'(Q + W)p [J].
+
+        Args:
+            product: r'z of the iterate [J].
+            previous_product: r'z of the iterate before [J]; infinite at first.
+        """
         scale = product / previous_product
         self._direction, self._image = self._z + scale * self._direction, self._residual + scale * self._image
         self._product = self._image + (self._contact_matrix @ self._direction.ravel()).reshape(-1, 3)
         return float(np.vdot(self._direction, self._product))
 
     def update_iterate(self, product: float, curvature: float) -> float:
-        """Update the iterate; return the preconditioned residual product."""
+        """Update the iterate; return the preconditioned residual product r'z [J].
+
+        Args:
+            product: r'z before the update [J].
+            curvature: p'(Q + W)p of the current direction [J].
+        """
         length = product / curvature
         self.x += length * self._direction
         self._residual -= length * self._product
@@ -255,7 +279,12 @@ class PreparedHalfSpaceLocalGlobal(IterativeSolver):
         )
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Return the initial state of a step; that of the contact-free method without active contact."""
+        """Return the initial state of a step; that of the contact-free method without active contact.
+
+        Args:
+            problem: step with vertex contact.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         contacts = begin_active_contacts(problem)
         if not contacts:
             return self.contact_free.init_state(problem, initial_guess)
@@ -267,7 +296,12 @@ class PreparedHalfSpaceLocalGlobal(IterativeSolver):
         return compute_max_coordinate(problem) * self.base.unpinned_trace**0.5
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual at p; no iteration is needed while contacts are active."""
+        """Return the residual [J^(1/2)]; no iteration is needed while contacts are active.
+
+        Args:
+            problem: step with vertex contact.
+            p: positions (n, 3) [m].
+        """
         return self.build_residual(problem)(p)
 
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:

@@ -69,7 +69,12 @@ class PreparedLocalGlobal(IterativeSolver):
     diagonal_dominance_ratio: float = 1.0
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return LocalGlobalState(self, problem, initial_guess)
 
     def residual_scale(self, problem: StepProblem) -> float:
@@ -108,9 +113,13 @@ class PreparedLocalGlobal(IterativeSolver):
         return y
 
     def solve_correction(self, b: Positions, out: Positions) -> Positions:
-        """Write Q^-1 b, without refinement of the factor's precision, to `out` and return `out`, both (n, 3).
+        """Write Q^-1 b, without refinement of the factor's precision, to `out`; return `out`.
 
         Exactly pinned vertices of `out` are not changed.
+
+        Args:
+            b: right-hand side (n, 3), as a gradient [N].
+            out: correction (n, 3) [m].
         """
         free = self.system.free_vertices
         if len(free) == len(b):
@@ -122,9 +131,14 @@ class PreparedLocalGlobal(IterativeSolver):
         return out
 
     def solve_positions(self, b: Positions, p: Positions, out: Positions) -> None:
-        """Write the solution of Q p = b to `out`, all (n, 3).
+        """Write the solution of Q p = b to `out`.
 
         A low-precision factor solves for the correction of p.
+
+        Args:
+            b: right-hand side (n, 3) [N].
+            p: approximate solution (n, 3) [m], read only for a low-precision factor.
+            out: solution (n, 3) [m], not `p` itself; exactly pinned vertices are not changed.
         """
         if self.correction_matrix is None:
             self.solve_correction(b, out)
@@ -135,7 +149,12 @@ class PreparedLocalGlobal(IterativeSolver):
         out[free] += p[free]
 
     def apply_exact_pins(self, p: Positions, problem: StepProblem) -> Positions:
-        """Return a copy of p with the exactly pinned vertices on their targets."""
+        """Return a copy of p with the exactly pinned vertices on their targets.
+
+        Args:
+            p: positions (n, 3) [m].
+            problem: step with the targets of the pins.
+        """
         placed = np.array(p, order="C")
         exact = self.system.pins.exact_mask
         placed[self.system.pins.vertices[exact]] = problem.pin_targets[exact]
@@ -180,7 +199,15 @@ class LocalGlobalState(SolverState):
 
 
 def require_projective(system: System, solver: str) -> list[ProjectiveEnergy]:
-    """Return the system's energies, all projective; raise Unsupported with the names of others."""
+    """Return the system's energies, all of them projective.
+
+    Args:
+        system: system whose energies are checked.
+        solver: name of the method for the error message.
+
+    Raises:
+        Unsupported: other energies, with their names.
+    """
     energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
     if len(energies) < len(system.energies):
         others = {type(e).__name__ for e in system.energies if not isinstance(e, ProjectiveEnergy)}
@@ -189,7 +216,15 @@ def require_projective(system: System, solver: str) -> list[ProjectiveEnergy]:
 
 
 def require_only_springs(system: System, solver: str) -> Springs:
-    """Return the system's springs as one energy; raise Unsupported if it has another energy."""
+    """Return the system's springs as one energy.
+
+    Args:
+        system: system whose energies are checked.
+        solver: name of the method for the error message.
+
+    Raises:
+        Unsupported: energies other than springs, with their names.
+    """
     others = {type(energy).__name__ for energy in system.energies if not isinstance(energy, Springs)}
     if others:
         raise Unsupported(f"{solver}: supports springs only; the scene has {', '.join(sorted(others))} as well")
@@ -253,6 +288,11 @@ def _build_local_step(energies: Iterable[Energy]) -> LocalStep:
 
 
 def factor_stats(entries: int, factor: LinearSolver) -> dict[str, float]:
-    """Return the number of entries of Q, and the statistics that the factor provides."""
+    """Return the number of entries of Q, and the statistics that the factor provides.
+
+    Args:
+        entries: stored entries of Q.
+        factor: linear solver; statistics without an attribute of it are omitted.
+    """
     counts = {name: getattr(factor, attribute, None) for name, attribute in _FACTOR_STATS.items()}
     return {"nnz_system": float(entries)} | {name: float(n) for name, n in counts.items() if n is not None}
