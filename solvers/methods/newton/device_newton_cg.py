@@ -295,9 +295,13 @@ class _NewtonCGState(DeviceSolverState):
 
 @cuda.jit
 def measure_max_coordinate(p, out):
-    """Update out[0] to the largest coordinate of p (n, 3).
+    """Update out[0] to the largest coordinate of p.
 
     The maximum is independent of the order of threads.
+
+    Args:
+        p: positions (n, 3) [m].
+        out: largest absolute coordinate so far (1,) [m], updated; the caller sets it to 0 first.
     """
     most, i = 0.0, cuda.grid(1)
     while i < p.shape[0]:
@@ -309,7 +313,12 @@ def measure_max_coordinate(p, out):
 
 @cuda.jit
 def write_negated(x, out):
-    """Write -x (f, 3) to `out`, rounded to its type."""
+    """Write -x to `out`, rounded to its type.
+
+    Args:
+        x: gradient (f, 3) [N] in float64.
+        out: right-hand side (f, 3) [N] in the type of the directions.
+    """
     i = cuda.grid(1)
     while i < out.shape[0]:
         out[i, 0], out[i, 1], out[i, 2] = -x[i, 0], -x[i, 1], -x[i, 2]
@@ -318,7 +327,17 @@ def write_negated(x, out):
 
 @cuda.jit
 def write_trial(p, d, t, q, g, sum_slot, partials):
-    """Write p + t d to the first rows of q, and store the first stage of the sum g'd."""
+    """Write the trial p + t d; store the first stage of g'd.
+
+    Args:
+        p: current point in rows (n, 3) [m]; the first f rows are free.
+        d: direction (f, 3) [m], in the type of the directions.
+        t: step size.
+        q: trial point (n, 3) [m], whose first f rows are overwritten.
+        g: gradient at p (f, 3) [N].
+        sum_slot: row of `partials` for the sum.
+        partials: sums of the blocks (k, MAX_BLOCKS) [J], see `device_sums`.
+    """
     total, i = 0.0, cuda.grid(1)
     while i < d.shape[0]:
         for c in range(3):
@@ -371,7 +390,14 @@ def build_conjugate_gradient_kernels(real: type[np.float32] | type[np.float64]) 
 
 @cuda.jit
 def evaluate_barrier_blocks(partials, which, count, now):
-    """Second stage of p'Hp, and its sign; one block."""
+    """Second stage of p'Hp, and its sign; one block.
+
+    Args:
+        partials: sums of the blocks (k, MAX_BLOCKS) [J], from the first stage.
+        which: row of `partials` with the terms of p'Hp.
+        count: number of blocks of the first stage.
+        now: scalars of conjugate gradients (6,); CURVATURE is written, and STATUS if p'Hp is not positive.
+    """
     if now[STATUS] != RUNNING:
         return
     total = device_sums.sum_partials(which, partials, count)
@@ -383,7 +409,14 @@ def evaluate_barrier_blocks(partials, which, count, now):
 
 @cuda.jit
 def check_convergence(partials, which, count, now):
-    """Second stage of r'z, and the convergence test; one block."""
+    """Second stage of r'z, and the convergence test; one block.
+
+    Args:
+        partials: sums of the blocks (k, MAX_BLOCKS) [J], from the first stage.
+        which: row of `partials` with the terms of r'z.
+        count: number of blocks of the first stage.
+        now: scalars of conjugate gradients (6,); both products and NUM_ITERATIONS are updated, and STATUS at the end.
+    """
     if now[STATUS] != RUNNING:
         return
     total = device_sums.sum_partials(which, partials, count)

@@ -76,7 +76,12 @@ class FrictionGaussSeidel:
         )
 
     def relax_friction(self, step: StepObjective, p: Positions) -> Positions:
-        """Return p (n, 3) with friction relaxed; p itself without friction."""
+        """Return a copy of p with friction relaxed; p itself without friction.
+
+        Args:
+            step: objective of the step, whose half-spaces may have friction.
+            p: positions (n, 3) [m], not modified.
+        """
         out = p
         for one in _active_contacts(step):
             planes = one.active_planes
@@ -86,7 +91,15 @@ class FrictionGaussSeidel:
         return out
 
     def relax_initial_point(self, step: StepObjective, at: DescentPoint) -> DescentPoint:
-        """Relax friction at the initial point, if that decreases the objective."""
+        """Relax friction at the initial point, if that decreases the objective.
+
+        Args:
+            step: objective of the step.
+            at: initial point of the solve.
+
+        Returns:
+            The relaxed point with its gradient, or `at` itself.
+        """
         p = self.relax_friction(step, at.positions)
         return (
             at

@@ -76,14 +76,27 @@ class RegularisationRule(Protocol):
     """The regularisation in one solve."""
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
-        """Factorise a Hessian and return its level: 0 for the exact one, more for others, None for no factor.
+        """Factorise a Hessian, modified if it is not positive definite.
 
-        The diagonal is that of `factorise_shifted`.
+        Args:
+            hessian: exact Hessian at the point.
+            at: point, whose gradient may select the elements that are projected.
+            diagonal: diagonal whose multiples are added (3f,) [N/m], as in `factorise_shifted`.
+
+        Returns:
+            The level: 0 for the exact Hessian, more for others, None for no factor.
         """
         ...
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
-        """Record a step from a point with the given Hessian to another point."""
+        """Record a step from a point with the given Hessian to another point.
+
+        Args:
+            step: objective of the step problem.
+            hessian: exact Hessian at the first point.
+            at: first point.
+            to: point at which the line search ended.
+        """
         ...
 
 
@@ -94,11 +107,24 @@ class ShiftScheduleRule:
     """
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
-        """Factorise at the first level of the schedule that has a factor."""
+        """Factorise at the first level of the schedule that has a factor.
+
+        Args:
+            hessian: exact Hessian at the point.
+            at: not used.
+            diagonal: diagonal whose multiples are added (3f,) [N/m].
+
+        Returns:
+            The level in SHIFT_SCHEDULE; None if no level has a factor.
+        """
         return factorise_shifted(hessian, diagonal)
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
-        """Record nothing."""
+        """Record nothing.
+
+        Args:
+            step, hessian, at, to: not used.
+        """
 
 
 class ContactScheduleRule(ShiftScheduleRule):
@@ -112,7 +138,16 @@ class ContactScheduleRule(ShiftScheduleRule):
         self._current_level = 0
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
-        """Factorise, starting one level below the previous one."""
+        """Factorise, starting one level below the previous one.
+
+        Args:
+            hessian: exact Hessian at the point.
+            at: not used.
+            diagonal: diagonal whose multiples are added (3f,) [N/m].
+
+        Returns:
+            The level in the schedule with active collisions; None if no level has a factor.
+        """
         level = factorise_shifted(
             hessian, diagonal, schedule=_CONTACT_SCHEDULE, first_level=max(0, self._current_level - 1)
         )
@@ -133,7 +168,16 @@ class ClampRule(ShiftScheduleRule):
         self.num_examined = self.num_projected = 0
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
-        """Factorise the projected Hessian, with a shift if necessary."""
+        """Factorise the projected Hessian, with a shift if necessary.
+
+        Args:
+            hessian: exact Hessian at the point; all elements are projected.
+            at: not used.
+            diagonal: diagonal whose multiples are added (3f,) [N/m].
+
+        Returns:
+            0 if no element changed and nothing was added, more for other factors, None for no factor.
+        """
         return self._factorise_projected(hessian, None, (0.0, *DIAGONAL_SHIFTS), diagonal)
 
     def _factorise_projected(
@@ -161,7 +205,14 @@ class TrustRegionRule(ClampRule):
         super().__init__(use_absolute=True)
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
-        """Compare the decrease in the step with the quadratic model."""
+        """Compare the decrease in the step with the quadratic model.
+
+        Args:
+            step: objective of the step problem.
+            hessian: exact Hessian at the first point, without projection.
+            at: first point.
+            to: point at which the line search ended.
+        """
         s = to.positions - at.positions
         model = inner_product(at.gradient, s) + 0.5 * inner_product(s, hessian.matvec(s))
         rise, _ = step.objective_change(at.positions, to.positions)
@@ -176,7 +227,16 @@ class ProgressiveRule(ClampRule):
         self._threshold = np.inf
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
-        """Factorise with the current threshold, halving it until there is a factor."""
+        """Factorise with the current threshold, halving it until there is a factor.
+
+        Args:
+            hessian: exact Hessian at the point.
+            at: point, whose gradient [N] is compared with the threshold.
+            diagonal: diagonal whose multiples are added (3f,) [N/m] if no threshold suffices.
+
+        Returns:
+            0 if no element changed and nothing was added, more for other factors, None for no factor.
+        """
         force = np.abs(at.gradient).max(axis=1, initial=0.0)
         for _ in range(_MAX_HALVINGS):
             level = self._factorise_projected(hessian, force >= self._threshold, (0.0,), diagonal)
@@ -186,7 +246,11 @@ class ProgressiveRule(ClampRule):
         return self._factorise_projected(hessian, None, DIAGONAL_SHIFTS, diagonal)
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
-        """Double the threshold."""
+        """Double the threshold.
+
+        Args:
+            step, hessian, at, to: not used.
+        """
         self._threshold *= 2.0
 
 

@@ -191,11 +191,21 @@ class PreparedHybrid(PreparedDescent):
         return SaddleCheck(self.fixed_objective)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return _HybridState(self, StepObjective(self.fixed_objective, problem), initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual [J^(1/2)] at p (n, 3) [m]."""
+        """Return the residual [J^(1/2)], by L-BFGS if its residuals are those of the metric.
+
+        Args:
+            problem: step whose objective is minimised.
+            p: positions (n, 3) [m].
+        """
         lbfgs = self.hybrid_iteration.exact_lbfgs
         return lbfgs.residual_at(ignore_barriers(problem), p) if lbfgs else super().residual_at(problem, p)
 
@@ -223,7 +233,13 @@ class SolveControl:
     first_run: AcceleratedState | None = None
 
     def add_phase(self, name: str, num_iterations: int, cost: float) -> None:
-        """Record iterations and the cost of a method, and set `num_iterations`."""
+        """Record iterations and the cost of a method, and set `num_iterations`.
+
+        Args:
+            name: name of the method in `solver_phases`.
+            num_iterations: iterations that led to the last point.
+            cost: cost of these iterations, in Newton steps.
+        """
         count, spent = self.solver_phases.get(name, (0, 0.0))
         self.solver_phases[name] = count + num_iterations, spent + cost
         self.num_iterations = num_iterations
@@ -373,11 +389,22 @@ class HybridIteration:
         self.newton_cost = (constant + per_flop * factor.flops + per_entry * factor.nonzeros) / lbfgs_cost
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
-        """Yield the points after `start`."""
+        """Yield the points after `start`.
+
+        Args:
+            step: objective of the step.
+            start: first point, of which only the positions are used.
+        """
         return self.iterate_from(step, start.positions, SolveControl())
 
     def iterate_from(self, step: StepObjective, p: Positions, control: SolveControl) -> Iterator[DescentPoint]:
-        """Yield the points after the positions p, (n, 3) [m]; restarts after an escape from a saddle."""
+        """Yield the points after the positions p; restart after an escape from a saddle.
+
+        Args:
+            step: objective of the step.
+            p: positions (n, 3) [m]; the inertial prediction replaces them if it is lower.
+            control: limits of the next iterations, read for each point; counts and costs are recorded there.
+        """
         lower, point = lower_start_positions(step, p), None
         first, control.first_run = control.first_run if lower is p else None, None
         p = lower
@@ -403,19 +430,39 @@ class HybridIteration:
                     break
 
     def start_lbfgs(self, step: StepObjective, p: Positions) -> AcceleratedState:
-        """Start L-BFGS at p, without surface contact."""
+        """Start L-BFGS, without surface contact.
+
+        Args:
+            step: objective of the step, whose barrier energies are ignored.
+            p: initial guess (n, 3) [m].
+        """
         return self._lbfgs.init_state(ignore_barriers(step.problem) if self._system_has_barriers else step.problem, p)
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
-        """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
+        """Return whether a stationary point is a minimum, as far as the method can determine.
+
+        Args:
+            step: objective of the step.
+            at: stationary point, whose exact Hessian is factorised.
+        """
         return self.newton.can_terminate(step, at)
 
     def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
-        """Return the phases of Newton's method, and a round of L-BFGS, as callables."""
+        """Return the phases of Newton's method, and a round of L-BFGS, as callables.
+
+        Args:
+            step: objective of the step.
+            at: point at which the phases are evaluated.
+        """
         return self.newton.iteration_phases(step, at) | {"lbfgs": lambda: self.relax_point(step, at.positions)}
 
     def relax_point(self, step: StepObjective, p: Positions) -> DescentPoint:
-        """Return the point after a few iterations of L-BFGS from p."""
+        """Return the point after a few iterations of L-BFGS.
+
+        Args:
+            step: objective of the step, whose barrier energies are ignored.
+            p: positions (n, 3) [m] from which L-BFGS starts.
+        """
         run = self.start_lbfgs(step, p)
         run.run_iterations(LoopLimits(_RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
         return _current_point(run)

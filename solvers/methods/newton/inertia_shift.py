@@ -34,7 +34,12 @@ class InertiaShift:
     """
 
     def __init__(self, value: float, max_value: float) -> None:
-        """Create the state with the first value, and the largest finite one."""
+        """Create the state of a solve.
+
+        Args:
+            value: first multiple of the inertia; infinite to start with another modification of the Hessian.
+            max_value: largest finite multiple; beyond it the value is infinite.
+        """
         self.value, self.can_reduce, self._max_value, self._ratio = value, False, max_value, _SHIFT_RATIO
 
     def find_smallest(self, attempt: Callable[[float], _Found | None]) -> _Found | None:

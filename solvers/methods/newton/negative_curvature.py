@@ -30,7 +30,12 @@ _CURVATURE_ROUNDOFF = 16.0 * np.finfo(np.float64).eps
 
 
 def is_positive_definite(step: StepObjective, p: Positions) -> bool:
-    """Return whether the exact Hessian at p (n, 3) is positive definite in floating point."""
+    """Return whether the exact Hessian is positive definite in floating point.
+
+    Args:
+        step: objective, whose Hessian is factorised.
+        p: positions (n, 3) [m].
+    """
     return step.hessian(p).factorise()
 
 
@@ -66,8 +71,13 @@ def probe_negative_curvature(
 ) -> DescentPoint | None:
     """Return a lower point next to one that approaches a saddle point, or None.
 
-    It is None if a few power iterations find no negative curvature. The arguments are those of `escape_saddle`; the
-    Hessian is that of a point near `at`.
+    It is None if a few power iterations find no negative curvature.
+
+    Args:
+        step: the objective.
+        at: point from which the line search starts.
+        hessian: the Hessian H of a point near `at`, factorised as H + E.
+        diagonal: diagonal of Q (3f,) [N/m].
     """
     found = _find_negative_curvature(at, hessian, diagonal, _PROBE_ITERATIONS)
     if found is None:

@@ -120,7 +120,12 @@ class TruncatedNewtonIteration:
         self._friction_search = make_friction_search(metric)
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
-        """Yield the points after `start`."""
+        """Yield the points after `start`.
+
+        Args:
+            step: objective of the step.
+            start: first point, which is not yielded; friction is relaxed there.
+        """
         loose = _MAX_ETA_IN_CONTACT if step.has_contact_elements else _MAX_ETA
         point, eta = (
             self._friction_search.relax_initial_point(step, start)
@@ -162,11 +167,20 @@ class TruncatedNewtonIteration:
         return self._friction_search.watchdog_search(step, at, direction, following)
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
-        """Return True: without a factor, definiteness is unknown."""
+        """Return True: without a factor, definiteness is unknown.
+
+        Args:
+            step, at: not used.
+        """
         return True
 
     def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
-        """Return the gradient, a product with the Hessian and the preconditioner as callables."""
+        """Return the gradient, a product with the Hessian and the preconditioner as callables.
+
+        Args:
+            step: objective of the step.
+            at: point at which the phases are evaluated.
+        """
         hessian, solve = self._linearise_at(step, at.positions)
         return {
             "gradient": lambda: step.gradient(at.positions),

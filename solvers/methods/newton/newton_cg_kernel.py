@@ -19,7 +19,15 @@ from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, compile_cg_loo
 
 
 def embed_factor(factor: SupernodalCholesky, free: NDArray[np.int64]) -> SupernodalFactor:
-    """Embed a float64 factor over the free vertices (f,) so that it solves with vectors of all vertices."""
+    """Embed a factor over the free vertices into vectors of all vertices.
+
+    Args:
+        factor: float64 factor of Q's free rows and columns (f, f).
+        free: the free vertices (f,).
+
+    Returns:
+        Factor with a work vector and thread team of its own; a solve neither reads nor writes the other vertices.
+    """
     at = factor.layout
     by_slot, by_vertex = (
         np.stack([free[order[:, 0]], order[:, 1]], axis=1).astype(np.uint32)

@@ -129,7 +129,12 @@ class NewtonIteration:
         self._friction_search = make_friction_search(metric)
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
-        """Yield the points after `start`."""
+        """Yield the points after `start`.
+
+        Args:
+            step: objective of the step.
+            start: first point, which is not yielded; friction is relaxed there.
+        """
         point, steepest, rule = start, 0.0, self._modification_rule()
         if step.barrier_energies and type(rule) is ShiftScheduleRule:
             rule = ContactScheduleRule()
@@ -140,11 +145,21 @@ class NewtonIteration:
             yield point
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
-        """Return whether the stationary point `at` is a minimum, as far as the method can determine."""
+        """Return whether a stationary point is a minimum, as far as the method can determine.
+
+        Args:
+            step: objective of the step.
+            at: stationary point, whose exact Hessian is factorised.
+        """
         return is_positive_definite(step, at.positions)
 
     def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
-        """Return the gradient, the Hessian with its factorisation, and a solve as callables."""
+        """Return the gradient, the Hessian with its factorisation, and a solve as callables.
+
+        Args:
+            step: objective of the step.
+            at: point at which the phases are evaluated.
+        """
         hessian, (keep, by) = (
             step.hessian(at.positions),
             SHIFT_SCHEDULE[-1],

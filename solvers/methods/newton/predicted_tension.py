@@ -40,7 +40,12 @@ class RelaxationMethod(Protocol):
     system_diagonal: NDArray[np.float64]
 
     def relax_point(self, step: StepObjective, p: Positions) -> DescentPoint:
-        """Return the point after local relaxation of p, which removes the second-order stretch of a step."""
+        """Return the point after local relaxation, which removes the second-order stretch of a step.
+
+        Args:
+            step: objective of the step.
+            p: positions at the end of a Newton step (n, 3) [m].
+        """
         ...
 
 
@@ -48,7 +53,13 @@ class PredictedTensionNewton:
     """Newton's method with predicted tensions in one solve."""
 
     def __init__(self, method: RelaxationMethod, step: StepObjective, origin: DescentPoint) -> None:
-        """Create the state with the point from which the first step starts."""
+        """Create the state of a solve.
+
+        Args:
+            method: metric, diagonals and local relaxation for the system.
+            step: objective of the step.
+            origin: point from which the first step starts.
+        """
         self._method, self._step = method, step
         self._first_point: DescentPoint | None = origin
         self._predicted_tensions = np.zeros(len(step.fixed_objective.springs.stiffness))
@@ -123,6 +134,11 @@ class PredictedTensionNewton:
 
 
 def objective_decrease(step: StepObjective, before: DescentPoint, after: DescentPoint) -> float:
-    """Return the decrease of the objective [J]; 0 if it increases or the decrease is below round-off."""
+    """Return the decrease of the objective [J]; 0 if it increases or is below round-off.
+
+    Args:
+        step: the objective.
+        before, after: points between which it is compared; their gradients are not used.
+    """
     rise, noise = step.objective_change(before.positions, after.positions)
     return -rise if -rise > noise else 0.0
