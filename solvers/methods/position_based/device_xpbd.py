@@ -87,7 +87,13 @@ class DeviceConstraints(NamedTuple):
     def from_constraints(
         cls, stream: DeviceStream, constraints: SpringConstraints, real: RealType
     ) -> DeviceConstraints:
-        """Copy the constraints to the device, which does not support empty arrays."""
+        """Copy the constraints to the device, which does not support empty arrays.
+
+        Args:
+            stream: stream of the copies.
+            constraints: springs by colour, on the host.
+            real: type of the stiffnesses; lengths and directions remain float64.
+        """
         m = max(1, len(constraints.stiffness))
         ends, direction = np.zeros((m, 2), np.int32), np.zeros((m, 3))
         stiffness, rest = np.zeros(m), np.zeros(m)
@@ -125,7 +131,12 @@ class VertexData(NamedTuple):
 
     @classmethod
     def from_system(cls, stream: DeviceStream, system: System) -> VertexData:
-        """Build the vertex data of a system."""
+        """Build the vertex data of a system.
+
+        Args:
+            stream: stream of the copies to the device.
+            system: masses, pins and time step.
+        """
         n, pins = system.num_vertices, system.pins
         weight = np.zeros(n)
         weight[pins.vertices] = pins.weight
@@ -152,7 +163,13 @@ class PreparedDeviceXpbd(DeviceSolver):
     is_substepping: ClassVar[bool] = False
 
     def upload_problem(self, problem: StepProblem, initial_guess: Positions, uploads: ReusedUploads) -> DeviceStep:
-        """Upload a step problem; the initial guess is not used."""
+        """Upload a step problem.
+
+        Args:
+            problem: the step.
+            initial_guess: not used.
+            uploads: device arrays of the previous step, overwritten.
+        """
         up, start = uploads.upload_array, problem.step_start
         target, force, pins = (
             up(problem.inertial_target),

@@ -114,7 +114,13 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
 
 @cuda.jit
 def write_device_positions(x, u, out):
-    """Write x + u to `out`, (n, 3) [m]."""
+    """Write x + u to `out`.
+
+    Args:
+        x: positions without springs (n, 3) [m], float64.
+        u: displacement (n, 4) [m], in the type of the kernels; column 3 is padding.
+        out: positions (n, 3) [m].
+    """
     i = cuda.grid(1)
     while i < x.shape[0]:
         for c in range(3):
@@ -154,7 +160,15 @@ def predict_step(
 
 @cuda.jit
 def finish_substep(h, before, x, u, v):
-    """Finish a substep: it ends at x + u, which determines the velocity."""
+    """Finish a substep: it ends at x + u, which determines the velocity.
+
+    Args:
+        h: substep [s].
+        before: positions at the start of the substep (n, 3) [m].
+        x: positions without springs (n, 3) [m], overwritten with those at the end.
+        u: displacement (n, 4) [m], set to zero; column 3 is padding.
+        v: velocity (n, 3) [m/s], overwritten.
+    """
     i = cuda.grid(1)
     while i < x.shape[0]:
         for c in range(3):

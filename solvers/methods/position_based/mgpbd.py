@@ -153,7 +153,12 @@ class PreparedMultigridXpbd(IterativeSolver):
     stats: dict[str, float] = field(default_factory=dict)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> MgpbdState:
-        """Start a solve at the positions that the vertices have without springs."""
+        """Start a solve at the positions that the vertices have without springs.
+
+        Args:
+            problem: step whose inertia, forces and pins determine these positions.
+            initial_guess: not used.
+        """
         return MgpbdState(self, vertex_terms.compute_anchor_positions(problem))
 
     def scaled_constraints(self, p: Positions) -> tuple[NDArray[np.float64], Positions]:

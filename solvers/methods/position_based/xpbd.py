@@ -132,7 +132,12 @@ class PreparedXpbd(IterativeSolver):
         return TypedKernel(kernels.run_projections)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> XpbdState:
-        """Start a solve at the positions that the vertices have without springs."""
+        """Start a solve at the positions that the vertices have without springs.
+
+        Args:
+            problem: step whose inertia, forces and pins determine these positions.
+            initial_guess: not used.
+        """
         return XpbdState(self, vertex_terms.compute_anchor_positions(problem))
 
 
@@ -177,11 +182,24 @@ class PreparedXpbdSmallSteps(IterativeSolver):
     stats: dict[str, float] = field(default_factory=dict)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve at the start of the step."""
+        """Start a solve at the start of the step.
+
+        Args:
+            problem: step that each iteration integrates again, with one more substep.
+            initial_guess: not used.
+        """
         return SubsteppingState(self.step, problem)
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
-        """Integrate the step in `substeps` substeps; return positions [m] and velocities [m/s]."""
+        """Integrate the step in equal substeps.
+
+        Args:
+            problem: step with its start, pin targets and external force.
+            substeps: number of substeps.
+
+        Returns:
+            Positions (n, 3) [m] and velocities (n, 3) [m/s] at the end of the step.
+        """
         s, pins, start = self.system, self.system.pins, problem.step_start
         h = s.time_step / substeps
         compliance, ease = _compute_compliance(

@@ -29,7 +29,12 @@ class SpringConstraints(NamedTuple):
 
     @classmethod
     def from_springs(cls, springs: Springs, order: NDArray[np.int64]) -> SpringConstraints:
-        """Select the springs in the order `order`."""
+        """Select springs in a given order.
+
+        Args:
+            springs: springs of the system.
+            order: indices of the selected springs (m,).
+        """
         fields = (springs.stiffness, springs.rest_length, springs.rest_direction)
         return cls(
             np.ascontiguousarray(springs.edges[order], np.int32), *(np.ascontiguousarray(x[order]) for x in fields)
