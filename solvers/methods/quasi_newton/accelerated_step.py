@@ -57,7 +57,16 @@ class AcceleratedStep(NamedTuple):
 
 @jit_kernel
 def start_solve(step: AcceleratedStep, window: AccelerationWindow, target, force, pin_targets, guess):
-    """Start the solve of a step and return the residual [J^(1/2)] at the guess."""
+    """Start the solve of a step and return the residual [J^(1/2)] at the guess.
+
+    Args:
+        step: data of the system; its vectors and objective values are overwritten.
+        window: state of the solve, initialised at the guess.
+        target: inertial target (n, 3) [m].
+        force: external force and constant force of the forms (n, 3) [N].
+        pin_targets: target positions of the pins (q, 3) [m].
+        guess: initial guess (n, 3) [m].
+    """
     write_right_hand_side(step.vertex_rows, target, force, pin_targets, step.right_hand_side)
     write_positions(step.vertex_rows, guess, pin_targets, window.trial_position)
     step.objective_values[0] = _evaluate_trial(step, window)
@@ -122,8 +131,19 @@ _iterate_loop = build_compiled_loop(_step_state, _residual)
 
 @jit_kernel
 def run_solve(step: AcceleratedStep, window: AccelerationWindow, limits, out):
-    """Run the iteration loop (see `springbench.solvers.kernels.iteration_loop`) and write the positions to `out` (n,
-    3)."""
+    """Run the iteration loop and write the positions to `out`.
+
+    See `springbench.solvers.kernels.iteration_loop`.
+
+    Args:
+        step: data of the system; its vectors and objective values are updated.
+        window: state of the solve, from `start_solve`; updated.
+        limits: limits of the loop, in iterations.
+        out: positions (n, 3) [m].
+
+    Returns:
+        Number of iterations, last residual [J^(1/2)] and termination reason.
+    """
     answer = _iterate_loop((step, window), limits)
     read_positions(step.vertex_rows, window.position, out)
     return answer
@@ -139,8 +159,20 @@ _iterate_rounds = build_compiled_rounds(_step_state, _residual, _objective_decre
 
 @jit_kernel
 def run_solve_rounds(step: AcceleratedStep, window: AccelerationWindow, rounds, limits, out):
-    """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions to `out` (n,
-    3)."""
+    """Run rounds of iterations and write the positions to `out`.
+
+    See `springbench.solvers.kernels.descent_rounds`.
+
+    Args:
+        step: data of the system; its vectors and objective values are updated.
+        window: state of the solve, from `start_solve`; updated.
+        rounds: state of the rounds (1,) of type ROUND_STATE_DTYPE, updated.
+        limits: limits of the loop, in rounds.
+        out: positions (n, 3) [m].
+
+    Returns:
+        Number of rounds, last residual [J^(1/2)] and termination reason.
+    """
     answer = _iterate_rounds((step, window), rounds, limits)
     read_positions(step.vertex_rows, window.position, out)
     return answer

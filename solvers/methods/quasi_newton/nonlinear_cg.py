@@ -99,7 +99,12 @@ class PreparedNonlinearCG(IterativeSolver):
     stats: dict[str, float]
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return _NonlinearCGState(
             self.metric, self.linearise_at, StepObjective(self.fixed_objective, problem), initial_guess
         )

@@ -44,7 +44,12 @@ class ContactEngine:
         self._objective, self._corrections = objective, ContactCorrections(base)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
-        """Return the initial state of a step."""
+        """Return the initial state of a step; that of the contact-free engine without active contact.
+
+        Args:
+            problem: step with vertex contact.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         contacts = begin_active_contacts(problem)
         if not contacts:
             return self._contact_free.init_state(problem, initial_guess)

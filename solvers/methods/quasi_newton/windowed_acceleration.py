@@ -81,7 +81,18 @@ def prepare_accelerated(
 def prepare_without_barriers(
     system: System, scheme: AccelerationScheme, linear: LinearSolverName, precision: Precision
 ) -> PreparedAccelerated:
-    """Prepare the method that ignores the system's barrier energies, as `prepare_accelerated` does."""
+    """Prepare the method that ignores the system's barrier energies, as `prepare_accelerated` does.
+
+    Args:
+        system: system, possibly with barriers and vertex contact.
+        scheme: coefficients of the acceleration.
+        linear: solver of Q x = b.
+        precision: floating-point type of its stored entries.
+
+    Raises:
+        Unsupported: for energies that the method does not support.
+        NotPositiveDefinite: if the system leaves some positions undetermined.
+    """
     bare = without_barriers(without_vertex_contact(system))
     energies = (
         require_projective(bare, scheme.name)
@@ -160,7 +171,12 @@ class PreparedAccelerated(IterativeSolver):
         return self.local_global.description
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return self.acceleration_engine.init_state(problem, initial_guess)
 
     def residual_scale(self, problem: StepProblem) -> float:
