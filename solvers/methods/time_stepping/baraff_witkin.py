@@ -97,6 +97,10 @@ class PreparedBaraffWitkin(IterativeSolver):
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve whose only iteration is the whole step.
 
+        Args:
+            problem: step whose objective is linearised at the current positions.
+            initial_guess: not used.
+
         Raises:
             NotPositiveDefinite: if no modification of the Hessian has a Cholesky factor.
         """

@@ -63,7 +63,15 @@ class ExplicitForces:
 
     @classmethod
     def from_system(cls, system: System, solver: str) -> ExplicitForces:
-        """Build the forces; raise Unsupported for energies that are not supported."""
+        """Build the forces of a system.
+
+        Args:
+            system: system of springs, constant quadratic forms and drag on vertices.
+            solver: name of the method for the error message.
+
+        Raises:
+            Unsupported: other energies.
+        """
         n = system.num_vertices
         springs = Springs.from_parts([energy for energy in system.energies if isinstance(energy, Springs)])
         drag, load, forms = np.zeros(n), np.zeros((n, 3)), list[csr_array]()
@@ -98,9 +106,14 @@ _PADDING_COORDINATE = 1e100
 
 
 def pad_rows(x: Positions, *, pad_far: bool = False) -> NDArray[np.float64]:
-    """Return x (n, 3) in rows of four, with two padding rows.
+    """Return vectors in rows of four, with two padding rows.
 
-    `pad_far` moves the last one away from all vertices.
+    Args:
+        x: vectors of the vertices (n, 3).
+        pad_far: whether the last row is far away from all vertices, as the ends of padding springs need.
+
+    Returns:
+        Array (4 (n + 2),), with zeros in the fourth column.
     """
     out = allocate_aligned(4 * (len(x) + 2))
     out.reshape(-1, 4)[: len(x), :3] = x
@@ -113,7 +126,12 @@ class SingleIterateState(SolverState):
     """A whole step as the only iterate, repeated."""
 
     def __init__(self, p: Positions, v: Positions | None) -> None:
-        """Create the state with the velocity at the end of the step, or None if it follows from the positions."""
+        """Create the state from the end of the step.
+
+        Args:
+            p: positions (n, 3) [m].
+            v: velocity (n, 3) [m/s], or None if it follows from the positions.
+        """
         self.positions, self.velocity = p, v
 
     def step_state(self) -> bool:

@@ -55,7 +55,13 @@ class FrameForces(NamedTuple):
 
 @jit_inner
 def add_forces(forces, p, out):
-    """Add all forces except drag [N] at p to `out`, in rows of four."""
+    """Add all forces except drag [N] at p to `out`.
+
+    Args:
+        forces: forces of the frame.
+        p: positions [m] in rows of four.
+        out: forces [N] in rows of four, updated.
+    """
     add_descent(
         forces.spring_packets, 0, len(forces.spring_packets.packet_start) - 1, p, forces.right_hand_side, out, 0
     )
@@ -72,7 +78,13 @@ def add_forces(forces, p, out):
 
 @jit_inner
 def compute_acceleration(forces, p, out):
-    """Write the acceleration [m/s^2] by these forces to `out`."""
+    """Write the acceleration [m/s^2] by all forces except drag to `out`.
+
+    Args:
+        forces: forces of the frame.
+        p: positions [m] in rows of four.
+        out: acceleration [m/s^2] in rows of four, overwritten; zero for pinned vertices.
+    """
     for k in range(len(out)):
         out[k] = 0.0
     add_forces(forces, p, out)
@@ -82,7 +94,13 @@ def compute_acceleration(forces, p, out):
 
 @jit_inner
 def apply_pins(forces, fraction, p):
-    """Move the pins to their positions at a fraction of the frame."""
+    """Move the pins to their positions at a fraction of the frame.
+
+    Args:
+        forces: forces of the frame, with the motion of the pins.
+        fraction: time within the frame, 0 at its start and 1 at its end.
+        p: positions [m] in rows of four, of which those of the pins are overwritten.
+    """
     for q in range(len(forces.pinned_vertices)):
         for c in range(3):
             p[4 * forces.pinned_vertices[q] + c] = forces.pin_end[q, c] + (1.0 - fraction) * (
@@ -92,9 +110,17 @@ def apply_pins(forces, fraction, p):
 
 @jit_inner
 def kick_and_drift(inverse, velocity_factor, gained, first, second, h, p, v, force):
-    """Apply one kick to v, a second one unless it is negative, and a drift of p for h [s].
+    """Apply one or two kicks to v and a drift to p; clear the force.
 
-    The force [N] is cleared.
+    Args:
+        inverse: 1/m [1/kg] in rows of four, 0 for pinned vertices.
+        velocity_factor, gained: decay of a velocity by each kick, and its gain per acceleration [s] (k, rows).
+        first: index of the first kick.
+        second: index of the second kick by the same force, negative for none.
+        h: duration of the drift [s].
+        p: positions [m] in rows of four, updated.
+        v: velocities [m/s] in rows of four, updated.
+        force: force of the kicks [N] in rows of four; set to zero.
     """
     for i in range(len(p)):
         a = force[i] * inverse[i]
@@ -184,7 +210,12 @@ class StageScratch(NamedTuple):
 
     @classmethod
     def from_sizes(cls, stages: int, rows: int) -> StageScratch:
-        """Allocate the scratch for a number of stages and of coordinates."""
+        """Allocate the scratch of a Runge-Kutta method.
+
+        Args:
+            stages: number of stages, with the one that ends the step.
+            rows: number of coordinates, including padding.
+        """
         return cls(allocate_aligned(rows), allocate_aligned(rows), *np.zeros((2, stages, rows)))
 
 

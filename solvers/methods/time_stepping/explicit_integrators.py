@@ -312,7 +312,12 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
         return integrate_drag(self.method.kicks, h, self._drag_rate_rows)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve whose only iteration is the whole step."""
+        """Start a solve whose only iteration is the whole step.
+
+        Args:
+            problem: step that is integrated from its start.
+            initial_guess: not used.
+        """
         return SingleIterateState(*self.step(problem)[:2])
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, NDArray[np.float64]]:

@@ -28,7 +28,13 @@ class SplittingMethod:
 
     @classmethod
     def from_first_half(cls, order: int, drifts: list[float], kicks: list[float]) -> SplittingMethod:
-        """Build a symmetric method from its first half; the middle coefficients complete the sums."""
+        """Build a symmetric method from its first half; the middle coefficients complete the sums.
+
+        Args:
+            order: order of the method.
+            drifts: drifts before the middle one, as fractions of a step.
+            kicks: kicks of the first half without its last one, as fractions of a step.
+        """
         middle = 1.0 - 2.0 * sum(drifts)
         kicks = [*kicks, 0.5 - sum(kicks)]
         return cls(order, np.array([*drifts, middle, *drifts[::-1]]), np.array([*kicks, *kicks[::-1]]))
@@ -112,7 +118,12 @@ _MAX_TRIED_RATIO = 20
 
 
 def compute_max_steps(count: int, tolerance: float) -> int:
-    """Return the maximum number of steps to try if `count` are stable; exactly `count` without a tolerance."""
+    """Return the maximum number of steps to try in a frame.
+
+    Args:
+        count: stable number of fixed steps.
+        tolerance: error tolerance of a step [m]; 0 for exactly `count` steps.
+    """
     return _MAX_TRIED_RATIO * count + 10_000 if tolerance else count
 
 

@@ -232,7 +232,12 @@ class PreparedRosenbrock(IterativeSolver):
         return replace(self, error_tolerance=tolerance)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve whose only iteration is the whole frame."""
+        """Start a solve whose only iteration is the whole frame.
+
+        Args:
+            problem: step that is integrated from its start.
+            initial_guess: not used.
+        """
         return SingleIterateState(*self.step(problem)[:2])
 
     def step(self, problem: StepProblem, h: float | None = None) -> tuple[Positions, Positions, AdaptiveStepStats]:

@@ -123,7 +123,12 @@ class PreparedSymplecticEuler(IterativeSolver):
     stats: dict[str, float] = field(default_factory=dict)
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve whose only iteration is the whole step."""
+        """Start a solve whose only iteration is the whole step.
+
+        Args:
+            problem: step that is integrated from its start.
+            initial_guess: not used.
+        """
         return SingleIterateState(*self._integrate_step(problem))
 
     @cached_property
