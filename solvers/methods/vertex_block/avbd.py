@@ -195,11 +195,21 @@ class PreparedAugmentedVertexBlockDescent(IterativeSolver):
         return self.vertex_block_descent.stats
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose warm start, if any, has the tensions and stiffnesses of the edges.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
         return AugmentedSweepState(self, problem, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual [J^(1/2)] at positions p (n, 3) with zero tensions."""
+        """Return the residual [J^(1/2)] with zero tensions.
+
+        Args:
+            problem: step whose objective is minimised.
+            p: positions (n, 3) [m].
+        """
         return self.augmented_residual(problem, p, np.zeros(len(self.min_stiffness)))
 
     def augmented_residual(self, problem: StepProblem, p: Positions, tension: NDArray[np.float64]) -> float:

@@ -49,9 +49,15 @@ def _clip(x, low, high):
 
 @jit_kernel
 def write_edge_parameters(blocks, hard, duals, p):
-    """Write the edges' stiffnesses and shifted limits to their parameters, and the vertex majorants to the lanes.
+    """Write the edges' stiffnesses and shifted limits, and the vertex majorants.
 
     If an edge pulls with t, the stiffness of a transverse step is at most t/l.
+
+    Args:
+        blocks: packets of the vertices; `majorant` (lanes,) [N/m] is overwritten.
+        hard: the edges (m,); columns 0 to 2 of `parameters` get stiffness [N/m], minimum and maximum length [m].
+        duals: tensions and stiffnesses of the edges; `majorant_scratch` is overwritten.
+        p: positions [m] in rows of four.
     """
     for row in range(len(duals.base_majorant)):
         duals.majorant_scratch[row] = duals.base_majorant[row]

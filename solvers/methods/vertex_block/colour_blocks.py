@@ -45,7 +45,13 @@ class VertexBlocks(NamedTuple):
 
     @classmethod
     def from_system(cls, system: System, parts: SpringForm, vertex_elements: VertexElements) -> VertexBlocks:
-        """Build the rows of a system from the decomposition of its energies."""
+        """Build the rows of a system from the decomposition of its energies.
+
+        Args:
+            system: masses, pins and time step.
+            parts: springs, forms and edges of the system's energies.
+            vertex_elements: the other energies with elements, whose vertices need different colours.
+        """
         n = system.num_vertices
         coloured = colouring.colour_vertices(
             np.concatenate([parts.system_pairs.edges, vertex_elements.vertex_pairs()]), n

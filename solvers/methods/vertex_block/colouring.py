@@ -30,13 +30,23 @@ class Colouring:
 
 
 def colour_springs(edges: NDArray[np.int64], n: int) -> Colouring:
-    """Colour springs (m, 2) over n vertices; no two of a colour share a vertex."""
+    """Colour springs so that no two of a colour share a vertex.
+
+    Args:
+        edges: vertices of the springs (m, 2).
+        n: number of vertices.
+    """
     A = signed_incidence_matrix_sparse(edges, n)
     return _colour_rows(A, csr_array(A.T))
 
 
 def colour_vertices(edges: NDArray[np.int64], n: int) -> Colouring:
-    """Colour n vertices; no two of a colour share one of the springs (m, 2)."""
+    """Colour vertices so that no two of a colour share a spring.
+
+    Args:
+        edges: adjacent vertices (m, 2), by springs or by other couplings.
+        n: number of vertices.
+    """
     A = signed_incidence_matrix_sparse(edges, n)
     return _colour_rows(csr_array(A.T), A)
 

@@ -65,7 +65,15 @@ class DeviceHalfSpaces:
     def __init__(
         self, stream: DeviceStream, system: System, order: NDArray[np.int64], vertex: Any, num_free: int
     ) -> None:
-        """Allocate the half-spaces; `order` and `vertex` (n,) are the vertices of the rows on host and device."""
+        """Allocate the half-spaces of a solve and upload the obstacles.
+
+        Args:
+            stream: stream of the copies and kernels.
+            system: system with vertex contact.
+            order: vertex of each row (n,), on the host.
+            vertex: vertex of each row (n,), on the device.
+            num_free: number of free rows, which come first.
+        """
         self._stream, self._vertex, self._dt = stream, vertex, system.time_step
         self._contacts = [energy for energy in system.energies if isinstance(energy, HalfSpaceContact)]
         all_of = [(contact, one) for contact in self._contacts for one in contact.obstacles]
@@ -114,7 +122,14 @@ class DeviceHalfSpaces:
 
 @cuda.jit
 def measure_max_speed(v, out):
-    """Update out[0] to the largest |v|^2, a maximum that is independent of the order of threads."""
+    """Update out[0] to the largest |v|^2.
+
+    The maximum is independent of the order of threads.
+
+    Args:
+        v: velocities (n, 3) [m/s].
+        out: largest squared speed so far (1,) [m^2/s^2], updated; the caller sets it to 0 first.
+    """
     most, i = 0.0, cuda.grid(1)
     while i < v.shape[0]:
         most = max(most, v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])

@@ -47,9 +47,15 @@ class IncidentElements(NamedTuple):
 
     @classmethod
     def from_elements(cls, law: ElementLaw, elements: Elements, row: NDArray[np.int64], rows: int) -> IncidentElements:
-        """Build the incident elements of rows `row` (n,) of `rows`.
+        """Build the incident elements of rows.
 
         An element that has a vertex twice is an edge from it to itself, and is omitted from the rows.
+
+        Args:
+            law: law of the elements.
+            elements: elements with vertices and coefficients (m, k).
+            row: row of each vertex (n,).
+            rows: number of rows.
         """
         at = row[elements.vertices].astype(np.int64)
         width = at.shape[1]
@@ -67,7 +73,12 @@ class IncidentElements(NamedTuple):
         return made.with_parameters(law, elements)
 
     def with_parameters(self, law: ElementLaw, elements: Elements) -> IncidentElements:
-        """Return the elements with other parameters."""
+        """Return the elements with other parameters.
+
+        Args:
+            law: law of the elements, as before.
+            elements: the same elements in the same order, with the new parameters (m, q).
+        """
         rows = len(self.row_starts) - 1 if law.has_constant_hessian else 0
         block = np.zeros((rows, 6))
         if law.has_constant_hessian:
