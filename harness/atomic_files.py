@@ -130,7 +130,12 @@ def describe_os_error(error: OSError) -> str:
 
 
 def build_write_error(path: Path, error: Exception) -> WriteError:
-    """Build the error for a file that cannot be written."""
+    """Build the error for a file that cannot be written.
+
+    Args:
+        path: the file.
+        error: cause, which the message states after the path.
+    """
     return WriteError(f"{path}: cannot be written: {describe_cause(error)}")
 
 

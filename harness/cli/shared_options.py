@@ -22,7 +22,15 @@ SCENE_HELP = "Scene (YAML), or scene of the assignment (JSON), or name of a ship
 
 
 def describe_config(metavar: str, help_text: str) -> Any:
-    """Describe an argument that is a config: a file, or the name of a shipped one."""
+    """Describe an argument that is a config, by file or by shipped name.
+
+    Args:
+        metavar: name of the argument in the usage line.
+        help_text: help of the argument.
+
+    Returns:
+        The annotation of Typer, which converts the argument to a path.
+    """
     return typer.Argument(parser=locate_config, metavar=metavar, help=help_text)
 
 
@@ -55,7 +63,16 @@ CompareOption = Annotated[
 
 
 def require_output_file(path: Path | None, suffix: str, option: str) -> None:
-    """Raise InputError unless a file with this suffix can be written at a path of an option; None is no file."""
+    """Require that an output file can be written at the path of an option.
+
+    Args:
+        path: path of the file; None for no file, which is valid.
+        suffix: required suffix, with its dot.
+        option: name of the option, for the message.
+
+    Raises:
+        InputError: the suffix is another, the folder does not exist, or the path is no file.
+    """
     if path and (path.suffix != suffix or not path.parent.is_dir() or (os.path.lexists(path) and not path.is_file())):
         raise InputError(f"{option}: got {path}; expected a file that ends in {suffix}, in a folder that exists")
 

@@ -89,7 +89,19 @@ def verify_archive(
 
 
 def verify_one_archive(archive: Path, seed: int | None, *, with_user_code: bool) -> int:
-    """Verify an archive, print a verdict on each claim, and return the exit code of `verify-archive`."""
+    """Verify an archive, and print a verdict on each claim.
+
+    Args:
+        archive: file (.zip) of `springbench publish`.
+        seed: seed that selects the runs to repeat; random if None.
+        with_user_code: whether to repeat runs that execute code from the archive.
+
+    Returns:
+        Exit code of `verify-archive`: 0 if all claims are confirmed, 1 if one is refuted, 3 if one is undecided.
+
+    Raises:
+        InputError: the archive is damaged or too large.
+    """
     from secrets import randbelow
     from tempfile import TemporaryDirectory
 

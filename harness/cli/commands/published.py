@@ -117,7 +117,16 @@ def _reproduce_one(
 
 
 def report_agreement(name: str, runs: Sequence[RunAgreement], ratios: Sequence[RunAgreement]) -> int:
-    """Print the counts and all differences, and return the exit code: 0 agrees, 1 differs, 3 is undecided."""
+    """Print how many results agree, and all differences.
+
+    Args:
+        name: name of the study, for the messages.
+        runs: comparisons of repeated runs with the published ones.
+        ratios: comparisons of ratios of times; empty for a study without times.
+
+    Returns:
+        Exit code: 0 agrees, 1 differs or has no runs, 3 is undecided.
+    """
     from springbench.harness.results.study_comparison import MAX_DIFFERING_SHARE, AgreementLevel
 
     codes = [] if runs else [1]

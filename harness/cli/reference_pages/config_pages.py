@@ -161,7 +161,16 @@ def _describe_formula(effect: Any) -> list[str]:
 
 
 def format_default(schema: Schema, is_required: bool) -> str:
-    """Format the default of a key; empty if it is a mapping, whose keys have defaults of their own."""
+    """Format the default of a key for the table of keys.
+
+    Args:
+        schema: JSON Schema of the key.
+        is_required: whether a config must have the key.
+
+    Returns:
+        `required`, or the default as JSON; empty if there is none, or if it is a mapping, whose keys have their own
+            defaults.
+    """
     default = schema.get("default")
     if is_required or "default" not in schema or isinstance(default, dict):
         return "required" if is_required else ""

@@ -10,7 +10,12 @@ _SECTION = re.compile(r"(Args|Returns|Raises|Yields|Attributes|Example):\s*(.*)"
 
 
 def format_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Format a table; cells may have several lines, which are joined."""
+    """Format a table in Markdown.
+
+    Args:
+        header: titles of the columns.
+        rows: cells of each row; the lines of a cell are joined.
+    """
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(map(_escape_cell, line)) + " |" for line in lines)
 
