@@ -167,7 +167,11 @@ def load_config(
 
 
 def load_scene_run(path: Path, size: int | None = None) -> RunSpec:
-    """Load a scene as one run, at a mesh size or its default one, like `load_config`.
+    """Load a scene as one run, like `load_config`.
+
+    Args:
+        path: file of the scene.
+        size: mesh size; the scene's default if None.
 
     Raises:
         InputError: for all mistakes, and for a sweep.
@@ -483,9 +487,14 @@ def check_scene_parts(
 
 
 def find_scene_mistakes(scene: SceneSpec, sizes: Sequence[int]) -> list[InputMistake]:
-    """Find mistakes between the parts of a scene.
+    """Find mistakes between the parts of a scene, by building it.
 
-    The scene is built at the smallest of the sizes.
+    Args:
+        scene: scene whose parts are valid by themselves.
+        sizes: mesh sizes, of which the smallest is built; nothing is built if there are none.
+
+    Returns:
+        Mistakes with their file, and their line where it is known.
     """
     try:
         if sizes:

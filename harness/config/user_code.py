@@ -68,7 +68,15 @@ def resolve_tag(
 
 
 def fingerprint_parameters(document: ConfigDocument, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return parameters of user code as in the file, with digests next to file names."""
+    """Return parameters of user code as in the file, with digests next to file names.
+
+    Args:
+        document: config, to whose folder file names are relative.
+        data: parameters of the user code.
+
+    Returns:
+        The parameters, in which the name of an existing file is replaced by [name, SHA-256 of the content].
+    """
     return {key: _add_digest(document, value) for key, value in data.items()}
 
 
@@ -136,9 +144,11 @@ def _run_in_worker(piece: Callable[[ProgressCallback], Any], limits: LoadLimits,
 
 
 def build_load_limits(seconds: float | None, memory_gib: float | None) -> LoadLimits:
-    """Build the load limits from a config's time [s] and memory [GiB].
+    """Build the limits for loading user code from those of a config's runs.
 
-    The time is bounded by the default.
+    Args:
+        seconds: time limit of a run [s], bounded by the default; the default if None.
+        memory_gib: memory limit [GiB]; the default if None.
     """
     return LoadLimits(
         min(DEFAULT_LOAD_LIMITS.seconds, seconds or DEFAULT_LOAD_LIMITS.seconds),
