@@ -112,7 +112,12 @@ class UnitClaims:
     """
 
     def __init__(self, folder: Path, units: Sequence[Path]) -> None:
-        """Record the initial state of the units, given as paths of their row files."""
+        """Record the initial state of the units.
+
+        Args:
+            folder: folder of the sweep, in which `.claims` is created.
+            units: row files of the units, which need not exist.
+        """
         self._lock = open_lock_file(folder / ".claims")
         self._units = {path: _file_identity(path) for path in units}
 

@@ -46,7 +46,15 @@ def read_npz_array(path: Path, name: str, *, allows_nonfinite: bool = False) -> 
 
 
 def read_npy_array(path: Path, *, allows_nonfinite: bool = False) -> NDArray[np.float64]:
-    """Read the array of an .npy file as float64, like `read_npz_array`."""
+    """Read the array of an .npy file as float64, like `read_npz_array`.
+
+    Args:
+        path: the .npy file.
+        allows_nonfinite: whether NaN and infinities are accepted.
+
+    Raises:
+        InputError: the file or the array is invalid; it names the file.
+    """
     check_data_file(path, ".npy")
     try:
         return sandbox.call_in_sandbox(_read_npy, path, allows_nonfinite, limits=_build_limits())
@@ -55,7 +63,15 @@ def read_npy_array(path: Path, *, allows_nonfinite: bool = False) -> NDArray[np.
 
 
 def check_data_file(path: Path, suffix: str) -> None:
-    """Raise InputError for what is no regular file, has the name of another kind, or is too large."""
+    """Raise InputError unless a path is a regular data file within the size limit.
+
+    Args:
+        path: path of the file.
+        suffix: expected suffix with its dot, for the message.
+
+    Raises:
+        InputError: it is no regular file, is too large, is empty, or contains a Git LFS pointer or a web page.
+    """
     try:
         if not path.is_file():
             raise InputError(InputMistake(f"is no file; give the path of an {suffix} file", path))

@@ -102,7 +102,13 @@ class ProgressDisplay(Protocol):
         ...
 
     def skip_run(self, title: str, cost: RunCost, outcome: str) -> None:
-        """Report a run that another command has taken over, and the reason as its outcome."""
+        """Report a run that another command has taken over.
+
+        Args:
+            title: description of the run.
+            cost: relative cost, as in the call of `start_sweep`.
+            outcome: why the run is not executed here.
+        """
         ...
 
     def finish_sweep(self) -> None:
@@ -141,7 +147,12 @@ class RemainingTime:
         self._runs, self.total_amount = self._runs - 1, self.total_amount - cost.amount
 
     def record_run(self, cost: RunCost, seconds: float) -> None:
-        """Record a finished run, with the seconds that it took itself."""
+        """Record a finished run.
+
+        Args:
+            cost: relative cost of the run.
+            seconds: time of the run itself [s], without compilation and waiting.
+        """
         if cost.amount in self._left.get(cost.kind, ()):
             self._left[cost.kind].remove(cost.amount)
         self._ended, self.finished_amount = self._ended + 1, self.finished_amount + cost.amount
@@ -292,13 +303,27 @@ class ProgressBars:
         self._sweep = self._bars.add_task("", phase="")
 
     def start_sweep(self, costs: Sequence[RunCost], num_concurrent: int = 1) -> None:
-        """Start the bars."""
+        """Start the bars.
+
+        Args:
+            costs: costs of the pending runs, whose sum is the length of the sweep's bar.
+            num_concurrent: number of runs that are executed concurrently.
+        """
         self._pace = RemainingTime(costs, num_concurrent)
         self._bars.start()
         self._bars.update(self._sweep, description="sweep", total=self._pace.total_amount, phase=f"{len(costs)} runs")
 
     def start_run(self, title: str, ticks: int, cost: RunCost) -> RunProgress:
-        """Add a bar for a run."""
+        """Add a bar for a run.
+
+        Args:
+            title: description of the run.
+            ticks: expected number of steps, the length of the bar.
+            cost: relative cost.
+
+        Returns:
+            Receiver of the run's events.
+        """
         running = _RunState(title, ticks, cost, self._pace, self._on_change, self._on_end)
         self._tasks[id(running)] = self._bars.add_task(title, total=ticks, phase="prepare")
         self._going.append(running)
@@ -326,7 +351,13 @@ class ProgressBars:
         self._update_total()
 
     def skip_run(self, title: str, cost: RunCost, outcome: str) -> None:
-        """Report a run that another command has taken over."""
+        """Print a run that another command executes, and shorten the bar of the sweep.
+
+        Args:
+            title: description of the run.
+            cost: relative cost, as in the call of `start_sweep`.
+            outcome: why the run is not executed here.
+        """
         self._pace.remove_run(cost)
         self._bars.update(self._sweep, total=self._pace.total_amount)
         self._bars.console.print(f"{title}: {outcome}", highlight=False)
@@ -350,7 +381,12 @@ class ProgressLines:
         self._runs = self._number = 0
 
     def start_sweep(self, costs: Sequence[RunCost], num_concurrent: int = 1) -> None:
-        """Start counting the runs."""
+        """Start counting the runs.
+
+        Args:
+            costs: costs of the pending runs.
+            num_concurrent: number of runs that are executed concurrently.
+        """
         self._runs, self._number, self._pace, self._printed = (
             len(costs),
             0,
@@ -361,7 +397,16 @@ class ProgressLines:
             self._print_line("starting")
 
     def start_run(self, title: str, ticks: int, cost: RunCost) -> RunProgress:
-        """Add a run."""
+        """Add a run.
+
+        Args:
+            title: description of the run.
+            ticks: expected number of steps.
+            cost: relative cost.
+
+        Returns:
+            Receiver of the run's events.
+        """
         running = _RunState(title, ticks, cost, self._pace, self._on_change, self._on_end)
         self._going.append(running)
         return running
@@ -376,7 +421,13 @@ class ProgressLines:
         self._print_line(f"{run.title}: {outcome}")
 
     def skip_run(self, title: str, cost: RunCost, outcome: str) -> None:
-        """Print a line for a run that another command has taken over."""
+        """Print a line for a run that another command has taken over.
+
+        Args:
+            title: description of the run.
+            cost: relative cost, as in the call of `start_sweep`.
+            outcome: why the run is not executed here.
+        """
         self._pace.remove_run(cost)
         self._number += 1
         self._print_line(f"{title}: {outcome}")

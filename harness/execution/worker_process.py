@@ -131,7 +131,11 @@ def serve_tasks(
 def tie_to_parent(parent: int, death_signal: signal.Signals = KILL_SIGNAL) -> None:
     """End this child process by a signal when its parent ends.
 
-    It is also the first to be killed when memory runs out.
+    It is also the first to be killed when memory runs out. Systems other than Linux do neither.
+
+    Args:
+        parent: process id of the parent; if it has ended already, so does this process.
+        death_signal: signal that the system sends when the parent ends.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, death_signal)
