@@ -73,7 +73,12 @@ class AblationUnit(EffectUnit):
         return _measure_ablation(self.run, self.with_pairs, tick)
 
     def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
-        """Build the row of a failed unit: without the full scene no comparison is possible."""
+        """Build the row of a failed unit: without the full scene no comparison is possible.
+
+        Args:
+            status: kind of failure, such as `unsupported`.
+            reason: cause of the failure, as a sentence.
+        """
         why = {"kind": "full-scene", "name": "", "status": status, "reason": reason}
         return [build_specification_columns(self.run) | build_provenance_columns() | why]
 

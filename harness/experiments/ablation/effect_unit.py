@@ -87,7 +87,12 @@ class EffectUnit(ABC):
 
     @abstractmethod
     def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
-        """Build the rows for a unit without a result."""
+        """Build the rows for a unit without a result.
+
+        Args:
+            status: kind of failure, such as `unsupported`.
+            reason: cause of the failure, as a sentence.
+        """
 
     def _write_rows(self, result_rows: list[ResultRow]) -> str:
         self.rows_path.parent.mkdir(parents=True, exist_ok=True)

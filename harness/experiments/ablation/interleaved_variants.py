@@ -101,7 +101,12 @@ def time_interleaved(
 
 
 def compute_cost(full: VariantRun, without: VariantRun) -> ConfidenceInterval:
-    """Return the CPU time per step that the full scene takes in addition [s]."""
+    """Return the CPU time per step that the full scene takes in addition [s].
+
+    Args:
+        full: timed run of the full scene.
+        without: timed run of the variant, interleaved with it; it has as many rounds and frames.
+    """
     return estimate_added_time(np.array(full.seconds) - np.array(without.seconds))
 
 

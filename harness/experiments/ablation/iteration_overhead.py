@@ -115,7 +115,12 @@ def list_measured_effects(scene: SceneSpec) -> list[str]:
 
 
 def select_effects(scene: SceneSpec, *kinds: str) -> SceneSpec:
-    """Return the scene with these effects and the baseline effects only; ALL_EFFECTS selects all."""
+    """Return the scene with some effects and the baseline effects only.
+
+    Args:
+        scene: scene with all of its effects.
+        kinds: kinds of the effects to select; ALL_EFFECTS selects all.
+    """
     if ALL_EFFECTS in kinds:
         return scene
     selected = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _is_baseline_effect(e)]
@@ -159,7 +164,16 @@ def measure_overheads(
 
 
 def prepare_scene(scene: SceneSpec, size: int, solver: Solver, *effects: str) -> PreparedScene:
-    """Build the scene with these effects and the baseline effects, and prepare the solver.
+    """Build the scene with some effects and the baseline effects, and prepare the solver.
+
+    Args:
+        scene: scene with all of its effects.
+        size: mesh size.
+        solver: solver to prepare.
+        effects: kinds of the effects to select; ALL_EFFECTS selects all.
+
+    Returns:
+        The built scene, and the solver prepared for its system.
 
     Raises:
         InputError: the scene cannot be built.

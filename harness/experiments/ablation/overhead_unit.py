@@ -58,7 +58,12 @@ class OverheadUnit(EffectUnit):
         return self._add_shared_columns(rows)
 
     def build_failure_rows(self, status: str, reason: str) -> list[ResultRow]:
-        """Build the rows of a unit without a result: no effect has an overhead."""
+        """Build the rows of a unit without a result: no effect has an overhead.
+
+        Args:
+            status: kind of failure, such as `unsupported`.
+            reason: cause of the failure, as a sentence.
+        """
         return self._add_shared_columns(
             [{"name": effect, "status": status, "reason": reason} for effect in list_measured_effects(self.run.scene)]
         )

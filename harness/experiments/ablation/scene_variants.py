@@ -23,7 +23,12 @@ class SceneVariant:
 
 
 def build_variants(scene: SceneSpec, *, with_pairs: bool) -> list[SceneVariant]:
-    """Build the full scene, then one variant without each effect in order; `with_pairs` adds pairs."""
+    """Build the full scene, then one variant without each effect in order.
+
+    Args:
+        scene: scene with all of its effects.
+        with_pairs: whether to add a variant without each pair of effects, at the end.
+    """
     names = name_effects(scene)
     chosen: list[tuple[int, ...]] = [(), *((i,) for i in range(len(names)))]
     if with_pairs:
