@@ -82,11 +82,21 @@ class GiveUpRule:
     reason: str = "they cost too much"
 
     def is_exceeded(self, cost: float, best_cost: float) -> bool:
-        """Return whether a cost is too large for a best cost."""
+        """Return whether a cost is too large for a best cost.
+
+        Args:
+            cost: expected or measured cost, in the unit of the search.
+            best_cost: smallest cost so far that meets the error; infinite without one.
+        """
         return cost > self.max_cost_ratio * best_cost
 
     def compute_limit(self, proposal: SettingProposal[Setting], best_cost: float) -> float:
-        """Return the limit of the cost of a trial."""
+        """Return the limit of the cost of a trial.
+
+        Args:
+            proposal: setting to try, with its limit for the case that no best cost is known.
+            best_cost: smallest cost so far that meets the error, in the unit of the search; infinite without one.
+        """
         return proposal.initial_limit if best_cost == inf else max(self.min_limit, self.max_cost_ratio * best_cost)
 
 

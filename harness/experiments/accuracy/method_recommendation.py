@@ -415,7 +415,15 @@ class StudyCandidates:
 
     @classmethod
     def from_goal(cls, goal: RecommendationGoal, engine: str | None) -> StudyCandidates:
-        """Return the candidates for a goal, of one engine if it is named. Raises InputError."""
+        """Return the candidates for a goal.
+
+        Args:
+            goal: limit of the error or of the wall time; with the latter, no step is longer than a frame.
+            engine: name of the only solver or engine to consider; None for all.
+
+        Raises:
+            InputError: there is no solver or engine of this name.
+        """
         refinements = [
             one for one in TIME_STEP_REFINEMENTS if one >= 1 or goal.max_error is not None
         ]  # a frame at most
@@ -517,7 +525,25 @@ def find_default_t_end(
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
 ) -> float:
-    """Return the default end time [s]. Raises InputError, Unpredictable."""
+    """Return the default end time [s].
+
+    Args:
+        path: file of the scene, which the message names.
+        scene: the scene.
+        size: mesh size.
+        max_error: relative error that must be measurable up to the end.
+        reference_store: store of the growth of perturbations.
+        print_message: called with the reason if the time is shorter than DEFAULT_T_END.
+
+    Returns:
+        DEFAULT_T_END, or the longest time at which the error can be measured, if that is shorter. Contact does not
+            shorten it.
+
+    Raises:
+        InputError: the scene is invalid.
+        UnpredictableMotion: nothing moves, or the error can be measured at no time.
+        NotIntegrable: the scene has no equations of motion.
+    """
     if mistakes := find_scene_mistakes(scene, [size]):
         raise InputError(mistakes)
     if has_contact(build_exact_scene(scene, size).system):
@@ -624,7 +650,13 @@ def _tune_time_steps(
 
 
 def list_tuned_specs(methods: Sequence[MeasuredMethod], cost_limit: float, t_end: float) -> list[WorkSpec]:
-    """List simulations whose step size uses up a cost limit [s/s], those with the least error predicted first."""
+    """List simulations whose step size uses up a cost limit, by increasing predicted error.
+
+    Args:
+        methods: measured methods, of which the most accurate one of each kind within the limit is refined.
+        cost_limit: wall time per simulated second [s/s].
+        t_end: simulated time [s].
+    """
     finest: dict[tuple[object, ...], MeasuredMethod] = {}
     for method in methods:
         key = (*method.kind, *method.work_spec.options.items())
@@ -652,7 +684,19 @@ def list_tuned_specs(methods: Sequence[MeasuredMethod], cost_limit: float, t_end
 def build_study(
     path: Path, scene: SceneSpec, size: int, candidates: StudyCandidates, t_end: float, time_limit: float
 ) -> AccuracyPlan:
-    """Build the study that is measured where no rows exist."""
+    """Build the study that is measured where no rows exist.
+
+    Args:
+        path: file of the scene, after which the study is named.
+        scene: scene, whose time step is refined.
+        size: mesh size; 0 for a mesh without sizes.
+        candidates: solvers, grid of settings, and refinements of the time step.
+        t_end: simulated time [s].
+        time_limit: wall-time limit of a simulation [s].
+
+    Raises:
+        InputError: an option is invalid for a candidate.
+    """
     steps = max(1, round(t_end / scene.time_step))
     time_steps = [t_end / round(steps * factor) for factor in candidates.refinements if round(steps * factor)]
     shared = {"t_end": t_end, "time_step": time_steps, "time_limit": time_limit} | ({"size": size} if size else {})

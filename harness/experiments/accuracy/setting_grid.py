@@ -117,9 +117,13 @@ def _propose_settings(
 
 
 def compute_setting_cost(spec: WorkSpec, row: Mapping[str, Any]) -> float:
-    """Return the wall time per simulated second of a simulation's row, on an otherwise idle machine.
+    """Return the wall time per simulated second of a simulation, on an otherwise idle machine.
 
     Where other programs interrupted a single thread of ours, its processor time is what it takes alone.
+
+    Args:
+        spec: specification of the simulation.
+        row: measured row, with `seconds_per_simulated_second` [s/s], and `cpu_seconds` of the whole simulation [s].
     """
     wall, cpu = row["seconds_per_simulated_second"], row.get("cpu_seconds")
     if cpu and row.get("preempted") and spec.measurement.threads == 1 and spec.solver.name in SOLVERS:

@@ -138,9 +138,14 @@ class SnapshotEvaluation:
         }
 
     def find_reached_minimum(self, p: Positions, stationarity: float) -> MinimumCertificate | None:
-        """Return the minimum whose basin contains p (n, 3) [m].
+        """Return the minimum whose basin contains the last iterate of a solver.
 
-        The result is None if p has not converged enough.
+        Args:
+            p: positions (n, 3) [m].
+            stationarity: relative stationarity at p.
+
+        Returns:
+            The minimum, or None if p has not converged enough, or if no certified minimum is found.
         """
         if not stationarity <= BASIN_STATIONARITY_TOLERANCE:
             return None

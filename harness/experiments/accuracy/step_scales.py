@@ -13,7 +13,12 @@ def compute_energy_roundoff(problem: StepProblem) -> float:
 
 
 def compute_vertex_distances(system: System, p: Positions, other: Positions) -> tuple[float, float]:
-    """Return the largest and the root-mean-square distance over the free vertices [m]."""
+    """Return the largest and the root-mean-square distance over the free vertices [m].
+
+    Args:
+        system: system whose free vertices count.
+        p, other: positions (n, 3) [m].
+    """
     away = np.linalg.norm(p - other, axis=1)[system.free_vertices]
     return float(away.max(initial=0.0)), float(np.sqrt((away**2).mean())) if len(away) else 0.0
 
@@ -21,9 +26,12 @@ def compute_vertex_distances(system: System, p: Positions, other: Positions) -> 
 def compute_stiffness_ratio(system: System, stiffness: np.ndarray) -> float:
     """Return k dt^2/m of the median stiffness and the mean mass.
 
-    The stiffness (m,) is in N/m, and the mass is that of the free vertices.
+    Args:
+        system: system with the time step, and with the masses, of which those of the free vertices count.
+        stiffness: stiffness of the springs (m,) [N/m].
 
-    The result is nan without springs.
+    Returns:
+        The dimensionless ratio; nan without springs or masses.
     """
     mass = system.mass[system.free_vertices]
     if not len(stiffness) or not len(mass) or not mass.any():

@@ -71,7 +71,12 @@ class ErrorTarget:
         return cls(scene, size, t_end, frames)
 
     def build_scene(self, time_step: float, integrator: str) -> Scene:
-        """Build the scene with a time step [s] and an integrator by name."""
+        """Build the scene with exact pins.
+
+        Args:
+            time_step: time step [s].
+            integrator: name of the integrator.
+        """
         return build_exact_scene(self.scene.with_time_step(time_step), self.size, integrator, show_warnings=False)
 
     @property
@@ -98,7 +103,12 @@ class Method:
 
 
 def format_method_name(integrator: str, solver: str) -> str:
-    """Return the name of a method for messages."""
+    """Return the name of a method for messages.
+
+    Args:
+        integrator: name of the integrator; `substepping` is that of the solver itself, and is omitted.
+        solver: name of the solver.
+    """
     return solver if integrator == "substepping" else f"{integrator} with {solver}"
 
 

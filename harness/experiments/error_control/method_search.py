@@ -169,9 +169,13 @@ class SearchResult:
         return {"status": "ok", "reason": self.note or None}
 
     def compute_error(self, p: Positions, free_vertices: NDArray[np.int64]) -> float:
-        """Return the error of end positions p (n, 3) [m] against the reference trial.
+        """Return the error of end positions against the reference trial.
 
         The error is relative to the displacement and taken over the free vertices.
+
+        Args:
+            p: positions at the end (n, 3) [m].
+            free_vertices: indices of the vertices that count.
         """
         q = self.reference_trial.trajectory.positions
         away, moved = (compute_position_error(x, q[-1], free_vertices) for x in (p, q[0]))

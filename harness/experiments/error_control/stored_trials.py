@@ -37,9 +37,14 @@ def format_problem_id(error_target: ErrorTarget) -> str:
 
 
 def read_stored_trials(folder: Path, error_target: ErrorTarget) -> list[ResultRow]:
-    """Return the stored trials of this motion in a folder of rows.
+    """Return the stored trials of a motion by the same source code on this machine.
 
-    They are of the same source code and machine.
+    Args:
+        folder: folder of accuracy rows.
+        error_target: motion, identified by scene, size, end time and frames.
+
+    Returns:
+        Rows of the kind `method`.
     """
     here = {
         "problem_digest": format_problem_id(error_target),
