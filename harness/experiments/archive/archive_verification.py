@@ -375,7 +375,19 @@ def sample_runs(runs: Sequence[PublishedRun], seed: int, fraction: float = 0.1) 
 
 
 def rerun_published(runs: Sequence[PublishedRun], folder: Path, display: ProgressDisplay) -> list[list[ResultRow]]:
-    """Repeat runs in a folder, and return the rows of each. Raises InputError."""
+    """Repeat runs in a folder, without recordings and pictures.
+
+    Args:
+        runs: published runs.
+        folder: folder for the rows, which is created if missing.
+        display: shows progress.
+
+    Returns:
+        Rows of each run, in the order of the runs.
+
+    Raises:
+        InputError: the input of a run is invalid.
+    """
     for part in ("rows", "recordings", "pictures"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     bare = [one.run.replace_options(record=False, pictures=False) for one in runs]
@@ -573,7 +585,12 @@ def _compute_step_ratios(ours: Mapping[int, float], theirs: Mapping[int, float])
 
 
 def select_runnable(runs: Sequence[PublishedRun], print_message: Callable[[str], None]) -> list[PublishedRun]:
-    """Return the runs for which this machine has enough cores."""
+    """Return the runs for which this machine has enough cores.
+
+    Args:
+        runs: published runs.
+        print_message: called with the number of the other runs, if there are any.
+    """
     usable = machine_info.describe_machine().cores
     found = [one for one in runs if machine_info.choose_threads(one.run.threads).count <= usable]
     if left := len(runs) - len(found):

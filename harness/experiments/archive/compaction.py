@@ -110,7 +110,11 @@ def _is_utf8(name: str) -> bool:
 
 
 def unify_schemas(units: Sequence[Path], schema: pa.Schema = _EMPTY_SCHEMA) -> pa.Schema:
-    """Return the common schema of all units; columns of `schema` come first.
+    """Return the common schema of all units.
+
+    Args:
+        units: row files, packed or not.
+        schema: columns that come first.
 
     Raises:
         InputError: a file has columns of other types; the message names it.

@@ -120,7 +120,12 @@ def write_study(
 
 
 def write_study_file(folder: Path, metadata: Mapping[str, Any]) -> published_set.PublishedStudy:
-    """Write `study.json` with the checksums of the tables in a folder, and return the study."""
+    """Write `study.json`, and return the study as it is read from there.
+
+    Args:
+        folder: folder of the study, whose tables (*.parquet) are listed with their checksums.
+        metadata: all other entries of the file.
+    """
     files = {path.name: published_set.compute_file_digest(path) for path in sorted(folder.glob("*.parquet"))}
     with atomic_write(folder / published_set.STUDY_FILE) as partial:
         partial.write_text(json.dumps({**metadata, "files": files}, indent=2) + "\n", encoding="utf-8")
@@ -128,7 +133,12 @@ def write_study_file(folder: Path, metadata: Mapping[str, Any]) -> published_set
 
 
 def write_published_table(path: Path, table: pa.Table) -> None:
-    """Write a table with the strongest compression: it is read rarely and cloned often."""
+    """Write a table with the strongest compression: it is read rarely and cloned often.
+
+    Args:
+        path: the Parquet file, which is replaced if it exists.
+        table: rows to write.
+    """
     with atomic_write(path) as partial:
         pq.write_table(table, partial, compression="zstd", compression_level=19, store_schema=False)
 

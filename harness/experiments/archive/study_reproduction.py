@@ -97,7 +97,12 @@ def reproduce_study(
 
 
 def draw_sample(items: Sequence[Any], seed: int | None) -> list[Any]:
-    """Draw a tenth of the items, at least one; all of them without a seed."""
+    """Draw a tenth of the items, at least one, in their order.
+
+    Args:
+        items: items to draw from.
+        seed: seed of the selection; None selects all items.
+    """
     if seed is None or not items:
         return list(items)
     count = max(1, math.ceil(QUICK_SHARE * len(items)))
@@ -106,7 +111,13 @@ def draw_sample(items: Sequence[Any], seed: int | None) -> list[Any]:
 
 
 def draw_from_groups(items: Sequence[Any], get_group: Callable[[Any], Hashable], seed: int | None) -> list[Any]:
-    """Draw a tenth of the items, at least one, from as few groups as suffice; all of them without a seed."""
+    """Draw a tenth of the items, at least one, from as few groups as suffice.
+
+    Args:
+        items: items to draw from, whose order remains.
+        get_group: returns the group of an item.
+        seed: seed of the selection; None selects all items.
+    """
     if seed is None or not items:
         return list(items)
     chance = random.Random(seed)
@@ -166,9 +177,13 @@ def _reproduce_sweep(
 
 
 def omit_missing_software(pairs: Sequence[RowPair], print_message: Callable[[str], None]) -> list[RowPair]:
-    """Return the pairs of published and repeated rows without the solvers whose software is not installed here.
+    """Return the pairs of rows of solvers whose software is installed here.
 
-    Such a solver is optional, and supports no repeated run, but a published one of them.
+    A missing solver is optional, and supports no repeated run, but a published one of them.
+
+    Args:
+        pairs: published and repeated rows of each run.
+        print_message: called for each missing solver with the number of its runs and the reason.
     """
     here = {new[0]["solver"] for _, new in pairs if new[0]["status"] != "unsupported"}
     found: list[RowPair] = []
