@@ -119,7 +119,19 @@ class DaskCluster(NamedTuple):
     def execute_units(
         self, folder: Path, display: ProgressDisplay, units: Sequence[RunUnit], skip_reason: Callable[[RunUnit], str]
     ) -> None:
-        """Execute units on the workers (`execute_on_cluster`)."""
+        """Execute units on the workers (`execute_on_cluster`).
+
+        Args:
+            folder: folder of the sweep, which receives the files of the runs.
+            display: shows progress.
+            units: runs to execute.
+            skip_reason: returns why another command has a unit, or an empty string (`execute_unclaimed`).
+
+        Raises:
+            InputError: the input is invalid.
+            WriteError: no worker can write any more.
+            RunFailed: the connection to the scheduler is lost.
+        """
         execute_on_cluster(self.client, units, folder, display, skip_reason)
 
 

@@ -202,7 +202,15 @@ def choose_num_workers() -> int:
 
 
 def execute_timed(unit: ExperimentUnit, tick: ProgressCallback) -> str:
-    """Execute a unit and return its outcome; compilation is reported through `tick` too."""
+    """Execute a unit, alone on the machine unless it times itself.
+
+    Args:
+        unit: unit to execute.
+        tick: called with the unit's events, and those of compilation and of waiting for the machine.
+
+    Returns:
+        The outcome as text.
+    """
     with report_compilation(tick), nullcontext() if isinstance(unit, SelfTimedUnit) else lock_timing_exclusive(tick):
         return unit.execute_unit(tick)
 
