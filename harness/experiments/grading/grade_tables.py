@@ -87,10 +87,18 @@ class ClassRow:
 def grade_folder(
     grader: SceneGrader, folder: Path, report_progress: ProgressCallback = lambda line: None
 ) -> list[ClassRow]:
-    """Grade each file and folder of positions in a folder; those that cannot be read have a reason.
+    """Grade each file and folder of positions in a folder.
+
+    Args:
+        grader: grader of the scene.
+        folder: folder with a file or a folder of positions for each submission.
+        report_progress: called with a line before each submission.
+
+    Returns:
+        Rows by increasing name; those of submissions that cannot be read have a reason.
 
     Raises:
-      InputError: the folder has no submissions.
+        InputError: the folder has no submissions.
     """
     found = sorted(one for one in folder.iterdir() if not one.name.startswith(".") and is_submission(one))
     inner = {one: _find_inner(one) for one in sorted(folder.iterdir()) if one.is_dir() and not is_submission(one)}

@@ -134,7 +134,15 @@ class SceneGrader:
             self._finder_note = f"mistakes are not looked for: {error.mistakes[0].problem.partition('; leave out')[0]}"
 
     def grade_file(self, path: Path, report_progress: ProgressCallback = lambda line: None) -> PositionGrade:
-        """Read and grade a submission; raises InputError for a file that cannot be graded."""
+        """Read and grade a submission.
+
+        Args:
+            path: file of positions, or folder of mesh files.
+            report_progress: called with a line about what is computed.
+
+        Raises:
+            InputError: the positions cannot be read, or are not those of the scene.
+        """
         read = read_position_file(path, len(self.scene.mesh.rest_positions), self.request.array)
         submission = align_submission(self.scene, read, self.request.first_frame, self._rest)
         return self.grade_submission(submission, report_progress)
@@ -142,7 +150,15 @@ class SceneGrader:
     def grade_submission(
         self, submission: SubmittedMotion, report_progress: ProgressCallback = lambda line: None
     ) -> PositionGrade:
-        """Grade a submission."""
+        """Grade a submission.
+
+        Args:
+            submission: positions in the scene's order of vertices, with at least one step.
+            report_progress: called with a line about what is computed.
+
+        Raises:
+            InputError: the submission has no steps.
+        """
         if not submission.num_steps:
             raise InputError(f"{submission.source}: has only the start; expected the positions after some steps")
         begun = time.monotonic()

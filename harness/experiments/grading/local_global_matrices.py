@@ -107,7 +107,12 @@ def build_local_global_matrices(scene: Scene, frame: int = 1, initial_guess: str
 
 
 def compute_constant_side(terms: SpringTerms, problem: StepProblem) -> Positions:
-    """Compute y (n, 3) [N] of a step."""
+    """Compute y (n, 3) [N] of a step.
+
+    Args:
+        terms: terms of the scene; of the pins, only penalties contribute.
+        problem: step problem with the inertial target and the external force.
+    """
     y = problem.system.inertia_diagonal[:, None] * problem.inertial_target + problem.external_force
     soft = terms.soft_mask
     y[terms.pinned[soft]] += terms.weight[soft, None] * problem.pin_targets[soft]
@@ -115,7 +120,16 @@ def compute_constant_side(terms: SpringTerms, problem: StepProblem) -> Positions
 
 
 def iterate_local_global(terms: SpringTerms, Q: csr_array, problem: StepProblem, iterations: int) -> Positions:
-    """Return p (n, 3) [m] after some iterations d(p), Q p = A'K d + y."""
+    """Return the positions p (n, 3) [m] after some local-global iterations.
+
+    An iteration evaluates d at p and solves Q p = A'K d + y.
+
+    Args:
+        terms: terms of the scene; exactly pinned vertices remain at their current positions.
+        Q: system matrix (n, n) [N/m].
+        problem: step problem, whose initial guess is the first iterate.
+        iterations: number of iterations.
+    """
     free, p, y = terms.free_vertices, problem.initial_guess.copy(), compute_constant_side(terms, problem)
     fixed = np.setdiff1d(np.arange(len(p)), free)
     p[fixed] = problem.current_positions[fixed]
@@ -174,10 +188,17 @@ def _format_one(name: str, formula: str, matrix: Any) -> Iterator[str]:
 
 
 def save_matrices(matrices: LocalGlobalMatrices, folder: Path) -> list[Path]:
-    """Write `matrices.npz` and one Matrix Market file for each matrix; return the paths.
+    """Write `matrices.npz` and one Matrix Market file for each matrix.
 
     In the .npz a sparse matrix X is the four arrays X_data, X_indices, X_indptr and X_shape of
     `scipy.sparse.csr_array`.
+
+    Args:
+        matrices: matrices and vectors to write.
+        folder: folder of the files, which is created if missing.
+
+    Returns:
+        Paths of the files, `matrices.npz` first.
     """
     folder.mkdir(parents=True, exist_ok=True)
     arrays: dict[str, Any] = dict(matrices.dense_arrays)

@@ -22,10 +22,17 @@ _NAMES = ("A", "C", "M", "Q", "y", "d", "b")
 
 
 def compare_matrix_file(matrices: LocalGlobalMatrices, path: Path) -> str:
-    """Compare a matrix with the one that its file is named after, such as `Q.mtx`; return a sentence.
+    """Compare a matrix with the one that its file is named after, such as `Q.mtx`.
+
+    Args:
+        matrices: matrices of the scene.
+        path: Matrix Market file.
+
+    Returns:
+        Sentence that states whether they are equal, else a known mistake or the entry that differs most.
 
     Raises:
-      InputError: the file cannot be read, or has another name or shape.
+        InputError: the file cannot be read, or has another name or shape.
     """
     name = path.stem
     if name not in _NAMES or path.suffix != ".mtx":

@@ -251,7 +251,12 @@ def _shift_pins(shift: int) -> Callable[[AssignmentProgram, Positions], Assignme
 
 
 def change_time_step(program: AssignmentProgram, time_step: float) -> AssignmentProgram:
-    """Return the program with another time step [s]."""
+    """Return the program with another time step in both the system matrix and the target.
+
+    Args:
+        program: correct or mistaken program.
+        time_step: time step [s].
+    """
     return replace(program, system_step=time_step, target_step=time_step)
 
 

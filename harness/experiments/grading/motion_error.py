@@ -72,7 +72,13 @@ class MotionReference:
     """The integrated motion and converged implicit Euler of one scene, computed once for all submissions."""
 
     def __init__(self, spec: SceneSpec, size: int, seconds: float) -> None:
-        """Set the scene, and the time limit [s] of each computation."""
+        """Build the scene with exact pins; nothing is simulated yet.
+
+        Args:
+            spec: scene of the submissions.
+            size: mesh size.
+            seconds: time limit [s] of each computation.
+        """
         self._spec, self._size, self._seconds = spec, size, seconds
         self._scene = build_exact_scene(spec, size, show_warnings=False)
         self._has_contact = has_contact(self._scene.system)

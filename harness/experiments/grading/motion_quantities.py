@@ -44,7 +44,12 @@ class MotionQuantities(NamedTuple):
 
 
 def measure_motion(scene: Scene, submission: SubmittedMotion) -> MotionQuantities:
-    """Measure the quantities of a submission."""
+    """Measure the quantities of a submission.
+
+    Args:
+        scene: scene with the time step of the submission.
+        submission: positions to measure, whose stored digits bound the round-off.
+    """
     p, system, springs = submission.positions, scene.system, scene.all_springs
     start = p[1]
     _, vertices, weight = system.penalty_pins

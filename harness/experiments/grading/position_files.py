@@ -89,7 +89,15 @@ def read_position_file(path: Path, num_vertices: int, array: str = DEFAULT_ARRAY
 
 
 def read_rest_positions(path: Path, num_vertices: int) -> NDArray[np.float64]:
-    """Read rest positions (n, 3) [m] from a mesh file, or from the only frame of a file of positions."""
+    """Read rest positions (n, 3) [m].
+
+    Args:
+        path: mesh file, or file of positions with a single frame.
+        num_vertices: number of vertices n of the scene.
+
+    Raises:
+        InputError: the file cannot be read, or has other vertices, several frames, or coordinates that are not finite.
+    """
     if path.suffix.lower() in MESH_SUFFIXES and path.is_file():
         points = _read_mesh_points(path)
         if len(points) != num_vertices:

@@ -120,7 +120,15 @@ def collect_spring_terms(scene: Scene) -> SpringTerms:
 
 
 def build_graded_scene(spec: SceneSpec, size: int) -> Scene:
-    """Build a scene with implicit Euler; its mistakes name the file."""
+    """Build a scene with implicit Euler.
+
+    Args:
+        spec: the scene.
+        size: mesh size, ignored by a mesh from a file.
+
+    Raises:
+        InputError: the parts of the scene do not fit together; the mistakes name its file.
+    """
     try:
         return build_scene(spec, size)
     except InputError as error:

@@ -96,7 +96,12 @@ class StepJudge:
         self._solver = NewtonSolver()
 
     def build_problem(self, submission: SubmittedMotion, step: int) -> StepProblem:
-        """Build the problem of a step from the two positions before it."""
+        """Build the problem of a step from the two positions before it.
+
+        Args:
+            submission: positions; those after the step provide the normal forces of friction.
+            step: number of the step, from 1.
+        """
         problem = build_step_problem(
             self._scene, submission.position_after(step - 1), submission.position_after(step - 2), step - 1
         )
@@ -126,7 +131,15 @@ class StepJudge:
         return list(verdicts.values())
 
     def find_minimum(self, problem: StepProblem, p: Positions) -> MinimumCertificate | None:
-        """Find the minimum of the basin of p (n, 3) [m]; None where Newton's method does not support the scene."""
+        """Find the minimum whose basin contains p.
+
+        Args:
+            problem: step problem.
+            p: positions (n, 3) [m].
+
+        Returns:
+            The minimum, certified or not; None where Newton's method does not support the scene.
+        """
         try:
             return refine_minimum(problem, p, self._solver)
         except Unsupported:
