@@ -85,7 +85,11 @@ class SequentialTest:
 
 
 def compute_log_ratio(a: Sequence[float], b: Sequence[float]) -> float:
-    """Compute the log ratio of a block's times [s]."""
+    """Compute the log of the ratio of a's total time to b's.
+
+    Args:
+        a, b: times of the two programs in one block [s].
+    """
     return log(sum(a) / sum(b))
 
 

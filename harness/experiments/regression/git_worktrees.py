@@ -38,7 +38,15 @@ def find_checkout(folder: Path) -> Path:
 
 
 def resolve_commit(checkout: Path, revision: str) -> str:
-    """Return the commit that a revision names; raise InputError if it is unknown."""
+    """Return the full hash of the commit that a revision names.
+
+    Args:
+        checkout: folder of the git checkout.
+        revision: commit, branch or tag.
+
+    Raises:
+        InputError: the revision is unknown.
+    """
     done = _run_git(checkout, "rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}")
     if done.returncode:
         expected = "expected a commit, a branch or a tag, such as HEAD~1; `git log --oneline` lists them"
@@ -69,6 +77,10 @@ def open_revisions(checkout: Path, revision: str) -> tuple[GitRevision, GitRevis
 
 def prepare_worktree(checkout: Path, commit: str) -> Path:
     """Return a clean worktree of a commit, from the cache or newly created.
+
+    Args:
+        checkout: git checkout that contains the commit.
+        commit: full hash of the commit.
 
     Raises:
         InputError: on failure.

@@ -174,6 +174,10 @@ def paired_benchmark(benchmark: BenchmarkFixture, request: pytest.FixtureRequest
     """Compare the times of two programs, or of two solvers on a scene.
 
     Their answers are checked first.
+
+    Args:
+        benchmark: fixture of pytest-benchmark, which records the times.
+        request: request of the test, to whose folder paths of scenes are relative.
     """
     return PairedBenchmark(benchmark, request.node)
 

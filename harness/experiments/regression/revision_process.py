@@ -112,7 +112,15 @@ class RevisionProcess:
         return answer
 
     def prepare_work(self, command: str, **arguments: Any) -> PreparedWork:
-        """Request the preparation of work; `revision_worker.py` lists the commands."""
+        """Request the preparation of work; `revision_worker.py` lists the commands.
+
+        Args:
+            command: name of the request, such as `prepare_run`.
+            arguments: its arguments except `positions`, which JSON can represent.
+
+        Raises:
+            InputError: with the worker's message, or if its process has ended.
+        """
         reply = self.send_request(command, positions=str(self._answer_path), **arguments)
         return PreparedWork(np.load(self._answer_path), reply["stats"], reply["clock"], reply.get("num_frames", 0))
 

@@ -44,7 +44,15 @@ class RevisionWorker:
         self._threads = ExitStack()
 
     def list_runs(self, config: str, run_options: dict[str, Any]) -> dict[str, Any]:
-        """List the runs of a scene or a sweep by their titles."""
+        """List the runs of a scene or a sweep by their titles.
+
+        Args:
+            config: file of the scene or sweep.
+            run_options: options of the runs, keyword arguments of `load_config`.
+
+        Returns:
+            {"runs": titles}.
+        """
         return {"runs": [_format_title(run) for run in _load_runs(config, run_options)]}
 
     def prepare_run(
