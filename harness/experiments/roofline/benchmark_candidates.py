@@ -251,6 +251,10 @@ def compute_call_seconds(seconds: Callable[[int], float], min_seconds: float = M
     """Return the seconds per call.
 
     This is one call, or the mean of enough calls to last `min_seconds` after a first one.
+
+    Args:
+        seconds: makes a number of calls, and returns their total time [s].
+        min_seconds: time for which to repeat the call [s].
     """
     once = seconds(1)
     number = _choose_num_repeats(once, min_seconds)

@@ -119,7 +119,13 @@ class CppBaseline:
 
 
 def write_problem(path: Path, problem: StepProblem, springs: Springs) -> None:
-    """Write a step problem of springs in the format of the program."""
+    """Write a step problem of springs in the binary format of the program.
+
+    Args:
+        path: file to write.
+        problem: step problem, of whose system the time step, the masses and the pins are written.
+        springs: springs of the scene.
+    """
     system = problem.system
     parts = [
         np.array([system.num_vertices, len(springs.edges), len(system.pins.vertices)], np.int64),

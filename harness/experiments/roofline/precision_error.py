@@ -55,9 +55,11 @@ def find_converged_problem(problem: StepProblem) -> ConvergedProblem | None:
 
 
 def compute_precision_error(converged: ConvergedProblem, prepared: PreparedSolver) -> float:
-    """Return the largest distance of a solver's positions from float64's.
+    """Return the largest difference of a coordinate from float64's positions, relative to the scene's size.
 
-    It is relative to the scene's size.
+    Args:
+        converged: step problem that starts at its minimum, and float64's positions.
+        prepared: solver, prepared for the system of the problem.
     """
     found = prepared.solve(converged.problem, _STOP_FROM_MINIMUM).positions
     return float(np.abs(found - converged.positions).max()) / float(np.ptp(converged.positions, axis=0).max())
