@@ -175,7 +175,15 @@ def _hang_cable(num_springs: int, axial_stiffness: float, span: float, solver: S
 
 
 def solve_elastic_catenary(axial_stiffness: float, span: float = 8.0, length: float = 10.0) -> tuple[float, float]:
-    """Return horizontal tension [N] and sag [m] of a cable of 1 kg/m (Irvine 1981, equations 1.30 and 1.31)."""
+    """Return horizontal tension [N] and sag [m] of a cable of 1 kg/m.
+
+    Source: Irvine 1981, equations 1.30 and 1.31.
+
+    Args:
+        axial_stiffness: force per strain EA [N].
+        span: distance of the supports, which are level [m].
+        length: unstretched length [m].
+    """
     weight = length * GRAVITY
     V = weight / 2
 

@@ -69,7 +69,15 @@ class MeasuredBand(NamedTuple):
 
 
 def measure_bending_length(fabric: PublishedFabric, solver: Solver) -> MeasuredBand:
-    """Simulate the cantilever test; bending length and band [m]."""
+    """Simulate the cantilever test of a fabric.
+
+    Args:
+        fabric: fabric with its density and its flexural rigidity.
+        solver: solver of the scene.
+
+    Returns:
+        Bending length [m], and its band from the smallest and the largest measured rigidity.
+    """
     stretch = max(fabric.warp, MIN_STRIP_STIFFNESS)
 
     def compute_excess(overhang: float) -> float:
@@ -128,7 +136,13 @@ def _predict_drape(c: float, angle: float) -> float:
 
 
 def compute_shadow_area(p: Positions, triangles: NDArray[np.int64], pixel: float = 5e-4) -> float:
-    """Return the area [m^2] of the triangles' shadow on the plane y = 0, on pixels of a side [m]."""
+    """Return the area [m^2] of the shadow of triangles on the plane y = 0.
+
+    Args:
+        p: positions (n, 3) [m].
+        triangles: vertex indices (t, 3).
+        pixel: side [m] of the square pixels that are counted.
+    """
     points = p[:, [0, 2]]
     low = points.min(axis=0) - pixel
     shape = np.ceil((points.max(axis=0) - low) / pixel).astype(int) + 2

@@ -68,13 +68,24 @@ def build_validation_scene(
 
 
 def simulate_to_time(scene: Scene, solver: Solver, num_steps: int) -> list[Positions]:
-    """Return the positions after each step."""
+    """Return the positions (n, 3) [m] after each step.
+
+    Args:
+        scene: scene to simulate from its start.
+        solver: solver, which solves each step by STEP_RULE.
+        num_steps: number of steps.
+    """
     steps = simulate_scene(scene, prepare(scene, solver), STEP_RULE, initial_guess="previous", frames=num_steps)
     return [step.positions.copy() for step in steps]
 
 
 def simulate_to_rest(scene: Scene, solver: Solver) -> Positions:
-    """Return the positions (n, 3) [m] at rest, or after the maximum number of steps."""
+    """Return the positions (n, 3) [m] at rest, or after the maximum number of steps.
+
+    Args:
+        scene: scene with a time step that damps its motion, such as REST_STEP.
+        solver: solver, which solves each step by STEP_RULE.
+    """
     limit = REST_MOTION * max(scene.mesh.bounding_box_diagonal, 1e-3)
     before = scene.mesh.rest_positions
     for step in simulate_scene(
