@@ -117,7 +117,15 @@ class RunSetup:
         return is_minimiser(self.build_solver())
 
     def observe_first_frames(self, count: int, recorder: RunRecorder | None = None) -> None:
-        """Simulate the first frames again, with a new solver, and record them; raises StepError."""
+        """Simulate the first frames again, with a new solver, and record them.
+
+        Args:
+            count: number of frames.
+            recorder: recorder of the frames; None for none.
+
+        Raises:
+            StepError: a step failed, or the energy diverges.
+        """
         observe_run(
             self.scene,
             prepare(self.scene, self.build_solver()),
@@ -497,6 +505,14 @@ def _open_recorder(job: RunJob, scene: Scene, outcome: Mapping[str, Any], *final
 
 
 def save_positions(path: Path, positions: np.ndarray) -> None:
-    """Store positions (frames, n, 3) [m] in a partial file and rename it. Raises WriteError."""
+    """Store positions in a partial file and rename it.
+
+    Args:
+        path: file (.npz), whose only array is `positions`.
+        positions: positions after each step (frames, n, 3) [m].
+
+    Raises:
+        WriteError: the file cannot be written.
+    """
     with atomic_write(path) as partial:
         np.savez_compressed(partial, positions=positions)

@@ -90,7 +90,14 @@ _TOP_RTOL = 1e-6
 
 
 def has_iterations_in_substep(solver: Any, name: str) -> bool:
-    """Return whether a solver or engine of this name iterates within a substep, so that a setting has two numbers."""
+    """Return whether a solver or engine iterates within a substep.
+
+    A setting then has two numbers.
+
+    Args:
+        solver: solver or engine.
+        name: its name in the registry.
+    """
     info = find_solver_info(solver, name)
     if is_engine(solver):
         return "iterations_per_substep" in [one.name for one in fields(solver)]
@@ -154,7 +161,16 @@ class SettingSimulator:
         return [frame * self.spec.time_step for frame in self.sample_frames]
 
     def build_step(self, spec: SceneSpec, setting: StepSetting) -> tuple[Scene, Any, StopRule, int]:
-        """Return the scene of a setting, its solver, its stop rule, and the number of steps of a frame."""
+        """Return what simulates a setting.
+
+        Args:
+            spec: scene whose time step is a frame.
+            setting: substeps of a frame, and iterations of a substep.
+
+        Returns:
+            Scene of the setting, its solver, its stop rule, and the number of steps of a frame, which is 1 for an
+                engine: it takes the substeps itself.
+        """
         if self.is_engine:
             own = {"iterations_per_substep": setting.iterations} if self.has_iterations else {}
             scene = build_exact_scene(spec, self.size, self.integrator, show_warnings=False)
@@ -251,7 +267,12 @@ class SampledReference:
 
     @classmethod
     def from_trajectory(cls, scene: Scene, trajectory: ReferenceTrajectory) -> SampledReference:
-        """Sample a reference trajectory of a scene."""
+        """Sample a reference trajectory of a scene.
+
+        Args:
+            scene: scene of the trajectory, whose energy is evaluated.
+            trajectory: reference at the times at which motions are compared.
+        """
         kinetic = [_kinetic_energy(scene, v) for v in trajectory.velocities]
         energy = _compute_energy(scene, trajectory.positions[-1], trajectory.velocities[-1])
         uncertainty = float(trajectory.disagreement.max())
@@ -266,11 +287,24 @@ class SampledReference:
         return self.measure_change(positions, self.positions)
 
     def measure_change(self, p: Positions, q: Positions) -> float:
-        """Return the largest distance of two motions (k, n, 3), relative to the largest displacement of q."""
+        """Return the largest distance of two motions, relative to the largest displacement of q.
+
+        Args:
+            p, q: positions at the times of the reference (k, n, 3) [m].
+        """
         return measure_change(p, q, self.start, self.free_vertices)
 
     def measure_drift(self, scene: Scene, p: Positions, v: Positions) -> float:
-        """Return the difference of the energy at the end, over the largest kinetic energy; NaN if unknown."""
+        """Return the error of the energy at the end, over the largest kinetic energy.
+
+        Args:
+            scene: scene whose energy is evaluated.
+            p: positions at the end (n, 3) [m].
+            v: velocities at the end (n, 3) [m/s].
+
+        Returns:
+            Signed ratio; NaN if the energy of the reference is unknown, or if the reference does not move.
+        """
         if self.end_energy is None or not self.kinetic_scale:
             return float("nan")
         return (_compute_energy(scene, p, v) - self.end_energy) / self.kinetic_scale

@@ -143,7 +143,12 @@ def _cached_fingerprint() -> Callable[[RunSpec], str]:
 
 
 def find_stale_run_ids(runs: Iterable[RunSpec], table: pa.Table) -> set[str]:
-    """Return the ids of the runs whose rows come from other source code."""
+    """Return the ids of the runs whose rows come from other source code.
+
+    Args:
+        runs: planned runs; those without rows count as stale.
+        table: rows with the columns `run_id` and `source_fingerprint`.
+    """
     code_of = _cached_fingerprint()
     here, made = (
         machine_info.describe_machine().machine_id,
