@@ -83,7 +83,12 @@ def _append_colour(count: int, colour: int, others: ColourArray) -> ColourArray:
 
 
 def build_curve_view(origin: str, name: str) -> rrb.Spatial2DView:
-    """Build a view of the drawing."""
+    """Build a view of the drawing.
+
+    Args:
+        origin: entity path under which `draw_curves` logged the drawing.
+        name: title of the view.
+    """
     bounds = rrb.VisualBounds2D(x_range=(-18, _WIDTH + 32), y_range=(-8, _HEIGHT + 14))
     return rrb.Spatial2DView(origin=origin, name=name, background=(28, 30, 34), visual_bounds=bounds)
 

@@ -38,7 +38,12 @@ def compute_local_origin(rest: Positions) -> NDArray[np.float64]:
 
 
 def store_relative(p: Positions, origin: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return positions (n, 3) [m] relative to the origin, in single precision."""
+    """Return positions relative to the origin, in single precision.
+
+    Args:
+        p: positions (n, 3) [m].
+        origin: local origin (3,) [m].
+    """
     with np.errstate(over="ignore"):
         return (p - origin).astype(np.float32)
 

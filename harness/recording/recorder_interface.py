@@ -126,7 +126,12 @@ class FrameSamples:
         self.positions: dict[int, Positions] = {}
 
     def add_frame(self, frame: int, p: Positions) -> None:
-        """Copy the positions (n, 3) [m] after a step if its frame is sampled."""
+        """Copy the positions after a step if its frame is sampled.
+
+        Args:
+            frame: number of the frame, from 1.
+            p: positions (n, 3) [m], which the caller may overwrite.
+        """
         if frame in self.frames:
             self.positions[frame] = p.copy()
 

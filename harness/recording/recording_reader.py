@@ -87,7 +87,12 @@ class RecordingSource:
     run_id: str
 
     def iterate_chunks(self, *, content: str, components: Sequence[str] | None = None) -> Iterator[Chunk]:
-        """Iterate over the chunks of the entities that match `content`, with the given components only."""
+        """Iterate over the chunks of some entities.
+
+        Args:
+            content: filter of entity paths, such as `/scene/mesh`, or `/**` for all.
+            components: names of the components to read; all if None.
+        """
         return iter(self.store.stream().filter(content=content, components=components))
 
 
@@ -304,7 +309,18 @@ def _read_scalars(source: RecordingSource) -> pa.Table:
 
 
 def read_convergence_frames(source: RecordingSource, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the frames with recorded convergence, and their times [s], in stored order."""
+    """Return the frames with recorded convergence, and their times [s], in stored order.
+
+    Args:
+        source: open recording.
+        entity: entity path of a convergence curve, such as `/convergence/residual`.
+
+    Returns:
+        Frame indices (k,) and times (k,) [s].
+
+    Raises:
+        InputError: the recording does not state the frames.
+    """
     for chunk in source.iterate_chunks(content=entity.rpartition("/")[0]):
         batch = chunk.to_record_batch()
         return read_cell(batch, "frames").astype(np.int64), read_cell(batch, "times").astype(float)
@@ -348,7 +364,15 @@ def read_cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
 
 
 def read_timeline(batch: pa.RecordBatch, timeline: str) -> NDArray[Any]:
-    """Return a timeline of a batch: frames, iterations, or times [s]."""
+    """Return a timeline of a batch: frames, iterations, or times [s].
+
+    Args:
+        batch: chunk of a recording.
+        timeline: name of the timeline: `frame`, `iteration` or `time`.
+
+    Returns:
+        Integers, or seconds for `time`, one of each row.
+    """
     found = get_column(batch, timeline)
     counts: NDArray[np.int64] = found.cast(pa.int64()).to_numpy()
     return counts / 1e9 if pa.types.is_duration(found.type) else counts
@@ -358,12 +382,25 @@ def get_column(batch: pa.RecordBatch, name: str) -> Any:
     """Return a column, untyped.
 
     pyarrow's stubs do not type arrays that depend on the schema.
+
+    Args:
+        batch: chunk of a recording.
+        name: name of the component or the timeline.
     """
     return cast(Any, batch[name])
 
 
 def get_scalar(batch: pa.RecordBatch, name: str, row: int) -> Any:
-    """Return one row of a column."""
+    """Return one row of a column.
+
+    Args:
+        batch: chunk of a recording.
+        name: name of the component.
+        row: index of the row.
+
+    Returns:
+        The scalar of pyarrow, which is a list for most components.
+    """
     return get_column(batch, name)[row]
 
 

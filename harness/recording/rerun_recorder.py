@@ -147,7 +147,12 @@ class RerunRecorder:
         self._curves[frame] = residuals, objective
 
     def record_solve(self, numbers: Sequence[int], curves: Mapping[str, Sequence[float]]) -> None:
-        """Record log10 of curves by name over numbered iterates, in a recording of one solve."""
+        """Record log10 of curves over numbered iterates, in a recording of one solve.
+
+        Args:
+            numbers: numbers of the iterates (k,).
+            curves: values at the iterates (k,) by name.
+        """
         for name, values in curves.items():
             entity = f"/solve/{name.replace(' ', '_')}"
             self._style_series(entity, f"log10 of the {name}")

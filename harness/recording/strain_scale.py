@@ -48,12 +48,22 @@ def round_scale_end(strain: NDArray[np.float64]) -> float:
 
 
 def format_percent(strain: float, digits: int = 3) -> str:
-    """Format a strain with its sign as a percentage."""
+    """Format a strain with its sign as a percentage.
+
+    Args:
+        strain: relative change of length.
+        digits: number of significant digits.
+    """
     return f"{100 * strain:+.{digits}g} %".replace("-", "−")
 
 
 def compute_strain_colours(strain: NDArray[np.float64], end: float) -> NDArray[np.uint32]:
-    """Return the colours 0xRRGGBBAA (m,) of strains (m,) on the scale from -end to end."""
+    """Return the colours 0xRRGGBBAA (m,) of strains on the scale from -end to end.
+
+    Args:
+        strain: strains (m,); NaN has NEUTRAL_COLOUR, and strains beyond the scale have the colour of its end.
+        end: strain at the end of the scale, positive.
+    """
     with np.errstate(invalid="ignore"):
         level = np.rint((np.clip(strain / end, -1, 1) + 1) * (NUM_LEVELS - 1) / 2)
     return _packed_palette()[np.where(np.isnan(level), NUM_LEVELS, level).astype(np.intp)]
@@ -65,6 +75,11 @@ def _packed_palette() -> NDArray[np.uint32]:
 
 
 def widen_range(ends: tuple[float, float], strain: NDArray[np.float64]) -> tuple[float, float]:
-    """Return the smallest and the largest of `ends` and the finite strains."""
+    """Return the smallest and the largest of `ends` and the finite strains.
+
+    Args:
+        ends: smallest and largest strain so far.
+        strain: strains (m,), which need not be finite.
+    """
     known = strain[np.isfinite(strain)]
     return float(known.min(initial=ends[0])), float(known.max(initial=ends[1]))

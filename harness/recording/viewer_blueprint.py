@@ -194,6 +194,10 @@ def build_panels(
     """Build the panels, with a time panel that loops by frame or iteration.
 
     Playback is in real time as far as a screen can show it (1 to 120 frames per second).
+
+    Args:
+        time_step: length of a frame [s].
+        timeline: name of the timeline that is played, `frame` or `iteration`.
     """
     fps = math.ceil(min(max(1 / time_step, 1.0), 120.0))
     time = rrb.TimePanel(state="collapsed", timeline=timeline, fps=fps, play_state="playing", loop_mode="all")
