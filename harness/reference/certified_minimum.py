@@ -128,7 +128,15 @@ class KnownMinima:
 
 
 def find_minima(problem: StepProblem, solver: Solver) -> KnownMinima:
-    """Find the minima that Newton's method reaches from current positions and inertial target."""
+    """Find the minima that Newton's method reaches from current positions and inertial target.
+
+    Args:
+        problem: step problem, whose initial guess is not used.
+        solver: Newton's method.
+
+    Returns:
+        The certified minima, lowest first, or the reason why there is none.
+    """
     guesses = (apply_initial_guess(problem, name).initial_guess for name in ("previous", "inertial"))
     return collect_minima(refine_minimum(problem, guess, solver) for guess in guesses)
 
@@ -155,10 +163,14 @@ def refine_minimum(problem: StepProblem, p: Positions, solver: Solver) -> Minimu
 
 
 def certify_minimum(problem: StepProblem, p: Positions) -> MinimumCertificate:
-    """Refine p (n, 3) [m], near a minimum, by Newton steps, and certify it.
+    """Refine positions near a minimum by Newton steps, and certify the minimum.
 
     The steps continue to round-off. The certificate contains the curvature, the objective and the length of one more
     step at the final point.
+
+    Args:
+        problem: step problem, whose exact pins are placed at their targets.
+        p: positions near a minimum (n, 3) [m], which remain unchanged.
     """
     p = _place_pins(problem, p)
     near = CERTIFIED_RTOL * measure_component_sizes(problem.system, p)
