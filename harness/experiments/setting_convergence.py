@@ -169,7 +169,7 @@ class SettingSimulator:
 
         Returns:
             Scene of the setting, its solver, its stop rule, and the number of steps of a frame, which is 1 for an
-                engine: it takes the substeps itself.
+            engine: it takes the substeps itself.
         """
         if self.is_engine:
             own = {"iterations_per_substep": setting.iterations} if self.has_iterations else {}

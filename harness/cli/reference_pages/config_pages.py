@@ -169,7 +169,7 @@ def format_default(schema: Schema, is_required: bool) -> str:
 
     Returns:
         `required`, or the default as JSON; empty if there is none, or if it is a mapping, whose keys have their own
-            defaults.
+        defaults.
     """
     default = schema.get("default")
     if is_required or "default" not in schema or isinstance(default, dict):

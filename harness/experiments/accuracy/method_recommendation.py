@@ -537,7 +537,7 @@ def find_default_t_end(
 
     Returns:
         DEFAULT_T_END, or the longest time at which the error can be measured, if that is shorter. Contact does not
-            shorten it.
+        shorten it.
 
     Raises:
         InputError: the scene is invalid.
