@@ -125,7 +125,7 @@ def iterate_local_global(terms: SpringTerms, Q: csr_array, problem: StepProblem,
     An iteration evaluates d at p and solves Q p = A'K d + y.
 
     Args:
-        terms: terms of the scene; exactly pinned vertices remain at their current positions.
+        terms: terms of the scene; exactly pinned vertices have the current positions of the problem, their targets.
         Q: system matrix (n, n) [N/m].
         problem: step problem, whose initial guess is the first iterate.
         iterations: number of iterations.
