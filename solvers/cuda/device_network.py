@@ -47,7 +47,12 @@ class EdgeEntries(NamedTuple):
 
     @classmethod
     def from_ends(cls, ends: IndexArray, rows: int) -> EdgeEntries:
-        """Build the entries of edges between rows (m, 2), for the first `rows` rows, without self-loops."""
+        """Build the entries of edges, without self-loops.
+
+        Args:
+            ends: rows of both ends of each edge (m, 2).
+            rows: number of rows with entries, the first ones; ends in later rows have none.
+        """
         proper = np.flatnonzero(ends[:, 0] != ends[:, 1])
         here, there = ends[proper].T.ravel(), ends[proper, ::-1].T.ravel()
         edge = np.concatenate([proper, ~proper])
@@ -184,7 +189,15 @@ class DeviceNetwork:
 
 
 def require_known_energies(solver: str, system: System) -> None:
-    """Raise Unsupported with the names of energies that the device kernels do not support."""
+    """Check that the device kernels support all energies of a system.
+
+    Args:
+        solver: name of the solver, for the message.
+        system: the system; its barriers and its contact of vertices are among the unsupported energies.
+
+    Raises:
+        Unsupported: with the names of the unsupported energies.
+    """
     bare = without_barriers(without_vertex_contact(system))
     there = {type(e).__name__ for e in system.energies if e not in bare.energies}
     parts = decompose_energies(bare)

@@ -60,7 +60,15 @@ class SchwarzLevel:
 
 
 def build_levels(network: DeviceNetwork, anchor_stiffness: NDArray[np.float64]) -> list[SchwarzLevel]:
-    """Build the levels of a network; `anchor_stiffness` (f,) is that of its rows [N/m]."""
+    """Build the levels of a network, up to one whose nodes fit in one subdomain.
+
+    Args:
+        network: edges between rows, whose free rows are the nodes of the first level.
+        anchor_stiffness: h of the free rows (f,) [N/m].
+
+    Returns:
+        The levels, the finest one first.
+    """
     none = np.zeros(1, np.int64)
     found = [SchwarzLevel(network.num_free, network.edge_entries, anchor_stiffness, len(network.ends), none, none)]
     ends = network.ends
@@ -79,7 +87,12 @@ def build_levels(network: DeviceNetwork, anchor_stiffness: NDArray[np.float64]) 
 
 
 def compute_schwarz_bytes(schwarz_levels: list[SchwarzLevel], item_size: int) -> float:
-    """Return the bytes on the device, for numbers of `item_size` bytes."""
+    """Return the bytes of the preconditioner on the device.
+
+    Args:
+        schwarz_levels: all levels, of `build_levels`.
+        item_size: bytes of a number of the inverses and residuals.
+    """
     return sum(
         1.0 * item_size * packed_length(additive_schwarz.SUBDOMAIN_SIZE) * one.num_subdomains
         + 48.0 * one.num_edges
@@ -101,7 +114,12 @@ class UploadedLevel(NamedTuple):
 
     @classmethod
     def from_level(cls, stream: DeviceStream, level: SchwarzLevel) -> UploadedLevel:
-        """Copy a level to the device, which does not support empty arrays."""
+        """Copy a level to the device, which does not support empty arrays.
+
+        Args:
+            stream: stream of the copies.
+            level: the level on the host.
+        """
         first, other, edge = level.edge_entries
         some = np.zeros(1, np.int32)
         return cls(
@@ -138,7 +156,12 @@ class DeviceAdditiveSchwarz:
         self._corrections = [cuda.device_array((one.num_nodes, 3), real) for one in schwarz_levels[1:]]
 
     def set_linearisation(self, edges: DeviceEdges, p: Any) -> None:
-        """Invert the subdomains of H+ at rows p (n, 3) [m]."""
+        """Invert the subdomains of H+ at given positions.
+
+        Args:
+            edges: edges of the finest level, on the device.
+            p: positions in rows (n, 3) [m], on the device.
+        """
         write_edge_blocks[self._launch_shape(self._levels[0].num_edges)](edges, p, self._edge_stiffness[0])
         for k, (level, there, stiff) in enumerate(zip(self._levels, self._uploaded, self._edge_stiffness, strict=True)):
             if k:
@@ -150,9 +173,13 @@ class DeviceAdditiveSchwarz:
             )
 
     def apply_preconditioner(self, z: Any, sum_slot: int, partials: Any, cg_status: Any) -> None:
-        """Write z (f, 3), and store the first stage of r'z.
+        """Apply the preconditioner to `r`, and store the first stage of the sum r'z.
 
-        Do nothing if now[0] is not 0.
+        Args:
+            z: output (f, 3) [m], on the device.
+            sum_slot: row of the partial sums that r'z is stored in.
+            partials: output, partial sums (k, MAX_BLOCKS) [J].
+            cg_status: state of conjugate gradients, on the device; nothing is done if its first number is not 0.
         """
         for level, r, coarse in zip(self._levels[1:], self._residuals, self._residuals[1:], strict=False):
             self._schwarz_kernels.restrict_residual[self._launch_shape(level.num_nodes)](r, coarse, cg_status)

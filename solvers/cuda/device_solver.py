@@ -149,7 +149,13 @@ class DeviceSolver(IterativeSolver):
 
     @abstractmethod
     def upload_problem(self, problem: StepProblem, initial_guess: Positions, uploads: ReusedUploads) -> DeviceStep:
-        """Upload a step to the device, with an initial guess (n, 3) [m]."""
+        """Upload a step to the device.
+
+        Args:
+            problem: the step on the host.
+            initial_guess: positions (n, 3) [m] from which the solve starts.
+            uploads: device arrays of the last step, which are overwritten.
+        """
 
     @cached_property
     def _finished_states(self) -> list[DeviceSolverState]:
@@ -157,7 +163,15 @@ class DeviceSolver(IterativeSolver):
         return []
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> DeviceSolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve, in the memory of one that has ended if there is any.
+
+        Args:
+            problem: the step, which is uploaded.
+            initial_guess: positions (n, 3) [m].
+
+        Raises:
+            DeviceFailure: the device has no memory left, or has failed.
+        """
         with cuda_device.guard_device_errors():
             run = self._finished_states.pop() if self._finished_states else self.allocate_state()
             run.mark_start()
@@ -167,7 +181,16 @@ class DeviceSolver(IterativeSolver):
             return run
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Iterate until the stop rule is met, or until no iteration descends."""
+        """Iterate until the stop rule is met, or until no iteration descends.
+
+        Args:
+            problem: the step on the host.
+            stop: the criteria that terminate the solve.
+
+        Raises:
+            DeviceFailure: the device has no memory left, or has failed.
+            Unsupported: the system has length constraints, which the method does not support.
+        """
         with cuda_device.guard_device_errors():
             return super().solve(problem, stop)
 
@@ -186,7 +209,18 @@ class DeviceSolver(IterativeSolver):
                 yield lambda: run.positions
 
     def replay_iterations(self, problem: StepProblem, iterations: int) -> tuple[Solution, SolveEvents | None]:
-        """Repeat iterations without residuals; return the solution, and the events or None without a clock."""
+        """Repeat a solve by its number of iterations, without residuals.
+
+        Args:
+            problem: the step on the host; the iterations start at its initial guess.
+            iterations: number of iterations.
+
+        Returns:
+            The solution, whose residuals are nan, and the events; None in the simulator, which has no times.
+
+        Raises:
+            DeviceFailure: the device has no memory left, or has failed.
+        """
         with cuda_device.guard_device_errors():
             run = self.init_state(problem, problem.initial_guess)
             run.run_unchecked(iterations)
@@ -212,13 +246,27 @@ class MinimisingSolver(DeviceSolver):
     supports_contact: ClassVar[bool] = False
 
     def upload_problem(self, problem: StepProblem, initial_guess: Positions, uploads: ReusedUploads) -> DeviceStep:
-        """Upload a step to the device, with an initial guess (n, 3) [m]."""
+        """Upload a step to the device, with its start if the method supports contact.
+
+        Args:
+            problem: the step on the host.
+            initial_guess: positions (n, 3) [m] from which the solve starts.
+            uploads: device arrays of the last step, which are overwritten.
+        """
         return self.uploaded_network.upload_step(
             problem, initial_guess, uploads, supports_contact=self.supports_contact
         )
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> DeviceSolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve whose state evaluates residuals of the step.
+
+        Args:
+            problem: the step, which is uploaded.
+            initial_guess: positions (n, 3) [m].
+
+        Raises:
+            DeviceFailure: the device has no memory left, or has failed.
+        """
         run = super().init_state(problem, initial_guess)
         run.residual_of_positions = self.residual_of_positions(problem)
         return run
@@ -229,5 +277,10 @@ class MinimisingSolver(DeviceSolver):
         return lambda p: self.metric.residual(step.gradient(step.apply_exact_pins(p)))
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual [J^(1/2)] at positions p (n, 3) [m]."""
+        """Return the residual [J^(1/2)], computed on the host.
+
+        Args:
+            problem: the step.
+            p: positions (n, 3) [m], whose exactly pinned vertices count as on their targets.
+        """
         return self.residual_of_positions(problem)(p)

@@ -59,9 +59,13 @@ class DeviceLanes(NamedTuple):
 
     @classmethod
     def from_packets(cls, stream: DeviceStream, bundles: SpringPackets, padding_row: int, real: Any) -> DeviceLanes:
-        """Copy the packets to the device.
+        """Copy packets of springs to the device.
 
-        `padding_row` + 1 is the row of the ends of padding springs.
+        Args:
+            stream: stream of the copies.
+            bundles: packets on the host; their strain limits and dashpots are not copied.
+            padding_row: row of the padding lanes; the next row is that of the ends of padding springs.
+            real: floating-point type of the kernels, for their weights and spring vectors.
         """
         entries = len(bundles.neighbour_offset)
         direction = bundles.rest_direction if len(bundles.rest_direction) else np.zeros((1, 3))
@@ -114,7 +118,12 @@ def _nonempty_array(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def compute_spring_bytes(bundles: SpringPackets, real: Any) -> int:
-    """Return the bytes of the lanes on the device."""
+    """Return the bytes of the lanes on the device.
+
+    Args:
+        bundles: packets on the host.
+        real: floating-point type of the kernels.
+    """
     size = np.dtype(real).itemsize
     return (
         len(bundles.neighbour_offset) * (8 + 3 * size) + 8 * len(bundles.row_offset) + (8 + size) * bundles.weights.size

@@ -84,7 +84,12 @@ class UploadedNetwork:
 
     @classmethod
     def from_network(cls, network: DeviceNetwork, stream: DeviceStream) -> UploadedNetwork:
-        """Copy a network to the device."""
+        """Copy a network to the device.
+
+        Args:
+            network: edges and row order on the host.
+            stream: stream of the copies.
+        """
         system, order = network.system, network.row_vertices
         pin, weight = number_pins(system), np.zeros(system.num_vertices)
         _, pinned, weights = system.penalty_pins
@@ -102,9 +107,13 @@ class UploadedNetwork:
     def upload_step(
         self, problem: StepProblem, initial_guess: Positions, uploads: ReusedUploads, *, supports_contact: bool = False
     ) -> DeviceStep:
-        """Upload a step problem with an initial guess (n, 3) [m].
+        """Upload a step problem.
 
-        For methods with contact, also upload the start of the step.
+        Args:
+            problem: the step on the host.
+            initial_guess: positions (n, 3) [m] from which the solve starts.
+            uploads: device arrays of the last step, which are overwritten.
+            supports_contact: whether to upload also the start of the step, which contact requires.
         """
         force, up = self.host_network.spring_form.compute_force(problem), uploads.upload_array
         target, pins, start = up(problem.inertial_target), upload_pin_targets(problem, uploads), problem.step_start
@@ -130,7 +139,15 @@ def number_pins(system: System) -> NDArray[np.int32]:
 
 
 def upload_pin_targets(problem: StepProblem, uploads: ReusedUploads) -> Any:
-    """Upload the pin targets to the device, which does not support empty arrays."""
+    """Upload the pin targets to the device, which does not support empty arrays.
+
+    Args:
+        problem: the step with the targets.
+        uploads: device arrays of the last step, which are overwritten.
+
+    Returns:
+        Device array (q, 3) [m]; one row of zeros if there are no pins.
+    """
     return uploads.upload_array(problem.pin_targets if len(problem.pin_targets) else np.zeros((1, 3)))
 
 
@@ -157,9 +174,11 @@ class LoadedStep:
         )
 
     def load_step(self, step: DeviceStep, *rows: Any) -> None:
-        """Load the step, and write its initial guess to the given rows of at least three numbers.
+        """Load a step, and write its initial guess to rows.
 
-        Exactly pinned vertices are set to their targets.
+        Args:
+            step: the step on the device.
+            *rows: outputs, device arrays (n, 3) or wider [m]; exactly pinned vertices are set to their targets.
         """
         uploaded, queue = self._uploaded_network, self._uploaded_network.stream.cuda_stream
         network, places = uploaded.host_network, uploaded.row_data
@@ -182,7 +201,15 @@ class LoadedStep:
 
 @cuda.jit
 def write_step_data(row_data, target, force, pin_targets, step_data):
-    """Write the anchors of the free rows, and the other forces on them."""
+    """Write the anchors of the free rows, and the other forces on them.
+
+    Args:
+        row_data: data of each row.
+        target: inertial target by vertices (n, 3) [m].
+        force: external force by vertices, with that of forms (n, 3) [N].
+        pin_targets: targets of the pins (q, 3) [m].
+        step_data: output, centres and forces of the free rows; its anchor stiffness is constant.
+    """
     i = cuda.grid(1)
     while i < step_data.anchor_positions.shape[0]:
         v, m, w = row_data.vertex_indices[i], row_data.inertia_diagonal[i], row_data.pin_weight[i]
@@ -197,9 +224,14 @@ def write_step_data(row_data, target, force, pin_targets, step_data):
 
 @cuda.jit
 def write_initial_rows(row_data, num_free, initial_guess, pin_targets, rows):
-    """Write an initial guess (n, 3) to rows.
+    """Write an initial guess to rows, with exactly pinned vertices on their targets.
 
-    Rows from `num_free` on are set to their pins' targets.
+    Args:
+        row_data: data of each row.
+        num_free: number of free rows, the first ones; the others are exactly pinned.
+        initial_guess: positions by vertices (n, 3) [m].
+        pin_targets: targets of the pins (q, 3) [m].
+        rows: output, (n, 3) or wider [m].
     """
     i = cuda.grid(1)
     while i < row_data.vertex_indices.shape[0]:
@@ -214,9 +246,15 @@ def write_initial_rows(row_data, num_free, initial_guess, pin_targets, rows):
 
 @cuda.jit
 def write_lagged_positions(first_dashpot, row_vertices, velocity_origin, lagged_positions, default_directions, edges):
-    """Write directions and offsets of the dashpots, the edges from `first_dashpot` on.
+    """Write the directions and offsets of the dashpots.
 
-    `default_directions` are used at zero length.
+    Args:
+        first_dashpot: index of the first dashpot; all edges from it on are dashpots.
+        row_vertices: vertex of each row (n,).
+        velocity_origin: origin of the stage's velocity, by vertices (n, 3) [m].
+        lagged_positions: positions that define the directions, by vertices (n, 3) [m].
+        default_directions: unit directions at zero length (m, 3).
+        edges: output, the `DeviceEdges` whose `edge_direction` and `dashpot_offset` are written.
     """
     e = first_dashpot + cuda.grid(1)
     while e < edges.ends.shape[0]:

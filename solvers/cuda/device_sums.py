@@ -44,7 +44,13 @@ def sum_block(value):
 
 @cuda.jit(device=True, inline="always")
 def store_partial_sum(value, sum_slot, partials):
-    """First stage: store the sum of the block in a row of partials (k, MAX_BLOCKS)."""
+    """Do the first stage of a sum: store the sum of the block.
+
+    Args:
+        value: term of this thread.
+        sum_slot: row of the partial sums.
+        partials: output, partial sums (k, MAX_BLOCKS), one column for each block.
+    """
     total = sum_block(value)
     if cuda.threadIdx.x == 0:
         partials[sum_slot, cuda.blockIdx.x] = total
@@ -52,9 +58,15 @@ def store_partial_sum(value, sum_slot, partials):
 
 @cuda.jit(device=True, inline="always")
 def sum_partials(sum_slot, partials, count):
-    """Second stage: return the sum of a row's first `count` partials to all threads.
+    """Do the second stage of a sum, in a kernel of one block.
 
-    It runs in a kernel of one block.
+    Args:
+        sum_slot: row of the partial sums.
+        partials: partial sums (k, MAX_BLOCKS).
+        count: number of partial sums, the blocks of the first stage.
+
+    Returns:
+        The sum, to all threads.
     """
     mine, k = 0.0, cuda.threadIdx.x
     while k < count:
@@ -65,7 +77,14 @@ def sum_partials(sum_slot, partials, count):
 
 @cuda.jit
 def collect_sums(rows, partials, count, out):
-    """Second stage of the first `rows` sums; one block."""
+    """Do the second stage of several sums; launched with one block.
+
+    Args:
+        rows: number of sums, in the first rows of the partial sums.
+        partials: partial sums (k, MAX_BLOCKS).
+        count: number of partial sums of each, the blocks of the first stage.
+        out: output, the sums, with at least `rows` numbers.
+    """
     for k in range(rows):
         total = sum_partials(k, partials, count)
         if cuda.threadIdx.x == 0:

@@ -27,7 +27,13 @@ _spring_energy_change = share_with_device(spring_law.spring_energy_change)
 def edge_direction_and_tension(edges, e, v0, v1, v2):
     """Return the direction, tension [N] and length [m] of an entry's edge.
 
-    The direction points away from the entry's own end; v is the vector from the other end.
+    Args:
+        edges: edges on the device.
+        e: index of the entry.
+        v0, v1, v2: vector from the edge's other end to the entry's own end [m].
+
+    Returns:
+        Three components of the unit direction, which points to the entry's own end, then tension and length.
     """
     k, rest = edges.entry_stiffness[e], edges.entry_rest_length[e]
     if rest == rest:
@@ -47,7 +53,14 @@ def edge_direction_and_tension(edges, e, v0, v1, v2):
 
 @cuda.jit
 def gradient_bytes(edges, step_data, p, out):
-    """Write the gradient [N] at rows p [m] to `out` (f, 3)."""
+    """Write the gradient of the objective at the free rows.
+
+    Args:
+        edges: edges on the device.
+        step_data: anchors and forces of the free rows.
+        p: positions in rows (n, 3) [m].
+        out: output (f, 3) [N].
+    """
     i = cuda.grid(1)
     while i < out.shape[0]:
         x, y, z, h = p[i, 0], p[i, 1], p[i, 2], step_data.anchor_stiffness[i]
@@ -70,7 +83,15 @@ def gradient_bytes(edges, step_data, p, out):
 
 @cuda.jit
 def sum_objective_change(edges, step_data, p, q, sum_slot, partials):
-    """First stage of the sum g(q) - g(p) [J], with p and q in rows."""
+    """Do the first stage of the sum g(q) - g(p) [J].
+
+    Args:
+        edges: edges on the device.
+        step_data: anchors and forces of the free rows.
+        p, q: positions in rows (n, 3) [m], before and after.
+        sum_slot: row of the partial sums.
+        partials: output, partial sums (k, MAX_BLOCKS) [J].
+    """
     total = 0.0
     i = cuda.grid(1)
     while i < step_data.anchor_stiffness.shape[0]:

@@ -33,9 +33,12 @@ def packed_length(num_nodes: int) -> int:
 
 @cuda.jit
 def write_edge_blocks(edges, p, stiff):
-    """Write b of all edges at rows p to `stiff` (6, m) [N/m].
+    """Write the block b of each edge of the finest level.
 
-    The six numbers are those of a symmetric block.
+    Args:
+        edges: edges on the device.
+        p: positions in rows (n, 3) [m].
+        stiff: output, xx, xy, xz, yy, yz and zz of each symmetric block (6, m) [N/m].
     """
     e = cuda.grid(1)
     while e < edges.ends.shape[0]:
@@ -56,7 +59,14 @@ def write_edge_blocks(edges, p, stiff):
 
 @cuda.jit
 def sum_fine_edge_blocks(level, count, finer, stiff):
-    """Sum b of the finer edges (6, m) for each of `count` edges of a level."""
+    """Sum the blocks of finer edges for each edge of a level.
+
+    Args:
+        level: the level on the device, with its lists of finer edges.
+        count: number of edges of the level.
+        finer: blocks of the edges of the next finer level (6, m) [N/m].
+        stiff: output, blocks of the level's edges (6, count) [N/m].
+    """
     e = cuda.grid(1)
     while e < count:
         for c in range(6):
@@ -78,7 +88,12 @@ class SchwarzKernels(NamedTuple):
 
 @cache
 def build_schwarz_kernels(real: RealType, patch: int) -> SchwarzKernels:
-    """Build the kernels with inverses and residuals of type `real`."""
+    """Build the kernels of the preconditioner for one precision.
+
+    Args:
+        real: floating-point type of inverses and residuals.
+        patch: number of nodes of a subdomain.
+    """
     rows, half = 3 * patch, packed_length(patch)
 
     @cuda.jit
