@@ -202,7 +202,15 @@ class EngineStepper(Protocol):
     """Interface of an engine with a loaded network."""
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
-        """Integrate a step in `substeps` substeps; return positions [m] and velocities [m/s], (n, 3), at its end."""
+        """Integrate a step in equal substeps.
+
+        Args:
+            problem: the step; its start, external force and pin targets are used, and its initial guess is not.
+            substeps: number of substeps.
+
+        Returns:
+            Positions [m] and velocities [m/s] at the end of the step, (n, 3) each.
+        """
         ...
 
 
@@ -230,7 +238,18 @@ class ExternalEngine(ABC):
 
     @abstractmethod
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[EngineStepper, str]:
-        """Build the network in the engine; return its stepper and a description, or raise Unsupported."""
+        """Build the network in the engine.
+
+        Args:
+            network: masses, springs, dashpots, drag and pins in the form that engines support.
+            library: the imported module of the engine.
+
+        Returns:
+            The stepper, and a description of how it computes.
+
+        Raises:
+            Unsupported: for parameters or features that the engine does not support.
+        """
 
     @abstractmethod
     def write_script(
@@ -267,7 +286,12 @@ class PreparedEngine(IterativeSolver):
     stats: dict[str, float] = field(default_factory=dict[str, float])
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve at the start of the step."""
+        """Start a solve at the start of the step.
+
+        Args:
+            problem: the step.
+            initial_guess: not used, because each iterate integrates the whole step from its start.
+        """
         return SubsteppingState(self.engine_stepper.step, problem)
 
 

@@ -84,7 +84,18 @@ class MujocoEngine(ExternalEngine):
     mujoco_integrator: MujocoIntegrator = "implicitfast"
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_MujocoStepper, str]:
-        """Build the network in the engine; return its stepper and a description."""
+        """Compile the network into a model of MuJoCo.
+
+        Args:
+            network: masses, springs, dashpots, drag and pins in the form that engines support.
+            library: the imported module `mujoco`.
+
+        Returns:
+            The stepper, and a description with the integrator and its stability limit.
+
+        Raises:
+            Unsupported: for masses that MuJoCo treats as zero.
+        """
         model = library.MjModel.from_xml_string(build_mjcf(network, self.mujoco_integrator))
         limit = _STABILITY_LIMIT.get(self.mujoco_integrator, 2.0)
         return _MujocoStepper(
@@ -94,7 +105,20 @@ class MujocoEngine(ExternalEngine):
     def write_script(
         self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
-        """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
+        """Return scripts that repeat a motion from a step's start with the engine only.
+
+        Args:
+            file_stem: NAME of the files.
+            network: the network, which becomes the model of `NAME.xml`.
+            problem: the step whose start is the model's key frame, and whose load acts in all frames.
+            frames: frames and their substeps.
+
+        Returns:
+            The texts of `NAME.py` and `NAME.xml`, by file name.
+
+        Raises:
+            Unsupported: for masses that MuJoCo treats as zero.
+        """
         load = (
             ""
             if network.uniform_acceleration(problem.external_force) is not None

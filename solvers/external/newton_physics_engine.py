@@ -116,7 +116,18 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
         return super().prepare(system)
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_NewtonPhysicsStepper, str]:
-        """Build the network in the engine; return its stepper and a description."""
+        """Build the network as particles and springs of a Newton model.
+
+        Args:
+            network: masses, springs and pins in the form that engines support.
+            library: the imported module `newton`.
+
+        Returns:
+            The stepper, and a description with the solver, its iterations or colours, and the device.
+
+        Raises:
+            Unsupported: for less than one iteration, and if Warp finds no CUDA device although one is requested.
+        """
         if not self.iterations_per_substep >= 1:
             raise Unsupported(
                 f"newton-physics: iterations_per_substep is {self.iterations_per_substep}; expected 1 or more"
@@ -163,7 +174,17 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
     def write_script(
         self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
-        """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
+        """Return a script that repeats a motion from a step's start with the engine only.
+
+        Args:
+            file_stem: NAME of the files.
+            network: the network, for its time step and the colours of its vertices.
+            problem: not used; the script reads the start and the load from `NAME.npz`.
+            frames: frames and their substeps.
+
+        Returns:
+            The text of `NAME.py`, by file name.
+        """
         made = {
             "vbd": f"SolverVBD(model, iterations={self.iterations_per_substep})",
             "xpbd": f"SolverXPBD(model, iterations={self.iterations_per_substep})",

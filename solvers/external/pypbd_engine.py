@@ -90,7 +90,18 @@ class PyPbdEngine(ExternalEngine):
     iterations_per_substep: int = 1
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_PyPbdStepper, str]:
-        """Build the network in the engine; return its stepper and a description."""
+        """Build the network as particles and distance constraints of pyPBD.
+
+        Args:
+            network: masses, springs and pins in the form that engines support.
+            library: the imported module `pypbd`.
+
+        Returns:
+            The stepper, and a description with the number of iterations and the precision.
+
+        Raises:
+            Unsupported: for less than one iteration.
+        """
         if not self.iterations_per_substep >= 1:
             raise Unsupported(f"pypbd: iterations_per_substep is {self.iterations_per_substep}; expected 1 or more")
         made = _PyPbdStepper(library, network, self.iterations_per_substep)
@@ -99,7 +110,20 @@ class PyPbdEngine(ExternalEngine):
     def write_script(
         self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
-        """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
+        """Return a script that repeats a motion from a step's start with the engine only.
+
+        Args:
+            file_stem: NAME of the files.
+            network: the network, for its time step and the check of the load.
+            problem: the step whose load must be the engine's gravity.
+            frames: frames and their substeps.
+
+        Returns:
+            The text of `NAME.py`, by file name.
+
+        Raises:
+            Unsupported: for loads other than `PYPBD_GRAVITY`.
+        """
         _require_gravity(network, problem)
         pieces = frames.num_substeps if frames.is_driven else 1  # of a frame, in steps of their own
         given = {

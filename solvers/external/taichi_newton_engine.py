@@ -93,7 +93,18 @@ class TaichiNewtonEngine(ExternalEngine):
         return super().prepare(system)
 
     def build_stepper(self, network: EngineNetwork, library: Any) -> tuple[_TaichiStepper, str]:
-        """Build the network in the engine; return its stepper and a description."""
+        """Compile the Taichi program of the network.
+
+        Args:
+            network: masses, springs and pins in the form that engines support.
+            library: the imported module `taichi`.
+
+        Returns:
+            The stepper, and a description with the number of iterations.
+
+        Raises:
+            Unsupported: for less than one iteration, and a tolerance outside (0, 1).
+        """
         if not self.iterations_per_substep >= 1:
             raise Unsupported(f"taichi: iterations_per_substep is {self.iterations_per_substep}; expected 1 or more")
         if not 0.0 < self.cg_rtol < 1.0:
@@ -104,7 +115,17 @@ class TaichiNewtonEngine(ExternalEngine):
     def write_script(
         self, file_stem: str, network: EngineNetwork, problem: StepProblem, frames: ScriptFrames
     ) -> dict[str, str]:
-        """Return scripts that repeat a motion from a step's start with the engine only, by file name."""
+        """Return a script that repeats a motion from a step's start with the engine only.
+
+        Args:
+            file_stem: NAME of the files.
+            network: the network, for its time step; the script reads its arrays from `NAME.npz`.
+            problem: not used; the script reads the start and the load from `NAME.npz`.
+            frames: frames and their substeps.
+
+        Returns:
+            The text of `NAME.py`, by file name.
+        """
         given = {"tolerance": self.cg_rtol, "newton": self.iterations_per_substep}
         given |= {"h": network.time_step / frames.num_substeps, "loop": frames.format_loop(_PLAIN_LOOP, _DRIVEN_LOOP)}
         driver = _SCRIPT_TEMPLATE.format(name=file_stem, **given)
