@@ -64,15 +64,32 @@ class DescentMethod(Protocol):
     identifies_saddles: ClassVar[bool]
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
-        """Yield the points after `start`."""
+        """Yield the points that follow a given one.
+
+        Args:
+            step: the objective.
+            start: first point, which is not yielded.
+        """
         ...
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
-        """Return whether a stationary point may be a minimum, as far as the method can determine."""
+        """Return whether a stationary point may be a minimum.
+
+        It may be one as far as the method can determine.
+
+        Args:
+            step: the objective.
+            at: the point.
+        """
         ...
 
     def iteration_phases(self, step: StepObjective, at: DescentPoint) -> dict[str, Callable[[], object]]:
-        """Return the phases of an iteration at a point, by name."""
+        """Return the phases of an iteration, by name.
+
+        Args:
+            step: the objective.
+            at: point at which the phases are evaluated.
+        """
         ...
 
 
@@ -127,7 +144,14 @@ def backtracking_line_search(
 
 
 def lower_start_positions(step: StepObjective, p: Positions) -> Positions:
-    """Return p or the inertial prediction, if that is lower and the path to it is free of collisions."""
+    """Return given positions or the inertial prediction, if that is lower.
+
+    The path to the prediction must also be free of collisions.
+
+    Args:
+        step: the objective.
+        p: positions (n, 3) [m], returned as the same array if the prediction is not lower.
+    """
     fall = step.inertial_prediction()
     if step.barrier_energies and step.max_step_size(p, fall - p) < 1.0:
         return p
@@ -135,18 +159,32 @@ def lower_start_positions(step: StepObjective, p: Positions) -> Positions:
 
 
 def pick_lower_start(step: StepObjective, start: DescentPoint) -> DescentPoint:
-    """Return the lower one of a point and the inertial prediction, as `lower_start_positions` does."""
+    """Return the lower one of a point and the inertial prediction, as `lower_start_positions` does.
+
+    Args:
+        step: the objective.
+        start: the point, returned itself if the prediction is not lower.
+    """
     p = lower_start_positions(step, start.positions)
     return start if p is start.positions else DescentPoint(p, step.gradient(p))
 
 
 def has_active_barrier(step: StepObjective, p: Positions) -> bool:
-    """Return whether a barrier energy is active at p."""
+    """Return whether a barrier energy is active.
+
+    Args:
+        step: the objective, with the barrier energies of its step.
+        p: positions (n, 3) [m].
+    """
     return any(energy.value(p) > 0.0 for energy in step.barrier_energies)
 
 
 def inner_product(a: Positions, b: Positions) -> float:
-    """Return the inner product of two fields, (n, 3)."""
+    """Return the inner product of two fields over all vertices.
+
+    Args:
+        a, b: fields (n, 3), such as a gradient [N] and a direction [m].
+    """
     return float(np.einsum("ij,ij->", a, b))
 
 
@@ -221,7 +259,12 @@ class ResidualMetric:
         return self.correction_norm(self.solve(gradient), gradient)
 
     def correction_norm(self, e: Positions, gradient: Positions) -> float:
-        """Return that residual for e = Q^-1 g, which is overwritten."""
+        """Return the residual |e|_Q [J^(1/2)] over the unpinned vertices, of e = Q^-1 g.
+
+        Args:
+            e: correction Q^-1 g (n, 3) [m], overwritten.
+            gradient: gradient g (n, 3) [N].
+        """
         if not self._has_penalty_pins:  # then |Q^-1 g|_Q is what g does along it
             return max(inner_product(e, gradient), 0.0) ** 0.5  # in this order, so that NaN remains
         e[self.system.pins.vertices] = 0.0
@@ -251,13 +294,25 @@ class PreparedDescent(IterativeSolver):
         return self.method.identifies_saddles
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve.
+
+        It starts at the inertial prediction if a barrier is active at the guess and the prediction is lower.
+
+        Args:
+            problem: the step.
+            initial_guess: positions (n, 3) [m], which are not modified.
+        """
         step, guess = self._build_step(problem, initial_guess)
         start = pick_lower_start(step, guess) if has_active_barrier(step, guess.positions) else guess
         return _DescentState(self, step, guess, start)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual [J^(1/2)] at p (n, 3) [m]."""
+        """Return the residual [J^(1/2)] at given positions.
+
+        Args:
+            problem: the step.
+            p: positions (n, 3) [m].
+        """
         return self.metric.residual(StepObjective(self.fixed_objective, problem).gradient(p))
 
     def residual_scale(self, problem: StepProblem) -> float:

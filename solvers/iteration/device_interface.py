@@ -84,9 +84,14 @@ class PreparedDeviceSolver(Protocol):
         ...
 
     def replay_iterations(self, problem: StepProblem, iterations: int) -> tuple[Solution, SolveEvents | None]:
-        """Return the solution of a host problem after n iterations, without residual, and its events.
+        """Repeat a solve by its number of iterations, without residuals.
 
-        The events are None for a device without a clock.
+        Args:
+            problem: the step on the host.
+            iterations: number of iterations.
+
+        Returns:
+            The solution, and its events; None for a device without a clock.
         """
         ...
 

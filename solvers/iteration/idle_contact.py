@@ -66,7 +66,14 @@ class IdleContactSolver:
             yield p if is_idle else following
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Iterate until `stop` terminates the solve, without contact if that is certified to make no difference."""
+        """Iterate until `stop` terminates the solve.
+
+        Contact is ignored if it is certified to make no difference.
+
+        Args:
+            problem: the step, with barrier energies.
+            stop: the criteria that terminate the solve.
+        """
         certificate = _Certificate(problem)
         if certificate.may_be_idle():
             found = self.contact_free.solve(problem, stop)
@@ -80,7 +87,12 @@ class IdleContactSolver:
         return evaluates_friction(self.with_contact)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual [J^(1/2)] at p (n, 3) [m], with contact."""
+        """Return the residual [J^(1/2)] at given positions, with contact.
+
+        Args:
+            problem: the step, with barrier energies.
+            p: positions (n, 3) [m].
+        """
         return self.with_contact.residual_at(problem, p)
 
     def build_residual(self, problem: StepProblem) -> Callable[[Positions], float]:

@@ -352,7 +352,13 @@ class SubsteppingState(SolverState):
     def __init__(
         self, step_in_substeps: Callable[[StepProblem, int], tuple[Positions, Positions]], problem: StepProblem
     ) -> None:
-        """Create the state; `step_in_substeps(problem, n)` returns positions [m] and velocity [m/s]."""
+        """Create the state at the start of a step.
+
+        Args:
+            step_in_substeps: function of the step and a number of substeps that returns positions [m] and velocities
+                [m/s] at its end, (n, 3) each.
+            problem: the step.
+        """
         self._step_in_substeps, self._problem, self._num_substeps = step_in_substeps, problem, 0
         self.positions = problem.step_start.positions
 

@@ -48,7 +48,14 @@ def build_preconditioner(
 ) -> PreconditionerBuilder:
     """Return the builder of a preconditioner.
 
-    Raises Unsupported if an energy without elements must be clamped.
+    Args:
+        name: name of the preconditioner.
+        metric: Q, whose factor is the preconditioner or whose diagonal keeps its blocks regular.
+        objective: the objective, whose other energies must be barriers for a preconditioner of the clamped Hessian.
+        solver: name of the solver, for the message.
+
+    Raises:
+        Unsupported: an energy without elements would have to be clamped.
     """
     if name == "cholesky":
         return _FactorPreconditioner(metric)
@@ -127,9 +134,17 @@ def _extend_to_all_vertices(free: NDArray[np.int64], solve: Preconditioner) -> P
 
 
 def assemble_diagonal_blocks(step: StepObjective, hessian: Hessian, p: Positions) -> NDArray[np.float64]:
-    """Return the diagonal blocks (f, 3, 3) [N/m] of the clamped Hessian without assembling that matrix.
+    """Return the diagonal blocks of the clamped Hessian, without assembling that matrix.
 
     They include springs, forms, elements and pairs.
+
+    Args:
+        step: the objective.
+        hessian: its Hessian at p.
+        p: positions (n, 3) [m].
+
+    Returns:
+        Blocks of the free vertices (f, 3, 3) [N/m].
     """
     whole, clamped = step.fixed_objective, hessian.project_to_psd(PsdProjection())
     terms, number, form = whole.objective_terms, whole.free_index, whole.quadratic_form
@@ -165,7 +180,13 @@ class ScaledPreconditioner:
     """
 
     def __init__(self, metric: ResidualMetric, vertices: NDArray[np.int64], blocks: NDArray[np.float64]) -> None:
-        """Create the preconditioner for positive semidefinite blocks W (c, 3, 3) [N/m] of vertices (c,)."""
+        """Create the preconditioner from the blocks that are added to Q.
+
+        Args:
+            metric: factorised Q.
+            vertices: scaled vertices (c,).
+            blocks: their positive semidefinite blocks W (c, 3, 3) [N/m].
+        """
         self._metric, system = metric, metric.system
         resists = np.full(system.num_vertices, np.inf)
         resists[system.free_vertices] = metric.free_diagonal

@@ -34,7 +34,12 @@ def compute_anchor_positions(problem: StepProblem) -> Positions:
 
 
 def apply_exact_pins(p: Positions, problem: StepProblem) -> Positions:
-    """Return a copy of p (n, 3) with the exactly pinned vertices on their targets."""
+    """Return a copy of positions with the exactly pinned vertices on their targets.
+
+    Args:
+        p: positions (n, 3) [m].
+        problem: the step, with pins and targets.
+    """
     out = np.array(p, np.float64, order="C")
     exact = problem.system.pins.exact_mask
     out[problem.system.pins.vertices[exact]] = problem.pin_targets[exact]
@@ -42,7 +47,16 @@ def apply_exact_pins(p: Positions, problem: StepProblem) -> Positions:
 
 
 def require_mass(system: System, anchor_stiffness: NDArray[np.float64], solver: str) -> None:
-    """Raise Unsupported, with the vertices concerned, if a vertex has neither mass nor a pin."""
+    """Check that each vertex has mass or a pin.
+
+    Args:
+        system: the system, for the message.
+        anchor_stiffness: anchor stiffness [N/m] or mass [kg] of each vertex (n,), positive where it suffices.
+        solver: name of the solver, for the message.
+
+    Raises:
+        Unsupported: with the vertices concerned.
+    """
     loose = np.flatnonzero(anchor_stiffness <= 0.0)
     if len(loose):
         named = ", ".join(map(str, loose[:5])) + (", ..." if len(loose) > 5 else "")
@@ -53,7 +67,15 @@ def require_mass(system: System, anchor_stiffness: NDArray[np.float64], solver: 
 
 
 def require_implicit_euler(system: System, solver: str) -> None:
-    """Raise Unsupported if the step is that of another integrator."""
+    """Check that the step is that of implicit Euler.
+
+    Args:
+        system: the system; another integrator has an inertia factor other than 1.
+        solver: name of the solver, for the message.
+
+    Raises:
+        Unsupported: the step is that of another integrator.
+    """
     if system.inertia_factor != 1.0:
         raise Unsupported(
             f"{solver}: divides the step itself and has its own velocity, which takes the place of an integrator; "
