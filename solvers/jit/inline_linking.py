@@ -103,7 +103,12 @@ class LinkedCompiler(_COMPILER_CLASS):
 
 
 def rebuild_result(context: Any, reduced: Any) -> CompileResult:
-    """Rebuild a compile result from the output of its `_reduce`."""
+    """Rebuild a compile result from its reduced form.
+
+    Args:
+        context: target context of the process that loads the code.
+        reduced: output of the result's `_reduce`, of a `LinkedLibrary` or of Numba's.
+    """
     (name, kind, content), fndesc, env, signature, objectmode, lifted, annotation, reload_init, envs = reduced
     if kind != LINKED_KIND:
         with _use_library_class(context.codegen(), _LIBRARY_CLASS):

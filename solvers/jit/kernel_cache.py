@@ -66,7 +66,12 @@ class KernelCache(_NUMBA_CACHE):
     """The compiled code of one kernel, by signature."""
 
     def __init__(self, function: Any, options: Mapping[str, Any]) -> None:
-        """Create the cache of a Python function with its compile options."""
+        """Create the cache of a kernel.
+
+        Args:
+            function: Python function of the kernel; its code and closure are part of the key.
+            options: compile options, also part of the key.
+        """
         self._source_file = function.__code__.co_filename
         self._module_name, self._kernel_name = function.__module__, function.__qualname__
         cells = tuple(_closure_key(cell.cell_contents) for cell in function.__closure__ or ())
@@ -96,7 +101,12 @@ class KernelCache(_NUMBA_CACHE):
         return os.access(_writable_root(os.path.dirname(self._source_file)), os.W_OK)
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
-        """Return the cached code of a signature, or None if there is none."""
+        """Return the cached code of a signature, or None if there is none.
+
+        Args:
+            sig: argument types, or a signature with the return type.
+            target_context: Numba's context of the processor, which is refreshed.
+        """
         target_context.refresh()
         key = self._entry_key(sig, target_context)
         path = self._entry_path(key)
@@ -109,7 +119,15 @@ class KernelCache(_NUMBA_CACHE):
         return rebuild_result(target_context, compiled) if there == key else None
 
     def compile_once(self, sig: Any, target_context: Any, compile_code: Callable[[], CompileResult]) -> CompileResult:
-        """Compile the code of a signature and store it, or wait for another process that does so, and load it."""
+        """Return the code of a signature, compiled by one process and loaded by the others.
+
+        A process waits while another one compiles the same code.
+
+        Args:
+            sig: argument types, or a signature with the return type.
+            target_context: Numba's context of the processor, into which loaded code is inserted.
+            compile_code: compiles the code; called if none is cached.
+        """
         path = self._entry_path(self._entry_key(sig, target_context))
         with suppress(OSError):
             if not path.parent.exists():
@@ -124,14 +142,27 @@ class KernelCache(_NUMBA_CACHE):
             return compiled
 
     def measure_code(self, sig: Any, target_context: Any) -> int:
-        """Return the size of the cached code of a signature [bytes], or 0 if there is none."""
+        """Return the size of the cached code of a signature [bytes].
+
+        Args:
+            sig: argument types, or a signature with the return type.
+            target_context: Numba's context of the processor.
+
+        Returns:
+            The size, or 0 if there is no code.
+        """
         try:
             return self._entry_path(self._entry_key(sig, target_context)).stat().st_size
         except OSError:
             return 0
 
     def save_overload(self, sig: Any, data: CompileResult) -> None:
-        """Do nothing: `compile_once` has stored the code."""
+        """Do nothing: `compile_once` has stored the code.
+
+        Args:
+            sig: argument types of the code.
+            data: compiled code.
+        """
 
     def _store_code(self, sig: Any, data: CompileResult) -> None:
         """Store the code compiled for a signature, if it is cacheable and the disk has space."""
