@@ -93,7 +93,12 @@ class AccelerationWindow(NamedTuple):
 
 @jit_kernel
 def init_window(window, correction):
-    """Initialise the window at the trial point, whose descent direction and correction are known."""
+    """Initialise the window at the trial point, without a history.
+
+    Args:
+        window: state of the solve; its trial position and descent are known.
+        correction: plain correction c at the trial point, at least N entries.
+    """
     now = window.window_state[0]
     now.num_pairs, now.newest_pair, now.spectral_radius, now.polynomial_degree = 0, -1, 0.0, 0
     size = len(window.correction)
@@ -114,7 +119,12 @@ def propose_trial(window):
 
 @jit_kernel
 def shorten_trial(window, fraction):
-    """Shorten the trial to a fraction of its length."""
+    """Shorten the trial to a fraction of its length.
+
+    Args:
+        window: state of the solve; its step size and trial position are updated.
+        fraction: ratio of the new step size to the present one.
+    """
     _set_trial(window, fraction * window.window_state[0].step_size)
 
 
@@ -156,7 +166,12 @@ def judge_trial(window):
 
 @jit_kernel
 def accept_trial(window, correction):
-    """Accept the trial point, where `correction` is the plain one, and add the pair of this step to the history."""
+    """Accept the trial point, and add the pair of this step to the history.
+
+    Args:
+        window: state of the solve; the oldest pair is replaced if the history is full.
+        correction: plain correction c at the trial point, at least N entries.
+    """
     now, m = window.window_state[0], len(window.a)
     new = (now.newest_pair + 1) % m
     now.num_pairs = min(now.num_pairs + 1, m)

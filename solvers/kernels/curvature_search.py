@@ -76,7 +76,16 @@ def bound_by_springs(terms, p, anchor_stiffness, linear, negative):
 
 @jit_kernel
 def bound_by_elements(terms, linear, joined, curvature, anchor_stiffness, negative):
-    """Return the same with elements, `joined`, and their second derivatives (m, 6) [N/m]; None for none."""
+    """Return whether the bound shows that the Hessian, with elements, has no negative curvature.
+
+    Args:
+        terms: objective terms.
+        linear: springs as `linearise_springs` writes them (m, 4).
+        joined: elements, or None.
+        curvature: second derivatives of the elements, one row of 6 each [N/m], or None.
+        anchor_stiffness: stiffness of inertia and pins (n,) [N/m], infinite at fixed vertices.
+        negative: scratch (n,).
+    """
     _add_spring_bounds(terms, linear, anchor_stiffness, negative)
     _add_element_bounds(joined, curvature, negative)
     return _is_outweighed(anchor_stiffness, negative)
@@ -129,7 +138,17 @@ def _is_semidefinite(curvature, e):
 
 @jit_kernel
 def fill_preconditioner(terms, linear, form, joined, curvature, anchor_stiffness, scratch):
-    """Write the inverse blocks and the absolute stiffness; the arguments are those of `multiply_hessian`."""
+    """Write the inverse blocks and the absolute stiffness of the scratch.
+
+    Args:
+        terms: objective terms.
+        linear: springs as `linearise_springs` writes them (m, 4).
+        form: quadratic form, or None.
+        joined: elements, or None.
+        curvature: second derivatives of the elements, one row of 6 each [N/m], or None.
+        anchor_stiffness: stiffness of inertia and pins (n,) [N/m], infinite at fixed vertices.
+        scratch: output.
+    """
     _fill_preconditioner(terms, linear, form, joined, curvature, anchor_stiffness, scratch)
 
 
@@ -264,7 +283,12 @@ def _precondition_residual(scratch):
 
 @jit_kernel
 def update_search_direction(scratch, ratio):
-    """Set the direction to z + ratio times the direction."""
+    """Set the direction to z + ratio times the direction.
+
+    Args:
+        scratch: scratch of the search, whose product contains z.
+        ratio: r'z over its previous value.
+    """
     _update_direction(scratch, ratio)
 
 
@@ -293,7 +317,12 @@ def _measure_curvature(scratch):
 
 @jit_kernel
 def update_residual(scratch, step_size):
-    """Subtract the product times the step size from the residual, and return r'z."""
+    """Subtract the product times the step size from the residual, and return r'z.
+
+    Args:
+        scratch: scratch of the search; its product, H times the direction, is overwritten with z.
+        step_size: r'z over the curvature.
+    """
     return _update_residual(scratch, step_size)
 
 

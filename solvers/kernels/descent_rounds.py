@@ -127,7 +127,16 @@ def build_rounds(
 def build_compiled_rounds(
     step_state: Callable[..., Any], residual: Callable[..., Any], decrease: Callable[..., Any]
 ) -> Any:
-    """Build the loop for kernels from inner functions of the state; `step_state` returns whether it succeeded."""
+    """Build the loop over rounds for kernels, from inner functions of the state.
+
+    Args:
+        step_state: does an iteration and returns whether it succeeded.
+        residual: returns the residual [J^(1/2)].
+        decrease: returns the decrease of the objective since the start [J].
+
+    Returns:
+        The function of `build_rounds`, compiled.
+    """
 
     return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, decrease))
 

@@ -63,7 +63,11 @@ class EdgePackets(NamedTuple):
     packet_start: NDArray[np.int64]
 
     def with_limits(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> EdgePackets:
-        """Return the packets with other limits (m,) [m] of the concatenated strain limits."""
+        """Return the packets with other limits.
+
+        Args:
+            low, high: shortest and longest lengths of the concatenated strain limits (m,) [m].
+        """
         number = self.limit_index.reshape(-1, 1, LANES)[:, 0]
         data = self.limit_data.reshape(-1, 4, LANES)[self.limit_offset // EDGE_STRIDE].copy()
         data[:, 1], data[:, 2] = (np.where(number >= 0, x[number], y) for x, y in ((low, 0.0), (high, np.inf)))
@@ -71,7 +75,12 @@ class EdgePackets(NamedTuple):
         return self._replace(limit_offset=offset, limit_data=copy_aligned(data))
 
     def with_directions(self, axis: Positions, offset: NDArray[np.float64]) -> EdgePackets:
-        """Return the packets with directions n (m, 3) and offsets o (m,) [m] of the concatenated dashpots."""
+        """Return the packets with other directions and offsets of the dashpots.
+
+        Args:
+            axis: unit directions n of the concatenated dashpots (m, 3).
+            offset: offsets o of the concatenated dashpots (m,) [m].
+        """
         data, blocks = allocate_aligned(4 * len(self.dashpot_index)), allocate_aligned(6 * LANES * self._num_packets)
         scale = np.sqrt(self.dashpot_stiffness)
         _write_dashpots(
@@ -113,6 +122,11 @@ class AttachedEdges(NamedTuple):
 
         A vertex pair with several springs has its edges at the first one. A second strain limit of a pair is attached
         to a spring of its own.
+
+        Args:
+            springs: the springs, to which edges without a spring add ones of zero stiffness.
+            limits: strain limits, concatenated in this order.
+            dashpots: dashpots, concatenated in this order; those of a vertex pair are added to one.
         """
         limit_ends = _concatenate_ends(limits)
         dashpot_ends = _concatenate_ends(dashpots)
@@ -257,9 +271,18 @@ def _dashpot_at(edges, entry, lane, v0, v1, v2):
 
 @jit_inner
 def add_edge_forces(edges, entry, lane, v, n, correct, force):
-    """Add minus the gradient of an entry's edges to a force, or A'K d if not `correct`; do nothing without edges.
+    """Add minus the gradient of an entry's edges to a force; do nothing without edges.
 
-    v: vector to the vertex; n: its direction, at zero length that of the rest shape.
+    Args:
+        edges: edges of the packets, or None.
+        entry, lane: position of the spring in the packets.
+        v: vector from the spring's other end to the vertex [m].
+        n: direction of v, at zero length that of the rest shape.
+        correct: whether to add minus the gradient; A'K d is added if not.
+        force: force on the vertex [N], a tuple of three.
+
+    Returns:
+        The new force.
     """
     if edges is None:
         return force
@@ -283,7 +306,13 @@ def add_edge_forces(edges, entry, lane, v, n, correct, force):
 
 @jit_inner
 def edge_energy(edges, entry, lane, v0, v1, v2):
-    """Return an end's share of the energy [J] of an entry's edges; 0 without edges."""
+    """Return an end's share of the energy [J] of an entry's edges.
+
+    Args:
+        edges: edges of the packets, or None; the energy is 0 without edges.
+        entry, lane: position of the spring in the packets.
+        v0, v1, v2: vector from the spring's other end to the vertex [m].
+    """
     if edges is None:
         return 0.0
     at = edges.limit_offset[entry] + lane
@@ -294,7 +323,20 @@ def edge_energy(edges, entry, lane, v0, v1, v2):
 
 @jit_inner
 def add_edge_derivatives(edges, entry, lane, v, n, length, gradient, block):
-    """Add an entry's edges to gradient and block of its vertex; do nothing without edges."""
+    """Add an entry's edges to gradient and block of its vertex; do nothing without edges.
+
+    Args:
+        edges: edges of the packets, or None.
+        entry, lane: position of the spring in the packets.
+        v: vector from the spring's other end to the vertex [m].
+        n: direction of v, at zero length that of the rest shape.
+        length: length of v [m].
+        gradient: gradient of the vertex [N], a tuple of three.
+        block: xx, xy, xz, yy, yz and zz of the vertex's Hessian [N/m].
+
+    Returns:
+        The new gradient and the new block.
+    """
     if edges is None:
         return gradient, block
     at = edges.limit_offset[entry] + lane
@@ -320,7 +362,14 @@ def add_edge_derivatives(edges, entry, lane, v, n, length, gradient, block):
 
 @jit_inner
 def edge_energy_change(edges, entry, lane, v, d):
-    """Return the change of the energy [J] of an entry's edges by a step d of its vertex, without cancellation."""
+    """Return the change [J] of an entry's edge energies by a step, without cancellation.
+
+    Args:
+        edges: edges of the packets, or None; the change is 0 without edges.
+        entry, lane: position of the spring in the packets.
+        v: vector from the spring's other end to the vertex before the step [m].
+        d: step of the vertex [m].
+    """
     if edges is None:
         return 0.0
     at = edges.limit_offset[entry] + lane

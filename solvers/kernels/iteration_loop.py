@@ -50,7 +50,15 @@ def iteration_limit(iterations: int) -> LoopLimits:
 
 @register_jitable(**jit_inner_options)
 def check_residual(residual, limits):
-    """Return the termination reason of a residual; ITERATIONS if it does not end the loop."""
+    """Return the termination reason of a residual.
+
+    Args:
+        residual: residual [J^(1/2)].
+        limits: limits of the loop; they end it only if the residual is computed in each iteration.
+
+    Returns:
+        REASON_TOLERANCE, REASON_FLOOR, or REASON_ITERATIONS if the residual does not end the loop.
+    """
     if limits.residual_mode != RESIDUAL_EACH:
         return REASON_ITERATIONS
     if residual <= limits.residual_limit:

@@ -18,11 +18,23 @@ ARMIJO_FRACTION = 1e-4
 
 @register_jitable(**jit_inner_options)
 def is_armijo_step(objective_change: float, step_size: float, slope: float, curvature: float) -> bool:
-    """Return whether the objective decreases enough for a step size, given its change [J]."""
+    """Return whether the objective decreases enough for a step size.
+
+    Args:
+        objective_change: g(p + t d) - g(p) [J].
+        step_size: t, as a multiple of the direction.
+        slope, curvature: first and second derivative along the direction at p [J].
+    """
     return objective_change <= ARMIJO_FRACTION * step_size * (slope + 0.5 * step_size * curvature)
 
 
 @register_jitable(**jit_inner_options)
 def is_approximate_wolfe_step(new_slope: float, slope: float, wolfe_fraction: float) -> bool:
-    """Return whether the slope [J] at the new point has decreased enough from the initial one."""
+    """Return whether the slope has decreased enough.
+
+    Args:
+        new_slope: derivative along the direction at the new point [J].
+        slope: derivative along the direction at the initial point [J].
+        wolfe_fraction: fraction of the condition, below 1/2.
+    """
     return new_slope <= (2.0 * wolfe_fraction - 1.0) * slope

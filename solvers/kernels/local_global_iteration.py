@@ -178,7 +178,16 @@ def _squared_norm(plan, form, part, e):
 
 @jit_kernel
 def compute_residual(plan, form, x, before, p, e):
-    """Return the residual [J^(1/2)] of an iteration from its vectors, as `run_iterations` defines it; e: scratch."""
+    """Return the residual [J^(1/2)] of an iteration, as `run_iterations` defines it.
+
+    Args:
+        plan: the plan.
+        form: packets of |e|_Q^2.
+        x: vector after the iteration: positions p^k, or corrections if p is given.
+        before: vector before the iteration; not used if p is given.
+        p: positions that are corrected, or None.
+        e: scratch, displacements in rows of four.
+    """
     groups = plan.top_range[2]
     for part in range(groups + 1):
         _compute_displacement(plan, part, x, before, p, e)
@@ -190,7 +199,16 @@ def compute_residual(plan, form, x, before, p, e):
 
 @jit_kernel
 def run_blocked_local_step(plan, bundles, x, right, p, out):
-    """Do the local step of all blocks without a solve."""
+    """Do the local step of all blocks without a solve.
+
+    Args:
+        plan: the plan, for the shift of its rows.
+        bundles: packets of the springs and edges.
+        x: positions in rows of four [m]; not used if p is given.
+        right: constant right-hand side (see `SpringPackets.build_right_hand_side`).
+        p: positions to correct, for which minus the gradient is computed, or None.
+        out: output in rows of four [N], overwritten.
+    """
     for k in range(len(out)):
         out[k] = 0.0
     if p is None:

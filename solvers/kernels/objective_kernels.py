@@ -36,7 +36,12 @@ class ObjectiveTerms(NamedTuple):
 
     @classmethod
     def from_system(cls, system: System, springs: Springs) -> ObjectiveTerms:
-        """Copy the terms of a system into arrays."""
+        """Copy the terms of a system into arrays.
+
+        Args:
+            system: the system, for inertia and penalty pins.
+            springs: all springs of the system, concatenated.
+        """
         _, pinned, weight = system.penalty_pins
         s = springs
         arrays: list[Any] = [
@@ -84,7 +89,16 @@ def compute_max_magnitude(p):
 
 @jit_kernel
 def predict_positions(inertia_diagonal, target, force, pinned_vertices, pin_targets, out):
-    """Write the positions (n, 3) [m] under inertia and force alone, with pinned vertices on their targets, to `out`."""
+    """Write the positions under inertia and external force alone.
+
+    Args:
+        inertia_diagonal: inertia h (n,) [N/m].
+        target: inertial target (n, 3) [m].
+        force: external force (n, 3) [N]; it does not move vertices without mass.
+        pinned_vertices: vertices of all pins (q,).
+        pin_targets: their targets (q, 3) [m], on which these vertices are placed.
+        out: output (n, 3) [m].
+    """
     for v in range(len(out)):
         h = inertia_diagonal[v]
         for c in range(3):
@@ -96,14 +110,31 @@ def predict_positions(inertia_diagonal, target, force, pinned_vertices, pin_targ
 
 @jit_inner
 def spring_direction(terms, e, p):
-    """Return the unit direction of spring e and its length [m]; at zero length that of the rest shape."""
+    """Return the unit direction of a spring and its length [m].
+
+    Args:
+        terms: objective terms.
+        e: index of the spring.
+        p: positions (n, 3) [m].
+
+    Returns:
+        Three components of the direction from second to first end, at zero length that of the rest shape, and the
+        length.
+    """
     i, j = terms.edges[e, 0], terms.edges[e, 1]
     return unit_direction(p[i, 0] - p[j, 0], p[i, 1] - p[j, 1], p[i, 2] - p[j, 2], terms.rest_direction, e)
 
 
 @jit_kernel
 def gradient(terms, step_data, p, out):
-    """Write the gradient [N] at p, both (n, 3), of springs, inertia, force and penalty pins to `out`."""
+    """Write the gradient of springs, inertia, force and penalty pins.
+
+    Args:
+        terms: objective terms.
+        step_data: data of the step.
+        p: positions (n, 3) [m].
+        out: output (n, 3) [N], overwritten; not zero at exactly pinned vertices.
+    """
     _write_gradient(terms, step_data, p, out)
 
 
@@ -134,9 +165,15 @@ def _write_gradient(terms, step_data, p, out):
 
 @jit_kernel
 def bound_gradient_roundoff(terms, step_data, p, out):
-    """Write the bound (n,) [N] of the rounding error of `gradient` at p (n, 3) [m] to `out`.
+    """Write the bound of the rounding error of `gradient`.
 
     It is that of `springbench.solvers.model.rounding_bound` for springs, inertia, force and penalty pins.
+
+    Args:
+        terms: objective terms.
+        step_data: data of the step.
+        p: positions (n, 3) [m].
+        out: output (n,) [N], overwritten.
     """
     for v in range(len(p)):
         out[v] = terms.inertia_diagonal[v] * (row_norm(p, v) + row_norm(step_data.inertial_target, v)) + row_norm(
@@ -164,13 +201,24 @@ def bound_gradient_roundoff(terms, step_data, p, out):
 
 @jit_inner
 def row_norm(x, v):
-    """Return the norm of row v of x (n, 3)."""
+    """Return the norm of a row.
+
+    Args:
+        x: rows (n, 3).
+        v: index of the row.
+    """
     return np.sqrt(x[v, 0] * x[v, 0] + x[v, 1] * x[v, 1] + x[v, 2] * x[v, 2])
 
 
 @jit_kernel
 def objective_change(terms, step_data, p, q):
-    """Return g(q) - g(p) [J] of springs, inertia, force and penalty pins, p and q (n, 3)."""
+    """Return g(q) - g(p) [J] of springs, inertia, force and penalty pins.
+
+    Args:
+        terms: objective terms.
+        step_data: data of the step.
+        p, q: positions (n, 3) [m], before and after.
+    """
     return _change_objective(terms, step_data, p, q)
 
 

@@ -45,13 +45,25 @@ class QuadraticForm(NamedTuple):
 
 @jit_kernel
 def add_gradient(form, p, out):
-    """Add L p [N] to `out`, both (n, 3)."""
+    """Add the gradient L p of a form.
+
+    Args:
+        form: the form.
+        p: positions (n, 3) [m].
+        out: (n, 3) [N], updated.
+    """
     _add_product(form, p, out)
 
 
 @jit_inner
 def add_product(form, x, out):
-    """Add L x [N] to `out`, both (n, 3); do nothing without a form."""
+    """Add the product L x; do nothing without a form.
+
+    Args:
+        form: the form, or None.
+        x: positions or displacements (n, 3) [m].
+        out: (n, 3) [N], updated.
+    """
     if form is None:
         return
     _add_product(form, x, out)
@@ -77,13 +89,23 @@ def _add_product(form, x, out):
 
 @jit_kernel
 def energy_change(form, p, q):
-    """Return q'Lq/2 - p'Lp/2 [J], p and q (n, 3)."""
+    """Return the change q'Lq/2 - p'Lp/2 [J] of a form's energy.
+
+    Args:
+        form: the form.
+        p, q: positions (n, 3) [m], before and after.
+    """
     return change_form(form, p, q)
 
 
 @jit_inner
 def change_form(form, p, q):
-    """Return q'Lq/2 - p'Lp/2 [J], p and q (n, 3); 0 without a form."""
+    """Return the change q'Lq/2 - p'Lp/2 [J]; 0 without a form.
+
+    Args:
+        form: the form, or None.
+        p, q: positions (n, 3) [m], before and after.
+    """
     if form is None:
         return 0.0
     total = 0.0
@@ -102,9 +124,13 @@ def change_form(form, p, q):
 
 @jit_kernel
 def add_quadratic_blocks(form, diagonal, off_diagonal, values):
-    """Add L [N/m] to the blocks `values` (b, 3, 3).
+    """Add L to the blocks of a matrix.
 
-    The indices are those of the diagonal (n,) and of the pairs in both directions (k, 2); -1 for none.
+    Args:
+        form: the form.
+        diagonal: index of each vertex's diagonal block (n,), -1 for none.
+        off_diagonal: indices of each pair's blocks in both directions (k, 2), -1 for none.
+        values: blocks (b, 3, 3) [N/m], updated.
     """
     for i in range(len(form.vertex_weight)):
         add_to_diagonal(values, diagonal[i], form.vertex_weight[i])
@@ -118,7 +144,14 @@ def add_quadratic_blocks(form, diagonal, off_diagonal, values):
 
 @jit_kernel
 def multiply_matrix(pointers, columns, values, x, out):
-    """Write the product of a matrix in compressed rows with x (n, 3) to `out` (n, 3)."""
+    """Write the product of a sparse matrix with three columns.
+
+    Args:
+        pointers: first entry of each row (n + 1,), the matrix being in compressed rows.
+        columns, values: column and number of each entry.
+        x: the columns (n, 3).
+        out: output (n, 3), overwritten.
+    """
     for i in range(len(out)):
         s0, s1, s2 = 0.0, 0.0, 0.0
         for e in range(pointers[i], pointers[i + 1]):
@@ -131,7 +164,13 @@ def multiply_matrix(pointers, columns, values, x, out):
 
 @jit_inner
 def add_to_diagonal(values, block, w):
-    """Add w [N/m] to the diagonal of a block, -1 for none."""
+    """Add a number to the diagonal of a block.
+
+    Args:
+        values: blocks (b, 3, 3) [N/m], updated.
+        block: index of the block, -1 for none.
+        w: number that is added [N/m].
+    """
     if block >= 0:
         values[block, 0, 0] += w
         values[block, 1, 1] += w

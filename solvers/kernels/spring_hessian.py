@@ -38,7 +38,13 @@ class BlockIndices(NamedTuple):
 
     @classmethod
     def from_graph(cls, system: System, edges: NDArray[np.int64], graph: csr_array) -> BlockIndices:
-        """Return the indices for a matrix with the block pattern `graph`, (f, f), sorted, over the free vertices."""
+        """Return the indices for a matrix over the free vertices.
+
+        Args:
+            system: the system, for its free vertices.
+            edges: ends of each spring (m, 2).
+            graph: block pattern of the matrix (f, f), with sorted columns and a full diagonal.
+        """
         n, f = system.num_vertices, len(system.free_vertices)
         key = np.repeat(np.arange(f), np.diff(graph.indptr)) * f + graph.indices
         number = np.full(n, -1)
@@ -55,11 +61,17 @@ class BlockIndices(NamedTuple):
 
 @jit_kernel
 def locate_blocks(number, starts, columns, transposed, vertices, out):
-    """Write the block of each vertex pair within rows of vertices (m, k) to `out` (m, k^2).
+    """Write the block of each vertex pair within rows of vertices.
 
-    It is -1 if one vertex is not free. Returns False if a block is missing. The matrix has sorted columns and a
-    symmetric pattern; `transposed` is the block (j, i) of each block (i, j); `number` is the index of each vertex among
-    the free ones, or -1.
+    Args:
+        number: index of each vertex among the free ones, -1 for none, (n + 1,); the last entry is that of vertex -1.
+        starts, columns: row pointers (f + 1,) and sorted columns of the matrix, whose pattern is symmetric.
+        transposed: index of the block (j, i) of each block (i, j).
+        vertices: rows of vertices (m, k), -1 for none.
+        out: output (m, k^2), -1 if one vertex of the pair is not free.
+
+    Returns:
+        Whether the matrix has all the blocks; if not, the output is incomplete.
     """
     many = vertices.shape[1]
     for e in range(len(vertices)):
@@ -136,7 +148,14 @@ def list_vertex_pairs(number, vertices, starts, higher, last_lower, pairs):
 
 @jit_kernel
 def linearise_tensions(terms, p, d, out):
-    """Write the springs' tensions [N] at p, linearised for a displacement d (both (n, 3)), to out (m,)."""
+    """Write the tensions of the springs, linearised for a displacement.
+
+    Args:
+        terms: objective terms.
+        p: positions (n, 3) [m].
+        d: displacement (n, 3) [m].
+        out: output (m,) [N].
+    """
     for e in range(len(terms.stiffness)):
         i, j = terms.edges[e, 0], terms.edges[e, 1]
         n0, n1, n2, length = spring_direction(terms, e, p)
@@ -160,7 +179,13 @@ def _add_block(values, block, sign, xx, xy, xz, yy, yz, zz):
 
 @jit_kernel
 def write_constant_blocks(terms, places, values):
-    """Write the stiffness [N/m] of inertia and penalty pins to the blocks `values`, (b, 3, 3)."""
+    """Write the stiffness of inertia and penalty pins to the blocks of a matrix.
+
+    Args:
+        terms: objective terms.
+        places: block indices.
+        values: output (b, 3, 3) [N/m], overwritten.
+    """
     _write_constant_blocks(terms, places, values)
 
 
@@ -213,9 +238,12 @@ def assemble_hessian(terms, places, constant, p, tension, negative_fraction, val
 
 @jit_kernel
 def linearise_springs(terms, p, out):
-    """Write the linearised springs at p (n, 3) to out (m, 4).
+    """Write the linearised springs.
 
-    These are sqrt(k - lateral) n and lateral, the transverse stiffness.
+    Args:
+        terms: objective terms.
+        p: positions (n, 3) [m].
+        out: output (m, 4), sqrt(k - lateral) n [(N/m)^(1/2)] and the transverse stiffness `lateral` [N/m].
     """
     for e in range(len(terms.stiffness)):
         n0, n1, n2, length = spring_direction(terms, e, p)

@@ -21,9 +21,12 @@ from springbench.solvers.model.energies.edge_energy import ZERO_LENGTH
 
 @jit_inner
 def unit_direction(v0, v1, v2, rest_direction, spring):
-    """Return the unit vector of v and the length of v [m]; at zero length that of the rest shape.
+    """Return the unit vector of v and the length of v [m].
 
-    rest_direction: (m, 3), of which row `spring` is used; reversed for ~spring, which names the second end.
+    Args:
+        v0, v1, v2: vector of the spring, from its other end [m].
+        rest_direction: unit directions of the rest shape (m, 3), for zero length.
+        spring: index of the spring; ~index at its second end, which reverses the direction.
     """
     length = np.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
     if length > ZERO_LENGTH:
@@ -35,7 +38,14 @@ def unit_direction(v0, v1, v2, rest_direction, spring):
 
 @jit_inner
 def transverse_stiffness(stiffness, rest_length, tension, length):
-    """Return a spring's transverse stiffness [N/m], at most k; 0 for zero length and positive rest length."""
+    """Return a spring's transverse stiffness [N/m], at most k.
+
+    Args:
+        stiffness: k [N/m].
+        rest_length: rest length r [m].
+        tension: tension [N], which may be predicted.
+        length: length [m]; the result is 0 at zero length unless r is 0.
+    """
     if rest_length == 0.0:
         return stiffness
     if length <= 0.0:
@@ -45,7 +55,14 @@ def transverse_stiffness(stiffness, rest_length, tension, length):
 
 @jit_inner
 def spring_energy_change(stiffness, rest_length, i, j, p, q):
-    """Return the change [J] of a spring's energy from p to q without cancellation; its ends are rows i and j."""
+    """Return the change [J] of a spring's energy from p to q without cancellation.
+
+    Args:
+        stiffness: stiffness k [N/m].
+        rest_length: rest length r [m].
+        i, j: rows of its ends.
+        p, q: positions, rows of at least three [m].
+    """
     before = after = change = 0.0
     for c in range(3):
         v = p[i, c] - p[j, c]

@@ -165,9 +165,15 @@ class SpringPackets(NamedTuple):
 
 @jit_inner
 def add_projection(bundles, begin, end, p, right, out, shift):
-    """Add y + A'K d(p) to rows of `out` that are shifted by `shift`.
+    """Add y + A'K d(p) of some packets.
 
-    It is that of the packets from `begin` to `end`.
+    Args:
+        bundles: packets of the springs and edges.
+        begin, end: range of the packets.
+        p: positions in rows of four [m].
+        right: right-hand side of the packets, with y.
+        out: rows of four [N], updated.
+        shift: number of rows from a vertex's position to its result.
     """
     moved = out[4 * shift :]
     for b in range(begin, end):
@@ -177,9 +183,15 @@ def add_projection(bundles, begin, end, p, right, out, shift):
 
 @jit_inner
 def add_descent(bundles, begin, end, p, right, out, shift):
-    """Add minus the gradient, y - Q p + A'K d(p), to rows of `out`.
+    """Add minus the gradient, y - Q p + A'K d(p), of some packets.
 
-    It is that of the packets from `begin` to `end`.
+    Args:
+        bundles: packets of the springs and edges.
+        begin, end: range of the packets.
+        p: positions in rows of four [m].
+        right: right-hand side of the packets, with y and anchor stiffness.
+        out: rows of four [N], updated.
+        shift: number of rows from a vertex's position to its result.
     """
     moved = out[4 * shift :]
     for b in range(begin, end):
@@ -189,7 +201,16 @@ def add_descent(bundles, begin, end, p, right, out, shift):
 
 @jit_inner
 def add_degenerate_packet(bundles, b, p, right, out, correct):
-    """Add either of them for a packet with a spring of zero length; `correct` selects minus the gradient."""
+    """Add the sums of a packet with a spring of zero length.
+
+    Args:
+        bundles: packets of the springs and edges.
+        b: index of the packet.
+        p: positions in rows of four [m].
+        right: right-hand side of the packets.
+        out: rows of four [N], updated.
+        correct: whether to add minus the gradient, as `add_descent`; if not, as `add_projection`.
+    """
     add_scalar_springs(bundles, b, p, out, correct)
     for lane in range(LANES):
         i, at = bundles.row_offset[LANES * b + lane], RHS_STRIDE * b + lane
@@ -201,9 +222,16 @@ def add_degenerate_packet(bundles, b, p, right, out, correct):
 
 @jit_inner
 def add_scalar_springs(bundles, b, p, out, correct):
-    """Add a packet's springs one by one.
+    """Add a packet's springs and their edges one by one.
 
-    One of zero length has the direction of its rest shape.
+    A spring of zero length has the direction of its rest shape.
+
+    Args:
+        bundles: packets of the springs and edges.
+        b: index of the packet.
+        p: positions in rows of four [m].
+        out: rows of four [N], updated.
+        correct: whether to add minus the gradient; A'K d is added if not.
     """
     for lane in range(LANES):
         i = bundles.row_offset[LANES * b + lane]
@@ -242,9 +270,13 @@ def _add_edges(bundles, edges, i, entry, lane, p, correct, force):
 
 @jit_inner
 def squared_norm(bundles, begin, end, e, measure):
-    """Return |e|_Q^2 [J] of displacements in rows of four, with half of each spring at each end.
+    """Return |e|_Q^2 [J], with half of each spring at each end.
 
-    `measure` is the diagonal part [N/m] of each lane.
+    Args:
+        bundles: packets whose springs have the stiffness of all energies.
+        begin, end: range of the packets.
+        e: displacements in rows of four [m].
+        measure: diagonal part of Q in each lane (8 b,) [N/m].
     """
     total = 0.0
     for b in range(begin, end):
@@ -254,9 +286,16 @@ def squared_norm(bundles, begin, end, e, measure):
 
 @jit_kernel
 def run_local_step(bundles, p, y, x, b, zero, out):
-    """Write y + A'K d(p), all (n, 3), to `out`.
+    """Write y + A'K d(p).
 
-    Scratch are x and b (n + 2 rows of four) and `zero`, a right-hand side of zeros.
+    Args:
+        bundles: packets of the springs, whose rows are the vertices.
+        p: positions (n, 3) [m].
+        y: right-hand side (n, 3) [N].
+        x: scratch, n + 2 rows of four; the last two, of padding, are not overwritten.
+        b: scratch, n + 2 rows of four.
+        zero: right-hand side of the packets, all zeros.
+        out: output (n, 3) [N].
     """
     n = len(p)
     for i in range(n):

@@ -47,7 +47,13 @@ class ObjectiveWeights(NamedTuple):
     def from_packets(
         cls, bundles: SpringPackets, anchor_stiffness: NDArray[np.float64], pinned: NDArray[np.int64]
     ) -> ObjectiveWeights:
-        """Build the weights of springs in packets, of which the rows `pinned` do not move."""
+        """Build the weights of springs in packets.
+
+        Args:
+            bundles: packets of the springs and edges.
+            anchor_stiffness: anchor stiffness h of each row [N/m].
+            pinned: rows of the exactly pinned vertices.
+        """
         pull, k = bundles.entry_weights()
         parts = np.where(np.isin(bundles.neighbour_offset, 4 * pinned), 0.5, 0.25)
         share = np.divide(parts, k, out=np.zeros_like(k), where=k != 0.0)
@@ -64,7 +70,18 @@ class ObjectiveWeights(NamedTuple):
 
 @jit_inner
 def value_and_descent(bundles, shares, p, right, out):
-    """Write minus the gradient at p to the rows of `out`, and return the objective."""
+    """Write minus the gradient and return the objective [J].
+
+    Args:
+        bundles: packets of the springs and edges.
+        shares: weights of the objective.
+        p: positions in rows of four [m].
+        right: right-hand side of the packets, with y and anchor stiffness.
+        out: output in rows of four [N], overwritten in the rows of the packets.
+
+    Returns:
+        The objective, up to a constant of the step.
+    """
     total = 0.0
     for b in range(len(bundles.packet_start) - 1):
         energy = spring_descent.spring_energy_and_descent(bundles, shares, b, p, right, out)

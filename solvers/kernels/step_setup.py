@@ -51,6 +51,13 @@ def write_right_hand_side(rows, target, force, pin_targets, right):
     """Write the right-hand side y = M target/dt^2 + f + w C'C p_pin.
 
     The exact pins' columns of Q are moved to it.
+
+    Args:
+        rows: rows of the vertices.
+        target: inertial target (n, 3) [m].
+        force: external force (n, 3) [N].
+        pin_targets: targets of all pins (q, 3) [m].
+        right: output, see `SpringPackets.build_right_hand_side`; the anchor stiffness in it is constant.
     """
     for v in range(len(target)):
         prefetch_entry(
@@ -73,7 +80,13 @@ def write_right_hand_side(rows, target, force, pin_targets, right):
 
 @jit_inner
 def write_exact_pins(rows, pin_targets, x):
-    """Write the targets of the exactly pinned vertices."""
+    """Write the targets of the exactly pinned vertices.
+
+    Args:
+        rows: rows of the vertices.
+        pin_targets: targets of all pins (q, 3) [m].
+        x: rows of four [m], updated.
+    """
     for q in range(len(rows.pinned_vertices)):
         if rows.pin_weight[q] == np.inf:
             for c in range(3):
@@ -82,7 +95,14 @@ def write_exact_pins(rows, pin_targets, x):
 
 @jit_inner
 def write_positions(rows, positions, pin_targets, x):
-    """Write positions to the rows of x, with exactly pinned vertices on their targets."""
+    """Write positions to rows, with exactly pinned vertices on their targets.
+
+    Args:
+        rows: rows of the vertices.
+        positions: positions (n, 3) [m].
+        pin_targets: targets of all pins (q, 3) [m].
+        x: output in rows of four [m].
+    """
     for v in range(len(positions)):
         _prefetch_row(rows, v, x)
         for c in range(3):
@@ -92,7 +112,13 @@ def write_positions(rows, positions, pin_targets, x):
 
 @jit_kernel
 def read_positions(rows, x, out):
-    """Write the rows of x to positions (n, 3)."""
+    """Read the rows of the vertices.
+
+    Args:
+        rows: rows of the vertices.
+        x: rows of four, such as positions [m].
+        out: output by vertices (n, 3).
+    """
     for v in range(len(out)):
         _prefetch_row(rows, v, x)
         for c in range(3):
@@ -101,7 +127,15 @@ def read_positions(rows, x, out):
 
 @jit_kernel
 def init_vectors(rows, vectors, p, positions, pin_targets):
-    """Write the initial positions to the vectors from which the iterations start."""
+    """Write the initial positions to the vectors from which the iterations start.
+
+    Args:
+        rows: rows of the vertices.
+        vectors: vectors of the iterations in rows of four, updated if p is None.
+        p: output in rows of four [m], positions to correct, or None.
+        positions: initial guess (n, 3) [m].
+        pin_targets: targets of all pins (q, 3) [m].
+    """
     if p is not None:
         write_positions(rows, positions, pin_targets, p)
         return

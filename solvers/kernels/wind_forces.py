@@ -15,7 +15,13 @@ _BLOCK_POINTS = 256
 
 @jit_kernel
 def compute_triangle_centres(p, triangles, out):
-    """Write the centres (f, 3) [m] of triangles (f, 3) at positions p (n, 3) [m]."""
+    """Write the centres of triangles.
+
+    Args:
+        p: positions (n, 3) [m].
+        triangles: vertex indices (f, 3).
+        out: output (f, 3) [m].
+    """
     for e in range(len(triangles)):
         a, b, c = triangles[e, 0], triangles[e, 1], triangles[e, 2]
         for k in range(3):
