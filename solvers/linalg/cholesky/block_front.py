@@ -177,7 +177,13 @@ def eliminate_rows_below(to, first, triangles, part, parts):
 
 @jit_inner
 def subtract_panel_product(to, first, part, parts):
-    """Subtract the product of a panel block from the columns to its right, in one of several parts of the rows."""
+    """Subtract the product of a panel block from the columns to its right.
+
+    Args:
+        to: front of a supernode, whose panel is updated.
+        first: first column of the block.
+        part, parts: which part of the rows is processed, and number of parts.
+    """
     end, left = _block_end(to, first), to.panel_offset + first * to.stride
     _subtract_lower_product(
         to.panels,
@@ -197,7 +203,13 @@ def subtract_panel_product(to, first, part, parts):
 
 @jit_inner
 def subtract_front_update(to, columns, part, parts):
-    """Subtract the product of a panel's rows below from columns of the update, in one of several parts of the rows."""
+    """Subtract the product of a panel's rows below from the update.
+
+    Args:
+        to: front of a supernode, whose update is changed.
+        columns: number of columns of the update without its right-hand side, in whole tiles.
+        part, parts: which part of the rows is processed, and number of parts.
+    """
     for first in range(0, to.width, PANEL_DEPTH):
         left, depth = to.panel_offset + first * to.stride, _block_end(to, first) - first
         _subtract_lower_product(

@@ -17,7 +17,14 @@ from springbench.solvers.linalg.cholesky.supernode_amalgamation import MAX_PANEL
 
 @jit_inner
 def tile_offset(row, col, width):
-    """Return the offset of an entry in a panel of tiles of four rows, stored by columns."""
+    """Return the offset of an entry in a panel.
+
+    A panel has tiles of four rows, stored by columns.
+
+    Args:
+        row, col: position of the entry in the panel.
+        width: number of columns of the panel.
+    """
     return (row >> 2) * 4 * width + 4 * col + (row & 3)
 
 

@@ -85,5 +85,10 @@ def order_subgraph(pointers, neighbours, piece, local):
 
 @cached_njit()
 def minimum_degree_order(pointers, neighbours, order):
-    """Sort `order`, all vertices of a graph in CSR form, into minimum degree order."""
+    """Sort all vertices of a graph into minimum degree order.
+
+    Args:
+        pointers, neighbours: graph in CSR form.
+        order: all vertices (n,), reordered in place.
+    """
     order_subgraph(pointers, neighbours, order, np.full(len(order), -1, np.int32))

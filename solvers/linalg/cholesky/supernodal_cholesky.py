@@ -208,7 +208,12 @@ class SupernodalCholesky:
         self._solve_in_thread = TypedKernel(solve_from_arrays)
 
     def solve(self, b: Positions, out: Positions) -> None:
-        """Write Q^-1 b to `out`, (n, 3) each; b is not modified and must not be `out`."""
+        """Solve with the factor: write Q^-1 b.
+
+        Args:
+            b: right-hand side (n, 3), which is not modified.
+            out: output (n, 3), another array than `b`.
+        """
         threads = self.choose_num_threads()
         is_usual = threads is None and b.flags.c_contiguous and out.flags.c_contiguous
         solve = self._solve_in_thread.call if is_usual else solve_from_arrays

@@ -157,7 +157,13 @@ def reset_team(team):
 
 @jit_inner
 def try_claim(team, task, phase):
-    """Return whether this thread has claimed the task of a phase."""
+    """Return whether this thread has claimed the task of a phase.
+
+    Args:
+        team: thread team.
+        task: index of the task.
+        phase: the phase; a task whose last claim is of this phase, or of a later one, cannot be claimed.
+    """
     before = _load_acquire(team.signals, _CLAIMS_INDEX + task)
     return before < phase and _compare_and_swap(team.signals, _CLAIMS_INDEX + task, before, phase)
 
@@ -176,7 +182,12 @@ def complete_task(team):
 
 @jit_inner
 def release_phase(team, phase):
-    """Release a later phase."""
+    """Start a later phase, whose tasks the threads may then claim.
+
+    Args:
+        team: thread team.
+        phase: the phase, greater than the present one.
+    """
     _store_release(team.signals, _PHASE_INDEX, phase)
 
 
@@ -188,7 +199,15 @@ def finish_phases(team):
 
 @jit_inner
 def wait_for_phase(team, phase):
-    """Wait for the end of a phase; return the next one, negative if there is none."""
+    """Wait for the end of a phase.
+
+    Args:
+        team: thread team.
+        phase: the phase whose tasks this thread could claim.
+
+    Returns:
+        The next phase, negative if there is none.
+    """
     looks = 0
     now = _load_acquire(team.signals, _PHASE_INDEX)
     while now == phase:
@@ -220,11 +239,22 @@ def raise_thread_error(team):
 
 @jit_inner
 def read_shared(array, index):
-    """Return an integer that another thread may write meanwhile."""
+    """Return an integer that another thread may write meanwhile, with acquire ordering.
+
+    Args:
+        array: shared integers.
+        index: index of the integer.
+    """
     return _load_acquire(array, index)
 
 
 @jit_inner
 def write_shared(array, index, value):
-    """Write an integer that other threads may read meanwhile."""
+    """Write an integer that other threads may read meanwhile, with release ordering.
+
+    Args:
+        array: shared integers.
+        index: index of the integer.
+        value: the new integer.
+    """
     _store_release(array, index, value)
