@@ -47,7 +47,7 @@ def store_partial_sum(value, sum_slot, partials):
     """Do the first stage of a sum: store the sum of the block.
 
     Args:
-        value: term of this thread.
+        value: sum of this thread's terms.
         sum_slot: row of the partial sums.
         partials: output, partial sums (k, MAX_BLOCKS), one column for each block.
     """
