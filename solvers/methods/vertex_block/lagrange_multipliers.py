@@ -50,7 +50,15 @@ class LagrangeMultipliers:
         self._free_vertices = free
 
     def multipliers_at(self, problem: StepProblem, p: Positions) -> NDArray[np.float64]:
-        """Return the multipliers (m,) [N] of a step at p (n, 3) [m], zero for lengths within their limits."""
+        """Return the multipliers of a step at p, zero for lengths within their limits.
+
+        Args:
+            problem: the step; its gradient does not include the length constraints.
+            p: positions (n, 3) [m].
+
+        Returns:
+            Multipliers t (m,) [N], positive if an edge pulls.
+        """
         x, k = self._constraints, self._stiffness
         length, n = unit_directions(p[x.edges[:, 0]] - p[x.edges[:, 1]], x.rest_direction)
         J, downhill = self._jacobian(n), -problem.gradient(p)[self._free_vertices].ravel()

@@ -117,7 +117,15 @@ class VertexBlockDescent(PrecisionOptions):
 def decompose_system(system: System, solver: str) -> tuple[SpringForm, VertexElements, VertexBlocks]:
     """Decompose a system without its contact into springs, elements, and free vertices by colour.
 
-    Raises Unsupported, with the name of the solver, for energies without elements.
+    Args:
+        system: the system; its barriers and its contact of vertices are left out.
+        solver: name of the solver, with which the message of an error begins.
+
+    Returns:
+        Springs and quadratic forms, elements of the other energies, and rows and packets of the vertices.
+
+    Raises:
+        Unsupported: an energy has no elements.
     """
     parts = decompose_energies(without_barriers(without_vertex_contact(system)))
     vertex_elements = VertexElements.from_system(system)
@@ -141,7 +149,7 @@ class PreparedVertexBlockDescent(IterativeSolver):
         colour_packets: packets of the free vertices by colour.
         row_of_vertex: (n,), row of each vertex in the packets.
         anchor_stiffness: inertia and penalty pins of each row [N/m].
-        majorant: (n,) [N/m], of all energies except contact.
+        hessian_majorant: (n,) [N/m], of all energies except contact.
         residual_solver: computes the residual at p by one local-global iteration; it has no other use.
     """
 
@@ -166,7 +174,16 @@ class PreparedVertexBlockDescent(IterativeSolver):
         spectral_radius: float,
         residual_solver: ContactFreeSolver,
     ) -> Self:
-        """Prepare sweeps from the parts of a system, see `decompose_system`."""
+        """Prepare sweeps from the parts of a system, see `decompose_system`.
+
+        Args:
+            system: the system of the steps; if it has barriers, they limit the sweeps.
+            parts: its springs and quadratic forms.
+            vertex_elements: the elements of its other energies.
+            made: rows and packets of its vertices.
+            spectral_radius: rho of the Chebyshev acceleration, in [0, 1); 0 disables it.
+            residual_solver: local-global method that computes residuals.
+        """
         shares = ObjectiveWeights.from_packets(
             made.spring_packets, made.anchor_stiffness, made.row_of_vertex[system.pins.vertices[system.pins.exact_mask]]
         )
@@ -192,7 +209,15 @@ class PreparedVertexBlockDescent(IterativeSolver):
         return self.residual_solver.stats
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m]."""
+        """Start a solve.
+
+        Args:
+            problem: the step.
+            initial_guess: positions (n, 3) [m], which are not modified.
+
+        Returns:
+            The state of sweeps; with barriers, that of sweeps with a contact model.
+        """
         sweeps = SweepState(self, problem, initial_guess)
         if not any(map(is_barrier_energy, self.system.energies)):
             return sweeps
@@ -243,7 +268,15 @@ class PreparedVertexBlockDescent(IterativeSolver):
         return FixedObjective(self.system)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual at p, by a local-global iteration if no contact is active."""
+        """Return the residual at p, by a local-global iteration if no contact is active.
+
+        Args:
+            problem: the step.
+            p: positions (n, 3) [m].
+
+        Returns:
+            Residual [J^(1/2)]; nan if the residual solver defines none.
+        """
         return self.residual_solver.build_residual(problem)(p)
 
     def residual_scale(self, problem: StepProblem) -> float:
@@ -328,7 +361,12 @@ class SweepState(SolverState):
         return self.positions
 
     def sweep_with_planes(self, p: Positions, planes: ContactPlanes) -> Positions:
-        """Return the positions (n, 3) after a sweep from p with the given contact planes."""
+        """Return the positions (n, 3) [m] after a sweep with the given contact planes.
+
+        Args:
+            p: positions (n, 3) [m] at which the sweep starts, without extrapolation.
+            planes: planes of vertices, which act on both sides and replace the active contacts.
+        """
         from springbench.solvers.contact.half_space.packed_half_spaces import pack_contact_planes
 
         made = self._prepared

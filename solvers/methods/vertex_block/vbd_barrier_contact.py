@@ -77,7 +77,15 @@ class VbdSweeps(Protocol):
         ...
 
     def sweep_with_planes(self, p: Positions, planes: ContactPlanes) -> Positions:
-        """Return the positions after a sweep from p with contact planes, without extrapolation."""
+        """Return the positions after a sweep from p with contact planes, without extrapolation.
+
+        Args:
+            p: positions (n, 3) [m] at which the sweep starts.
+            planes: planes of vertices, see `SeparableModel.to_contact_planes`.
+
+        Returns:
+            Positions (n, 3) [m].
+        """
         ...
 
 

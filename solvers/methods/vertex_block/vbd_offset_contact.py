@@ -186,7 +186,12 @@ class PreparedOffsetContact(IterativeSolver):
         return self.sweeps.description
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
-        """Start a solve from an initial guess (n, 3) [m], and the truncated displacement to the prediction."""
+        """Start a solve from the truncated displacement to the prediction.
+
+        Args:
+            problem: the step.
+            initial_guess: positions (n, 3) [m] at which contacts are first detected; the displacement starts there.
+        """
         return OffsetContactState(self, problem, initial_guess)
 
 

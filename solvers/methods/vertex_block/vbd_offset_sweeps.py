@@ -81,7 +81,18 @@ def _combine_rows(p, rows, c0, c1, c2, c3, axis):
 
 @jit_inner
 def add_offset_contacts(contacts, i, p, gradient, block):
-    """Add the contacts of row i at positions p to its gradient and block."""
+    """Add the contacts of row i at positions p to its gradient and block.
+
+    Args:
+        contacts: contacts by rows, see `OffsetContacts`.
+        i: index of a free row.
+        p: positions in rows of four [m], those of obstacles included.
+        gradient: gradient of the row's vertex, three numbers [N].
+        block: upper triangle of its block, row by row, six numbers [N/m].
+
+    Returns:
+        Gradient and block with the contacts.
+    """
     g0, g1, g2 = gradient
     xx, xy, xz, yy, yz, zz = block
     for entry in range(contacts.row_starts[i], contacts.row_starts[i + 1]):
@@ -120,7 +131,16 @@ def add_offset_contacts(contacts, i, p, gradient, block):
 
 @jit_inner
 def truncate_row(contacts, i, p):
-    """Move row i of p to the ball around its position at the detection; return whether it was outside."""
+    """Move row i of p into the ball around its position at the detection.
+
+    Args:
+        contacts: positions at the detection and displacement bounds, see `OffsetContacts`.
+        i: index of a free row.
+        p: positions in rows of four [m], updated.
+
+    Returns:
+        Whether the position was outside the ball, or not a number.
+    """
     at = 4 * i
     a, b, c = p[at] - contacts.centre[at], p[at + 1] - contacts.centre[at + 1], p[at + 2] - contacts.centre[at + 2]
     length = np.sqrt(a * a + b * b + c * c)
@@ -140,7 +160,13 @@ def truncate_row(contacts, i, p):
 
 @jit_kernel
 def truncate_displacements(contacts, num_free, p):
-    """Move the free rows of p to their balls, and return how many were outside."""
+    """Move the free rows of p into their balls, and return how many were outside.
+
+    Args:
+        contacts: positions at the detection and displacement bounds, see `OffsetContacts`.
+        num_free: number of free rows, which come first.
+        p: positions in rows of four [m], updated.
+    """
     count = 0
     for i in range(num_free):
         count += truncate_row(contacts, i, p)

@@ -116,7 +116,15 @@ def _sweep_vertices(blocks, spaces, elements, right, p, work):
 
 @jit_inner
 def write_degenerate_descent(bundles, b, p, right, out):
-    """Write minus the gradient of a packet with a spring of zero length to the rows of `out`."""
+    """Write minus the gradient of a packet with a spring of zero length to `out`.
+
+    Args:
+        bundles: springs, see `SpringPackets`.
+        b: index of the packet.
+        p: positions in rows of four [m].
+        right: see `SpringPackets.build_right_hand_side`.
+        out: output, in rows of four [N]; the rows of other packets do not change.
+    """
     for lane in range(LANES):
         for k in range(4):
             out[bundles.row_offset[LANES * b + lane] + k] = 0.0
@@ -135,7 +143,16 @@ def _evaluate_objective(blocks, spaces, elements, p, right, out):
 
 
 def build_iteration(sweep: Any, level: Any) -> Any:
-    """Build the iteration from a sweep and the objective."""
+    """Build the iteration from a sweep and the objective.
+
+    Args:
+        sweep: compiled function (blocks, spaces, elements, right, p, work) that updates p by a sweep.
+        level: compiled function (blocks, spaces, elements, p, right, out) that returns the objective [J] at p; `out` is
+            scratch.
+
+    Returns:
+        The kernel of the iteration.
+    """
 
     @jit_kernel
     def iterate(blocks, spaces, elements, right, radius, work, p, iterations):

@@ -69,7 +69,12 @@ class VertexElements:
         return total
 
     def with_rows(self, row: NDArray[np.int64], rows: int) -> VertexElements:
-        """Return these energies with vertices in rows `row` (n,) of `rows`."""
+        """Return these energies with their elements sorted by rows.
+
+        Args:
+            row: row of each vertex (n,).
+            rows: number of rows, padding included.
+        """
         if not self.energy_indices:
             return self
         from springbench.solvers.methods.vertex_block.incident_elements import IncidentElements
