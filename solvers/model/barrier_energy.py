@@ -38,11 +38,21 @@ class PairBlocks(Protocol):
         ...
 
     def add_product(self, x: Positions, out: Positions) -> None:
-        """Add the product with x (n, 3) to `out`."""
+        """Add the product of the blocks with x to `out`.
+
+        Args:
+            x: displacements (n, 3) [m].
+            out: sum of products (n, 3) [N], updated.
+        """
         ...
 
     def add_blocks(self, block_indices: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-        """Add the blocks to a matrix with blocks (b, 3, 3), at indices (a, k^2); -1 for none."""
+        """Add the blocks to a matrix.
+
+        Args:
+            block_indices: block of the matrix for each pair of a row's vertices (a, k^2), -1 for none.
+            values: blocks of the matrix (b, 3, 3) [N/m], updated.
+        """
         ...
 
 
@@ -51,7 +61,12 @@ class BarrierEnergy(Energy, Protocol):
     """An energy that is infinite beyond a surface and whose active vertex pairs depend on the positions."""
 
     def collision_free_step_size(self, p: Positions, direction: Positions) -> float:
-        """Return the largest collision-free step size up to 1 from p along a direction, both (n, 3) [m]."""
+        """Return the largest collision-free step size up to 1 from p along a direction.
+
+        Args:
+            p: positions (n, 3) [m].
+            direction: displacements (n, 3) [m] at a step size of 1.
+        """
         ...
 
     def collision_free_step_size_moving(self, p: Positions, direction: Positions, start_fraction: float) -> float:
@@ -97,9 +112,11 @@ class BarrierEnergy(Energy, Protocol):
         ...
 
     def hessian_blocks(self, p: Positions, negative_fraction: float = 1.0) -> PairBlocks:
-        """Return the Hessian blocks at p (n, 3).
+        """Return the Hessian blocks of the active pairs at p.
 
-        `negative_fraction` is the factor of their negative part; 0 makes them positive semidefinite.
+        Args:
+            p: positions (n, 3) [m].
+            negative_fraction: factor of the blocks' negative part; 0 makes them positive semidefinite.
         """
         ...
 
@@ -110,7 +127,13 @@ def is_barrier_energy(energy: Energy) -> TypeGuard[BarrierEnergy]:
 
 
 def max_step_size(energies: Iterable[Energy], p: Positions, direction: Positions) -> float:
-    """Return the largest collision-free step size up to 1 from p along a direction, both (n, 3) [m]."""
+    """Return the largest step size up to 1 that is collision-free for all energies.
+
+    Args:
+        energies: energies of a step, of which only barriers limit the step size.
+        p: positions (n, 3) [m].
+        direction: displacements (n, 3) [m] at a step size of 1.
+    """
     return min(
         (energy.collision_free_step_size(p, direction) for energy in energies if is_barrier_energy(energy)), default=1.0
     )

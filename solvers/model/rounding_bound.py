@@ -38,17 +38,26 @@ class RoundingBoundEnergy(Energy, Protocol):
     """An energy that provides the absolute terms of its gradient."""
 
     def add_absolute_terms(self, p: Positions, out: FloatArray) -> None:
-        """Add the absolute terms [N] of the gradient at p (n, 3) [m] to `out` (n,).
+        """Add the absolute terms of the gradient to `out`.
 
         Multiplied by eps they bound its rounding error at each vertex, including that of the positions.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of absolute terms (n,) [N], updated.
         """
         ...
 
 
 def gradient_roundoff(problem: StepProblem, p: Positions) -> FloatArray:
-    """Return the bound delta (n,) [N] of the rounding error of `problem.gradient(p)` at each vertex.
+    """Return the bound delta of the rounding error of `problem.gradient(p)` at each vertex.
 
-    It is zero at exactly pinned vertices and infinite where a term overflows. The positions p are (n, 3) [m].
+    Args:
+        problem: the step.
+        p: positions (n, 3) [m].
+
+    Returns:
+        Bound (n,) [N], zero at exactly pinned vertices and infinite where a term overflows.
     """
     s, size = problem.system, stable_row_norms(p)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -68,20 +77,32 @@ def gradient_roundoff(problem: StepProblem, p: Positions) -> FloatArray:
 
 
 def is_gradient_roundoff(problem: StepProblem, p: Positions, factor: float = ROUNDOFF_FACTOR) -> bool:
-    """Return whether the gradient at p (n, 3) [m] is round-off at every free vertex.
+    """Return whether the gradient at p is round-off at every free vertex.
 
     It is if it is at most `factor` times the bound, and the bound is finite. A sum over vertices would let the
     round-off of one part hide the gradient of another. Vertices with a penalty pin are included, because
     others depend on them.
+
+    Args:
+        problem: the step.
+        p: positions (n, 3) [m].
+        factor: multiple of the bound up to which a gradient counts as round-off.
     """
     bound, size = gradient_roundoff(problem, p), stable_row_norms(problem.gradient(p))
     return bool(((size <= factor * bound) & np.isfinite(bound))[problem.system.free_vertices].all())
 
 
 def clip_to_roundoff(gradient: Positions, bound: FloatArray) -> Positions:
-    """Return the part of a gradient (n, 3) [N] that is no longer than the bound (n,) [N].
+    """Return the part of a gradient that is no longer than a bound.
 
     The remainder exceeds round-off. An infinite bound explains no part of the gradient.
+
+    Args:
+        gradient: gradient (n, 3) [N].
+        bound: largest norm of each row (n,) [N].
+
+    Returns:
+        Gradient (n, 3) [N] whose rows are shortened to the bound; zero where the bound is not finite.
     """
     size = stable_row_norms(gradient)
     share = np.divide(np.minimum(size, bound), size, out=np.zeros_like(size), where=(size > 0.0) & np.isfinite(bound))

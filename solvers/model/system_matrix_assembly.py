@@ -30,7 +30,15 @@ FloatArray = NDArray[np.float64]
 
 
 def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> FloatArray:
-    """Return the dense A of springs (m, 2) over n vertices, shape (m, n)."""
+    """Return the dense A of springs.
+
+    Args:
+        springs: vertex pairs (m, 2).
+        n: number of vertices.
+
+    Returns:
+        A (m, n).
+    """
     A = np.zeros((len(springs), n))
     rows, (i, j) = np.arange(len(springs)), springs.T
     A[rows, i] += 1.0
@@ -39,7 +47,15 @@ def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> FloatAr
 
 
 def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> scipy.sparse.csr_array:
-    """Return the sparse A of springs (m, 2) over n vertices, shape (m, n), with 2 entries per row."""
+    """Return the sparse A of springs, with 2 entries per row.
+
+    Args:
+        springs: vertex pairs (m, 2).
+        n: number of vertices.
+
+    Returns:
+        A (m, n), with an empty row for a self-loop.
+    """
     i, j = springs.T
     rows = np.flatnonzero(i != j)
     values = np.concatenate([np.ones(len(rows)), -np.ones(len(rows))])
@@ -58,20 +74,44 @@ def mass_matrix_sparse(mass: ArrayLike) -> scipy.sparse.csr_array:
 
 
 def selection_matrix_dense(pinned: NDArray[np.int64], n: int) -> FloatArray:
-    """Return the dense C of pinned vertices (q,), shape (q, n)."""
+    """Return the dense C of pinned vertices.
+
+    Args:
+        pinned: pinned vertices (q,), in the order of the rows.
+        n: number of vertices.
+
+    Returns:
+        C (q, n).
+    """
     C = np.zeros((len(pinned), n))
     C[np.arange(len(pinned)), pinned] = 1.0
     return C
 
 
 def selection_matrix_sparse(pinned: NDArray[np.int64], n: int) -> scipy.sparse.csr_array:
-    """Return the sparse C of pinned vertices (q,), shape (q, n), with one entry per row."""
+    """Return the sparse C of pinned vertices, with one entry per row.
+
+    Args:
+        pinned: pinned vertices (q,), in the order of the rows.
+        n: number of vertices.
+
+    Returns:
+        C (q, n).
+    """
     q = len(pinned)
     return scipy.sparse.csr_array(scipy.sparse.coo_array((np.ones(q), (np.arange(q), pinned)), shape=(q, n)))
 
 
 def rest_lengths(rest: FloatArray, springs: NDArray[np.int64]) -> FloatArray:
-    """Return the length r of each spring [m] at the rest positions (n, 3), shape (m,)."""
+    """Return the length r of each spring at the rest positions.
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        springs: vertex pairs (m, 2).
+
+    Returns:
+        Lengths (m,) [m].
+    """
     i, j = springs.T
     return np.linalg.norm(rest[i] - rest[j], axis=1)
 
@@ -101,9 +141,17 @@ def system_matrix_sparse(
     C: scipy.sparse.csr_array,
     weight: ArrayLike,
 ) -> scipy.sparse.csr_array:
-    """Return the sparse Q [N/m], shape (n, n), with one entry per vertex and two per spring.
+    """Return the sparse Q [N/m], shape (n, n), without explicit zeros.
 
-    The arguments are those of `system_matrix_dense`.
+    It has one entry per vertex and two per spring.
+
+    Args:
+        A: signed incidence matrix (m, n).
+        stiffness: (m,) [N/m], or one number.
+        M: mass matrix (n, n) [kg].
+        time_step: dt [s].
+        C: selection matrix of the pins (q, n).
+        weight: pin weights (q,) [N/m], or one number.
     """
     K = diagonal_matrix(np.broadcast_to(np.asarray(stiffness, float), len(A.indptr) - 1))
     W = diagonal_matrix(np.broadcast_to(np.asarray(weight, float), len(C.indptr) - 1))
@@ -136,6 +184,10 @@ def stiffness_shares(system: System, energies: Iterable[ProjectiveEnergy]) -> It
     """Yield each energy's contribution A'KA [N/m] to Q, (n, n).
 
     That of a lagged energy depends on the velocity_rate of the steps only.
+
+    Args:
+        system: provides the number of vertices and the velocity_rate.
+        energies: its projective energies, in the order of the contributions.
     """
     nowhere = np.zeros((system.num_vertices, 3))
     start = StepStart(nowhere, nowhere, 0.0, nowhere, system.velocity_rate, 0.0)
@@ -146,9 +198,16 @@ def stiffness_shares(system: System, energies: Iterable[ProjectiveEnergy]) -> It
 
 
 def require_determined_positions(system: System, Q: scipy.sparse.csr_array) -> None:
-    """Raise NotPositiveDefinite, with the vertices concerned, if some positions are not determined.
+    """Check that a mass or a pin determines the position of every vertex.
 
-    Every connected component of the graph of Q needs a mass or a pin.
+    Every connected component of the graph of Q needs one.
+
+    Args:
+        system: its masses and pins.
+        Q: matrix (n, n), of which only the pattern is used.
+
+    Raises:
+        NotPositiveDefinite: some positions are not determined; the error names the first vertices concerned.
     """
     from scipy.sparse.csgraph import connected_components  # brings scipy.linalg along
 
@@ -167,7 +226,12 @@ def require_determined_positions(system: System, Q: scipy.sparse.csr_array) -> N
 
 
 def energy_norm(Q: FloatArray | scipy.sparse.csr_array, e: FloatArray) -> float:
-    """Return the energy norm |e|_Q = sqrt(tr(e'Qe)) [J^(1/2)] of a displacement (n, 3) [m]."""
+    """Return the energy norm |e|_Q = sqrt(tr(e'Qe)) [J^(1/2)] of a displacement.
+
+    Args:
+        Q: positive semidefinite matrix (n, n) [N/m].
+        e: displacement (n, 3) [m].
+    """
     # If stiffness exceeds inertia by all digits of float64, round-off can make a sum of zero negative.
     return sqrt(max(float(np.einsum("ij,ij->", e, Q @ e)), 0.0))  # in this order, so that NaN remains
 

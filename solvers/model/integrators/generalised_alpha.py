@@ -61,7 +61,16 @@ class GeneralisedAlpha:
         return self.gamma / self.beta
 
     def iterate_stages(self, motion: Motion, acceleration: Positions | None, dt: float) -> StageGenerator:
-        """Yield the stage of a step of dt [s]; raise ValueError without a start acceleration."""
+        """Yield the only stage of a step, and return the end of the step.
+
+        Args:
+            motion: motion at the start of the step.
+            acceleration: acceleration (n, 3) [m/s^2] at the start of the step.
+            dt: length of the step [s].
+
+        Raises:
+            ValueError: the acceleration is None.
+        """
         if acceleration is None:
             raise ValueError("the method needs the acceleration at the step's start")
         (p, v), a = motion, acceleration

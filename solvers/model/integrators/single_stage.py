@@ -54,7 +54,12 @@ class SingleStageIntegrator:
     order: int = 1
 
     def complete_step(self, step_start: StepStart, solution: Solution) -> Motion:
-        """Return the motion at the end of the step, with the solver's own velocity if the solution has one."""
+        """Return the motion at the end of the step.
+
+        Args:
+            step_start: motion at the start of the step, and the velocity as a function of the stage.
+            solution: the solution of the stage; its velocity, if the solver computes one, is that of the result.
+        """
         x = solution.positions
         if solution.velocity is not None:
             return Motion(x, solution.velocity)
@@ -87,7 +92,15 @@ class SubsteppingIntegrator(SingleStageIntegrator):
     has_split_filters: ClassVar[bool] = False
 
     def complete_step(self, step_start: StepStart, solution: Solution) -> Motion:
-        """Return the solver's motion; raise Unsupported for a solver without a velocity."""
+        """Return the solver's motion at the end of the step.
+
+        Args:
+            step_start: motion at the start of the step, not used.
+            solution: positions and velocity at the end of the step.
+
+        Raises:
+            Unsupported: the solver computes no velocity.
+        """
         if solution.velocity is None:
             raise Unsupported(
                 "the integrator `substepping` leaves it to the solver to integrate a step, and this one minimises what "

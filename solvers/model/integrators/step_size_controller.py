@@ -107,7 +107,15 @@ def choose_next_step_size(
 
 @register_jitable(**jit_inner_options)
 def compute_rejection_factor(control: StepSizeController, ratio: float) -> float:
-    """Return the change of the step size after a rejected step; its error ratio may be infinite or nan."""
+    """Return the change of the step size after a rejected step.
+
+    Args:
+        control: a `StepSizeController`.
+        ratio: error of the step over the tolerance; may be infinite or nan.
+
+    Returns:
+        Factor of the step size, at least `min_factor`; `failure_factor` for a ratio that is infinite or nan.
+    """
     if ratio < np.inf:
         return max(control.min_factor, control.safety * ratio ** (-1.0 / control.error_order))
     return control.failure_factor
