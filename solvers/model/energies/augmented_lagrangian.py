@@ -53,7 +53,13 @@ class AugmentedLagrangian(StrainLimits):
     def from_constraints(
         cls, constraints: LengthConstraints, stiffness: NDArray[np.float64], tensions: NDArray[np.float64]
     ) -> AugmentedLagrangian:
-        """Return edges with positive stiffnesses k [N/m] and tensions t [N], both (m,)."""
+        """Return the edges of L for length constraints.
+
+        Args:
+            constraints: edges and the limits of their lengths.
+            stiffness: stiffnesses k (m,) [N/m], positive.
+            tensions: tensions t (m,) [N], which shift the limits.
+        """
         moved = tensions / stiffness
         return cls(
             constraints.edges,
@@ -76,15 +82,31 @@ def concatenate_constraints(parts: Sequence[LengthConstraints]) -> LengthConstra
 
 
 def length_errors(constraints: LengthConstraints, p: Positions) -> NDArray[np.float64]:
-    """Return the constraint violations at p (n, 3) [m], negative below the minimum length: (m,) [m]."""
+    """Return the constraint violations at p, negative below the minimum length.
+
+    Args:
+        constraints: edges and the limits of their lengths.
+        p: positions (n, 3) [m].
+
+    Returns:
+        Violations (m,) [m], zero within the limits.
+    """
     found = np.linalg.norm(p[constraints.edges[:, 0]] - p[constraints.edges[:, 1]], axis=1)
     return found - np.clip(found, constraints.min_length, constraints.max_length)
 
 
 def compute_penalty_stiffness(system: System, constraints: LengthConstraints) -> NDArray[np.float64]:
-    """Return stiffnesses k (m,) [N/m] by which an edge resists as much as its two ends do, 1/(1/q_i + 1/q_j).
+    """Return stiffnesses by which edges resist as much as their ends do.
 
-    Here q is the diagonal of Q. An edge between exact pins, which cannot move, gets the value 1.
+    They are k = 1/(1/q_i + 1/q_j), where q is the diagonal of Q. An edge between exact pins, which cannot move, gets the
+    value 1.
+
+    Args:
+        system: inertia, pins and projective energies, which determine q.
+        constraints: the edges.
+
+    Returns:
+        Stiffnesses k (m,) [N/m].
     """
     q = system.inertia_diagonal.copy()
     for share in stiffness_shares(

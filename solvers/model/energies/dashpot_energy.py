@@ -104,15 +104,30 @@ class Dashpots(EdgeEnergy):
         return 0.5 * float(self.stiffness @ self._closing_length(p) ** 2)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N], shape (n, 3), to `out`."""
+        """Add the gradient to `out`.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of gradients (n, 3) [N], updated.
+        """
         self._scatter_forces(self._closing_length(p)[:, None] * self.direction, out)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """Add A'K d(p) [N], shape (n, 3), to `out` (the local step)."""
+        """Add A'K d(p) to `out` (the local step).
+
+        Args:
+            p: positions (n, 3) [m], from which d is found.
+            out: right-hand side (n, 3) [N], updated.
+        """
         self._scatter_forces(self._edge_vectors(p) - self._closing_length(p)[:, None] * self.direction, out)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add k (|p_i| + |p_j| + |offset|) [N] to `out` (n,) at both ends (`rounding_bound`)."""
+        """Add k (|p_i| + |p_j| + |offset|) [N] to `out` at both ends (`rounding_bound`).
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of absolute terms (n,) [N], updated.
+        """
         self._scatter_absolute_terms(self._endpoint_norms(p) + np.abs(self.offset), out)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:

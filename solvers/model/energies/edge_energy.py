@@ -93,12 +93,28 @@ def _row_norms(v: Positions) -> NDArray[np.float64]:
 
 
 def vertex_pair_keys(edges: NDArray[np.int64], num_vertices: int) -> NDArray[np.int64]:
-    """Return one number for the vertices of each edge (m, 2), the same for both directions."""
+    """Return one number for the vertices of each edge, the same for both directions.
+
+    Args:
+        edges: vertex pairs (m, 2).
+        num_vertices: bound above all vertex indices; keys of different sets compare only with the same bound.
+
+    Returns:
+        Keys (m,).
+    """
     return num_vertices * edges.min(axis=1, initial=num_vertices) + edges.max(axis=1, initial=0)
 
 
 def unit_directions(v: Positions, fallback: Positions) -> tuple[NDArray[np.float64], Positions]:
-    """Return |v| (m,) and v/|v| (m, 3) of each row, with the fallback for a row of zero length."""
+    """Return the length and the unit vector of each row.
+
+    Args:
+        v: vectors (m, 3) [m].
+        fallback: unit vectors (m, 3) of rows of zero length.
+
+    Returns:
+        |v| (m,) [m], and v/|v| (m, 3).
+    """
     length = _row_norms(v)
     unit = v / np.maximum(length, ZERO_LENGTH)[:, None]
     zero = length <= ZERO_LENGTH
@@ -107,9 +123,16 @@ def unit_directions(v: Positions, fallback: Positions) -> tuple[NDArray[np.float
 
 
 def rest_directions(rest: Positions, edges: NDArray[np.int64]) -> tuple[NDArray[np.float64], Positions]:
-    """Return the rest lengths (m,) [m] and directions (m, 3).
+    """Return the lengths and directions of edges at rest.
 
     Edges of zero length get the first axis.
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        edges: vertex pairs (m, 2).
+
+    Returns:
+        Rest lengths (m,) [m], and unit vectors (m, 3) from second to first end.
     """
     i, j = edges.T
     v = rest[i] - rest[j]

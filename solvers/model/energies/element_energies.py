@@ -27,7 +27,12 @@ class Elements(NamedTuple):
 
     @classmethod
     def from_edges(cls, edges: NDArray[np.int64], *parameters: NDArray[np.float64]) -> Elements:
-        """Return elements of edges (m, 2), z from second to first end, with columns of parameters, (m,) or (m, c)."""
+        """Return elements of edges, with z from second to first end.
+
+        Args:
+            edges: vertex pairs (m, 2).
+            *parameters: columns of the parameters of phi, (m,) or (m, c) each.
+        """
         return cls(edges, np.tile([1.0, -1.0], (len(edges), 1)), np.column_stack(parameters))
 
 
@@ -68,7 +73,12 @@ class ElementLaw(NamedTuple):
     def from_functions(
         cls, value: Any, gradient: Any, hessian: Any, energy_change: Any, *, has_constant_hessian: bool = False
     ) -> ElementLaw:
-        """Build the passes from the functions of a single element (see `ElementFunctions`)."""
+        """Build the passes from the functions of a single element.
+
+        Args:
+            value, gradient, hessian, energy_change: functions of an element, see `ElementFunctions`.
+            has_constant_hessian: whether the second derivatives do not depend on z.
+        """
 
         @jit_kernel
         def values(elements, p):
@@ -122,7 +132,13 @@ class ElementLaw(NamedTuple):
 
 @jit_inner
 def gather_coordinates(elements, e, p):
-    """Return z of element e at p (n, 3)."""
+    """Return the three coordinates of z of an element.
+
+    Args:
+        elements: the elements, with rows of A.
+        e: index of the element.
+        p: positions (n, 3) [m].
+    """
     z0 = z1 = z2 = 0.0
     for a in range(elements.vertices.shape[1]):
         i, c = elements.vertices[e, a], elements.coefficients[e, a]
@@ -132,7 +148,15 @@ def gather_coordinates(elements, e, p):
 
 @jit_inner
 def axial_hessian(along, across, n0, n1, n2):
-    """Return the Hessian with stiffness `along` the unit vector n and stiffness `across` perpendicular to it."""
+    """Return the Hessian of an element with a stiffness along and one across a direction.
+
+    Args:
+        along, across: stiffness along n, and perpendicular to it [N/m].
+        n0, n1, n2: coordinates of the unit vector n.
+
+    Returns:
+        Second derivatives xx, xy, xz, yy, yz, zz [N/m].
+    """
     more = along - across
     return (
         more * n0 * n0 + across, more * n0 * n1, more * n0 * n2,
@@ -165,13 +189,13 @@ class JoinedElements(NamedTuple):
 
 @jit_kernel
 def add_blocks(elements, block_indices, hessians, values):
-    """Add the second derivatives (m, 6) of elements to matrix blocks (b, 3, 3).
+    """Add the second derivatives of elements to matrix blocks.
 
     Args:
         elements: the elements.
         block_indices: block of each pair of an element's vertices (m, k^2), -1 for none.
         hessians: second derivatives (m, 6) [N/m].
-        values: blocks (b, 3, 3) [N/m].
+        values: blocks (b, 3, 3) [N/m], updated.
     """
     width = elements.vertices.shape[1]
     for e in range(len(hessians)):
@@ -197,9 +221,15 @@ def add_blocks(elements, block_indices, hessians, values):
 
 @jit_inner
 def add_products(joined, hessians, x, out):
-    """Add the product [N] of all second derivatives with x [m], (n, 3), to `out`.
+    """Add the product of all second derivatives with x to `out`.
 
     Does nothing without elements.
+
+    Args:
+        joined: the rows of A of all elements, or None.
+        hessians: second derivatives of the elements (m, 6) [N/m]; None without elements.
+        x: displacements (n, 3) [m].
+        out: sum of products (n, 3) [N], updated.
     """
     if joined is None:
         return

@@ -74,14 +74,23 @@ class Gas:
         return out
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N], shape (n, 3), to `out`."""
+        """Add the gradient to `out`.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of gradients (n, 3) [N], updated.
+        """
         out -= self._pressure_at(p)[0] * self._volume_gradient(p)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add the absolute terms [N] of the gradient to `out` (n,) (`rounding_bound`).
+        """Add the absolute terms of the gradient to `out` (`rounding_bound`).
 
         They are p |b||c|/6 plus the effect of the rounding of b and c at each corner of each triangle a b c, and
         p/V |grad V| times the error of V.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of absolute terms (n,) [N], updated.
         """
         pressure, volume = self._pressure_at(p)
         size, relative = (np.linalg.norm(x, axis=1) for x in (p, p - p.mean(axis=0)))

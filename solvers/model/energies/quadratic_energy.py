@@ -38,16 +38,31 @@ class Quadratic:
         return 0.5 * float(self.weight @ np.einsum("ij,ij->i", away, away))
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N], shape (n, 3), to `out`."""
+        """Add the gradient A'W (A p - d) to `out`.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of gradients (n, 3) [N], updated.
+        """
         out += self._weighted_transpose(self.A @ p - self.d)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add |A|'W (|A| |p| + |d|) [N] to `out` (n,) (`rounding_bound`)."""
+        """Add |A|'W (|A| |p| + |d|) [N] to `out` (`rounding_bound`).
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of absolute terms (n,) [N], updated.
+        """
         size = abs(self.A)
         out += size.T @ (self.weight * (size @ np.linalg.norm(p, axis=1) + np.linalg.norm(self.d, axis=1)))
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """Add A'W d [N], shape (n, 3), which does not depend on p, to `out`."""
+        """Add A'W d to `out`.
+
+        Args:
+            p: positions (n, 3) [m], not used, because d does not depend on them.
+            out: right-hand side (n, 3) [N], updated.
+        """
         out += self._weighted_transpose(self.d)
 
     def _weighted_transpose(self, x: Positions) -> Positions:
@@ -77,9 +92,13 @@ class ViscousDamping(Quadratic):
 
     @classmethod
     def from_operator(cls, A: scipy.sparse.csr_array, damping: NDArray[np.float64]) -> ViscousDamping:
-        """Return damping of A v, A: (m, n), with coefficients c (m,) [N s/m].
+        """Return damping of A v.
 
         Undamped rows are omitted.
+
+        Args:
+            A: sparse matrix (m, n).
+            damping: coefficients c (m,) [N s/m] divided by the unit of A squared.
         """
         damped = np.flatnonzero(damping)
         return cls(scipy.sparse.csr_array(A[damped]), damping[damped], np.zeros((len(damped), 3)))

@@ -62,25 +62,50 @@ class Springs(EdgeEnergy):
         return 0.5 * float(self.stiffness @ (self.edge_lengths(p) - self.rest_length) ** 2)
 
     def rest_hessian(self, lateral_ratio: float, n: int) -> scipy.sparse.csr_array:
-        """Return the Hessian [N/m], (3n, 3n), of the rest shape with a transverse stiffness of `lateral_ratio` k."""
+        """Return the Hessian of the rest shape with a given transverse stiffness.
+
+        A spring of zero rest length has stiffness k in all directions.
+
+        Args:
+            lateral_ratio: transverse stiffness of the other springs relative to k.
+            n: number of vertices.
+
+        Returns:
+            Hessian (3n, 3n) [N/m].
+        """
         across = np.where(self.rest_length == 0.0, 1.0, lateral_ratio)
         return self._block_hessian(across, self.rest_direction, n)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient A'K (A p - d) [N], shape (n, 3), to `out`."""
+        """Add the gradient A'K (A p - d) to `out`.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of gradients (n, 3) [N], updated.
+        """
         v = self._edge_vectors(p)
         _, unit = unit_directions(v, self.rest_direction)
         self._scatter_forces(v - self.rest_length[:, None] * unit, out)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """Add A'K d(p) [N], shape (n, 3), to `out` (the local step)."""
+        """Add A'K d(p) to `out` (the local step).
+
+        Args:
+            p: positions (n, 3) [m], from which d is found.
+            out: right-hand side (n, 3) [N], updated.
+        """
         _, unit = unit_directions(self._edge_vectors(p), self.rest_direction)
         self._scatter_forces(self.rest_length[:, None] * unit, out)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add k (max(1, r/l - 1) (|p_i| + |p_j|) + l + r) [N] to `out` (n,) at both ends (`rounding_bound`).
+        """Add the absolute terms of the gradient to `out` at both ends (`rounding_bound`).
 
-        The error of a unit direction is at most of order 1, so that a spring of nearly zero length adds 2 k r / eps.
+        They are k (max(1, r/l - 1) (|p_i| + |p_j|) + l + r). The error of a unit direction is at most of order 1, so
+        that a spring of nearly zero length adds 2 k r / eps.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of absolute terms (n,) [N], updated.
         """
         length, r = self.edge_lengths(p), self.rest_length
         lateral = np.divide(r, length, out=np.full_like(length, np.inf), where=length > ZERO_LENGTH) - 1.0

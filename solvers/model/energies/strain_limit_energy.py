@@ -34,13 +34,26 @@ def _is_within_limits(numbers, e, squared):
 
 @jit_inner
 def length_excess(numbers, e, length):
-    """Return the length beyond the limits, negative below the minimum."""
+    """Return the length [m] beyond the limits of an edge, negative below the minimum.
+
+    Args:
+        numbers: parameters (m, 6): stiffness [N/m], minimum and maximum length [m], rest direction.
+        e: index of the edge.
+        length: length of the edge [m].
+    """
     return length - min(max(length, numbers[e, 1]), numbers[e, 2])
 
 
 @jit_inner
 def edge_direction(numbers, e, length, z0, z1, z2):
-    """Return the unit vector from second to first end; that of the rest shape for zero length."""
+    """Return the unit vector of an edge; that of the rest shape for zero length.
+
+    Args:
+        numbers: parameters (m, 6): stiffness [N/m], minimum and maximum length [m], rest direction.
+        e: index of the edge.
+        length: length of the edge [m].
+        z0, z1, z2: vector from second to first end [m].
+    """
     if length <= ZERO_LENGTH:
         return numbers[e, 3], numbers[e, 4], numbers[e, 5]
     return z0 / length, z1 / length, z2 / length
@@ -128,19 +141,34 @@ class StrainLimits(EdgeEnergy):
         return 0.5 * float(self.stiffness @ beyond**2)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N], shape (n, 3), to `out`."""
+        """Add the gradient to `out`.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of gradients (n, 3) [N], updated.
+        """
         _, _, beyond, unit = self._evaluate_edges(p)
         self._scatter_forces(beyond[:, None] * unit, out)
 
     def add_projection(self, p: Positions, out: Positions) -> None:
-        """Add A'K d(p) [N], shape (n, 3), to `out` (the local step)."""
+        """Add A'K d(p) to `out` (the local step).
+
+        Args:
+            p: positions (n, 3) [m], from which d is found.
+            out: right-hand side (n, 3) [N], updated.
+        """
         v, _, beyond, unit = self._evaluate_edges(p)
         self._scatter_forces(v - beyond[:, None] * unit, out)
 
     def add_absolute_terms(self, p: Positions, out: NDArray[np.float64]) -> None:
-        """Add k (max(1, |l - t|/l) (|p_i| + |p_j|) + 2 l) [N] to `out` (n,) at both ends (`rounding_bound`).
+        """Add the absolute terms of the gradient to `out` at both ends (`rounding_bound`).
 
-        Only edges that exceed their limits, or may do so by round-off, contribute.
+        They are k (max(1, |l - t|/l) (|p_i| + |p_j|) + 2 l). Only edges that exceed their limits, or may do so by
+        round-off, contribute.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: sum of absolute terms (n,) [N], updated.
         """
         _, length, beyond, _ = self._evaluate_edges(p)
         reach = self._endpoint_norms(p)
