@@ -169,7 +169,16 @@ class FixedObjective:
         return BlockMatrix.from_graph(self.system, terms, self.quadratic_form, self.free_index, graph, i, j, count)
 
     def matrix_with_blocks(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> BlockMatrix:
-        """Return a matrix that also has blocks (i, j) of free vertices."""
+        """Return a matrix that also has blocks (i, j) of free vertices.
+
+        The last extended one is cached for the same blocks.
+
+        Args:
+            i, j: rows and columns of the blocks (k,), by index among the free vertices.
+
+        Returns:
+            The Hessian's matrix if it has the blocks, else one extended by them and by (j, i).
+        """
         if self._extended_matrix is not None and all(map(np.array_equal, self._extended_blocks, (i, j))):
             return self._extended_matrix
         for known in (self.hessian_matrix, self._extended_matrix):

@@ -41,7 +41,7 @@ class BlockMatrix:
             system: the system.
             terms: objective terms.
             quadratic_form: quadratic form of the system, or None.
-            free_index: index of each vertex among the free ones (n,), or -1.
+            free_index: index of each vertex among the free ones (n + 1,), or -1; see `FixedObjective.free_index`.
             graph: pattern of the blocks (f, f), sorted, with a diagonal.
             count: the count to which its factorisations are added.
         """
@@ -70,7 +70,15 @@ class BlockMatrix:
     ) -> BlockMatrix:
         """Return a matrix with the blocks of a graph and additional ones.
 
-        The latter are between vertices i and j, in both directions, where both are free.
+        Args:
+            system: the system.
+            terms: its springs, inertia and penalty pins.
+            quadratic_form: quadratic form of the system, or None.
+            free_index: index of each vertex among the free ones (n + 1,), or -1; see `FixedObjective.free_index`.
+            graph: pattern of blocks (f, f), nonzero where the matrix has one, with a diagonal.
+            i, j: ends of additional blocks (k,), by index among the free vertices; -1 for a vertex that is not free.
+                Both blocks, (i, j) and (j, i), are added where both ends are free.
+            count: the count to which its factorisations are added.
         """
         i, j = i[(i >= 0) & (j >= 0)], j[(i >= 0) & (j >= 0)]
         ones = np.ones(2 * len(i))
@@ -84,32 +92,67 @@ class BlockMatrix:
         return self._block_keys // self._num_free, self._block_keys % self._num_free
 
     def has_blocks(self, i: IndexArray, j: IndexArray) -> bool:
-        """Return whether the matrix has the blocks (i, j)."""
+        """Return whether the matrix has the blocks (i, j).
+
+        Args:
+            i, j: rows and columns of the blocks (k,), by index among the free vertices.
+        """
         keys = i * self._num_free + j
         at = np.minimum(np.searchsorted(self._block_keys, keys), len(self._block_keys) - 1)
         return bool((self._block_keys[at] == keys).all())
 
     def is_exact_extension(self, i: IndexArray, j: IndexArray, base: BlockMatrix) -> bool:
-        """Return whether the matrix has exactly the blocks of another one, (i, j) and (j, i)."""
+        """Return whether the matrix only has the blocks of `base` and additional ones.
+
+        The latter are (i, j) and (j, i).
+
+        Args:
+            i, j: rows and columns of additional blocks (k,), by index among the free vertices; the matrix has them all.
+            base: the other matrix, whose blocks the matrix has too.
+        """
         size = self._num_free
         return len(np.unique(np.concatenate([base._block_keys, i * size + j, j * size + i]))) == len(self._block_keys)
 
     def entry_indices(self, rows: IndexArray, columns: IndexArray) -> IndexArray:
-        """Return the indices of the entries (rows, columns) within the flat values."""
+        """Return the indices of entries within the flat values.
+
+        Args:
+            rows, columns: coordinates of the entries (k,), three for each free vertex; their blocks must exist.
+
+        Returns:
+            Indices (k,) into `values.reshape(-1)`.
+        """
         block = np.searchsorted(self._block_keys, rows // 3 * self._num_free + columns // 3)
         return 9 * block + 3 * (rows % 3) + columns % 3
 
     def element_block_indices(self, energy: int, vertices: IndexArray) -> IndexArray:
-        """Return the block index of each vertex pair of an energy's elements (m, k), as (m, k^2); -1 if not free.
+        """Return the block index of each vertex pair of an energy's elements.
 
-        They are cached for the same array of vertices. Raises LookupError if a block is missing.
+        They are cached for the same array of vertices, and overwritten for another one.
+
+        Args:
+            energy: index of the energy in the system, or -1 - k for the k-th barrier energy.
+            vertices: vertices of the elements (m, k), -1 for none.
+
+        Returns:
+            Indices (m, k^2), -1 if a vertex is not free.
+
+        Raises:
+            LookupError: a block is missing.
         """
         if not self.has_element_blocks(energy, vertices):
             raise LookupError("the matrix has no place for some blocks of these elements")
         return self._element_indices[energy][1]
 
     def has_element_blocks(self, energy: int, vertices: IndexArray) -> bool:
-        """Return whether the matrix has all blocks of an energy's elements."""
+        """Return whether the matrix has all blocks of an energy's elements.
+
+        If it has, their indices are cached for `element_block_indices`.
+
+        Args:
+            energy: index of the energy in the system, or -1 - k for the k-th barrier energy.
+            vertices: vertices of the elements (m, k), -1 for none.
+        """
         known = self._element_indices.get(energy)
         if known is not None and known[0] is vertices:
             return True

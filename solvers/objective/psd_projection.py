@@ -66,16 +66,32 @@ class PsdProjection:
         return met
 
     def project_springs(self, edges: NDArray[np.int64], tension: FloatArray) -> tuple[float, FloatArray]:
-        """Return the negative fraction and the tensions (m,) [N] of projected springs (m, 2).
+        """Return how springs are assembled so that their blocks are positive semidefinite.
 
         The transverse eigenvalue of a spring is t/l.
+
+        Args:
+            edges: vertices of the springs (m, 2).
+            tension: tensions t (m,) [N], negative if compressed.
+
+        Returns:
+            Fraction of the negative transverse parts, -1 for absolute values and 1 otherwise, and tensions (m,) [N],
+            which are zero for clamped springs.
         """
         bent = self.select_elements(edges) & (tension < 0.0)
         self.num_projected += int(bent.sum())
         return (-1.0, tension) if self.use_absolute else (1.0, np.where(bent, 0.0, tension))
 
     def project_packed(self, vertices: NDArray[np.int64], packed_hessians: FloatArray) -> FloatArray:
-        """Project packed Hessians (m, 6) [N/m] of elements with vertices (m, k)."""
+        """Project packed Hessians of elements.
+
+        Args:
+            vertices: vertices of the elements (m, k), -1 for none.
+            packed_hessians: second derivatives xx, xy, xz, yy, yz, zz of each element (m, 6) [N/m].
+
+        Returns:
+            Second derivatives (m, 6) [N/m]; the given array if no eigenvalue is negative.
+        """
         blocks = self.project_blocks(vertices, packed_hessians[:, _PACKED_INDEX])
         return packed_hessians if blocks is None else np.ascontiguousarray(blocks.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]])
 
@@ -85,7 +101,15 @@ class PsdProjection:
         return pairs if blocks is None else pairs.with_values(blocks)
 
     def project_blocks(self, vertices: NDArray[np.int64], blocks: FloatArray) -> FloatArray | None:
-        """Project symmetric blocks (m, k, k) of elements; return None if no eigenvalue is negative."""
+        """Project symmetric blocks of elements; return None if no eigenvalue is negative.
+
+        Args:
+            vertices: vertices of the elements (m, v), -1 for none.
+            blocks: blocks (m, k, k) [N/m], not modified.
+
+        Returns:
+            Blocks (m, k, k) [N/m], of which only those with a negative eigenvalue differ.
+        """
         met = np.flatnonzero(self.select_elements(vertices))
         size, axes = np.linalg.eigh(blocks[met])
         bent = size[:, 0] < -_EIGENVALUE_ROUNDOFF * np.abs(size).max(axis=1, initial=0.0)

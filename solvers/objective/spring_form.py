@@ -98,7 +98,12 @@ class SpringForm:
         return self if len(limits) == len(self.strain_limits) else replace(self, strain_limits=limits)
 
     def update_edges(self, packets: SpringPackets, problem: StepProblem) -> SpringPackets:
-        """Return packets whose strain limits and dashpots are those of a step."""
+        """Return packets whose strain limits and dashpots are those of a step.
+
+        Args:
+            packets: packets of the springs, with the edges of this form attached.
+            problem: the step.
+        """
         edges = packets.edges
         if edges is None:
             return packets

@@ -24,15 +24,24 @@ class StepMatrix:
         barrier_energies: list[BarrierEnergy],
         pattern_positions: Positions | None = None,
     ) -> None:
-        """Create the matrix; its first blocks are those near `pattern_positions` (n, 3) [m], if given."""
+        """Create the matrix, with the pattern of the objective until a step needs more blocks.
+
+        Args:
+            fixed_objective: the objective, without the pairs of barriers.
+            barrier_energies: barriers whose candidate pairs extend the pattern.
+            pattern_positions: positions (n, 3) [m] near which the first extension takes its pairs; None for p itself.
+        """
         self._fixed_objective, self._barrier_energies = fixed_objective, barrier_energies
         self._pattern_positions = pattern_positions
         self._cached_matrix: BlockMatrix | None = None
 
     def matrix_at(self, p: Positions, i: IndexArray, j: IndexArray, block_vertices: list[IndexArray]) -> BlockMatrix:
-        """Return the matrix at p with blocks (i, j) of free vertices and the blocks of each barrier energy.
+        """Return the matrix at p with blocks (i, j) and those of each barrier energy.
 
-        The latter are between the vertices `block_vertices` (a, k).
+        Args:
+            p: positions (n, 3) [m], near which the pattern is extended if it does not suffice.
+            i, j: rows and columns of blocks (k,), by index among the free vertices.
+            block_vertices: vertices (a, k) of the blocks of each barrier energy at p, -1 for none.
         """
         known = self._cached_matrix or self._fixed_objective.hessian_matrix
         if not _covers_blocks(known, i, j, block_vertices) and self._pattern_positions is not None:
@@ -75,7 +84,12 @@ class BarrierHessian:
         return [energy.block_vertices(self._positions) for energy in self._barrier_energies]
 
     def add_to_matrix(self, negative_fraction: float, matrix: BlockMatrix) -> None:
-        """Add the blocks to the matrix, with a fraction of their negative parts."""
+        """Add the blocks to the matrix, with a fraction of their negative parts.
+
+        Args:
+            negative_fraction: factor of the blocks' negative part; 0 makes them positive semidefinite.
+            matrix: matrix that has all blocks between `block_vertices`; its values are updated.
+        """
         for k, (energy, vertices) in enumerate(zip(self._barrier_energies, self.block_vertices, strict=True)):
             if len(vertices):
                 indices = matrix.element_block_indices(-1 - k, vertices)

@@ -66,7 +66,15 @@ class StepObjective:
     """
 
     def __init__(self, fixed_objective: FixedObjective, problem: StepProblem) -> None:
-        """Build the objective of a problem; raise ValueError if its system has another number of energies."""
+        """Build the objective of a problem.
+
+        Args:
+            fixed_objective: the parts that do not change, of the same system.
+            problem: the step.
+
+        Raises:
+            ValueError: the system of the problem has another number of energies.
+        """
         if len(problem.system.energies) != len(fixed_objective.system.energies):
             raise ValueError("the objective was made for a system of other energies than the step's")
         self.fixed_objective, self.problem = fixed_objective, problem
@@ -115,9 +123,12 @@ class StepObjective:
         return any(not one.is_projective for one in self.element_energies)
 
     def max_step_size(self, p: Positions, search_direction: Positions, initial_step: float = 1.0) -> float:
-        """Return the largest collision-free step size up to `initial_step`.
+        """Return the largest collision-free step size up to `initial_step`; see `barrier_energy`.
 
-        It is that from p along the search direction, both (n, 3); see `barrier_energy`.
+        Args:
+            p: positions (n, 3) [m].
+            search_direction: search direction (n, 3) [m], the displacement at a step size of 1.
+            initial_step: upper bound of the step size, returned without barriers.
         """
         return (
             initial_step
@@ -169,9 +180,16 @@ class StepObjective:
         return out
 
     def objective_change(self, p: Positions, q: Positions) -> tuple[float, float]:
-        """Return g(q) - g(p) [J], and the part that may be round-off of energies without an element-wise form.
+        """Return the change of the objective from p to q, and its round-off.
 
-        Such an energy contributes the difference of its values, or the mean slope if that difference is cancelled.
+        An energy without an element-wise form contributes the difference of its values, or the mean slope if that
+        difference is cancelled.
+
+        Args:
+            p, q: positions (n, 3) [m].
+
+        Returns:
+            g(q) - g(p) [J], and the part that may be round-off of energies without an element-wise form [J].
         """
         p, q, fixed = np.ascontiguousarray(p), np.ascontiguousarray(q), self.fixed_objective
         change, noise = fixed.kernels.objective_change.call(fixed.objective_terms, self.step_data, p, q), 0.0
@@ -219,7 +237,15 @@ class StepObjective:
         return TrialStep(q, change, 0.0, gradient if is_sufficient else None)
 
     def linearise_tensions(self, p: Positions, d: Positions) -> FloatArray:
-        """Return the springs' tensions [N], (m,), at p, linearised for a displacement d."""
+        """Return the springs' tensions at p, linearised for a displacement d.
+
+        Args:
+            p: positions (n, 3) [m].
+            d: displacement (n, 3) [m].
+
+        Returns:
+            Tensions (m,) [N], positive if a spring pulls.
+        """
         fixed, out = self.fixed_objective, np.empty(len(self.fixed_objective.objective_terms.stiffness))
         p, d = np.ascontiguousarray(p), np.ascontiguousarray(d)
         fixed.kernels.linearise_tensions.call(fixed.objective_terms, p, d, out)
@@ -240,7 +266,16 @@ class StepObjective:
         return out
 
     def constant_blocks(self, matrix: BlockMatrix, p: Positions) -> FloatArray | None:
-        """Return the matrix blocks that do not depend on the point p of this step; None for springs alone."""
+        """Return the matrix blocks that do not depend on the positions in this step.
+
+        Args:
+            matrix: matrix whose pattern the blocks have.
+            p: any positions (n, 3) [m]; constant Hessians of elements are evaluated there.
+
+        Returns:
+            Blocks (b, 3, 3) [N/m] of inertia, penalty pins, forms and elements; None if there are neither forms nor
+            elements with a constant Hessian.
+        """
         steady = [one for one in self.element_energies if one.element_law.has_constant_hessian]
         if not steady:
             return matrix.constant_blocks if self.fixed_objective.quadratic_form is not None else None
@@ -336,9 +371,11 @@ class Hessian:
         return self._assemble(clamped.negative_fraction, 0.0, clamped.spring_tensions, clamped)
 
     def factorise_projected(self, projected: ProjectedHessian, shift: FloatArray | float = 0.0) -> bool:
-        """Factorise a projected Hessian plus `shift` [N/m] on its diagonal.
+        """Factorise a projected Hessian, and return whether it is positive definite.
 
-        Returns whether it is positive definite.
+        Args:
+            projected: the result of `project_to_psd` of this Hessian.
+            shift: value added to the diagonal [N/m], one number or one for each free coordinate (3f,).
         """
         return self._factor.factorise(
             self._assemble(projected.negative_fraction, shift, projected.spring_tensions, projected).values
@@ -353,7 +390,14 @@ class Hessian:
     ) -> Positions | None:
         """Factorise and solve in one pass, faster than both calls.
 
-        Returns None if it is not positive definite.
+        Args:
+            b: right-hand side (n, 3) [N].
+            negative_fraction: fraction of the negative transverse part of springs to include.
+            shift: value added to the diagonal [N/m], one number or one for each free coordinate (3f,).
+            tension: tensions of the springs (m,) [N]; None for those at the point.
+
+        Returns:
+            Solution (n, 3) [m], zero at vertices that are not free; None if the Hessian is not positive definite.
         """
         values = self._assemble(negative_fraction, shift, tension).values
         x = self._factor.factorise_and_solve(values, self._select_free(b))

@@ -43,12 +43,28 @@ LinearSolve = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def sparse_part(energy: Energy, p: Positions) -> csr_array:
-    """Return the Hessian of an energy without its low-rank part V V'."""
+    """Return the Hessian of an energy without its low-rank part V V'.
+
+    Args:
+        energy: an energy; its whole Hessian is sparse unless it is a `RankUpdateEnergy`.
+        p: positions (n, 3) [m].
+
+    Returns:
+        Sparse matrix (3n, 3n) [N/m].
+    """
     return csr_array(energy.sparse_hessian(p) if isinstance(energy, RankUpdateEnergy) else energy.hessian(p))
 
 
 def low_rank_columns(energies: Sequence[Energy], p: Positions) -> NDArray[np.float64] | None:
-    """Return V of all energies (n, 3, r), or None if there is none."""
+    """Return V of all energies, or None if there is none.
+
+    Args:
+        energies: energies, of which those that are no `RankUpdateEnergy` have no columns.
+        p: positions (n, 3) [m].
+
+    Returns:
+        Columns of all energies (n, 3, r) [(N/m)^(1/2)].
+    """
     found = [energy.low_rank_columns(p) for energy in energies if isinstance(energy, RankUpdateEnergy)]
     return np.concatenate(found, axis=2) if found else None
 
@@ -57,7 +73,12 @@ class Woodbury:
     """The factorisation of H = S + V V' with S in a block matrix; same interface as `BlockCholesky`."""
 
     def __init__(self, matrix: BlockMatrix, V: NDArray[np.float64]) -> None:
-        """Create the factorisation for columns V (f, 3, r), over the free vertices."""
+        """Create the factorisation for given columns; S follows with `factorise`.
+
+        Args:
+            matrix: block matrix over the free vertices, whose pattern and Cholesky factorisation S uses.
+            V: columns (f, 3, r) [(N/m)^(1/2)].
+        """
         self._matrix, self._V = matrix, V
 
     def factorise(self, values: NDArray[np.float64]) -> bool:
@@ -83,7 +104,15 @@ class Woodbury:
         return x - self._W @ along
 
     def factorise_and_solve(self, values: NDArray[np.float64], b: Positions) -> Positions | None:
-        """Factorise H from the blocks of S and return H^-1 b; None if H is not positive definite."""
+        """Factorise H from the blocks of S, and return H^-1 b.
+
+        Args:
+            values: blocks of S (b, 3, 3) [N/m].
+            b: right-hand side (f, 3) [N].
+
+        Returns:
+            H^-1 b (f, 3) [m]; None if H is not positive definite.
+        """
         return self.solve(b) if self.factorise(values) else None
 
 
