@@ -98,8 +98,8 @@ def length_errors(constraints: LengthConstraints, p: Positions) -> NDArray[np.fl
 def compute_penalty_stiffness(system: System, constraints: LengthConstraints) -> NDArray[np.float64]:
     """Return stiffnesses by which edges resist as much as their ends do.
 
-    They are k = 1/(1/q_i + 1/q_j), where q is the diagonal of Q. An edge between exact pins, which cannot move, gets the
-    value 1.
+    They are k = 1/(1/q_i + 1/q_j), where q is the diagonal of Q. An edge between exact pins, which cannot move, gets
+    the value 1.
 
     Args:
         system: inertia, pins and projective energies, which determine q.
