@@ -43,9 +43,21 @@ class EdgeBuilder:
         *,
         correct: bool = True,
     ) -> Any:
-        """Subtract the forces of an entry's dashpots from sums, and those of limits from the factor of the vectors.
+        """Subtract the forces of an entry's edges from those of its springs.
 
-        If not `correct`, A'K d is added in their place. Where there is a fourth sum, it receives the energy.
+        Those of dashpots are subtracted from the sums, those of limits from the factor of the vectors.
+
+        Args:
+            entry: index of the entry.
+            arrow: x, y and z of the vectors v from the other ends [m].
+            squared: |v|^2 [m^2].
+            root: 1/|v| [1/m].
+            factor: factor of v in the force of the springs [N/m].
+            sums: pointers to x, y and z of the force [N]; a fourth one, if any, receives the energy [J].
+            correct: whether the sums are minus the gradient; if not, A'K d is added in place of the forces.
+
+        Returns:
+            The factor of v with the limits [N/m].
         """
         b, v = self._builder, self._vectors
         found = cgutils.alloca_once_value(b, factor)
@@ -71,9 +83,20 @@ class EdgeBuilder:
     def add_derivatives(
         self, entry: Any, arrow: list[Any], squared: Any, root: Any, factors: list[Any], sums: list[Any]
     ) -> list[Any]:
-        """Add an entry's limits to the factors of its spring, and the gradient of its dashpots to three sums.
+        """Add the derivatives of an entry's limits and dashpots.
 
-        factors: of the vector in the force, of I and of nn' in the block.
+        Limits change the factors of their spring, dashpots the sums of their gradient.
+
+        Args:
+            entry: index of the entry.
+            arrow: x, y and z of the vectors v from the other ends [m].
+            squared: |v|^2 [m^2].
+            root: 1/|v| [1/m].
+            factors: factors of v in the force, of I and of nn' in the block [N/m].
+            sums: pointers to x, y and z of the gradient of dashpots [N].
+
+        Returns:
+            The three factors with the limits.
         """
         b, v = self._builder, self._vectors
         found = [cgutils.alloca_once_value(b, factor) for factor in factors]
@@ -117,7 +140,13 @@ class EdgeBuilder:
             v.add_products([b.fmul(b.fmul(_HALF, k), longer)], [b.fadd(one, other)], [total])
 
     def add_dashpot_change(self, gradient: list[Any], d: list[Any], total: Any) -> None:
-        """Add the energy change g.d + d'Bd/2 of the packet's dashpots by steps d of its vertices."""
+        """Add the energy change g.d + d'Bd/2 of the packet's dashpots.
+
+        Args:
+            gradient: x, y and z of their gradient g at each vertex [N].
+            d: x, y and z of the steps of the vertices [m].
+            total: pointer to the sum of energy changes [J].
+        """
         b, v = self._builder, self._vectors
         with self._if_any(self._edges.has_dashpots):
             xx, xy, xz, yy, yz, zz = self._load_blocks()

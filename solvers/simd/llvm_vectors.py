@@ -18,7 +18,15 @@ _ELEMENT_BYTES = {ir.HalfType(): 2, ir.FloatType(): 4}
 
 
 def literal_signature(*kinds: Any, compiled_in: int = 1) -> Any:
-    """Return a void signature whose last `compiled_in` arguments are literal integers; raise TypingError otherwise."""
+    """Return a void signature whose last arguments are literal integers.
+
+    Args:
+        *kinds: Numba types of the arguments.
+        compiled_in: number of arguments at the end that are compiled into the code.
+
+    Raises:
+        TypingError: one of these is not a literal integer.
+    """
     usual, literal = map(types.unliteral, kinds[:-compiled_in]), kinds[-compiled_in:]
     if not all(isinstance(kind, types.IntegerLiteral) for kind in literal):
         raise TypingError(f"the last {compiled_in} arguments must be literal integers")
@@ -30,6 +38,11 @@ def unpack_arguments(context: Any, builder: Any, signature: Any, args: Any) -> l
 
     Arrays become pointers to their data, numbers int64, literals Python integers, None stays None, and named tuples are
     unpacked alike.
+
+    Args:
+        context, builder: Numba's target context and the builder of the code.
+        signature: Numba signature, whose types determine the conversion.
+        args: LLVM values of the arguments as Numba passes them.
     """
     return [_unpack_argument(context, builder, *both) for both in zip(signature.args, args, strict=True)]
 
@@ -57,32 +70,62 @@ class VectorBuilder:
         self.has_avx512 = "+avx512f" in context.codegen().magic_tuple()[2]
 
     def load(self, pointer: Any, kind: Any) -> Any:
-        """Load a number or a vector, with the alignment of its items, the only one that NumPy guarantees."""
+        """Load a number or a vector, with the alignment of its items.
+
+        That is the only alignment that NumPy guarantees.
+
+        Args:
+            pointer: pointer to the first item, of any type.
+            kind: LLVM type of the number or vector.
+        """
         return self.builder.load(self.builder.bitcast(pointer, kind.as_pointer()), align=_alignment_of(kind))
 
     def store(self, value: Any, pointer: Any) -> None:
-        """Store a number or a vector, with the alignment of its items."""
+        """Store a number or a vector, with the alignment of its items.
+
+        Args:
+            value: the number or vector.
+            pointer: pointer to the first item, of any type.
+        """
         place = self.builder.bitcast(pointer, value.type.as_pointer())
         self.builder.store(value, place, align=_alignment_of(value.type))
 
     def shuffle(self, a: Any, b: Any, lanes: Any) -> Any:
-        """Return lanes of two vectors, numbered through both."""
+        """Return lanes of two vectors, numbered through both.
+
+        Args:
+            a, b: vectors of one type with n lanes.
+            lanes: number of each lane of the result, from n on those of b.
+        """
         lanes = list(lanes)
         return self.builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(I32, len(lanes)), lanes))
 
     def broadcast_scalar(self, value: Any, lanes: int) -> Any:
-        """Return a vector with a number in all lanes."""
+        """Return a vector with a number in all lanes.
+
+        Args:
+            value: the number, whose type is that of the lanes.
+            lanes: number of lanes.
+        """
         kind = ir.VectorType(value.type, lanes)
         single = self.builder.insert_element(ir.Constant(kind, ir.Undefined), value, I32(0))
         return self.shuffle(single, single, [0] * lanes)
 
     def multiply_add(self, a: Any, b: Any, c: Any) -> Any:
-        """Return a b + c, or a b if c is None."""
+        """Return a b + c, or a b if c is None.
+
+        Args:
+            a, b, c: floating-point numbers or vectors of one type.
+        """
         product = self.builder.fmul(a, b, flags=("contract",))
         return product if c is None else self.builder.fadd(product, c, flags=("contract",))
 
     def subtract_product(self, c: Any, a: Any, b: Any) -> Any:
-        """Return c - a b."""
+        """Return c - a b.
+
+        Args:
+            c, a, b: floating-point numbers or vectors of one type.
+        """
         return self.builder.fsub(c, self.builder.fmul(a, b, flags=("contract",)), flags=("contract",))
 
     def sum_lanes(self, a: Any) -> Any:
@@ -111,7 +154,13 @@ def _alignment_of(kind: Any) -> int:
 
 
 def prefetch_line(builder: Any, pointer: Any, distance: int = 0) -> None:
-    """Prefetch the cache line at a distance in bytes from a pointer."""
+    """Prefetch the cache line at a distance from a pointer.
+
+    Args:
+        builder: LLVM builder of the code.
+        pointer: pointer of any type.
+        distance: distance in bytes, which may be negative.
+    """
     byte = I8.as_pointer()
     kind = ir.FunctionType(ir.VoidType(), [byte, I32, I32, I32])
     at = builder.gep(builder.bitcast(pointer, byte), [I64(distance)])

@@ -60,7 +60,13 @@ class SpringPacket(NamedTuple):
 
     @classmethod
     def from_bundles(cls, builder: Any, bundles: Any, number: Any) -> SpringPacket:
-        """Load the packet with a given index."""
+        """Load the packet with a given index.
+
+        Args:
+            builder: LLVM builder of the code.
+            bundles: pointers to the arrays of all packets, `SpringPackets` as `unpack_arguments` returns it.
+            number: index of the packet.
+        """
         begin, end = (builder.load(builder.gep(bundles.packet_start, [builder.add(number, I64(k))])) for k in (0, 1))
         arrays = bundles.row_offset, bundles.neighbour_offset, bundles.weight_offset, bundles.weights
         return cls(*arrays, number, begin, end, bundles.edges)
@@ -70,13 +76,29 @@ class PacketBuilder(VectorBuilder):
     """Builder for packets of eight float64, one for each spring that ends at eight vertices."""
 
     def load_row_offsets(self, indices: Any, bundle: Any) -> list[Any]:
-        """Load the offsets of eight rows, those of a packet in a list of int32."""
+        """Load the offsets of eight rows.
+
+        Args:
+            indices: pointer to offsets (int32), eight for each packet or entry.
+            bundle: index of the packet or entry.
+
+        Returns:
+            Eight int64.
+        """
         b = self.builder
         first = b.mul(bundle, I64(LANES))
         return [b.zext(b.load(b.gep(indices, [b.add(first, I64(lane))])), I64) for lane in range(LANES)]
 
     def gather_rows(self, array: Any, places: list[Any]) -> list[Any]:
-        """Gather x, y and z of eight rows."""
+        """Gather x, y and z of eight rows.
+
+        Args:
+            array: pointer to rows of four float64.
+            places: offsets of the eight rows.
+
+        Returns:
+            Three packets.
+        """
         rows = [self.load(self.builder.gep(array, [place]), ROW_TYPE) for place in places]
         pairs = [self.shuffle(rows[lane], rows[lane + 2], list(range(8))) for lane in (0, 1, 4, 5)]
         low = [0, 8, 2, 10, 4, 12, 6, 14]
@@ -86,7 +108,14 @@ class PacketBuilder(VectorBuilder):
         return [self.shuffle(a[0], a[1], lanes) for a, lanes in ((xz, first), (y, first), (xz, second))]
 
     def load_packets(self, table: Any, kind: Any, entry: Any, many: int = 2) -> list[Any]:
-        """Load the vectors of an entry's kind (see `kinds`)."""
+        """Load the packets that a table contains for an entry.
+
+        Args:
+            table: pointer to packets, stored once for equal entries.
+            kind: pointer to the offset in the table of each entry (int32).
+            entry: index of the entry.
+            many: number of packets of each entry.
+        """
         b = self.builder
         begin = b.zext(b.load(b.gep(kind, [entry])), I64)
         return [self.load(b.gep(table, [b.add(begin, I64(LANES * k))]), PACKET_TYPE) for k in range(many)]
@@ -96,17 +125,37 @@ class PacketBuilder(VectorBuilder):
         return [cgutils.alloca_once_value(self.builder, constant_packet(0.0)) for _ in range(many)]
 
     def compute_spring_vectors(self, x: Any, centre: list[Any], neighbour: Any, entry: Any) -> list[Any]:
-        """Return the vectors to eight vertices from the other ends of an entry's springs."""
+        """Return the vectors to eight vertices from the other ends of an entry's springs.
+
+        Args:
+            x: pointer to positions in rows of four [m].
+            centre: x, y and z of the eight vertices [m].
+            neighbour: pointer to the offsets of the other ends (int32), eight for each entry.
+            entry: index of the entry.
+
+        Returns:
+            x, y and z of the vectors [m].
+        """
         others = self.gather_rows(x, self.load_row_offsets(neighbour, entry))
         return [self.builder.fsub(a, b) for a, b in zip(centre, others, strict=True)]
 
     def add_products(self, factors: list[Any], terms: list[Any], sums: list[Any]) -> None:
-        """Add factor times term to each accumulator."""
+        """Add factor times term to each accumulator.
+
+        Args:
+            factors, terms: packets, as many as accumulators.
+            sums: pointers to the accumulators.
+        """
         for factor, term, total in zip(factors, terms, sums, strict=True):
             self.builder.store(self.multiply_add(factor, term, self.builder.load(total)), total)
 
     def update_minimum(self, value: Any, least: Any) -> None:
-        """Update the lane-wise minimum in memory."""
+        """Update the lane-wise minimum in memory.
+
+        Args:
+            value: packet of new values; NaN changes nothing.
+            least: pointer to the minimum.
+        """
         self.builder.store(self.select_minimum(self.builder.load(least), value), least)
 
     def has_short_spring(self, least: Any) -> Any:
@@ -122,6 +171,12 @@ class PacketBuilder(VectorBuilder):
 
         One entry is read while each stage processes an earlier one, which hides latencies. There must be at
         least as many entries as stages.
+
+        Args:
+            begin, end: range of entries.
+            read: function that returns the values of an entry.
+            *stages: functions of the values of the stage before, in order of execution; the result of the last one is
+                ignored.
         """
         b, depth = self.builder, len(stages)
         waiting: list[list[Any]] = []  # for each stage, the last one first
@@ -145,7 +200,12 @@ class PacketBuilder(VectorBuilder):
                 values = stage(values)
 
     def transpose_to_rows(self, vectors: list[Any], element: ir.Type = F64) -> list[Any]:
-        """Transpose vectors to eight rows of x, y, z and zero, rounded to float32 if that is the element type."""
+        """Transpose vectors to eight rows of x, y, z and zero.
+
+        Args:
+            vectors: packets of x, y and z.
+            element: type of the items of rows, to which float64 is rounded.
+        """
         zero, pairs = ir.Constant(ir.VectorType(element, LANES), [0.0] * LANES), [0, 2, 4, 6]
         if element != F64:
             vectors = [self.builder.fptrunc(a, zero.type) for a in vectors]
@@ -170,7 +230,12 @@ class PacketBuilder(VectorBuilder):
         return squared
 
     def add_row(self, pointer: Any, row: Any) -> None:
-        """Add a row to one in memory."""
+        """Add a row to one in memory.
+
+        Args:
+            pointer: pointer to the row in memory.
+            row: vector of four numbers.
+        """
         self.store(self.builder.fadd(self.load(pointer, row.type), row), pointer)
 
     def clamp_squared_length(self, s: Any) -> Any:
@@ -180,16 +245,36 @@ class PacketBuilder(VectorBuilder):
         )
 
     def select_minimum(self, a: Any, b: Any, order: str = "<=") -> Any:
-        """Return the lane-wise minimum, or the maximum with order ">="; a where the comparison involves NaN."""
+        """Return the lane-wise minimum or maximum.
+
+        Args:
+            a, b: packets; the result is a where one is NaN.
+            order: "<=" for the minimum, ">=" for the maximum.
+        """
         return self.builder.select(self.builder.fcmp_ordered(order, b, a), b, a)
 
     def load_right_hand_side(self, array: Any, bundle: Any) -> list[Any]:
-        """Load the constant right-hand side of a packet, and the stiffness of its vertices."""
+        """Load the constant right-hand side of a packet, and the stiffness of its vertices.
+
+        Args:
+            array: pointer to the right-hand side, see `SpringPackets.build_right_hand_side`.
+            bundle: index of the packet.
+
+        Returns:
+            Packets of x, y and z [N], and of stiffnesses [N/m].
+        """
         at = self.builder.gep(array, [self.builder.mul(bundle, I64(RHS_STRIDE))])
         return [self.load(self.builder.gep(at, [I64(LANES * k)]), PACKET_TYPE) for k in range(4)]
 
     def prefetch_ahead(self, springs: SpringPacket, places: list[Any], right: Any, out: Any) -> None:
-        """Prefetch the data that a packet PREFETCH_ROWS rows ahead will read."""
+        """Prefetch the data that a packet PREFETCH_ROWS rows ahead will read.
+
+        Args:
+            springs: the current packet.
+            places: offsets of its eight rows.
+            right: pointer to the right-hand side.
+            out: pointer to the rows of the result.
+        """
         b = self.builder
         first = b.mul(b.add(springs.packet_index, I64(PREFETCH_ROWS // LANES)), I64(RHS_STRIDE))
         for k in range(4):
@@ -219,7 +304,12 @@ class PacketBuilder(VectorBuilder):
         return self.evaluate_polynomial(e, *(5 / 16, 3 / 8, 1 / 2) if self.has_avx512 else (3 / 8, 1 / 2))
 
     def evaluate_polynomial(self, e: Any, *coefficients: float) -> Any:
-        """Evaluate a polynomial in e, with coefficients from the highest power down."""
+        """Evaluate a polynomial in e.
+
+        Args:
+            e: packet of arguments.
+            *coefficients: coefficients, from the highest power down.
+        """
         first, *others = map(constant_packet, coefficients)
         for c in others:
             first = self.multiply_add(first, e, c)
