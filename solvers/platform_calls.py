@@ -32,7 +32,15 @@ class LockMode(Enum):
 
 
 def try_lock_file(handle: int, mode: LockMode) -> bool:
-    """Lock an open file without waiting, and return whether that succeeded; always, on a platform without locks."""
+    """Lock an open file without waiting.
+
+    Args:
+        handle: file descriptor, whose copies share the lock.
+        mode: shared or exclusive; replaces a lock that the descriptor already has.
+
+    Returns:
+        Whether that succeeded; always True on a platform without locks.
+    """
     if fcntl is None:
         return True
     try:
@@ -43,7 +51,14 @@ def try_lock_file(handle: int, mode: LockMode) -> bool:
 
 
 def wait_for_lock(handle: int, mode: LockMode) -> None:
-    """Lock an open file as soon as no other process prevents it."""
+    """Lock an open file as soon as no other process prevents it.
+
+    Does nothing on a platform without locks.
+
+    Args:
+        handle: file descriptor, whose copies share the lock.
+        mode: shared or exclusive; replaces a lock that the descriptor already has.
+    """
     if fcntl is not None:
         fcntl.flock(handle, getattr(fcntl, mode.value))
 
@@ -55,7 +70,15 @@ def unlock_file(handle: int) -> None:
 
 
 def try_lock_byte(handle: int, offset: int) -> bool:
-    """Lock one byte of an open file for this process, and return whether that succeeded."""
+    """Lock one byte of an open file for this process, without waiting.
+
+    Args:
+        handle: descriptor of a file that is open for writing.
+        offset: position of the byte, which may be beyond the end of the file.
+
+    Returns:
+        Whether that succeeded; always True on a platform without locks.
+    """
     if fcntl is None:
         return True
     try:

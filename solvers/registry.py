@@ -83,8 +83,10 @@ def find_solver_name(solver: Any) -> str:
 
 
 def find_solver_info(solver: Any, name: str) -> SolverInfo:
-    """Return the metadata of a solver of this name.
+    """Return the metadata of a solver, or those of a family of its own.
 
-    Without any, the solver is a family of its own.
+    Args:
+        solver: the solver or its class.
+        name: name of the family if the solver states no metadata.
     """
     return getattr(solver, "solver_info", SolverInfo(name))

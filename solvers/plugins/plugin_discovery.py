@@ -70,7 +70,13 @@ class PluginTable(Mapping[str, Any]):
     """A mapping from names to import targets: built-in ones, installed ones, and every `PluginName`."""
 
     def __init__(self, entry_point_group: str, *builtin_tables: Mapping[str, Any]) -> None:
-        """Create a table from an entry-point group and tables of "module:name" or of the objects themselves."""
+        """Create a table from an entry-point group and built-in tables.
+
+        Args:
+            entry_point_group: group of installed entry points, such as `springbench.solvers`.
+            *builtin_tables: mappings from names to "module:name", or to the objects themselves; the first with a name
+                applies.
+        """
         self._entry_point_group, self.builtin_tables = entry_point_group, builtin_tables
 
     def __getitem__(self, name: str) -> Any:
