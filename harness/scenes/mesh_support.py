@@ -29,7 +29,18 @@ _LOG = logging.getLogger("springbench")
 
 
 def find_mesh_support(scene: SceneSpec, mesh: Mesh) -> MeshSupport | None:
-    """Find the supports of the mesh of a scene; None if obstacles or user code may do so."""
+    """Find the supports of the mesh of a scene.
+
+    Args:
+        scene: scene whose effects pin, attach or sew vertices.
+        mesh: mesh on which the effects select their vertices.
+
+    Returns:
+        The supports; None if there are obstacles or user code, which may support the mesh as well.
+
+    Raises:
+        InputError: an effect selects vertices that the mesh does not have.
+    """
     supported, joined = [NO_VERTICES], [NO_PAIRS]
     for k, effect in enumerate(scene.effects):
         if effect.kind not in (*_HOLDING_EFFECTS, *_JOINING_EFFECTS, *_OTHER_EFFECTS):
@@ -44,7 +55,12 @@ def find_mesh_support(scene: SceneSpec, mesh: Mesh) -> MeshSupport | None:
 
 
 def log_mesh_remarks(scene: SceneSpec, mesh: Mesh) -> None:
-    """Log what is suspicious in the mesh of a scene if it is from a file, and the membrane stiffness it has."""
+    """Log suspicious findings and the membrane stiffness of a mesh from a file.
+
+    Args:
+        scene: scene that names the file; nothing is logged for generated meshes.
+        mesh: mesh of that file.
+    """
     if not isinstance(scene.mesh, FileMesh):
         return
     path: Path = scene.mesh.find_geometry_path()
@@ -58,7 +74,15 @@ def log_mesh_remarks(scene: SceneSpec, mesh: Mesh) -> None:
 
 
 def describe_membranes(scene: SceneSpec, mesh: Mesh) -> list[str]:
-    """Describe the membrane stiffness that the springs of a scene have on its mesh, one line for each effect."""
+    """Describe the membrane stiffness of a scene's springs, one line for each effect.
+
+    Args:
+        scene: scene with the springs effects and the time step.
+        mesh: mesh on which the springs act.
+
+    Returns:
+        The lines; none unless the mesh is a surface of at most `_MAX_MODULUS_VERTICES` vertices.
+    """
     if mesh.dimension != 2 or len(mesh.rest_positions) > _MAX_MODULUS_VERTICES:
         return []
     lines = list[str]()

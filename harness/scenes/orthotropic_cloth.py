@@ -42,9 +42,17 @@ class OrthotropicStiffness(ConfigModel):
         return self
 
     def compute_stiffness(self, mesh: Mesh, springs: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Compute the constants (m,) of springs (m, 2).
+        """Compute the stiffness constant of each spring.
 
-        Raise InputError if the surface has no part along the warp.
+        Args:
+            mesh: surface at rest; its triangles give the tangent planes.
+            springs: vertices of each spring (m, 2).
+
+        Returns:
+            Constants (m,), in the unit of `stretch`.
+
+        Raises:
+            InputError: the mesh is no surface of triangles, or the warp direction is normal to it at a spring.
         """
         if mesh.dimension != 2 or not len(mesh.triangles):
             raise InputError(InputMistake("warp and weft need a mesh of triangles; give one number", key="stretch"))

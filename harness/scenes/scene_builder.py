@@ -55,7 +55,15 @@ class StatesMaterial(Protocol):
     """An effect that states the material of a cloth."""
 
     def list_material_values(self, mesh: Mesh, mass: NDArray[np.float64]) -> list[tuple[PlausibleRange, float]]:
-        """Return values of the material, each with the range of published fabrics."""
+        """Return values of the material, each with the range of published fabrics.
+
+        Args:
+            mesh: the cloth at rest.
+            mass: vertex masses (n,) [kg].
+
+        Returns:
+            Ranges and values, in the unit of the range.
+        """
         ...
 
 

@@ -38,7 +38,17 @@ IMPORT_NOTICE = "\0importing "
 
 
 def load_plugin(document: ConfigDocument, plugin: PluginName, part_kind: str, key: ConfigKey) -> Any:
-    """Load a plug-in of one of PLUGIN_KINDS, which runs its code; None after a recorded mistake."""
+    """Load a plug-in, which runs its code.
+
+    Args:
+        document: document that names it and gets the mistakes.
+        plugin: name of the plug-in.
+        part_kind: expected kind, a key of PLUGIN_KINDS.
+        key: location in the document, for the mistakes.
+
+    Returns:
+        The class, function or object; None after a mistake was added.
+    """
     expected, fits = PLUGIN_KINDS[part_kind]
     document.user_code.on_import(f"{IMPORT_NOTICE}{plugin}")
     try:
@@ -65,9 +75,17 @@ def load_plugin(document: ConfigDocument, plugin: PluginName, part_kind: str, ke
 def build_plugin_part(
     document: ConfigDocument, plugin: PluginName, part_kind: str, parameters: dict[str, Any], key: ConfigKey
 ) -> Any:
-    """Build an effect or a mesh from a plug-in class and its parameters.
+    """Build an effect or a mesh from a plug-in class, which is imported.
 
-    The class is imported. Return None after recorded mistakes.
+    Args:
+        document: document that names it and gets the mistakes.
+        plugin: name of the plug-in.
+        part_kind: "effect" or "mesh".
+        parameters: values of the model's fields.
+        key: location of the part in the document.
+
+    Returns:
+        The effect or mesh; None after mistakes were added.
     """
     model = load_plugin(document, plugin, part_kind, (*key, "kind"))
     if model is None:
@@ -136,7 +154,16 @@ class PluginEffect:
         return _load_part(self, "effect")
 
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
-        """Build the effect's contribution; raise InputError on failure."""
+        """Build the effect's contribution from the loaded plug-in.
+
+        Args:
+            mesh: the mesh at rest.
+            mass: vertex masses (n,) [kg].
+            time_step: dt [s].
+
+        Raises:
+            InputError: the plug-in cannot be loaded, or does not accept its parameters.
+        """
         return self.load_effect().build_contribution(mesh, mass, time_step)
 
 
@@ -185,7 +212,17 @@ def preserve_working_directory() -> Generator[None]:
 
 @contextmanager
 def attribute_errors(plugin: PluginName, method_name: str) -> Generator[None]:
-    """Turn exceptions of a plug-in, except the project's own, into InputError with its name and line."""
+    """Turn exceptions of a plug-in into InputError with its name and line.
+
+    The working directory is restored, too.
+
+    Args:
+        plugin: plug-in whose code runs in the context.
+        method_name: name of the method or of the computed quantity, for the message.
+
+    Raises:
+        InputError: from any exception but MemoryError and those of the project, which are raised unchanged.
+    """
     try:
         with preserve_working_directory():
             yield
@@ -306,7 +343,15 @@ def _require_pin(pin: Any, count: int) -> None:
 
 
 def check_plugin_mesh(plugin: PluginName, mesh: Any) -> Mesh:
-    """Check a mesh from a plug-in; raise InputError if it is invalid."""
+    """Check a mesh from a plug-in, and return it.
+
+    Args:
+        plugin: the plug-in, for messages.
+        mesh: result of its method `generate_mesh`, of any type.
+
+    Raises:
+        InputError: it is no `Mesh`, or an array of it has a wrong shape, type or value.
+    """
     with attribute_errors(plugin, "generate_mesh"):
         _require_true(
             isinstance(mesh, Mesh),

@@ -171,6 +171,10 @@ def compute_modulus_exponent(scaling_rule: str, dimension: int) -> int:
 
     The modulus is EA of a chain (k h), E t of a sheet (k) and E of a solid (k / h), for springs of stiffness k along
     its lines. With `continuum` and `area` it does not depend on h.
+
+    Args:
+        scaling_rule: a key of SCALING_RULES.
+        dimension: 1 for a chain, 2 for a sheet, 3 for a solid.
     """
     return {"continuum": 0, "area": 0, "fixed": 2 - dimension, "liu2013": 1 - dimension}[scaling_rule]
 

@@ -171,7 +171,12 @@ class MeshObstacle(ConfigModel):
         return self.scale * points + np.array(self.offset), triangles
 
     def place_points(self, points: Positions, time: float) -> Positions:
-        """Return the positions (o, 3) [m] at a time [s] of the points of `build_surface`."""
+        """Return the positions (o, 3) [m] of the surface points at a time.
+
+        Args:
+            points: positions (o, 3) [m] by `build_surface`; recorded frames replace them.
+            time: time [s].
+        """
         if self.frames:
             points = self.scale * self.frames.interpolate_positions(time) + np.array(self.offset)
         return points if self.motion is None else self.motion.transform_points(points, time)

@@ -64,6 +64,10 @@ class ConfigDocument:
         """Add a mistake at a key.
 
         A key that is not in the file gets the line of its parent mapping.
+
+        Args:
+            problem: description of the mistake, with its remedy.
+            at: location in the document; empty for the document as a whole.
         """
         line = next((self.lines[at[:k]] for k in range(len(at), -1, -1) if at[:k] in self.lines), None)
         self.mistakes.append(InputMistake(problem, self.path, line, format_key(at)))
@@ -103,7 +107,16 @@ class ConfigDocument:
             return None
 
     def resolve_paths(self, model: type[BaseModel], data: dict[str, Any], at: ConfigKey) -> dict[str, Any]:
-        """Resolve file names relative to the config's folder; a missing file is a mistake."""
+        """Resolve file names relative to the config's folder; a missing file is a mistake.
+
+        Args:
+            model: pydantic model, whose fields of the type Path are file names.
+            data: plain data of the model, not modified.
+            at: location of the data in the document.
+
+        Returns:
+            The data with the resolved names.
+        """
         kinds: tuple[Any, ...] = (Path, Path | None)
         paths = [k for k, f in model.model_fields.items() if f.annotation in kinds]
         names = [k for k in paths if isinstance(data.get(k), str)]

@@ -55,7 +55,15 @@ class Triangulation(NamedTuple):
 
 
 def triangulate_polygons(rest: PointArray, polygons: IndexArray) -> Triangulation:
-    """Triangulate faces (f, k) of vertices with rest positions (n, 3) [m]."""
+    """Triangulate faces of one number of corners.
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        polygons: vertices of each face (f, k), at least three.
+
+    Returns:
+        The triangulation. Faces that are not strictly convex count as self-crossing beyond MAX_CONCAVE_CORNERS corners.
+    """
     f, k = polygons.shape
     if k == 3:
         return Triangulation(polygons.reshape(f, 1, 3), np.ones(f, np.bool_), np.zeros(f, np.bool_))
@@ -105,7 +113,16 @@ def _rotate_lowest_first(triangles: IndexArray) -> IndexArray:
 
 
 def compute_vertex_areas(rest: PointArray, polygons: IndexArray, surface: Triangulation) -> PointArray:
-    """Compute the area (n,) [m^2] of faces (f, k) by vertex."""
+    """Compute the area of faces that each vertex represents.
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        polygons: vertices of each face (f, k).
+        surface: triangulation of these faces.
+
+    Returns:
+        Area of each vertex, summed over its faces, (n,) [m^2].
+    """
     if polygons.shape[1] == 3:
         return lump_areas(rest, polygons)
     faces = polygons[surface.is_convex]
@@ -151,6 +168,14 @@ def find_face_covers(
     """Find faces that are part of a larger face.
 
     Their corners are corners of the larger face, and they lie inside it.
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        polygons: number of corners k -> vertices of each face (f, k).
+        surfaces: number of corners k -> triangulation of these faces.
+
+    Returns:
+        For each two numbers of corners, the smaller faces, each with one larger face that contains it.
     """
     sizes = [k for k in sorted(polygons) if k >= 3 and len(polygons[k])]
     if len(sizes) < 2:

@@ -93,7 +93,15 @@ def describe_repeated_corner(num_corners: int) -> str:
 
 
 def check_mesh_file(path: Path, *, max_bytes: int = MAX_FILE_BYTES) -> None:
-    """Raise InputError unless `path` is a nonempty regular file of at most `max_bytes` and no placeholder."""
+    """Check that a file can be read and has a plausible content.
+
+    Args:
+        path: the file.
+        max_bytes: maximum size of the file [bytes].
+
+    Raises:
+        InputError: `path` is no readable regular file, or it is empty, too large, a Git LFS pointer or a web page.
+    """
     try:
         size = path.stat().st_size
     except (OSError, ValueError) as error:
@@ -323,7 +331,12 @@ def _exclude_pairs(pairs: IndexArray, others: IndexArray) -> IndexArray:
 
 
 def find_boundary_triangles(rest: PointArray, tetrahedra: IndexArray) -> IndexArray:
-    """Return the faces of exactly one tetrahedron, facing outwards, (f, 3)."""
+    """Return the faces of exactly one tetrahedron, facing outwards, (f, 3).
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        tetrahedra: vertices of each tetrahedron (t, 4), in either orientation.
+    """
     inverted = compute_signed_volumes(rest, tetrahedra) < 0
     tetrahedra = np.where(inverted[:, None], tetrahedra[:, [1, 0, 2, 3]], tetrahedra)
     faces = np.concatenate([tetrahedra[:, f] for f in ([0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2])])

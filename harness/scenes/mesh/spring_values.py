@@ -132,7 +132,15 @@ def find_springs(pairs: IndexArray, springs: IndexArray) -> IndexArray:
 
 
 def read_vertex_pairs(table: DataTable, num_vertices: int) -> IndexArray:
-    """Return the columns `i` and `j` of a table, zero-based vertices, (rows, 2)."""
+    """Return the columns `i` and `j` of a table, zero-based vertices, (rows, 2).
+
+    Args:
+        table: rows of springs.
+        num_vertices: number of vertices of the mesh.
+
+    Raises:
+        InputError: a column is missing, an entry names no vertex, or a row joins a vertex to itself.
+    """
     ends = np.column_stack([table.require_column("i"), table.require_column("j")])
     wrong = ~((ends >= 0) & (ends < num_vertices) & (ends == np.floor(ends)))
     if wrong.any():
@@ -144,7 +152,16 @@ def read_vertex_pairs(table: DataTable, num_vertices: int) -> IndexArray:
 
 
 def spread_columns(columns: Columns, rows: IndexArray, m: int) -> dict[str, NDArray[np.float64]]:
-    """Return columns (rows,) as values of all m springs, NaN for those without a row."""
+    """Return columns as values of all springs.
+
+    Args:
+        columns: values by name, each (rows,).
+        rows: spring of each row, (rows,).
+        m: number of springs.
+
+    Returns:
+        Values by name, each (m,), NaN for springs without a row.
+    """
     spread = dict[str, NDArray[np.float64]]()
     for name, values in columns.items():
         spread[name] = np.full(m, np.nan)

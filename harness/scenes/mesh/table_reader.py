@@ -63,7 +63,12 @@ class DataTable:
         return found
 
     def make_error(self, problem: str, row: int) -> InputError:
-        """Return an error at a row, counted from 0."""
+        """Return an error at a row.
+
+        Args:
+            problem: description of the mistake, with its remedy.
+            row: number of the row, from 0; the message states its line in the file if the file has lines.
+        """
         if self.first_line:
             return InputError(InputMistake(problem, self.path, self.first_line + row))
         return InputError(InputMistake(f"row {row} (from 0): {problem}", self.path))
