@@ -205,8 +205,18 @@ class AdaptiveImplicitStepper(Stepper):
     def integrate_motion(
         self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
     ) -> Trajectory:
-        """Integrate the motion; raises Unsupported for an integrator without an error estimate and for velocity
-        filters.
+        """Integrate the motion up to the end time.
+
+        Args:
+            setting: error tolerance [m] of each step.
+            cpu_limit: limit on the processor time [s] of this thread.
+            observe: called after each accepted step.
+
+        Raises:
+            Unsupported: the integrator estimates no error, there are velocity filters, or the solver does not support
+                the scene.
+            TimeBudgetExceeded: the limit is exceeded.
+            StepSizeUnderflow: the tolerance would need steps below the minimum step size.
         """
         return _AdaptiveIntegration(self, setting, cpu_limit, observe).run_to_end()
 

@@ -43,7 +43,12 @@ StopCriterion = StopRule | AutoTolerance
 
 
 def build_stop_rule(max_iterations: int, rtol: float | str | None) -> StopCriterion:
-    """Build the stop rule from a run's options."""
+    """Build the stop rule from a run's options.
+
+    Args:
+        max_iterations: maximum number of iterations of a solve.
+        rtol: relative tolerance, None for none; any text selects the automatic tolerance.
+    """
     return AutoTolerance(max_iterations) if isinstance(rtol, str) else StopRule(max_iterations, rtol)
 
 
@@ -54,7 +59,12 @@ class ConstantStopRule:
     rule: StopRule
 
     def record_step(self, after: Motion, error: Motion | None) -> None:
-        """Record the end of a step."""
+        """Ignore the end of a step, which does not change the rule.
+
+        Args:
+            after: motion at the end of the step.
+            error: embedded error estimate of the step, None without one.
+        """
 
 
 class LocalErrorStopRule:
@@ -85,7 +95,12 @@ class LocalErrorStopRule:
         self.rule = StopRule(auto.max_iterations, FIRST_STEP_RTOL)
 
     def record_step(self, after: Motion, error: Motion | None) -> None:
-        """Record the end of a step and its embedded error estimate, if any."""
+        """Record the end of a step, and set the rule of the next one.
+
+        Args:
+            after: motion at the end of the step.
+            error: embedded error estimate of the step, (n, 3) [m] and (n, 3) [m/s]; None without one.
+        """
         self._past.append(after.velocity)
         if len(self._past) < self._order + 2:
             return

@@ -20,7 +20,12 @@ class DevicePreparedSolver(DelegatingSolver):
     """A prepared solver on a device that records the number of iterations of each solve."""
 
     def __init__(self, prepared: PreparedSolver, usual: PreparedDeviceSolver) -> None:
-        """Wrap a prepared solver; `usual` is the one of the scene's own system, of two."""
+        """Wrap a prepared solver.
+
+        Args:
+            prepared: prepared solver of the scene, possibly an `AlternatingSolver` of two systems.
+            usual: the device solver in it that is prepared for the scene's own system.
+        """
         super().__init__(prepared)
         self.usual = usual
         self._counts = list[int]()
@@ -34,7 +39,12 @@ class DevicePreparedSolver(DelegatingSolver):
         return ReplayingDeviceSolver(self._prepared, self._counts)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Return the solver's solution."""
+        """Return the solver's solution.
+
+        Args:
+            problem: step problem on the host.
+            stop: stop rule of the solve.
+        """
         return self._prepared.solve(problem, stop)
 
 
@@ -51,7 +61,12 @@ class ReplayingDeviceSolver(DelegatingSolver):
         return {**found}
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Return the solution after the given number of iterations, without a residual."""
+        """Return the solution after the given number of iterations, without a residual.
+
+        Args:
+            problem: step problem on the host, the next one in the order of the recorded counts.
+            stop: not used; the recorded count ends the solve.
+        """
         one: Any = (
             self._prepared.select_solver(problem) if isinstance(self._prepared, AlternatingSolver) else self._prepared
         )

@@ -397,7 +397,12 @@ class DissipationBudget(_StepAccount):
     """Dissipation of one run, whose steps are added in order."""
 
     def __init__(self, scene: Scene, *, has_inner_solves: bool = False) -> None:
-        """Start at the scene's start; `has_inner_solves` states that a solver iterates within frames."""
+        """Start at the scene's start.
+
+        Args:
+            scene: scene that is stepped.
+            has_inner_solves: whether a solver iterates within the frames that it integrates itself.
+        """
         super().__init__(scene, scene.system.mass)
         self._kinetic = self._kinetic_energy(self._motion.velocity)
         self._has_inner_solves, self._time = has_inner_solves, 0.0
@@ -408,7 +413,12 @@ class DissipationBudget(_StepAccount):
         self._dynamic = self._free
 
     def add_step(self, step: SimulationStep, end_time: float | None = None) -> StepDissipation:
-        """Return the dissipation of the next step, which ends at a time [s]; that of its index if omitted."""
+        """Return the dissipation of the next step.
+
+        Args:
+            step: completed step; steps are added in order.
+            end_time: time [s] at which it ends; that of its index if omitted.
+        """
         end = self._scene.compute_time(step.index) if end_time is None else end_time
         if step.index == 1:
             self._place_start(step, end)
@@ -696,7 +706,13 @@ class FrameDissipation:
         self.by_frame = dict[int, StepDissipation]()
 
     def add_step(self, scene: Scene, step: SimulationStep, end_time: float) -> None:
-        """Add the next step, which ends at a time [s]; its scene differs from the others in the step size only."""
+        """Add the dissipation of the next step to that of its frame.
+
+        Args:
+            scene: scene of the step; the scenes of all steps differ in the step size only.
+            step: completed step.
+            end_time: time [s] at which it ends.
+        """
         self._budget = self._budget or DissipationBudget(scene)
         found, frame = self._budget.add_step(step, end_time), ceil(end_time / self._frame_seconds - 1e-6)
         last = max(self.by_frame, default=0)
@@ -712,7 +728,12 @@ def sum_dissipation(by_frame: Mapping[int, StepDissipation]) -> StepDissipation:
 
 
 def compute_kinetic_energy(mass: NDArray[np.float64], velocity: Positions) -> float:
-    """Compute 1/2 v' M v [J] of masses (n,) [kg] and velocities (n, 3) [m/s]."""
+    """Compute the kinetic energy 1/2 v' M v [J].
+
+    Args:
+        mass: vertex masses (n,) [kg].
+        velocity: velocities (n, 3) [m/s].
+    """
     return 0.5 * float(mass @ np.einsum("ij,ij->i", velocity, velocity))
 
 

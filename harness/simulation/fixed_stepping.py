@@ -49,7 +49,17 @@ class FixedImplicitStepper(Stepper):
     def integrate_motion(
         self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
     ) -> Trajectory:
-        """Integrate the motion; raises Unsupported as the solver does."""
+        """Integrate the motion up to the end time.
+
+        Args:
+            setting: number of steps of each frame, rounded up.
+            cpu_limit: limit on the processor time [s] of this thread.
+            observe: called after each step.
+
+        Raises:
+            Unsupported: the solver or the automatic tolerance does not support the scene.
+            TimeBudgetExceeded: the limit is exceeded.
+        """
         cpu, parts = thread_time(), ceil(setting)
         scene = self.build_scene(self.t_end / (self.frames * parts))
         ready, seen, reached, iterations = (

@@ -257,6 +257,10 @@ def compute_returned_residual(prepared: PreparedSolver, step: SimulationStep) ->
     """Compute the residual [J^(1/2)] at the positions that a step's solve returned.
 
     It costs an iteration where the solver reports the residual of the previous iterate only.
+
+    Args:
+        prepared: solver of the step.
+        step: completed step, of which the last stage counts.
     """
     solution = step.solution
     if solution.residual_iterate == "previous":
@@ -284,9 +288,16 @@ def describe_phases(step: SimulationStep) -> str | None:
 
 
 def compute_strain_columns(scene: Scene, p: Positions) -> dict[str, float]:
-    """Compute the strain columns: the largest absolute strain of a spring and its 99th percentile.
+    """Compute the strain columns: the largest absolute strain and the 99th percentile.
 
-    The strain is |length / rest length - 1| at p (n, 3) [m]; both columns are 0 without springs.
+    The strain of a spring is |length / rest length - 1|.
+
+    Args:
+        scene: scene with the springs.
+        p: positions (n, 3) [m].
+
+    Returns:
+        The columns `max_strain` and `strain_p99`, both 0 without springs.
     """
     of_spring, _ = compute_strains(p, scene.all_springs.edges, scene.all_springs.rest_length)
     strain = np.abs(of_spring)

@@ -59,7 +59,15 @@ class CoarseLevel:
 
 
 def build_interpolation(sources: Positions, targets: Positions) -> csr_array:
-    """Build the interpolation weights (targets, sources) between rest positions, each (n, 3) [m]."""
+    """Build the interpolation weights between the vertices of two meshes.
+
+    Args:
+        sources: rest positions of the vertices with given values, (s, 3) [m].
+        targets: rest positions of the vertices that get values, (t, 3) [m].
+
+    Returns:
+        Weights (t, s).
+    """
     from scipy.spatial import cKDTree
 
     tree: Any = cKDTree(sources)

@@ -58,7 +58,12 @@ class DelegatingSolver:
         return self._prepared.iteration_phases(problem)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the solver's residual at p."""
+        """Return the solver's residual [J^(1/2)]; nan if it is not defined.
+
+        Args:
+            problem: step problem that defines the objective.
+            p: positions (n, 3) [m].
+        """
         return self._prepared.residual_at(problem, p)
 
 
@@ -107,7 +112,15 @@ class ContractCheckedSolver(DelegatingSolver):
         self._contract, self._own = contract, user_files
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        """Return the solver's solution; raises RunFailed if it is invalid or an input was modified."""
+        """Return the solver's solution after checking it.
+
+        Args:
+            problem: step problem, which the solver must not modify.
+            stop: stop rule of the solve.
+
+        Raises:
+            RunFailed: the result is no `Solution`, its positions have a wrong shape or type, or an input was modified.
+        """
         before = {name: array.copy() for name, array in _collect_problem_arrays(problem).items()}
         found: Any = self._prepared.solve(problem, stop)
         usual: Any = getattr(self._prepared, "usual", self._prepared)

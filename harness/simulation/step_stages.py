@@ -50,7 +50,14 @@ class StageSequence:
     """The stages of one step of a scene, from a filtered motion at a time."""
 
     def __init__(self, scene: Scene, now: Motion, acceleration: Positions | None, time: float) -> None:
-        """Start a step; `acceleration` (n, 3) [m/s^2] may be unknown (None)."""
+        """Start a step.
+
+        Args:
+            scene: scene of the step, whose integrator has stages.
+            now: motion at the start of the step, after the velocity filters.
+            acceleration: acceleration (n, 3) [m/s^2] at the start; None if unknown, it is then computed where needed.
+            time: time [s] at the start.
+        """
         method = scene.integrator
         assert isinstance(method, StagedIntegrator)
         self.scene, self.time, pins = scene, time, scene.system.pins

@@ -108,7 +108,18 @@ class PhaseWatch:
         return max(CLOCK_RTOL * self.wall_seconds, CLOCK_ATOL_SECONDS, CALL_OVERHEAD_SECONDS * self.num_entries)
 
     def build_columns(self, what: str, seconds: Iterable[float]) -> dict[str, Any]:
-        """Build the check columns of the rows with given times; raises ClockMismatch."""
+        """Build the check columns of rows with measured times.
+
+        Args:
+            what: name of the measured work, for the message.
+            seconds: times [s] by another clock, which together cover all contexts of this watch.
+
+        Returns:
+            The columns `wall_seconds_check`, `wall_seconds_sum`, `cpu_seconds` and `preempted`.
+
+        Raises:
+            ClockMismatch: the sum of the times differs from the wall time of this watch by more than its tolerance.
+        """
         total = sum(seconds)
         if (
             not -self.max_difference
@@ -152,8 +163,15 @@ def check_phases(prepared: PreparedSolver, problem: StepProblem) -> dict[str, Ca
 
     The returned array of each phase is overwritten with NaN, and a second call must restore it.
 
+    Args:
+        prepared: solver with the phases of an iteration.
+        problem: step problem at which they are called.
+
+    Returns:
+        Functions by the names of the phases.
+
     Raises:
-      RunFailed: a phase does nothing.
+        RunFailed: a phase does nothing.
     """
     phases = prepared.iteration_phases(problem)
     for phase, call in phases.items():

@@ -109,10 +109,19 @@ class AdaptiveSubstepper(Stepper):
     def integrate_motion(
         self, setting: float, *, cpu_limit: float = inf, observe: StepObserver | None = None
     ) -> Trajectory:
-        """Integrate the motion.
+        """Integrate the motion up to the end time.
 
-        Raises Unsupported as the solver does, and for quantities that change within a frame where the error estimate
-        would not detect it.
+        Args:
+            setting: error tolerance [m] of each step or, with a fixed step size, number of steps relative to the
+                smallest.
+            cpu_limit: limit on the processor time [s] of this thread.
+            observe: called after each frame or, where a frame is divided into pieces, after each piece.
+
+        Raises:
+            Unsupported: the solver does not support the scene or the setting, or quantities change within a frame where
+                the error estimate would not detect it.
+            TimeBudgetExceeded: the limit is exceeded.
+            StepSizeUnderflow: the tolerance would need steps below the minimum step size.
         """
         cpu = thread_time()
         scene, ready, pieces = self._prepare_pieces(setting)

@@ -156,7 +156,12 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
 
 
 def build_integrated_step(problem: StepProblem, state: MotionState) -> SimulationStep:
-    """Build the step of a solver that integrated a frame itself, from its problem and the state after it."""
+    """Build the step of a solver that integrated a frame itself.
+
+    Args:
+        problem: problem of the frame.
+        state: state after the frame; its positions and velocity become the solution, of one iteration.
+    """
     solution = Solution(state.motion.positions, 1, np.nan, np.nan, "max-iter", state.motion.velocity)
     return SimulationStep(problem, solution, state, (1,), ((problem, solution),), StopRule(1))
 
@@ -164,9 +169,16 @@ def build_integrated_step(problem: StepProblem, state: MotionState) -> Simulatio
 def prepare(scene: Scene, solver: Solver) -> PreparedSolver:
     """Prepare the solver for all of the scene's steps.
 
+    Args:
+        scene: scene that is stepped, with one system or two.
+        solver: solver of the steps.
+
+    Returns:
+        The prepared solver; an `AlternatingSolver` for two systems.
+
     Raises:
-      Unsupported: the scene alternates step sizes with a multistep integrator, the integrator needs masses that are
-        zero, or the solver does not support exact lengths; also as `solver.prepare` raises.
+        Unsupported: the scene alternates step sizes with a multistep integrator, the integrator needs masses that are
+            zero, or the solver does not support exact lengths; also as `solver.prepare` raises.
     """
     require_masses(scene)
     if scene.system.length_constraints and not getattr(solver, "supports_length_constraints", False):
@@ -257,7 +269,13 @@ class AlternatingSolver:
     """A solver prepared for two systems of one scene that differ in their rate."""
 
     def __init__(self, usual: PreparedSolver, other: PreparedSolver, rate: float) -> None:
-        """Combine two prepared solvers; `rate` [1/s] is that of the other system."""
+        """Combine two prepared solvers.
+
+        Args:
+            usual: solver prepared for the scene's own system.
+            other: solver prepared for the other system, that of the first step or of every second one.
+            rate: velocity rate [1/s] of the other system, by which its problems are recognised.
+        """
         self.usual, self.other, self._rate = usual, other, rate
         self.description, self.stats = usual.description, usual.stats
 
@@ -335,7 +353,12 @@ INITIAL_GUESSES: dict[str, Callable[[StepProblem], StepProblem]] = {
 def apply_initial_guess(step_problem: StepProblem, initial_guess: str) -> StepProblem:
     """Set an initial guess by name, made intersection-free.
 
-    It raises what `springbench.solvers.contact.obstacle_advancement.intersection_free_guess` raises.
+    Args:
+        step_problem: problem that gets the guess.
+        initial_guess: a key of `INITIAL_GUESSES`.
+
+    Raises:
+        NoClearance: no intersection-free start was found.
     """
     return intersection_free_guess(INITIAL_GUESSES[initial_guess](step_problem))
 

@@ -201,8 +201,15 @@ class _StepStopwatch(Stopwatch):
 def prepare_untimed(scene: Scene, solver: Solver) -> RunMeasurement:
     """Prepare once, for an instrumentation pass without timed passes.
 
-    The clock of that pass is `RunMeasurement.clock`. Writes of the solver to its inputs are not checked. Raises
-    Unsupported, NotPositiveDefinite.
+    The clock of that pass is `RunMeasurement.clock`. Writes of the solver to its inputs are not checked.
+
+    Args:
+        scene: scene that is stepped.
+        solver: solver of the steps.
+
+    Raises:
+        Unsupported: the solver does not support the scene.
+        NotPositiveDefinite: a matrix is not positive definite.
     """
     preparing, stepping = (PhaseWatch(numba.get_num_threads()) for _ in range(2))
     clock = Stopwatch(preparing)
@@ -250,7 +257,22 @@ def hash_positions(p: Positions) -> str:
 def measure_rows(
     scene: Scene, solver: Solver, settings: SteppingSettings, tick: Callable[[str], None]
 ) -> tuple[RunMeasurement, list[dict[str, Any]]]:
-    """Measure a run as `measure_run` does, and build its timing rows; once more where two clocks do not agree."""
+    """Measure a run as `measure_run` does, and build its timing rows.
+
+    The measurement is repeated once if two clocks do not agree.
+
+    Args:
+        scene: scene that is stepped.
+        solver: solver of the steps.
+        settings: settings of the time stepping.
+        tick: called with the name of the pass after each step.
+
+    Returns:
+        The measurement, and the columns of one row for each time.
+
+    Raises:
+        ClockMismatch: the clocks do not agree the second time either; also as `measure_run` raises.
+    """
     measured = measure_run(scene, solver, settings, tick)
     return measured, build_timing_rows(measured)
 
@@ -296,7 +318,15 @@ def _check_phase_sums(timings: list[TimingSample]) -> dict[str, bool]:
 
 
 def compute_milliseconds(measured: RunMeasurement, frames: int) -> dict[str, list[float]]:
-    """Compute the median over the rounds of each phase in each frame [ms]."""
+    """Compute the median time of each phase in each frame.
+
+    Args:
+        measured: times of all rounds.
+        frames: number of frames.
+
+    Returns:
+        Name of the phase -> times (frames,) [ms], medians over the rounds.
+    """
     by_phase: dict[str, list[list[float]]] = {}
     for t in measured.timings:
         if t.frame is not None:
