@@ -118,15 +118,40 @@ class CollisionMesh:
         )
 
     def compute_clearance_bounds(self, p: Positions, q: Positions, query: CollisionQuery) -> ClearanceBounds | None:
-        """Return lower bounds of the distances at q, if the displacement from p to q violates no limit."""
+        """Return lower bounds of the distances at q, if no pair violates a limit.
+
+        Args:
+            p: start positions (n, 3) [m] of the linear motion.
+            q: end positions (n, 3) [m].
+            query: limits of the distances.
+
+        Returns:
+            Clearance bounds; None if the test is inconclusive.
+        """
         return self._cluster_culling.compute_clearance_bounds(p, q, query)
 
     def max_relative_displacement(self, p: Positions, q: Positions) -> float:
-        """Return the largest relative displacement [m] of two vertices that are close to each other at rest."""
+        """Return the largest relative displacement of two vertices close to each other at rest.
+
+        Args:
+            p: start positions, contiguous (n, 3) [m].
+            q: end positions, contiguous (n, 3) [m].
+
+        Returns:
+            Upper bound [m].
+        """
         return self._cluster_culling.max_relative_displacement(p, q)
 
     def find_proximity_candidates(self, p: Positions, inflation_radius: float) -> Candidates:
-        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
+        """Return the pairs closer than a radius.
+
+        Args:
+            p: positions (n, 3) [m].
+            inflation_radius: radius [m], compared with unscaled distances.
+
+        Returns:
+            Candidates with their barrier parameters.
+        """
         x = pad_positions(p)
         met, first = self._find_close_pairs(x, inflation_radius)
         many = len(met)
@@ -149,7 +174,17 @@ class CollisionMesh:
         return self.points.primitives, self.triangles.primitives, self.edges.primitives
 
     def find_ccd_candidates(self, x: FloatArray, y: FloatArray, query: CollisionQuery, edges: bool) -> Candidates:
-        """Return the pairs that may violate a limit between x and y, without barrier parameters."""
+        """Return the pairs that may violate a limit between x and y.
+
+        Args:
+            x: start positions (n, 4) [m]; column 3 is padding.
+            y: end positions (n, 4) [m]; column 3 is padding.
+            query: limits of the distances.
+            edges: True for edge-edge pairs, False for point-triangle pairs.
+
+        Returns:
+            Candidates with their distance scales, without stiffness and mollifier threshold.
+        """
         one, other = (self.edges, self.edges) if edges else (self.points, self.triangles)
         met = find_candidate_pairs(one, other, x, y, query)
         first = 0 if edges else len(met)

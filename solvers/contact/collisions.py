@@ -147,7 +147,14 @@ def gather_collisions(candidates, x, tile, slots, out):
 def compute_packet_distances(vertices, x, first, last, edges, limit, tile):
     """Return as bits which of eight pairs have |z|^2 below a limit.
 
-    The rows of the tile (9, 8) get c, z, |z|^2 and |u x v|^2. Lanes beyond `last` repeat that pair.
+    Args:
+        vertices: vertices of each pair (k, 4).
+        x: positions (n, 4) [m]; column 3 is padding.
+        first: first of the eight pairs.
+        last: last pair, which is repeated in lanes beyond it.
+        edges: True for edge-edge pairs, False for point-triangle pairs.
+        limit: limit of the squared distance [m^2].
+        tile: output (9, 8); its rows get c (4), z (3) [m], |z|^2 [m^2] and |u x v|^2 [m^4], 0 for point-triangle pairs.
     """
     a, b = gather_rows(x, vertices, first, last, 0), gather_rows(x, vertices, first, last, 1)
     c, d = gather_rows(x, vertices, first, last, 2), gather_rows(x, vertices, first, last, 3)
@@ -171,7 +178,21 @@ def compute_packet_distances(vertices, x, first, last, edges, limit, tile):
 
 @jit_inner
 def insert_collision(candidates, e, edges, tile, lane, slots, out, count):
-    """Add a pair if it is active, merging equal point-point and point-edge ones; return the new count."""
+    """Add a pair if it is active, merging equal point-point and point-edge ones.
+
+    Args:
+        candidates: candidate pairs.
+        e: index of the pair.
+        edges: whether it is an edge-edge pair.
+        tile: result of `compute_packet_distances` (9, 8).
+        lane: column of the pair in the tile.
+        slots: hash table (2^s,) of the indices of collisions, -1 for none; updated.
+        out: collisions; row `count` is written, or the stiffness of an earlier one increased.
+        count: number of collisions so far.
+
+    Returns:
+        The new number of collisions.
+    """
     scale = candidates.distance_scale[e]
     if scale < 1.0 and not tile[7, lane] < (scale * (candidates.min_distance + candidates.dhat)) ** 2:
         return count
@@ -236,9 +257,13 @@ def pad_positions(p: FloatArray) -> FloatArray:
 
 @jit_kernel
 def copy_padded(p, x):
-    """Copy positions p (n, 3) to x (n, 4), with a zero last column.
+    """Copy positions to padded ones, with a zero last column.
 
     NumPy takes seven times as long for such short rows.
+
+    Args:
+        p: positions (n, 3) [m].
+        x: output (n, 4) [m].
     """
     for i in range(len(p)):
         x[i, 0], x[i, 1], x[i, 2], x[i, 3] = p[i, 0], p[i, 1], p[i, 2], 0.0

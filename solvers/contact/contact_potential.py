@@ -131,7 +131,12 @@ class BarrierContact:
         return pressed + self.tangential_collisions.value(p) if len(self.tangential_collisions.vertices) else pressed
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N] at p (n, 3) to `out` (n, 3)."""
+        """Add the gradient, with that of friction.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: gradient (n, 3) [N], updated; unchanged if a coordinate of p is not finite.
+        """
         n, p = len(p), self.append_obstacle_positions(p)
         if not candidate_cache.has_no_active_collisions(self.collision_mesh, self.candidate_caches, p):
             if not np.isfinite(p).all():
@@ -159,7 +164,12 @@ class BarrierContact:
         return float(self.tangential_collisions.value(self.append_obstacle_positions(p)))
 
     def obstacle_work(self, p: Positions, start: Positions) -> ObstacleWork:
-        """Return the work of the obstacles in the step, by their forces at p (n, 3) [m]."""
+        """Return the work of the obstacles in the step, zero without obstacles.
+
+        Args:
+            p: positions (n, 3) [m] of the stage, whose forces act.
+            start: positions (n, 3) [m] at the step's start.
+        """
         return ObstacleWork()
 
     def hessian_blocks(self, p: Positions, negative_fraction: float = 1.0) -> PackedBlocks:
@@ -370,7 +380,16 @@ class ObstacleContact(BarrierContact):
         return np.concatenate([direction, np.zeros_like(self.current_positions)])
 
     def collision_free_step_size_moving(self, p: Positions, direction: Positions, start_fraction: float) -> float:
-        """Return the largest collision-free step size while the obstacles move to their end positions."""
+        """Return the largest collision-free step size while obstacles move to their end positions.
+
+        Args:
+            p: positions (n, 3) [m].
+            direction: displacements (n, 3) [m] over the remainder of the step.
+            start_fraction: fraction of their motion at which the obstacles start.
+
+        Returns:
+            Fraction of the remaining displacements, in [0, 1]; 0 if a gap is closed at p.
+        """
         there = self.at_fraction(start_fraction).current_positions
         displacement = np.concatenate([direction, self.end_positions - there])
         return candidate_cache.find_collision_free_step_size(
@@ -392,7 +411,12 @@ class ObstacleContact(BarrierContact):
         return self.comoving_map(*self.step_times, p)
 
     def obstacle_work(self, p: Positions, start: Positions) -> ObstacleWork:
-        """Return the work of the obstacles in the step, by their forces at p (n, 3) [m]."""
+        """Return the work of the obstacles from the step's start to its stage.
+
+        Args:
+            p: positions (n, 3) [m] of the stage, whose forces act.
+            start: not used; the displacements are those of the obstacle vertices.
+        """
         if self.start_positions is self.end_positions:
             return ObstacleWork()
         n, p, moved = len(p), self.append_obstacle_positions(p), self.end_positions - self.start_positions

@@ -52,7 +52,12 @@ class BVH(NamedTuple):
 
     @classmethod
     def from_primitives(cls, rest: Positions, corners: IndexArray) -> BVH:
-        """Build a tree over primitives (m, k) of a rest shape (n, 3) [m]."""
+        """Build a tree over the primitives of a rest shape.
+
+        Args:
+            rest: rest shape (n, 3) [m].
+            corners: vertices of each primitive (m, k), in any order.
+        """
         order, size = morton_order(rest[corners].mean(axis=1)), 0.0
         if len(corners):
             size = float(np.linalg.norm(np.ptp(rest[corners], axis=1), axis=1).mean())
@@ -158,7 +163,12 @@ def refit_aabbs(tree, x, y, boxes):
 
 @jit_kernel
 def propagate_bounds(boxes, num_primitives):
-    """Compute the boxes (nodes, 6, 8) of all inner nodes from those of the last level."""
+    """Compute the boxes of all inner nodes from those of the last level.
+
+    Args:
+        boxes: boxes (nodes, 6, 8) [m], updated; unused lanes of the last level get empty boxes at infinity.
+        num_primitives: number of boxes of the last level.
+    """
     last = len(boxes) - (num_primitives + 7) // 8
     boxes[:last, :3], boxes[:last, 3:] = np.inf, -np.inf
     for k in range(num_primitives, 8 * ((num_primitives + 7) // 8)):

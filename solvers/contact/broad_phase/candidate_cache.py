@@ -75,7 +75,15 @@ class CandidateSource(Protocol):
         ...
 
     def find_proximity_candidates(self, p: Positions, inflation_radius: float) -> Candidates:
-        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
+        """Return the pairs closer than a radius.
+
+        Args:
+            p: positions (n, 3) [m].
+            inflation_radius: radius [m], compared with unscaled distances.
+
+        Returns:
+            Candidates with their barrier parameters.
+        """
         ...
 
     def find_ccd_candidates(self, x: FloatArray, y: FloatArray, query: CollisionQuery, edges: bool) -> Candidates:
@@ -106,7 +114,13 @@ class CachedCandidates(NamedTuple):
 
     @classmethod
     def without_candidates(cls, source: CandidateSource, p: Positions, gaps: ClearanceBounds) -> CachedCandidates:
-        """Return a cache entry without pairs, with clearance bounds at p (n, 3)."""
+        """Return a cache entry without pairs.
+
+        Args:
+            source: primitives, whose distance limits the entry repeats.
+            p: positions (n, 3) [m], stored without a copy.
+            gaps: clearance bounds at p.
+        """
         none = np.empty(0)
         pairs = Candidates(np.empty((0, 4), np.int64), 0, none, none, none, source.min_distance, source.dhat)
         return cls(p, min(gaps), pairs, gaps.far_clearance)
@@ -117,7 +131,12 @@ class CachedCandidates(NamedTuple):
         return not len(self.candidates.vertices)
 
     def covers_positions(self, p: Positions, limit: float) -> bool:
-        """Return whether these include all pairs closer than a limit [m] at p (n, 3)."""
+        """Return whether these include all pairs closer than a limit.
+
+        Args:
+            p: positions (n, 3) [m].
+            limit: distance [m].
+        """
         if self.positions.shape != p.shape:
             return False
         moved = (
@@ -174,7 +193,16 @@ def _keeps_gaps_open(gap: float, displacements: tuple[float, float]) -> bool:
 
 
 def has_no_active_collisions(source: CandidateSource, caches: list[CachedCandidates], p: Positions) -> bool:
-    """Return whether no pair is known to be active at p (n, 3), by the caches alone."""
+    """Return whether no pair can be active, by the caches alone.
+
+    Args:
+        source: primitives, whose activation distance is the limit.
+        caches: cached candidates, of which only those without pairs are used.
+        p: positions (n, 3) [m].
+
+    Returns:
+        True if it is certain; False also where the caches do not cover p.
+    """
     limit = source.min_distance + source.dhat
     return any(one.is_empty and one.covers_positions(p, limit) for one in caches)
 

@@ -196,7 +196,14 @@ def max_cluster_displacement(vertices, pairs, rest_clusters, p, q, displacement,
 
 @jit_inner
 def store_vectors(v, tile, first, out):
-    """Store a vector packet in the rows of eight clusters."""
+    """Store a packet of vectors in the rows of eight clusters.
+
+    Args:
+        v: three packets, one for each coordinate.
+        tile: scratch of at least (3, 8).
+        first: first of the eight rows.
+        out: vectors (m, 4), of which the first three columns are updated.
+    """
     for axis in range(3):
         store_packet(v[axis], tile, 8 * axis)
     for lane in range(8):
@@ -218,7 +225,13 @@ def _scale_vector(t, v):
 
 @jit_inner
 def add_scaled(v, t, w):
-    """Return v + t w."""
+    """Return v + t w.
+
+    Args:
+        v: packet of vectors.
+        t: packet of factors.
+        w: packet of vectors.
+    """
     return v[0] + t * w[0], v[1] + t * w[1], v[2] + t * w[2]
 
 

@@ -68,7 +68,13 @@ def primitive_aabbs(corners, first, last, x):
 
 @jit_inner
 def store_aabbs(low, high, boxes, node):
-    """Store eight boxes in a node."""
+    """Store eight boxes in a node.
+
+    Args:
+        low, high: lower and upper corners [m], three packets each.
+        boxes: boxes of the tree (nodes, 6, 8) [m], updated.
+        node: index of the node.
+    """
     for axis in range(3):
         store_packet(low[axis], boxes, _NODE_STRIDE * node + 8 * axis)
         store_packet(high[axis], boxes, _NODE_STRIDE * node + 24 + 8 * axis)
@@ -108,7 +114,13 @@ def compute_aabb_clearance(
 
 @jit_kernel
 def compute_vertex_aabb(x, first, last, low, high):
-    """Write the smallest and largest coordinates (3,) of the rows `first` to `last` of x (n, 3)."""
+    """Write the smallest and largest coordinates of a range of vertices.
+
+    Args:
+        x: positions (n, 3) [m].
+        first, last: range of rows, without the last one.
+        low, high: outputs (3,) [m]; infinite for an empty range.
+    """
     low[:], high[:] = np.inf, -np.inf
     for i in range(first, last):
         for axis in range(3):
@@ -117,7 +129,12 @@ def compute_vertex_aabb(x, first, last, low, high):
 
 @jit_inner
 def merge_aabbs(boxes, num_boxes):
-    """Return the corners of the union of the first `num_boxes` boxes of a node (6, 8)."""
+    """Return the lower and upper corner of the union of boxes of a node.
+
+    Args:
+        boxes: boxes of the node (6, 8) [m].
+        num_boxes: number of leading boxes to unite.
+    """
     l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
     for k in range(num_boxes):
         l0, l1, l2 = min(l0, boxes[0, k]), min(l1, boxes[1, k]), min(l2, boxes[2, k])
@@ -181,19 +198,32 @@ def overlap_mask(boxes, end_boxes, node, low, high, lower, upper, query):
 
 @jit_inner
 def extract_aabb(boxes, slot):
-    """Return the lower and upper corner of one box of a node (6, 8)."""
+    """Return the lower and upper corner of one box of a node.
+
+    Args:
+        boxes: boxes of the node (6, 8) [m].
+        slot: column of the box.
+    """
     return (boxes[0, slot], boxes[1, slot], boxes[2, slot]), (boxes[3, slot], boxes[4, slot], boxes[5, slot])
 
 
 @jit_inner
 def componentwise_min(a, b):
-    """Return the componentwise minimum of packets of points."""
+    """Return the componentwise minimum of packets of points.
+
+    Args:
+        a, b: three packets each, one for each coordinate.
+    """
     return where(a[0] < b[0], a[0], b[0]), where(a[1] < b[1], a[1], b[1]), where(a[2] < b[2], a[2], b[2])
 
 
 @jit_inner
 def componentwise_max(a, b):
-    """Return the componentwise maximum of packets of points."""
+    """Return the componentwise maximum of packets of points.
+
+    Args:
+        a, b: three packets each, one for each coordinate.
+    """
     return where(a[0] > b[0], a[0], b[0]), where(a[1] > b[1], a[1], b[1]), where(a[2] > b[2], a[2], b[2])
 
 
@@ -205,7 +235,14 @@ def _union_width(x, y, low, high):
 
 @jit_inner
 def has_common_vertex(first, e, second, f):
-    """Return whether two primitives have a common vertex."""
+    """Return whether two primitives have a common vertex.
+
+    Args:
+        first: vertices of the primitives of one tree (m, k).
+        e: index of a primitive in `first`.
+        second: vertices of the primitives of the other tree (l, j).
+        f: index of a primitive in `second`.
+    """
     shared = False
     for a in range(first.shape[1]):
         for b in range(second.shape[1]):

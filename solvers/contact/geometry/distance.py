@@ -21,25 +21,42 @@ _PARALLEL_THRESHOLD = 1e-16
 
 @jit_inner
 def load_point(p, i):
-    """Return row i of p as three floats."""
+    """Return row i of p as three floats.
+
+    Args:
+        p: points, (n, 3) or padded (n, 4).
+        i: index of the row.
+    """
     return p[i, 0], p[i, 1], p[i, 2]
 
 
 @jit_inner
 def subtract3(a, b):
-    """Return a - b."""
+    """Return a - b.
+
+    Args:
+        a, b: three floats or packets each.
+    """
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @jit_inner
 def dot3(a, b):
-    """Return the dot product of a and b."""
+    """Return the dot product of a and b.
+
+    Args:
+        a, b: three floats or packets each.
+    """
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @jit_inner
 def cross3(a, b):
-    """Return the cross product of a and b."""
+    """Return the cross product of a and b.
+
+    Args:
+        a, b: three floats or packets each.
+    """
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
@@ -54,7 +71,15 @@ def _project_onto_edge(w, u):
 
 @jit_inner
 def point_triangle_closest_point(x, a, b, c):
-    """Return the coefficients c_1, c_2, c_3 of a point and a triangle."""
+    """Return the coefficients c_1, c_2, c_3 of a point and a triangle.
+
+    Args:
+        x: the point [m], three floats or packets.
+        a, b, c: corners of the triangle [m], likewise.
+
+    Returns:
+        Negative barycentric coordinates of the closest point, which add up to -1.
+    """
     u, v, w = subtract3(b, a), subtract3(c, a), subtract3(x, a)
     n = cross3(u, v)
     area = dot3(n, n)
@@ -74,7 +99,15 @@ def point_triangle_closest_point(x, a, b, c):
 
 @jit_inner
 def edge_edge_closest_point(a, b, c, d):
-    """Return s and t of the closest points of two edges, and |u x v|^2."""
+    """Return the places of the closest points on two edges.
+
+    Args:
+        a, b: ends of one edge [m], three floats or packets each.
+        c, d: ends of the other edge [m], likewise.
+
+    Returns:
+        s and t in [0, 1], from a to b and from c to d, and |u x v|^2 [m^4] of the edges u and v.
+    """
     u, v, w = subtract3(b, a), subtract3(d, c), subtract3(a, c)
     n = cross3(u, v)
     area = dot3(n, n)
@@ -97,14 +130,30 @@ def edge_edge_closest_point(a, b, c, d):
 
 @jit_inner
 def point_triangle_distance_vector(x, a, b, c):
-    """Return c_0 .. c_3 and the distance vector z of a point and a triangle."""
+    """Return the distance vector z from a triangle to a point.
+
+    Args:
+        x: the point x_0 [m], three floats or packets.
+        a, b, c: corners x_1, x_2, x_3 of the triangle [m], likewise.
+
+    Returns:
+        c_0, c_1, c_2, c_3 and z [m].
+    """
     c1, c2, c3 = point_triangle_closest_point(x, a, b, c)
     return 1.0 + 0.0 * c1, c1, c2, c3, _combine_vertices(x, a, b, c, c1, c2, c3)
 
 
 @jit_inner
 def edge_edge_distance_vector(a, b, c, d):
-    """Return c_0 .. c_3 and the distance vector z of two edges, and |u x v|^2."""
+    """Return the distance vector z from the second of two edges to the first.
+
+    Args:
+        a, b: ends x_0, x_1 of the first edge [m], three floats or packets each.
+        c, d: ends x_2, x_3 of the second edge [m], likewise.
+
+    Returns:
+        c_0, c_1, c_2, c_3, z [m] and |u x v|^2 [m^4] of the edges u and v.
+    """
     s, t, area = edge_edge_closest_point(a, b, c, d)
     return 1.0 - s, s, t - 1.0, 0.0 - t, _combine_vertices(a, b, c, d, s, t - 1.0, 0.0 - t), area
 
@@ -122,7 +171,13 @@ def _combine_vertices(o, i, j, k, c1, c2, c3):
 
 @jit_inner
 def compute_pair_distance(p, x, edges):
-    """Return the distance |z| of the pair with the vertices x (4,)."""
+    """Return the distance |z| [m] of a pair.
+
+    Args:
+        p: positions [m], (n, 3) or padded (n, 4).
+        x: vertices of the pair (4,).
+        edges: True for an edge-edge pair, False for a point-triangle pair.
+    """
     a, b, c, d = load_point(p, x[0]), load_point(p, x[1]), load_point(p, x[2]), load_point(p, x[3])
     z = edge_edge_distance_vector(a, b, c, d)[4] if edges else point_triangle_distance_vector(a, b, c, d)[4]
     return sqrt_packet(dot3(z, z))
