@@ -73,17 +73,42 @@ class ObstacleCollisionMesh:
     dhat: float
 
     def compute_clearance_bounds(self, p: Positions, q: Positions, query: CollisionQuery) -> ClearanceBounds | None:
-        """Return clearance bounds at q from one box around each side, or None."""
+        """Return clearance bounds at q from one box around each side.
+
+        Args:
+            p: start positions of all vertices (N, 3) [m], those of the mesh first.
+            q: end positions of all vertices (N, 3) [m].
+            query: limits of the distances.
+
+        Returns:
+            Clearance bounds; None if the boxes do not prove that no pair violates a limit.
+        """
         n = len(self.stiffness)
         clearance = aabb.compute_aabb_clearance((0, n), (n, len(p)), p, q, query)
         return ClearanceBounds(clearance, clearance) if clearance else None
 
     def max_relative_displacement(self, p: Positions, q: Positions) -> float:
-        """Return the largest relative displacement [m] of any two vertices."""
+        """Return the largest relative displacement of any two vertices.
+
+        Args:
+            p: start positions of all vertices, contiguous (N, 3) [m].
+            q: end positions of all vertices, contiguous (N, 3) [m].
+
+        Returns:
+            Upper bound [m].
+        """
         return ccd.max_relative_displacement(p, q)
 
     def find_proximity_candidates(self, p: Positions, inflation_radius: float) -> Candidates:
-        """Return the pairs closer than `inflation_radius` [m] at p (n, 3) [m]."""
+        """Return the pairs of both sides closer than a radius.
+
+        Args:
+            p: positions of all vertices (N, 3) [m], those of the mesh first.
+            inflation_radius: radius [m].
+
+        Returns:
+            Candidates with their barrier parameters.
+        """
         x, limits = pad_positions(p), CollisionQuery(inflation_radius, inflation_radius, 0.0, 0.0)
         one, two = (self.find_ccd_candidates(x, x, limits, edges) for edges in (False, True))
         pairs = one._replace(
@@ -102,7 +127,17 @@ class ObstacleCollisionMesh:
         )
 
     def find_ccd_candidates(self, x: FloatArray, y: FloatArray, query: CollisionQuery, edges: bool) -> Candidates:
-        """Return the pairs that may violate a limit on the displacement from x to y."""
+        """Return the pairs of both sides that may violate a limit between x and y.
+
+        Args:
+            x: start positions of all vertices (N, 4) [m], those of the mesh first; column 3 is padding.
+            y: end positions of all vertices (N, 4) [m]; column 3 is padding.
+            query: limits of the distances.
+            edges: True for edge-edge pairs, False for point-triangle pairs.
+
+        Returns:
+            Candidates with their barrier parameters; their stiffness is the mean over the vertices of the mesh.
+        """
         a, b = self.mesh, self.obstacles
         if edges:
             e, f = find_candidate_pairs(a.edges, b.edges, x, y, query).T

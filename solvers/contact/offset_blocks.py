@@ -50,7 +50,13 @@ class SurfaceAdjacency(NamedTuple):
 
     @classmethod
     def from_primitives(cls, edges: IndexArray, triangles: IndexArray, num_vertices: int) -> SurfaceAdjacency:
-        """Build the adjacency of edges (m, 2) and triangles (f, 3); triangles that repeat a vertex are edges."""
+        """Build the adjacency of edges and triangles.
+
+        Args:
+            edges: vertex indices (m, 2).
+            triangles: vertex indices (f, 3); those that repeat a vertex are edges, and ignored here.
+            num_vertices: number of vertices n.
+        """
         ends = np.concatenate([edges, edges[:, ::-1]])
         triangles = triangles[(np.diff(np.sort(triangles, axis=1), axis=1) > 0).all(axis=1)]
         corners = np.concatenate([np.roll(triangles, -k, axis=1) for k in range(3)])

@@ -63,7 +63,15 @@ def require_device(solver: str) -> Any:
 
 
 def require_memory(solver: str, needed: float) -> None:
-    """Raise Unsupported if the device has fewer free bytes than needed."""
+    """Check that the device has enough free memory.
+
+    Args:
+        solver: name of the solver, for the message.
+        needed: memory that it needs [bytes].
+
+    Raises:
+        Unsupported: the device has fewer free bytes.
+    """
     if is_simulated():
         return
     left, _ = import_module("numba.cuda").current_context().get_memory_info()

@@ -37,23 +37,48 @@ class DeviceStream:
         self.cuda_stream: Any = cuda.stream()
 
     def upload_array(self, array: NDArray[Any], dtype: Any = None) -> Any:
-        """Copy a host array to the device."""
+        """Copy a host array to a new device array.
+
+        Args:
+            array: array on the host, of any shape.
+            dtype: type of the device array; that of the host array if omitted.
+        """
         return cuda.to_device(np.ascontiguousarray(array, dtype), stream=self.cuda_stream)
 
     def overwrite_array(self, array: NDArray[Any], device_array: Any) -> None:
-        """Copy a host array to an existing device array of the same shape and type."""
+        """Copy a host array to an existing device array.
+
+        Args:
+            array: array on the host, whose values are converted to the type of the device array.
+            device_array: destination of the same shape.
+        """
         device_array.copy_to_device(np.ascontiguousarray(array, device_array.dtype), stream=self.cuda_stream)
 
     def copy_array(self, array: Any, device_array: Any) -> None:
-        """Copy a device array to another one of the same shape and type."""
+        """Copy a device array to another one of the same shape and type.
+
+        Args:
+            array: source on the device.
+            device_array: destination.
+        """
         device_array.copy_to_device(array, stream=self.cuda_stream)
 
     def allocate_array(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
-        """Allocate an uninitialised device array."""
+        """Allocate an uninitialised device array.
+
+        Args:
+            shape: number of entries along each axis.
+            dtype: NumPy type of the entries.
+        """
         return cuda.device_array(shape, dtype, stream=self.cuda_stream)
 
     def allocate_zeros(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
-        """Allocate a device array of zeros."""
+        """Allocate a device array of zeros.
+
+        Args:
+            shape: number of entries along each axis.
+            dtype: NumPy type of the entries.
+        """
         return self.upload_array(np.zeros(shape, dtype))
 
     def download_array(self, device_array: Any) -> NDArray[Any]:
@@ -87,7 +112,15 @@ class ReusedUploads:
         self._next = 0
 
     def upload_array(self, array: NDArray[Any], dtype: Any = None) -> Any:
-        """Copy a host array to the device, over that of the last step."""
+        """Copy a host array to the device, over the one of the last step.
+
+        Args:
+            array: array on the host, of any shape.
+            dtype: type of the device array; that of the host array if omitted.
+
+        Returns:
+            The device array, which the next step overwrites.
+        """
         array, position = np.ascontiguousarray(array, dtype), self._next
         self._next += 1
         known = self._arrays[position] if position < len(self._arrays) else None

@@ -267,7 +267,12 @@ class HalfSpaceContact:
         return 0.5 * float(pressed) + float(self.active_planes.friction_limit[friction.planes] @ friction.smoothed)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N] at p to `out`, (n, 3) each."""
+        """Add the gradient, with that of friction.
+
+        Args:
+            p: positions (n, 3) [m].
+            out: gradient (n, 3) [N], updated.
+        """
         if self.has_no_active_collisions():
             return
         planes, gap = self.active_planes, self.compute_gaps(p)

@@ -75,7 +75,12 @@ def _tangential_displacement(s, k, x):
 
 @jit_inner
 def half_space_energy(s, p):
-    """Return the half-spaces' energy [J] at positions in rows of four; 0 without half-spaces."""
+    """Return the half-spaces' energy [J].
+
+    Args:
+        s: half-spaces; None for none, whose energy is 0.
+        p: flat positions [m], four numbers for each row, of which the last one is padding.
+    """
     if s is None:
         return 0.0
     total = 0.0
@@ -128,9 +133,22 @@ def _add_outer_product(block, weight, n0, n1, n2):
 
 @jit_inner
 def add_half_spaces(s, i, x, d, level, gradient, block):
-    """Add active half-spaces and friction at x, or after a step d, to gradient and block.
+    """Add the half-spaces of a row to its gradient and block.
 
-    Returns the active set as bits.
+    Included are those active at x or after a step d, or all if they are two-sided or with the full majorant, and all
+    friction.
+
+    Args:
+        s: half-spaces.
+        i: index of the row.
+        x: position [m], three numbers.
+        d: step [m], three numbers.
+        level: kind of block, from `EXACT_BLOCK` to `_FULL_MAJORANT`.
+        gradient: three numbers [N].
+        block: upper triangle by rows, six numbers [N/m].
+
+    Returns:
+        The new gradient and block, and the included half-spaces of the row as bits.
     """
     mask = 0
     for k in range(s.row_starts[i], s.row_starts[i + 1]):
@@ -154,7 +172,15 @@ def add_half_spaces(s, i, x, d, level, gradient, block):
 
 @jit_inner
 def solve_block(block, g):
-    """Return -B^-1 g, and whether B is positive definite."""
+    """Solve a block for the step -B^-1 g.
+
+    Args:
+        block: upper triangle of B by rows, six numbers [N/m].
+        g: gradient [N], three numbers.
+
+    Returns:
+        The step [m], three numbers, and whether B is positive definite; the step is zero if it is not.
+    """
     a, b, c, d, e, f = block
     least = _PIVOT_ROUNDOFF * (a + d + f)
     if not a > least:
@@ -198,7 +224,18 @@ def _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load):
 
 @jit_inner
 def add_half_space_change(s, i, x, d, total):
-    """Add to a change that of the half-spaces' energy [J] by a step d of row i from x."""
+    """Add the change of the half-spaces' energy by a step of a row.
+
+    Args:
+        s: half-spaces.
+        i: index of the row.
+        x: position [m], three numbers.
+        d: step [m], three numbers.
+        total: change of the other energies [J].
+
+    Returns:
+        Total change [J].
+    """
     end = x[0] + d[0], x[1] + d[1], x[2] + d[2]
     for k in range(s.row_starts[i], s.row_starts[i + 1]):
         n0, n1, n2 = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2]

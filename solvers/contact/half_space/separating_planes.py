@@ -118,7 +118,23 @@ def build_separating_planes(p, v, dt, frames, obstacle, margin, out, work):
 
 @jit_inner
 def write_separating_plane(p, v, i, dt, frames, obstacle, margin, out, row_index, work):
-    """Return whether vertex i may reach an obstacle; if so, write its half-space to row `row_index` of `out`."""
+    """Write the half-space of one vertex, if it may reach an obstacle.
+
+    Args:
+        p: positions (n, 3) [m].
+        v: velocities (n, 3) [m/s].
+        i: index of the vertex.
+        dt: time step [s].
+        frames: frame at the step's start and end, (2, 4, 3).
+        obstacle: rounded box in its frame.
+        margin: distance [m], in addition to twice its displacement, beyond which a vertex gets no half-space.
+        out: separating planes, of which all but `vertices` are written.
+        row_index: row of `out`.
+        work: scratch (5, 3).
+
+    Returns:
+        Whether the vertex may reach the obstacle; otherwise `out` is unchanged.
+    """
     _, normal, offset, carried = out
     a, b, x, c, n = work[0], work[1], work[2], work[3], work[4]
     first, second, travel = frames[0], frames[1], 0.0

@@ -39,14 +39,24 @@ def clamped_distance(gap):
 
 @jit_inner
 def compute_distance_and_gap(collisions, k):
-    """Return the distance d [m] of a collision, and the relative gap (d - t)/r."""
+    """Return the distance d [m] of a collision, and its relative gap (d - t)/r.
+
+    Args:
+        collisions: active collisions.
+        k: index of the collision; t and r are scaled by its `distance_scale`.
+    """
     z0, z1, z2 = collisions.distance_vector[k, 0], collisions.distance_vector[k, 1], collisions.distance_vector[k, 2]
     d = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
     return d, (d / collisions.distance_scale[k] - collisions.min_distance) / collisions.dhat
 
 
 def compute_distances(candidates: Candidates, p: FloatArray) -> FloatArray:
-    """Return the distance [m] of each candidate pair at p (n, 3) [m]."""
+    """Return the unscaled distance [m] of each candidate pair, (k,).
+
+    Args:
+        candidates: candidate pairs.
+        p: positions [m], (n, 3) or padded (n, 4).
+    """
     out = np.empty(len(candidates.vertices))
     _write_distances(candidates.vertices, candidates.num_point_triangle, p, out)
     return out
@@ -105,7 +115,12 @@ def _add_scaled_row(out, i, c, g0, g1, g2):
 
 @jit_kernel
 def compute_normal_forces(collisions, out):
-    """Write the normal forces -f' [N] of collisions to `out` (a,)."""
+    """Compute the normal forces -f' of collisions.
+
+    Args:
+        collisions: active collisions.
+        out: output (a,) [N].
+    """
     for k in range(len(collisions.vertices)):
         gap, m = compute_distance_and_gap(collisions, k)[1], 1.0
         if collisions.mollifier_threshold[k] > 0.0:

@@ -86,6 +86,11 @@ def collect_block_vertices(
     """Return the block vertices (a, 4) of collisions and friction.
 
     Missing vertices, and those beyond the first n, are -1.
+
+    Args:
+        collisions: active collisions, which come first.
+        tangential_collisions: friction.
+        n: number of vertices that move.
     """
     met = np.where(np.arange(4) < collisions.kind[:, None], collisions.vertices, -1)
     return mask_static_vertices(met, tangential_collisions, n)
@@ -94,7 +99,16 @@ def collect_block_vertices(
 def mask_static_vertices(
     vertices: NDArray[np.int64], tangential_collisions: TangentialCollisions, n: int
 ) -> NDArray[np.int64]:
-    """Return vertices (a, 4) followed by those of friction; -1 for those beyond the first n."""
+    """Return vertices followed by those of friction; -1 for those that do not move.
+
+    Args:
+        vertices: vertices of blocks (a, 4), -1 for none.
+        tangential_collisions: friction of g collisions.
+        n: number of vertices that move, which are the first ones.
+
+    Returns:
+        Vertices (a + g, 4).
+    """
     both = np.concatenate([vertices, tangential_collisions.vertices])
     return np.where(both < n, both, -1)
 
@@ -133,9 +147,15 @@ def add_barrier_hessian(
 
 @jit_kernel
 def write_barrier_hessian(collisions, p, negative_fraction, starts, scratch, out):
-    """Write the Hessian block of each collision at p (n, 3) to `out`.
+    """Write the Hessian block of each collision.
 
-    starts: first entry of each block; scratch (4, 16): zero initially.
+    Args:
+        collisions: active collisions.
+        p: positions (n, 3) [m].
+        negative_fraction: fraction of the negative curvature to include.
+        starts: first entry of each block, and the end of the last one, (a + 1,).
+        scratch: (4, 16), zero initially.
+        out: packed blocks [N/m], with room for eight entries beyond the last block.
     """
     for k in range(len(collisions.vertices)):
         _write_hessian_block(collisions, k, p, negative_fraction, scratch, out[starts[k] :])
@@ -180,9 +200,14 @@ class HessianWeights(NamedTuple):
 
 @jit_inner
 def compute_hessian_weights(collisions, k, p, negative_fraction, scratch):
-    """Return the Hessian weights of collision k at p (n, 3).
+    """Return the Hessian weights of a collision.
 
-    The vectors g, m, b1 and b2 are written to the rows of scratch, of 12 numbers or more.
+    Args:
+        collisions: active collisions.
+        k: index of the collision.
+        p: positions (n, 3) [m].
+        negative_fraction: fraction of the negative curvature to include.
+        scratch: output of four rows of 12 numbers or more, the vectors g, m, b1 and b2.
     """
     x, kind = collisions.vertices[k], collisions.kind[k]
     many = min(kind, 4)
@@ -225,7 +250,13 @@ def compute_hessian_weights(collisions, k, p, negative_fraction, scratch):
 
 @jit_inner
 def compute_row_weights(terms, scratch, r):
-    """Return the factors of g, m, b1 and b2 in row r of the block."""
+    """Return the factors of g, m, b1 and b2 in a row of the block.
+
+    Args:
+        terms: Hessian weights of the collision.
+        scratch: vectors g, m, b1 and b2 in its rows, by `compute_hessian_weights`.
+        r: row of the block, 3 i + a for coordinate a of vertex i.
+    """
     g, dc = scratch[_G, r], scratch[_DC, r]
     tangent_1, tangent_2 = (
         terms.first_tangent * scratch[_FIRST_TANGENT, r],
@@ -241,7 +272,14 @@ def compute_row_weights(terms, scratch, r):
 
 @jit_inner
 def combine_row_terms(weights, g, dc, first, second):
-    """Return one entry of the row, or a packet of eight consecutive ones."""
+    """Return one entry of a row, or a packet of eight consecutive ones.
+
+    The isotropic term and the rotation of edges are excluded.
+
+    Args:
+        weights: factors of g, m, b1 and b2 in the row, by `compute_row_weights`.
+        g, dc, first, second: entries of g, m, b1 and b2 in the columns, a float or a packet each.
+    """
     along, mixed, tangent_1, tangent_2 = weights
     return (along * g + mixed * dc) - (tangent_1 * first + tangent_2 * second)
 

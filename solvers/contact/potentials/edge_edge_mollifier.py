@@ -33,7 +33,12 @@ class EdgeCrossProduct(NamedTuple):
 
 @jit_inner
 def compute_edge_cross_product(p, x):
-    """Return the cross product data of two edges with the vertices x (4,)."""
+    """Return the cross product data of two edges.
+
+    Args:
+        p: positions (n, 3) [m].
+        x: vertices of both edges (4,).
+    """
     a, b, c, d = x[0], x[1], x[2], x[3]
     u0, u1, u2 = p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
     v0, v1, v2 = p[d, 0] - p[c, 0], p[d, 1] - p[c, 1], p[d, 2] - p[c, 2]
@@ -44,7 +49,12 @@ def compute_edge_cross_product(p, x):
 
 @jit_inner
 def edge_edge_mollifier(c, e):
-    """Return m and its first two derivatives with respect to c."""
+    """Return m and its first two derivatives with respect to c.
+
+    Args:
+        c: |u x v|^2 [m^4].
+        e: threshold of c [m^4], above 0.
+    """
     if not c < e:
         return 1.0, 0.0, 0.0
     return (2.0 - c / e) * c / e, 2.0 * (1.0 - c / e) / e, -2.0 / (e * e)
@@ -111,7 +121,17 @@ def add_edge_rotation_hessian(edges, weight, negative_fraction, H):
 
 @jit_inner
 def compute_edge_rotation_entries(edges, weight, negative_fraction, a, b):
-    """Return entry (a, b) of the diagonal blocks of both edges' ends."""
+    """Return entry (a, b) of the diagonal blocks of both edges' ends.
+
+    Args:
+        edges: cross product data of both edges.
+        weight: 2 f m'.
+        negative_fraction: included fraction of the negative curvature.
+        a, b: coordinates of the row and of the column.
+
+    Returns:
+        The entry for the ends of the first edge, and that for the ends of the second one [N/m].
+    """
     u, v, uu, _, vv, c = edges
     w, rest, same = np.sqrt(c), 1.0 - negative_fraction, 1.0 if a == b else 0.0
     more_u, more_v = rest * w * np.sqrt(vv / uu), rest * w * np.sqrt(uu / vv)

@@ -73,7 +73,12 @@ class TangentialCollisions(NamedTuple):
         return friction_energy(self, p)
 
     def add_gradient(self, p: Positions, out: Positions) -> None:
-        """Add the gradient [N] at p (n, 3) to `out`."""
+        """Add the gradient of friction.
+
+        Args:
+            p: positions of all vertices (n, 3) [m].
+            out: gradient (n, 3) [N], updated.
+        """
         add_friction_gradient(self, p, out)
 
     def hessian_blocks(self, p: Positions) -> PackedBlocks:
@@ -86,13 +91,27 @@ class TangentialCollisions(NamedTuple):
 
 @jit_inner
 def combine_coordinate(x, c, p, axis):
-    """Return sum_i c_i p_i [m] along an axis."""
+    """Return sum_i c_i p_i [m] along an axis.
+
+    Args:
+        x: vertices of the collision (4,).
+        c: coefficients (4,).
+        p: positions (n, 3) [m].
+        axis: coordinate, 0 to 2.
+    """
     return c[0] * p[x[0], axis] + c[1] * p[x[1], axis] + c[2] * p[x[2], axis] + c[3] * p[x[3], axis]
 
 
 @jit_kernel
 def combine_positions(vertices, weights, p, out):
-    """Write sum_i c_i p_i [m] of each collision to `out`."""
+    """Compute sum_i c_i p_i of each collision.
+
+    Args:
+        vertices: vertices of each collision (g, 4).
+        weights: coefficients c (g, 4).
+        p: positions (n, 3) [m].
+        out: output (g, 3) [m].
+    """
     for e in range(len(vertices)):
         for axis in range(3):
             out[e, axis] = combine_coordinate(vertices[e], weights[e], p, axis)
@@ -100,7 +119,13 @@ def combine_positions(vertices, weights, p, out):
 
 @jit_inner
 def tangential_displacement(tangential_collisions, p, e):
-    """Return the tangential displacement u and |u| [m] of collision e."""
+    """Return the tangential displacement u, three numbers, and |u| [m] of a collision.
+
+    Args:
+        tangential_collisions: collisions with friction.
+        p: positions (n, 3) [m].
+        e: index of the collision.
+    """
     x, c, n = tangential_collisions.vertices[e], tangential_collisions.coefficients[e], tangential_collisions.normal[e]
     u0, u1, u2 = project_tangentially(
         combine_coordinate(x, c, p, 0) - tangential_collisions.friction_anchor[e, 0],
@@ -113,7 +138,13 @@ def tangential_displacement(tangential_collisions, p, e):
 
 @jit_inner
 def slip_direction(u0, u1, u2, length, smoothing_length):
-    """Return u/|u| of a collision that slips, and zero of one that sticks."""
+    """Return u/|u| of a collision that slips, and zero of one that sticks.
+
+    Args:
+        u0, u1, u2: tangential displacement u [m].
+        length: |u| [m].
+        smoothing_length: s [m], up to which a collision sticks.
+    """
     if length <= smoothing_length:
         return 0.0, 0.0, 0.0
     return u0 / length, u1 / length, u2 / length
@@ -121,7 +152,12 @@ def slip_direction(u0, u1, u2, length, smoothing_length):
 
 @jit_kernel
 def friction_energy(tangential_collisions, p):
-    """Return the friction energy [J] at p (n, 3)."""
+    """Return the friction energy [J].
+
+    Args:
+        tangential_collisions: collisions with friction.
+        p: positions (n, 3) [m].
+    """
     total, s = 0.0, tangential_collisions.smoothing_length
     for e in range(len(tangential_collisions.vertices)):
         length = tangential_displacement(tangential_collisions, p, e)[3]
@@ -131,7 +167,13 @@ def friction_energy(tangential_collisions, p):
 
 @jit_kernel
 def add_friction_gradient(tangential_collisions, p, out):
-    """Add the friction gradient [N] at p (n, 3) to `out`."""
+    """Add the friction gradient.
+
+    Args:
+        tangential_collisions: collisions with friction.
+        p: positions (n, 3) [m].
+        out: gradient (n, 3) [N], updated.
+    """
     for e in range(len(tangential_collisions.vertices)):
         u0, u1, u2, length = tangential_displacement(tangential_collisions, p, e)
         w = friction_stiffness(tangential_collisions.friction_limit[e], length, tangential_collisions.smoothing_length)
@@ -144,7 +186,13 @@ def add_friction_gradient(tangential_collisions, p, out):
 
 @jit_kernel
 def write_friction_hessian(tangential_collisions, p, out):
-    """Write the packed Hessian block of each collision at p (n, 3) to `out`."""
+    """Write the packed Hessian block of each collision.
+
+    Args:
+        tangential_collisions: collisions with friction.
+        p: positions (n, 3) [m].
+        out: blocks of `BLOCK_ENTRIES` numbers each, (90 g,) [N/m].
+    """
     for e in range(len(tangential_collisions.vertices)):
         n, c, H = (
             tangential_collisions.normal[e],

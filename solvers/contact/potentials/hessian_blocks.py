@@ -56,7 +56,12 @@ class PackedBlocks(NamedTuple):
 
     @classmethod
     def from_dense(cls, vertices: NDArray[np.int64], values: FloatArray) -> PackedBlocks:
-        """Build packed blocks from symmetric blocks (a, 12, 12) of vertices (a, 4)."""
+        """Build packed blocks from symmetric dense ones.
+
+        Args:
+            vertices: vertices of each block (a, 4); -1 for none.
+            values: blocks (a, 12, 12) [N/m]; each row is read up to the end of its diagonal block.
+        """
         row, column = np.nonzero(np.arange(12) // 3 <= np.arange(12)[:, None] // 3)
         return cls(vertices, BLOCK_ENTRIES * np.arange(len(vertices) + 1), np.ravel(values[:, row, column]))
 
@@ -89,17 +94,32 @@ class PackedBlocks(NamedTuple):
         return csr_array(coo_array((values[own], (rows[own], columns[own])), shape=(3 * n, 3 * n)))
 
     def add_product(self, x: Positions, out: Positions) -> None:
-        """Add the product with x (n, 3) to `out` (n, 3)."""
+        """Add the product with vectors.
+
+        Args:
+            x: vectors (n, 3).
+            out: product (n, 3), updated.
+        """
         multiply_blocks(*self, x, out)
 
     def add_blocks(self, block_indices: NDArray[np.int64], values: FloatArray) -> None:
-        """Add the blocks to `values` (b, 3, 3), at block indices (a, 16); -1 for none."""
+        """Add the blocks to existing 3x3 blocks.
+
+        Args:
+            block_indices: target block of each vertex pair, (a, 16); -1 for none.
+            values: blocks (b, 3, 3) [N/m], updated.
+        """
         scatter_blocks(self.block_starts, self.packed, block_indices, values)
 
 
 @jit_inner
 def row_offset(i, a):
-    """Return the offset of row a of vertex i."""
+    """Return the offset of a row in a packed block.
+
+    Args:
+        i: vertex of the row in the block, 0 to 3.
+        a: coordinate of the row, 0 to 2.
+    """
     return 9 * i * (i + 1) // 2 + 3 * a * (i + 1)
 
 
@@ -111,14 +131,27 @@ def count_block_vertices(numbers):
 
 @jit_kernel
 def scatter_blocks(starts, packed, block_indices, values):
-    """Add packed blocks to `values` (b, 3, 3), at block indices (a, 16); -1 for none."""
+    """Add packed blocks to existing 3x3 blocks.
+
+    Args:
+        starts: first entry of each block, and the end of the last one, (a + 1,).
+        packed: entries of the blocks [N/m].
+        block_indices: target block of each vertex pair, (a, 16); -1 for none.
+        values: blocks (b, 3, 3) [N/m], updated.
+    """
     for k in range(len(block_indices)):
         add_block_at(packed[starts[k] : starts[k + 1]], block_indices[k], values)
 
 
 @jit_inner
 def add_block_at(H, block_indices, values):
-    """Add one packed block H to `values` (b, 3, 3), at block indices (16,); -1 for none."""
+    """Add one packed block to existing 3x3 blocks.
+
+    Args:
+        H: packed block [N/m] of two, three or four vertices: 27, 54 or 90 entries.
+        block_indices: target block of each vertex pair (i, j) at 4 i + j, (16,); -1 for none.
+        values: blocks (b, 3, 3) [N/m], updated.
+    """
     for i in range(count_block_vertices(len(H))):
         for j in range(i + 1):
             at, across = block_indices[4 * i + j], block_indices[4 * j + i]
@@ -138,7 +171,13 @@ def add_block_at(H, block_indices, values):
 
 @jit_kernel
 def expand_blocks(starts, packed, out):
-    """Write packed blocks to the leading parts of dense blocks `out` (a, 12, 12)."""
+    """Expand packed blocks to the leading parts of dense ones.
+
+    Args:
+        starts: first entry of each block, and the end of the last one, (a + 1,).
+        packed: entries of the blocks [N/m].
+        out: dense blocks (a, 12, 12) [N/m]; entries of missing vertices are not written.
+    """
     for k in range(len(out)):
         H = packed[starts[k] : starts[k + 1]]
         for i in range(count_block_vertices(len(H))):

@@ -16,7 +16,12 @@ from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 
 @jit_inner
 def offset_force(d, radius):
-    """Return -g'(d) and g''(d) at a positive distance d [m]."""
+    """Return -g'(d) [m] and g''(d), per stiffness.
+
+    Args:
+        d: distance [m], above 0.
+        radius: contact radius r [m].
+    """
     if d >= radius:
         return 0.0, 0.0
     if 2.0 * d >= radius:
