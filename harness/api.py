@@ -98,7 +98,10 @@ def make_scene(
         folder: folder of the files that the scene names.
         name: name of the scene in messages.
         fields: other keys of a scene file.
-    Returns: the validated scene.
+
+    Returns:
+        The validated scene.
+
     Raises:
         InputError: for any mistake in the scene.
 
@@ -163,7 +166,9 @@ class Simulation:
             rtol: relative tolerance of a step; None performs all iterations.
             initial_guess: initial guess of a step; the scene's default if omitted.
             parameters: parameters of a solver that is given by name.
-        Raises: InputError, and the errors of the solver's preparation.
+
+        Raises:
+            InputError, and the errors of the solver's preparation.
         """
         size = size if size is not None else scene.default_size
         self._spec, self._scene = scene, build_scene(scene, size or 0, integrator)
@@ -263,7 +268,10 @@ def run_config(
         folder: folder of the scenes and the code that a mapping names.
         results: folder that contains a results folder for each sweep.
         rerun: whether to repeat runs that have results.
-    Returns: the rows, a pandas DataFrame.
+
+    Returns:
+        The rows, a pandas DataFrame.
+
     Raises:
         InputError: for any mistake in the config.
 
@@ -320,7 +328,8 @@ def _to_plain_data(value: Any, at: ConfigKey = ()) -> Any:
 def load_rows(folder: str | Path) -> Any:
     """Load the rows of a sweep's results folder, such as "results/quickstart"; raise InputError.
 
-    Returns: a pandas DataFrame; the columns are described in configs/reference/columns.md.
+    Returns:
+        A pandas DataFrame; the columns are described in configs/reference/columns.md.
 
     Example:
         >>> rows = springbench.load_rows("results/small")
@@ -367,8 +376,9 @@ class RunRecording(RecordingReplay):
 def open_recording(path: str | Path) -> RunRecording:
     """Open a recording, of which a notebook displays the picture; raise InputError if it cannot be read.
 
-    Returns: times (k,) [s], positions (k, n, 3) [m] relative to `origin` (3,), springs and scalars. Its method
-    `absolute_positions(k)` adds the origin in double precision.
+    Returns:
+        Times (k,) [s], positions (k, n, 3) [m] relative to `origin` (3,), springs and scalars. Its method
+        `absolute_positions(k)` adds the origin in double precision.
 
     Example:
         >>> path = sorted(Path("results/small/recordings").glob("chain-5-newton-*.rrd"))[0]
@@ -388,7 +398,10 @@ def view_recording(path: str | Path, *, width: int | Literal["auto"] = "auto", h
         path: path of the recording.
         width: width in pixels, or "auto" for that of the cell.
         height: height in pixels.
-    Returns: the viewer, which a notebook displays at the end of a cell.
+
+    Returns:
+        The viewer, which a notebook displays at the end of a cell.
+
     Raises:
         InputError: if the recording cannot be read, or the extra `notebook` is not installed.
 
@@ -429,6 +442,7 @@ def draw_picture(source: str | Path | RecordingReplay | Mapping[str, str | Path 
 
     Args:
         source: a recording or its path, or a mapping of names to these.
+
     Raises:
         InputError: if a recording cannot be read.
         RunFailed: if the system cannot draw.

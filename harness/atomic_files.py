@@ -62,7 +62,10 @@ def open_lock_file(path: Path, access: int = os.O_RDWR, *, hint: str = "") -> in
         path: lock file.
         access: flag of `os.open`, for reading or writing.
         hint: alternative to removing the file, appended to the error message.
-    Returns: file descriptor.
+
+    Returns:
+        File descriptor.
+
     Raises:
         InputError: if something else is at this path.
     """
@@ -158,7 +161,9 @@ def describe_misnamed_file(head: bytes, size: int) -> str:
     Args:
         head: first HEAD_BYTES bytes of the file.
         size: size of the file [bytes].
-    Returns: the end of a sentence for an empty file, a Git LFS pointer or a web page; "" for any other file.
+
+    Returns:
+        The end of a sentence for an empty file, a Git LFS pointer or a web page; "" for any other file.
     """
     start = head.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
     if not start and size <= len(head):

@@ -56,7 +56,9 @@ def split_wide_table(table: Table, key_columns: int = 1, width: int = CONSOLE_WI
         table: table to split.
         key_columns: number of leading columns that each part repeats.
         width: maximum width, in characters.
-    Returns: the parts, followed by the caption.
+
+    Returns:
+        The parts, followed by the caption.
     """
     from rich.console import Console, Group
     from rich.constrain import Constrain

@@ -75,7 +75,9 @@ def suggest_name(got: object, allowed: Iterable[str]) -> str:
     Args:
         got: name that the user gave.
         allowed: valid names.
-    Returns: `one of a, b, c; did you mean 'b'?`, as the end of a message.
+
+    Returns:
+        `one of a, b, c; did you mean 'b'?`, as the end of a message.
     """
     names = sorted(allowed)
     near = difflib.get_close_matches(str(got), names, n=1)

@@ -96,6 +96,7 @@ def expand_studies(
         fields: validated fields of the config.
         scenes: scenes by name.
         solvers: solvers of the config.
+
     Raises:
         InputError: for all mistakes.
     """

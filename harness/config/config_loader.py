@@ -104,7 +104,10 @@ def read_config(
         path: YAML file; or JSON file of an assignment, whose document is empty.
         kinds: expected kinds.
         policy: policy for code that the config names.
-    Returns: its kind, and its document.
+
+    Returns:
+        Its kind, and its document.
+
     Raises:
         InputError: if it cannot be read, or is of another kind.
     """
@@ -159,6 +162,7 @@ def load_config(
         sizes: mesh sizes; the scene's default if empty.
         imports_code: whether user code is tried first in a worker process. Otherwise its parameters are not checked.
         options: options of `springbench.harness.config.sweep_config.SweepOptions`; None corresponds to null in a sweep.
+
     Raises:
         InputError: for all mistakes.
     """

@@ -44,7 +44,9 @@ def resolve_scene_path(name: str, folder: Path) -> Path:
     Args:
         name: path of a file, relative to the folder; or name of a shipped scene.
         folder: folder of the config.
-    Returns: the path, which does not exist for a name that is neither.
+
+    Returns:
+        The path, which does not exist for a name that is neither.
     """
     path = folder / name
     return path if path.is_file() else find_shipped_scene(name) or path
@@ -61,6 +63,7 @@ def locate_config(name: str | Path) -> Path:
 
     Args:
         name: path of a file; or name of a shipped config, if there is no such file.
+
     Raises:
         InputError: for a name without a suffix that is neither.
     """

@@ -54,7 +54,9 @@ def resolve_tag(
         data: value that should be a mapping.
         tag: key that selects the name, such as `kind`.
         at: location of the data in the document.
-    Returns: (name, other keys), or None after a mistake was added.
+
+    Returns:
+        (name, other keys), or None after a mistake was added.
     """
     if is_mapping(data) and isinstance(data.get(tag), str):
         try:
@@ -101,7 +103,10 @@ def load_in_sandbox(
         find_plugins: lists the user code of a loaded config.
         read_metadata: reads metadata by solver, where the classes are imported.
         limits: limits of the trial for a loaded config.
-    Returns: the loaded config.
+
+    Returns:
+        The loaded config.
+
     Raises:
         InputError: for a mistake, or if the worker process fails.
     """

@@ -32,7 +32,9 @@ def locate_error(error: BaseException, user_files: Collection[str]) -> str:
     Args:
         error: exception with a traceback.
         user_files: paths of the user's source files.
-    Returns: the location, such as `mine.py:12, raised in core.py:40`.
+
+    Returns:
+        The location, such as `mine.py:12, raised in core.py:40`.
     """
     frames = [(frame.filename, frame.lineno or 0) for frame in traceback.extract_tb(error.__traceback__)]
     theirs = [frame for frame in frames if not source_digest.is_known_source(frame[0])]
@@ -46,7 +48,8 @@ def parse_fault_location(dump: str) -> str:
 
     The dump lists the innermost frame first. The first frame in user code is preferred, else the first frame is used.
 
-    Returns: the location, or "" if the dump has no frames.
+    Returns:
+        The location, or "" if the dump has no frames.
     """
     frames = re.findall(r'File "(.+?)", line (\d+) in (\S+)', dump)
     if not frames:

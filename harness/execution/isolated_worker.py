@@ -113,7 +113,10 @@ class IsolatedWorker:
             tick: progress callback.
             limits: wall time and memory.
             background_call: called once in this process after the task was submitted.
-        Returns: the task's value.
+
+        Returns:
+            The task's value.
+
         Raises:
             SpringbenchError: if the task raises it.
             TaskFailure: if the task returns no result.
@@ -143,8 +146,12 @@ class IsolatedWorker:
             limits: wall time and memory.
             user_code: user code that the task runs. A worker that has run user code is replaced before a task without
                 that code.
-        Returns: generator that yields the connection to wait for, and returns the task's value.
-        Raises: as `run_task`.
+
+        Returns:
+            Generator that yields the connection to wait for, and returns the task's value.
+
+        Raises:
+            as `run_task`.
         """
         if not can_isolate_processes():
             return _run_unlimited(function, tick)

@@ -105,7 +105,8 @@ def read_commit(root: Path = _PROJECT_ROOT) -> str:
 
     The default is the project's own checkout, independent of the working directory. This function never fails.
 
-    Returns: the commit, or "unknown" outside a checkout.
+    Returns:
+        The commit, or "unknown" outside a checkout.
     """
     # An explicit repository prevents git from using one that merely contains the project.
     git = ["git", "--no-optional-locks", f"--git-dir={root / '.git'}", f"--work-tree={root}"]

@@ -32,7 +32,10 @@ def read_npz_array(path: Path, name: str, *, allows_nonfinite: bool = False) -> 
         path: the .npz file.
         name: name of the array.
         allows_nonfinite: whether NaN and infinities are accepted.
-    Returns: C-contiguous array.
+
+    Returns:
+        C-contiguous array.
+
     Raises:
         InputError: if the file or the array is invalid; it names the file.
     """

@@ -97,7 +97,9 @@ class ProgressDisplay(Protocol):
             title: description of the run.
             ticks: expected number of steps.
             cost: relative cost.
-        Returns: receiver of the run's events.
+
+        Returns:
+            Receiver of the run's events.
         """
         ...
 
@@ -164,7 +166,9 @@ class RemainingTime:
 
         Args:
             running: started runs; from a twentieth of its steps on, a run's own pace is used.
-        Returns: seconds, or None while too few runs have ended for an estimate.
+
+        Returns:
+            seconds, or None while too few runs have ended for an estimate.
         """
         known = max(self._ended / max(1, self._runs), self.finished_amount / (self.total_amount or 1.0))
         kinds = {kind for kind, amounts in self._left.items() if amounts}

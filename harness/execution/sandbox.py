@@ -59,7 +59,10 @@ def call_in_sandbox(function: Callable[..., Any], *arguments: Any, limits: CallL
         function: function of a module; it is pickled by reference.
         arguments: positional arguments, which must pickle.
         limits: processor time and memory of this call.
-    Returns: the function's return value, which must pickle.
+
+    Returns:
+        The function's return value, which must pickle.
+
     Raises:
         InputError: if the function raises it.
         SandboxError: if the function raises anything else, exceeds a limit, or crashes.

@@ -97,7 +97,10 @@ def reserve_cores(number: int, tick: ProgressCallback) -> Generator[list[int]]:
     Args:
         number: number of cores.
         tick: progress callback, which reports the waiting time.
-    Yields: the numbers of the cores.
+
+    Yields:
+        The numbers of the cores.
+
     Raises:
         ValueError: if this process may not use that many cores.
     """

@@ -70,8 +70,12 @@ def run_tasks(
         create_task: called with the index of a task when a worker is available for it.
         background_call: called once in this process after the workers have started. No worker is polled until it
             returns.
-    Yields: (index, value or TaskFailure) in order of completion.
-    Raises: the SpringbenchError that a task raises.
+
+    Yields:
+        (index, value or TaskFailure) in order of completion.
+
+    Raises:
+        the SpringbenchError that a task raises.
 
     Closing the generator stops the workers.
     """

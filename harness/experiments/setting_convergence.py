@@ -108,11 +108,11 @@ def complete_settings(settings: Sequence[StepSetting], solver: SolverSpec) -> li
     """Return the given settings without repetitions, or the default one of a solver.
 
     Args:
-      settings: given settings; 0 iterations where none were given.
-      solver: solver or engine with its parameters.
+        settings: given settings; 0 iterations where none were given.
+        solver: solver or engine with its parameters.
 
     Raises:
-      InputError: a setting has iterations, and the solver has none; or vice versa.
+        InputError: a setting has iterations, and the solver has none; or vice versa.
     """
     iterates = has_iterations_in_substep(load_target(SOLVER_TABLE[solver.name])(**solver.parameters), solver.name)
     for one in settings:
@@ -132,11 +132,11 @@ class SettingSimulator:
         """Prepare a solver for a scene.
 
         Args:
-          spec: scene whose time step is a frame.
-          size: mesh size.
-          solver: solver or engine with its parameters.
-          integrator: name of the integrator; the usual one of the solver if None.
-          t_end: simulated time [s], at least a frame.
+            spec: scene whose time step is a frame.
+            size: mesh size.
+            solver: solver or engine with its parameters.
+            integrator: name of the integrator; the usual one of the solver if None.
+            t_end: simulated time [s], at least a frame.
         """
         self.spec, self.size, self.name = spec, size, solver.name
         self.solver = load_target(SOLVER_TABLE[solver.name])(**solver.parameters)
@@ -185,9 +185,9 @@ class SettingSimulator:
         """Simulate a setting and measure its error; a failure becomes a reason.
 
         Args:
-          setting: substeps and iterations.
-          reference: reference; without one, errors and drift are NaN.
-          time_limit: processor time [s].
+            setting: substeps and iterations.
+            reference: reference; without one, errors and drift are NaN.
+            time_limit: processor time [s].
         """
         try:
             scene, solver, stop, pieces = self.build_step(self.spec, setting)
@@ -248,13 +248,13 @@ class SampledReference:
     """Reference at the times at which motions are compared.
 
     Attributes:
-      description: what it is, in words.
-      free_vertices: indices of the vertices that are not pinned.
-      start: positions (n, 3) [m] at the start.
-      positions: positions (k, n, 3) [m].
-      end_energy: energy at the end [J]; None where velocities are unknown.
-      kinetic_scale: largest kinetic energy at these times [J].
-      min_error: smallest relative error that can be measured against it.
+        description: what it is, in words.
+        free_vertices: indices of the vertices that are not pinned.
+        start: positions (n, 3) [m] at the start.
+        positions: positions (k, n, 3) [m].
+        end_energy: energy at the end [J]; None where velocities are unknown.
+        kinetic_scale: largest kinetic energy at these times [J].
+        min_error: smallest relative error that can be measured against it.
     """
 
     description: str
@@ -314,9 +314,9 @@ def measure_change(p: Positions, q: Positions, start: Positions, free_vertices: 
     """Return max_k |p_k - q_k| / max_k |q_k - start|.
 
     Args:
-      p, q: positions of two motions at the same times (k, n, 3) [m].
-      start: positions at the start (n, 3) [m].
-      free_vertices: vertices that count.
+        p, q: positions of two motions at the same times (k, n, 3) [m].
+        start: positions at the start (n, 3) [m].
+        free_vertices: vertices that count.
     """
     apart, moved = ((x - y)[:, free_vertices].reshape(len(q), -1) for x, y in ((p, q), (q, start[None])))
     largest = float(np.linalg.norm(moved, axis=1).max(initial=0.0))
@@ -336,16 +336,16 @@ def study_convergence(
     """Simulate the settings around given ones, and compare them with the reference.
 
     Args:
-      simulator: scene and solver.
-      given: the given settings, at least one.
-      store: store of references.
-      error_requested: relative error that counts as converged.
-      num_doublings: how often numbers are doubled and halved.
-      limits: limits of times.
-      print_message: prints a remark.
+        simulator: scene and solver.
+        given: the given settings, at least one.
+        store: store of references.
+        error_requested: relative error that counts as converged.
+        num_doublings: how often numbers are doubled and halved.
+        limits: limits of times.
+        print_message: prints a remark.
 
     Raises:
-      RunFailed: the motion is unpredictable, or a given setting is not supported.
+        RunFailed: the motion is unpredictable, or a given setting is not supported.
     """
     with machine_info.limit_threads(1):
         _require_support(simulator, given)
@@ -395,10 +395,10 @@ class StudyLimits(NamedTuple):
     """Limits of times of a study.
 
     Attributes:
-      time_limit: processor time of a setting [s].
-      search_time: wall time after which no further setting starts [s].
-      growth_end: time [s] up to which the growth of perturbations is known; None for that of the motion.
-      is_end_given: whether the end of the motion was requested, so that it must not be shortened.
+        time_limit: processor time of a setting [s].
+        search_time: wall time after which no further setting starts [s].
+        growth_end: time [s] up to which the growth of perturbations is known; None for that of the motion.
+        is_end_given: whether the end of the motion was requested, so that it must not be shortened.
     """
 
     time_limit: float
@@ -440,11 +440,11 @@ def build_hanging_scene(spec: SceneSpec, size: int) -> tuple[SceneSpec, NDArray[
     """Build the scene that hangs a mesh by one end of its longest side, which is turned upright.
 
     Args:
-      spec: scene with the mesh and its material.
-      size: mesh size.
+        spec: scene with the mesh and its material.
+        size: mesh size.
 
     Returns:
-      The scene, and a mask of its lowest vertices (n,).
+        The scene, and a mask of its lowest vertices (n,).
     """
     axis = int(np.argmax(np.ptp(spec.mesh.build_mesh(size).rest_positions, axis=0)))
     mesh = _UprightMesh(spec.mesh, axis)
@@ -494,7 +494,7 @@ def _find_reference(
     """Return the reference of the motion, to which the simulation may be shortened; None, with a message, without one.
 
     Raises:
-      RunFailed: the motion is unpredictable.
+        RunFailed: the motion is unpredictable.
     """
     spec, size, times = simulator.spec, simulator.size, simulator.sample_times
     scene = build_exact_scene(spec, size, show_warnings=False)

@@ -27,8 +27,8 @@ def find_framed_vertices(start: NDArray[np.floating], moved: NDArray[np.floating
     """Return a mask (n,) of the vertices that a camera frames.
 
     Args:
-      start: initial positions (n, 3) [m], finite.
-      moved: largest displacement from `start` over the frames shown (n,) [m].
+        start: initial positions (n, 3) [m], finite.
+        moved: largest displacement from `start` over the frames shown (n,) [m].
     """
     calm = moved <= np.median(moved)
     reach = np.linalg.norm(start - np.median(start[calm], axis=0), axis=1) + moved

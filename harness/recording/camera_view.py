@@ -59,9 +59,9 @@ class ViewExtent:
     """Positions of some frames, and the camera that frames them (see `springbench.harness.recording.camera_framing`).
 
     Args:
-      rest: rest positions (n, 3) [m].
-      aspect: width of the view over its height.
-      initial_positions: positions shown first (n, 3) [m]; the rest positions if omitted or not finite.
+        rest: rest positions (n, 3) [m].
+        aspect: width of the view over its height.
+        initial_positions: positions shown first (n, 3) [m]; the rest positions if omitted or not finite.
     """
 
     def __init__(
@@ -124,9 +124,9 @@ class ViewExtent:
         """Build the strip of colours below the mesh, facing the camera, and its numbers.
 
         Args:
-          strain_range: strain at the ends of the colour scale.
-          strain_limits: smallest and largest strain of a spring. Where one is outside the scale, the strip ends in a
-            tip labelled with that strain.
+            strain_range: strain at the ends of the colour scale.
+            strain_limits: smallest and largest strain of a spring. Where one is outside the scale, the strip ends in a
+              tip labelled with that strain.
         """
         sight = self._select_view()
         (x, y, distance), near = sight.place, sight.near
@@ -164,11 +164,11 @@ class _CameraView:
     """The points of some frames, seen from one direction.
 
     Attributes:
-      axes: unit vectors (3, 3) to the right, up and towards the camera.
-      place: cx, cy and D [m].
-      near: largest coordinate of the points towards the camera [m].
-      far: smallest coordinate of the points towards the camera [m].
-      filled: fraction of the view that the points of a frame span, as the geometric mean over the frames.
+        axes: unit vectors (3, 3) to the right, up and towards the camera.
+        place: cx, cy and D [m].
+        near: largest coordinate of the points towards the camera [m].
+        far: smallest coordinate of the points towards the camera [m].
+        filled: fraction of the view that the points of a frame span, as the geometric mean over the frames.
     """
 
     def __init__(

@@ -43,10 +43,10 @@ def draw_curves(
     """Log curves over the iterations 1, 2, ... with a logarithmic axis, as a drawing.
 
     Args:
-      stream: open recording.
-      entity: entity path under which the drawing is logged.
-      curves: values of each iteration by curve name; values that are not positive and finite are omitted.
-      colours: colours of the curves.
+        stream: open recording.
+        entity: entity path under which the drawing is logged.
+        curves: values of each iteration by curve name; values that are not positive and finite are omitted.
+        colours: colours of the curves.
     """
     found = {name: np.asarray(values, float) for name, values in curves.items()}
     known = np.concatenate([values[np.isfinite(values) & (values > 0)] for values in found.values()] or [np.empty(0)])

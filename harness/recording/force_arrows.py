@@ -39,10 +39,10 @@ class ForceArrows:
         """Buffer the force arrows of one frame.
 
         Args:
-          frame: frame index.
-          p: positions (n, 3) [m].
-          forces: forces (n, 3) [N] by name; a subset of the vertices is drawn where more than MAX_ARROWS carry a force.
-          times: builds the time columns from frame indices.
+            frame: frame index.
+            p: positions (n, 3) [m].
+            forces: forces (n, 3) [N] by name; a subset of the vertices is drawn where more than MAX_ARROWS carry a force.
+            times: builds the time columns from frame indices.
         """
         for name, force in forces.items():
             acting = np.flatnonzero(np.abs(force).max(axis=1, initial=0.0) > 0.0)

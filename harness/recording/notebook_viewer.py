@@ -17,9 +17,9 @@ class NotebookViewer:
     The file is read each time the viewer is displayed: a widget sends its data to the first display only.
 
     Attributes:
-      path: path of the recording.
-      width: width in pixels, or "auto" for that of the cell.
-      height: height in pixels.
+        path: path of the recording.
+        width: width in pixels, or "auto" for that of the cell.
+        height: height in pixels.
     """
 
     path: Path

@@ -33,10 +33,10 @@ class ObstacleRecorder:
     """Obstacles of an open recording.
 
     Args:
-      stream: open recording.
-      obstacles: declared obstacles.
-      rest: rest positions of the mesh (n, 3) [m].
-      origin: origin of the recorded positions (3,) [m].
+        stream: open recording.
+        obstacles: declared obstacles.
+        rest: rest positions of the mesh (n, 3) [m].
+        origin: origin of the recorded positions (3,) [m].
     """
 
     def __init__(self, stream: rr.RecordingStream, obstacles: Sequence[AnySurface], rest: Array, origin: Array) -> None:

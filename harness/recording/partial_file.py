@@ -37,7 +37,7 @@ class PartialFile:
     """An open recording stream into a partial file in the folder of the final file.
 
     Raises:
-      WriteError: from any method, if the file cannot be written or is incomplete at the end.
+        WriteError: from any method, if the file cannot be written or is incomplete at the end.
     """
 
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
@@ -89,7 +89,8 @@ class PartialFile:
     def finish_file(self, layout: rrb.Blueprint) -> Path:
         """Close the file, check that it is complete, and give it its final name.
 
-        Returns: the final path.
+        Returns:
+            The final path.
         """
         try:
             self.write_blueprint(layout)

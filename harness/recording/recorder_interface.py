@@ -34,14 +34,14 @@ class RecordedFrame:
     """One simulated step, as recorded; frame 0 is the initial state.
 
     Attributes:
-      index: frame number.
-      time: simulated time [s].
-      positions: vertex positions (n, 3) [m].
-      energies: energies [J] by name.
-      residual: residual norm [J^(1/2)].
-      num_iterations: number of solver iterations of the step.
-      forces: forces (n, 3) [N] by name, drawn as arrows.
-      num_intersections: number of self-intersections of the mesh; None where they were not counted.
+        index: frame number.
+        time: simulated time [s].
+        positions: vertex positions (n, 3) [m].
+        energies: energies [J] by name.
+        residual: residual norm [J^(1/2)].
+        num_iterations: number of solver iterations of the step.
+        forces: forces (n, 3) [N] by name, drawn as arrows.
+        num_intersections: number of self-intersections of the mesh; None where they were not counted.
     """
 
     index: int
@@ -59,18 +59,18 @@ class RecordingInfo:
     """Properties of a recording that are constant over its frames.
 
     Attributes:
-      title: scene, size and solver in words.
-      run_id: identifier of the run.
-      mesh: mesh of the scene.
-      springs: vertex pairs (m, 2) of the scene's springs, which may be fewer than those of the mesh.
-      rest_lengths: rest lengths of the springs (m,) [m].
-      pinned_vertices: indices of the pinned vertices (q,).
-      time_step: step size [s].
-      strain_range: strain at the ends of the colour scale (0.1 is 10 %).
-      has_self_contact: whether an effect prevents self-intersection of the mesh; pictures of surfaces state it.
-      properties: flat metadata of the run and its machine (scene, size, solver, iterations, cpu, ...).
-      is_solve: whether the frames are the numbered iterates of one solve, instead of the steps of a run.
-      obstacles: obstacles drawn with the mesh.
+        title: scene, size and solver in words.
+        run_id: identifier of the run.
+        mesh: mesh of the scene.
+        springs: vertex pairs (m, 2) of the scene's springs, which may be fewer than those of the mesh.
+        rest_lengths: rest lengths of the springs (m,) [m].
+        pinned_vertices: indices of the pinned vertices (q,).
+        time_step: step size [s].
+        strain_range: strain at the ends of the colour scale (0.1 is 10 %).
+        has_self_contact: whether an effect prevents self-intersection of the mesh; pictures of surfaces state it.
+        properties: flat metadata of the run and its machine (scene, size, solver, iterations, cpu, ...).
+        is_solve: whether the frames are the numbered iterates of one solve, instead of the steps of a run.
+        obstacles: obstacles drawn with the mesh.
     """
 
     title: str
@@ -98,9 +98,9 @@ class RunRecorder(Protocol):
         """Record the convergence within one frame.
 
         Args:
-          frame: frame index.
-          residuals: residual [J^(1/2)] of each iteration.
-          objective: objective [J] of each iteration.
+            frame: frame index.
+            residuals: residual [J^(1/2)] of each iteration.
+            objective: objective [J] of each iteration.
         """
         ...
 
@@ -108,7 +108,7 @@ class RunRecorder(Protocol):
         """Write the phase times, finish the file and return its final path.
 
         Args:
-          milliseconds: wall time [ms] of each phase by frame, from the timed pass; index 0 is frame 1.
+            milliseconds: wall time [ms] of each phase by frame, from the timed pass; index 0 is frame 1.
         """
         ...
 
@@ -141,19 +141,19 @@ class RecordingReplay:
     """Contents of a recording that has been read back, from which pictures are drawn.
 
     Attributes:
-      title: title as recorded.
-      run_id: identifier of the run.
-      frames: frame indices (k,).
-      times: simulated times (k,) [s].
-      positions: positions (k, n, 3) float32 [m], relative to `origin`.
-      triangles: vertex indices (f, 3).
-      springs: vertex pairs (m, 2).
-      rest_lengths: rest lengths of the springs (m,) [m].
-      pinned_vertices: indices of the pinned vertices (q,).
-      strain_range: strain at the ends of the colour scale.
-      scalars: (frames, values) by entity name.
-      properties: metadata as recorded.
-      origin: origin of the positions (3,) [m], zero unless the mesh is far from zero.
+        title: title as recorded.
+        run_id: identifier of the run.
+        frames: frame indices (k,).
+        times: simulated times (k,) [s].
+        positions: positions (k, n, 3) float32 [m], relative to `origin`.
+        triangles: vertex indices (f, 3).
+        springs: vertex pairs (m, 2).
+        rest_lengths: rest lengths of the springs (m,) [m].
+        pinned_vertices: indices of the pinned vertices (q,).
+        strain_range: strain at the ends of the colour scale.
+        scalars: (frames, values) by entity name.
+        properties: metadata as recorded.
+        origin: origin of the positions (3,) [m], zero unless the mesh is far from zero.
     """
 
     title: str

@@ -40,16 +40,17 @@ def require_recorded_frames(
     """Check some frames of a recording against the run.
 
     Args:
-      path: path of the recording.
-      info: properties of the recording.
-      times: time [s] of each checked frame.
-      run: positions (n, 3) [m] of each checked frame; the last of them is the run's last frame.
+        path: path of the recording.
+        info: properties of the recording.
+        times: time [s] of each checked frame.
+        run: positions (n, 3) [m] of each checked frame; the last of them is the run's last frame.
 
-    Returns: SHA-256 of the positions in the recording's last frame, as stored (float32 bytes).
+    Returns:
+        SHA-256 of the positions in the recording's last frame, as stored (float32 bytes).
 
     Raises:
-      RunFailed: the recording does not end with that frame, or times, positions or colours of a frame differ.
-      InputError: the file cannot be read.
+        RunFailed: the recording does not end with that frame, or times, positions or colours of a frame differ.
+        InputError: the file cannot be read.
     """
     last = max(run)
     origin, end, found = _read_frames(path, run)
@@ -76,9 +77,9 @@ class _ReadFrame(NamedTuple):
     """A recorded frame.
 
     Attributes:
-      time: time [s].
-      positions: positions (n, 3) [m] relative to the origin.
-      colours: colours (n,) as 0xRRGGBBAA.
+        time: time [s].
+        positions: positions (n, 3) [m] relative to the origin.
+        colours: colours (n,) as 0xRRGGBBAA.
     """
 
     time: float

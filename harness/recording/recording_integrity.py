@@ -45,8 +45,8 @@ def mark_verified(path: Path, *, shared: bool = True) -> None:
     """Mark a recording in its present state as readable.
 
     Args:
-      path: path of the recording.
-      shared: whether other processes see the mark too.
+        path: path of the recording.
+        shared: whether other processes see the mark too.
     """
     _verified_states.add(state := _file_state(path))
     if shared:
@@ -96,7 +96,8 @@ def _file_state(path: Path) -> bytes:
 def scan_messages(path: Path) -> tuple[bool, int]:
     """Find the end of the last complete message.
 
-    Returns: whether the file has its end mark, and the offset [bytes] of the end of its last complete message.
+    Returns:
+        Whether the file has its end mark, and the offset [bytes] of the end of its last complete message.
     """
     size, place = path.stat().st_size, _HEADER_BYTES
     with path.open("rb") as file:
@@ -115,11 +116,11 @@ def require_intact(path: Path, read_recording: Callable[[Path], None]) -> None:
     """Require that a recording can be read in a child process within limits.
 
     Args:
-      path: path of the recording.
-      read_recording: function at module level that reads it.
+        path: path of the recording.
+        read_recording: function at module level that reads it.
 
     Raises:
-      InputError: the recording cannot be read.
+        InputError: the recording cannot be read.
     """
     if _is_verified(path):
         return

@@ -52,16 +52,16 @@ class RecordingSummary:
     """Contents of a recording without its positions.
 
     Attributes:
-      path: path of the file.
-      is_complete: whether the run closed the file.
-      title: title as recorded.
-      run_id: identifier of the run.
-      application: application name.
-      properties: metadata as recorded.
-      frames: indices of the recorded frames (k,).
-      timelines: (first, last) by timeline name.
-      entities: entity paths.
-      scalars: table with schema SCALAR_SCHEMA.
+        path: path of the file.
+        is_complete: whether the run closed the file.
+        title: title as recorded.
+        run_id: identifier of the run.
+        application: application name.
+        properties: metadata as recorded.
+        frames: indices of the recorded frames (k,).
+        timelines: (first, last) by timeline name.
+        entities: entity paths.
+        scalars: table with schema SCALAR_SCHEMA.
     """
 
     path: Path
@@ -100,11 +100,11 @@ def read_replay(path: Path, frames: Collection[int] | None = None) -> RecordingR
     """Read a recording with all frames or a selection of them, in order.
 
     Args:
-      path: path of the recording.
-      frames: indices of the frames, -1 for the last; all if omitted.
+        path: path of the recording.
+        frames: indices of the frames, -1 for the last; all if omitted.
 
     Raises:
-      InputError: the file is not the recording of a run or lacks a selected frame.
+        InputError: the file is not the recording of a run or lacks a selected frame.
     """
     with open_recording_source(path) as source:
         springs = read_network(source)
@@ -140,7 +140,7 @@ def summarise_recording(path: Path) -> RecordingSummary:
     """Read the contents of a recording, of one or several runs, without positions.
 
     Raises:
-      InputError: the file is not a Rerun recording.
+        InputError: the file is not a Rerun recording.
     """
     with open_recording_source(path) as source:
         entities: set[str] = set()
@@ -183,7 +183,7 @@ def open_recording_source(path: Path) -> Generator[RecordingSource]:
     """Open the recording at `path` for the duration of the context.
 
     Raises:
-      InputError: the file is not a Rerun recording, is damaged, or contains no readable data.
+        InputError: the file is not a Rerun recording, is damaged, or contains no readable data.
     """
     if not path.is_file():
         raise InputError(InputMistake("there is no such file; a Rerun recording (.rrd) was expected", file=path))
@@ -237,10 +237,11 @@ def iterate_positions(
     """Iterate over the positions (n, 3) [m] of the selected frames, in file order.
 
     Args:
-      source: open recording.
-      frames: indices of the frames; all if omitted.
+        source: open recording.
+        frames: indices of the frames; all if omitted.
 
-    Returns: tuples of frame, time [s] and positions, which are relative to the origin.
+    Returns:
+        Tuples of frame, time [s] and positions, which are relative to the origin.
     """
     for chunk in source.iterate_chunks(content="/scene/mesh", components=_POSITION_COMPONENTS):
         batch = chunk.to_record_batch()
@@ -353,9 +354,9 @@ def read_cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:
     """Return all numbers of one row of a component as a flat array.
 
     Args:
-      batch: chunk of a recording.
-      name: name of the component.
-      row: index of the row.
+        batch: chunk of a recording.
+        name: name of the component.
+        row: index of the row.
     """
     values = get_scalar(batch, name, row).values
     while pa.types.is_nested(values.type):
@@ -408,9 +409,9 @@ def replace_cells(batch: pa.RecordBatch, name: str, rows: Sequence[NDArray[Any]]
     """Return the batch with the numbers of a component replaced row by row.
 
     Args:
-      batch: chunk of a recording.
-      name: name of the component.
-      rows: new numbers of each row, flat.
+        batch: chunk of a recording.
+        name: name of the component.
+        rows: new numbers of each row, flat.
     """
     at = batch.schema.get_field_index(name)
     return batch.set_column(at, batch.schema.field(at), pa.array(rows, batch.schema.field(at).type))

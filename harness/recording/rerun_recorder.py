@@ -69,7 +69,7 @@ class RerunRecorder:
     frames.
 
     Raises:
-      RunFailed: the file cannot be written or is incomplete at the end.
+        RunFailed: the file cannot be written or is incomplete at the end.
     """
 
     def __init__(self, path: Path, info: RecordingInfo) -> None:
@@ -140,9 +140,9 @@ class RerunRecorder:
         """Record the convergence within one frame.
 
         Args:
-          frame: frame index.
-          residuals: residual [J^(1/2)] after each iteration, from the first.
-          objective: objective [J] after each iteration.
+            frame: frame index.
+            residuals: residual [J^(1/2)] after each iteration, from the first.
+            objective: objective [J] after each iteration.
         """
         self._curves[frame] = residuals, objective
 
@@ -167,8 +167,8 @@ class RerunRecorder:
         """Write the phase times and changed properties, finish the file and return its path.
 
         Args:
-          milliseconds: wall time [ms] of each phase by frame, from frame 1.
-          final_properties: properties that changed at the end of the run.
+            milliseconds: wall time [ms] of each phase by frame, from frame 1.
+            final_properties: properties that changed at the end of the run.
         """
         if not self._frames:
             self._open_scene()

@@ -69,14 +69,14 @@ def write_side_by_side(out: Path, recordings: Mapping[str, Path], title: str, st
     """Write several recordings side by side on one timeline to one file.
 
     Args:
-      out: path of the new file.
-      recordings: paths of the recordings by solver name.
-      title: title of the new recording.
-      styles: line styles by solver name.
+        out: path of the new file.
+        recordings: paths of the recordings by solver name.
+        title: title of the new recording.
+        styles: line styles by solver name.
 
     Raises:
-      InputError: a file is not the recording of a run.
-      RunFailed: `out` cannot be written.
+        InputError: a file is not the recording of a run.
+        RunFailed: `out` cannot be written.
     """
     file = PartialFile(out, f"springbench side by side {title}", title, title)
     try:

@@ -35,12 +35,13 @@ def compute_strain_range(
     A spring to a vertex that the camera does not frame is left out: it would leave all others grey.
 
     Args:
-      rest_positions: rest positions (n, 3) [m].
-      positions: vertex positions, each (n, 3) [m].
-      springs: vertex pairs (m, 2).
-      rest_lengths: rest lengths (m,) [m].
+        rest_positions: rest positions (n, 3) [m].
+        positions: vertex positions, each (n, 3) [m].
+        springs: vertex pairs (m, 2).
+        rest_lengths: rest lengths (m,) [m].
 
-    Returns: the range of `round_scale_end` over all strains; DEFAULT_STRAIN_RANGE without springs.
+    Returns:
+        The range of `round_scale_end` over all strains; DEFAULT_STRAIN_RANGE without springs.
     """
     found = list[RealArray]()
     for p in positions if len(rest_lengths) else ():

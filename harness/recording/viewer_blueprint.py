@@ -54,10 +54,10 @@ def build_scene_view(root: str, name: str, extent: ViewExtent, *, springs_visibl
     """Build the 3D view of the mesh under a root entity.
 
     Args:
-      root: entity path above `/scene`.
-      name: title of the view.
-      extent: extent of the positions, from which the camera is computed.
-      springs_visible: whether springs are shown at first; forces are hidden at first.
+        root: entity path above `/scene`.
+        name: title of the view.
+        extent: extent of the positions, from which the camera is computed.
+        springs_visible: whether springs are shown at first; forces are hidden at first.
     """
     shown: dict[Any, rrb.EntityBehavior] = {f"{root}/scene/springs": rrb.EntityBehavior(visible=springs_visible)}
     shown[f"{root}/scene/forces"] = rrb.EntityBehavior(visible=False)
@@ -77,10 +77,10 @@ def build_plot(
     """Build a plot of all scalars under the given paths.
 
     Args:
-      name: title of the plot.
-      contents: entity queries.
-      last: last frame shown.
-      value_range: smallest and largest value; if given, a legend is shown in a space of its own above the data.
+        name: title of the plot.
+        contents: entity queries.
+        last: last frame shown.
+        value_range: smallest and largest value; if given, a legend is shown in a space of its own above the data.
     """
     corner = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=value_range is not None)
     across = rrb.TimeRange(*(rrb.TimeRangeBoundary.absolute(seq=at) for at in (0, max(last, 1))))
@@ -101,10 +101,10 @@ def build_blueprint(
     """Build the viewer layout of one recording.
 
     Args:
-      info: properties of the recording.
-      extent: extent of the positions, from which the camera is computed.
-      last: last frame.
-      value_ranges: smallest and largest value of groups of scalars, by entity.
+        info: properties of the recording.
+        extent: extent of the positions, from which the camera is computed.
+        last: last frame.
+        value_ranges: smallest and largest value of groups of scalars, by entity.
     """
     value_ranges = value_ranges or {}
     series = rrb.Vertical(

@@ -59,14 +59,14 @@ class MinimumCertificate:
     """End point of Newton's method, with its certificate.
 
     Attributes:
-      positions: positions (n, 3) [m], read-only; all other attributes refer to this point.
-      objective: value g [J].
-      newton_step_length: length [m] of the next Newton step at the vertex where it is largest, infinite where the
-        Hessian has no factor.
-      min_eigenvalue: smallest eigenvalue of the Hessian without the exactly pinned vertices [N/m].
-      eigenvalue_uncertainty: bound on its uncertainty [N/m].
-      position_tolerance: CERTIFIED_RTOL times the size of each vertex's component (n,) [m].
-      kind: one of the kinds above.
+        positions: positions (n, 3) [m], read-only; all other attributes refer to this point.
+        objective: value g [J].
+        newton_step_length: length [m] of the next Newton step at the vertex where it is largest, infinite where the
+          Hessian has no factor.
+        min_eigenvalue: smallest eigenvalue of the Hessian without the exactly pinned vertices [N/m].
+        eigenvalue_uncertainty: bound on its uncertainty [N/m].
+        position_tolerance: CERTIFIED_RTOL times the size of each vertex's component (n,) [m].
+        kind: one of the kinds above.
     """
 
     positions: Positions
@@ -154,9 +154,9 @@ def refine_minimum(problem: StepProblem, p: Positions, solver: Solver) -> Minimu
     """Find and certify the minimum of the basin of p.
 
     Args:
-      problem: step problem.
-      p: positions (n, 3) [m].
-      solver: Newton's method.
+        problem: step problem.
+        p: positions (n, 3) [m].
+        solver: Newton's method.
     """
     solution = solver.prepare(problem.system).solve(replace(problem, initial_guess=p), UNLIMITED_STOP_RULE)
     return certify_minimum(problem, solution.positions)

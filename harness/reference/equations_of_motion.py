@@ -46,11 +46,11 @@ class OdeField:
         """Check that the scene has equations of motion.
 
         Args:
-          scene: scene with exact pins.
-          compiled: whether springs are summed by the compiled loop instead of NumPy.
+            scene: scene with exact pins.
+            compiled: whether springs are summed by the compiled loop instead of NumPy.
 
         Raises:
-          NotIntegrable: the scene has no equations of motion.
+            NotIntegrable: the scene has no equations of motion.
         """
         system = scene.system
         self._scene, self._free, self._system = scene, system.free_vertices, system
@@ -169,12 +169,12 @@ def add_springs(
     The gradient is k (1 - r/l) (p_i - p_j) at p (n, 3) [m].
 
     Args:
-      p: positions (n, 3) [m].
-      edges: vertex pairs (m, 2).
-      stiffness: k (m,) [N/m].
-      rest_length: r (m,) [m].
-      direction: unit vectors (m, 3) used where the length is zero.
-      out: forces (n, 3) [N], incremented.
+        p: positions (n, 3) [m].
+        edges: vertex pairs (m, 2).
+        stiffness: k (m,) [N/m].
+        rest_length: r (m,) [m].
+        direction: unit vectors (m, 3) used where the length is zero.
+        out: forces (n, 3) [N], incremented.
     """
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]

@@ -66,9 +66,9 @@ class ExactLengths:
         """Return the step whose objective is the Lagrangian of given tensions.
 
         Args:
-          problem: step problem.
-          tension: tensions (m,) [N].
-          penalty_factor: factor on the penalties.
+            problem: step problem.
+            tension: tensions (m,) [N].
+            penalty_factor: factor on the penalties.
         """
         return replace(problem, system=self._augment_system(tension, penalty_factor))
 

@@ -47,10 +47,11 @@ def measure_gradient_errors(scene: Scene, frames: int) -> dict[str, float]:
     Each energy is evaluated at random points, with a fixed seed.
 
     Args:
-      scene: scene of the run.
-      frames: number of frames; the points lie at times of these.
+        scene: scene of the run.
+        frames: number of frames; the points lie at times of these.
 
-    Returns: largest relative error by class name of the energy; 0 within round-off.
+    Returns:
+        Largest relative error by class name of the energy; 0 within round-off.
     """
     errors, min_length = dict[str, float](), _find_min_length(scene)
     if all(map(_is_shipped, scene.system.energies)):
@@ -101,13 +102,14 @@ def measure_gradient_error(
     """Return the relative error of an energy's slope along a direction by its gradient.
 
     Args:
-      energy: energy of a step.
-      x: positions (n, 3) [m].
-      direction: direction (n, 3).
-      coordinate_scale: largest coordinate [m] that the energy depends on.
-      min_length: smallest length [m] that it depends on.
+        energy: energy of a step.
+        x: positions (n, 3) [m].
+        direction: direction (n, 3).
+        coordinate_scale: largest coordinate [m] that the energy depends on.
+        min_length: smallest length [m] that it depends on.
 
-    Returns: error relative to the derivative of its value; 0 within round-off, inf if it is not finite.
+    Returns:
+        Error relative to the derivative of its value; 0 within round-off, inf if it is not finite.
     """
     gradient = np.zeros_like(x)
     energy.add_gradient(x, gradient)

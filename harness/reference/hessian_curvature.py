@@ -48,9 +48,9 @@ class SplitHessian(NamedTuple):
     """H = S + V V' [N/m] without the exactly pinned vertices.
 
     Attributes:
-      sparse: S (3 f, 3 f).
-      columns: V (3 f, r), with r = 0 where all energies have sparse Hessians (see
-      `springbench.solvers.objective.woodbury`).
+        sparse: S (3 f, 3 f).
+        columns: V (3 f, r), with r = 0 where all energies have sparse Hessians (see
+        `springbench.solvers.objective.woodbury`).
     """
 
     sparse: csr_array
@@ -80,10 +80,10 @@ class HessianCurvature:
     """Smallest eigenvalue of the Hessian at a point.
 
     Attributes:
-      min_eigenvalue: smallest eigenvalue [N/m], infinite where no vertex is free.
-      eigenvalue_uncertainty: bound on its uncertainty by round-off [N/m].
-      direction: its eigenvector (n, 3), zero at exactly pinned vertices.
-      solve: product with the inverse of the Hessian (3 f,), with the smallest shift that makes it positive definite.
+        min_eigenvalue: smallest eigenvalue [N/m], infinite where no vertex is free.
+        eigenvalue_uncertainty: bound on its uncertainty by round-off [N/m].
+        direction: its eigenvector (n, 3), zero at exactly pinned vertices.
+        solve: product with the inverse of the Hessian (3 f,), with the smallest shift that makes it positive definite.
     """
 
     min_eigenvalue: float
@@ -143,12 +143,13 @@ def step_across(
     """Return p after Newton's step orthogonal to the softest direction.
 
     Args:
-      problem: step problem.
-      p: positions (n, 3) [m].
-      at: curvature at p.
-      max_fraction: maximum length of the step relative to the mesh extent; longer steps are scaled down.
+        problem: step problem.
+        p: positions (n, 3) [m].
+        at: curvature at p.
+        max_fraction: maximum length of the step relative to the mesh extent; longer steps are scaled down.
 
-    Returns: positions (n, 3) [m].
+    Returns:
+        Positions (n, 3) [m].
     """
     free, q, x = problem.system.free_vertices, p.copy(), at.direction[problem.system.free_vertices].ravel()
     gradient = problem.gradient(p)[free].ravel()

@@ -57,11 +57,11 @@ class PerturbationGrowth:
     """Growth of a perturbation over a motion.
 
     Attributes:
-      times: sample times (k,) [s].
-      displacement: displacement from the start (k,) [m], Frobenius norm over the free vertices.
-      growth_factor: size (k,) of a perturbation that was 1e-12 of the mesh size at the start, relative to the
-        displacement, at most 1.
-      scale: root mean square displacement of a free coordinate at the end [m].
+        times: sample times (k,) [s].
+        displacement: displacement from the start (k,) [m], Frobenius norm over the free vertices.
+        growth_factor: size (k,) of a perturbation that was 1e-12 of the mesh size at the start, relative to the
+          displacement, at most 1.
+        scale: root mean square displacement of a free coordinate at the end [m].
     """
 
     times: NDArray[np.float64]
@@ -97,11 +97,11 @@ class PerturbationGrowth:
         """Require that a relative error can be measured at some times.
 
         Args:
-          error: relative error.
-          times: times [s]; the end if omitted.
+            error: relative error.
+            times: times [s]; the end if omitted.
 
         Raises:
-          UnpredictableMotion: the perturbation has grown too large at one of the times.
+            UnpredictableMotion: the perturbation has grown too large at one of the times.
         """
         times = times or [float(self.times[-1])]
         for t, grown in zip(times, self.interpolate_growth(times), strict=True):
@@ -123,13 +123,13 @@ def estimate_growth(spec: SceneSpec, size: int, t_end: float) -> PerturbationGro
     """Estimate the growth of a perturbation of a scene's motion up to an end time.
 
     Args:
-      spec: specification of the scene.
-      size: size of the scene.
-      t_end: end time [s].
+        spec: specification of the scene.
+        size: size of the scene.
+        t_end: end time [s].
 
     Raises:
-      UnpredictableMotion: nothing moves, or the motion is not finite.
-      NotIntegrable: the scene has no equation of motion.
+        UnpredictableMotion: nothing moves, or the motion is not finite.
+        NotIntegrable: the scene has no equation of motion.
     """
     samples = max(_MIN_SAMPLES, ceil(t_end / _SAMPLE_SECONDS * (1.0 - 1e-9)))
     scene, begun, advance = _build_motion(spec, size, t_end / samples)

@@ -49,9 +49,9 @@ class StationarityReading(NamedTuple):
     """Stationarity of a point.
 
     Attributes:
-      stationarity: residual relative to the initial residual.
-      roundoff_bound: bound on the share of it that is due to round-off.
-      above_roundoff: the share that round-off does not explain.
+        stationarity: residual relative to the initial residual.
+        roundoff_bound: bound on the share of it that is due to round-off.
+        above_roundoff: the share that round-off does not explain.
     """
 
     stationarity: float
@@ -152,9 +152,9 @@ class ReferenceEvaluator:
         """Measure the stationarity of p.
 
         Args:
-          problem: step problem.
-          p: positions (n, 3) [m].
-          initial_residual: residual [J^(1/2)] that the result is relative to; that of the problem if omitted.
+            problem: step problem.
+            p: positions (n, 3) [m].
+            initial_residual: residual [J^(1/2)] that the result is relative to; that of the problem if omitted.
         """
         initial_residual = self.compute_initial_residual(problem) if initial_residual is None else initial_residual
         gradient, bound = problem.gradient(p), gradient_roundoff(problem, p)
@@ -188,8 +188,8 @@ def measure_graph_components(graph: csr_array, p: Positions) -> NDArray[np.float
     A component without extent is assigned the median size of those that have one, and 1 m where none has.
 
     Args:
-      graph: adjacency matrix (n, n).
-      p: positions (n, 3) [m].
+        graph: adjacency matrix (n, n).
+        p: positions (n, 3) [m].
     """
     count, label = connected_components(graph, directed=False)
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)

@@ -74,8 +74,8 @@ class ReferenceStore:
     """Store of all references in one folder, shared by all users of the same scenes.
 
     Attributes:
-      folder: folder of the files.
-      solver: solver of reference runs, Newton's method.
+        folder: folder of the files.
+        solver: solver of reference runs, Newton's method.
     """
 
     folder: Path
@@ -87,13 +87,13 @@ class ReferenceStore:
         """Load or compute the snapshots SNAPSHOT_NAMES of the scene's `frames` steps.
 
         Args:
-          spec: specification of the scene.
-          size: size of the scene.
-          integrator: name of the integrator.
+            spec: specification of the scene.
+            size: size of the scene.
+            integrator: name of the integrator.
 
         Raises:
-          InputError: the scene cannot be built.
-          RunFailed: a step of the reference run does not converge.
+            InputError: the scene cannot be built.
+            RunFailed: a step of the reference run does not converge.
         """
         request = _ReferenceRequest(spec, size, integrator)
         path = self.folder / f"run-{request.name}.npz"
@@ -114,14 +114,14 @@ class ReferenceStore:
         A run continues from the last stored snapshot before the first missing one.
 
         Args:
-          spec: specification of the scene.
-          size: size of the scene.
-          frames: frames, counted from 1.
-          integrator: name of the integrator.
+            spec: specification of the scene.
+            size: size of the scene.
+            frames: frames, counted from 1.
+            integrator: name of the integrator.
 
         Raises:
-          InputError: the scene cannot be built.
-          RunFailed: a step of the reference run does not converge.
+            InputError: the scene cannot be built.
+            RunFailed: a step of the reference run does not converge.
         """
         request = _ReferenceRequest(spec, size, integrator)
         known = self._load_known_snapshots(request, frames)
@@ -184,19 +184,19 @@ class ReferenceStore:
         the scene's own step size.
 
         Args:
-          spec: specification of the scene.
-          size: size of the scene.
-          times: ascending times [s].
-          error: smallest relative error to be measured.
-          report_progress: called with the progress of an integration.
-          growth_end: time [s] up to which the growth of a perturbation is estimated; the last time by default.
-          contact_error: relative error for which a motion with contact is refined if none is stored; `error` by
-            default.
+            spec: specification of the scene.
+            size: size of the scene.
+            times: ascending times [s].
+            error: smallest relative error to be measured.
+            report_progress: called with the progress of an integration.
+            growth_end: time [s] up to which the growth of a perturbation is estimated; the last time by default.
+            contact_error: relative error for which a motion with contact is refined if none is stored; `error` by
+              default.
 
         Raises:
-          InputError: the scene cannot be built.
-          NotIntegrable: the scene has no equations of motion.
-          UnpredictableMotion: the reference would not be accurate enough.
+            InputError: the scene cannot be built.
+            NotIntegrable: the scene has no equations of motion.
+            UnpredictableMotion: the reference would not be accurate enough.
         """
         name = _build_motion_name(spec, size, times)
         if has_contact(build_exact_scene(spec, size).system):
@@ -220,13 +220,13 @@ class ReferenceStore:
         """Load or estimate the growth of a perturbation up to an end time [s].
 
         Args:
-          spec: specification of the scene.
-          size: size of the scene.
-          t_end: end time [s].
+            spec: specification of the scene.
+            size: size of the scene.
+            t_end: end time [s].
 
         Raises:
-          UnpredictableMotion: nothing moves, or the motion is not finite.
-          NotIntegrable: the scene has no equations of motion.
+            UnpredictableMotion: nothing moves, or the motion is not finite.
+            NotIntegrable: the scene has no equations of motion.
         """
         witness = OdeField(build_ode_scene(spec, size)).evaluate_fingerprint()
         path = self.folder / f"growth-{_build_motion_name(spec, size, [t_end])}.npz"
@@ -253,16 +253,16 @@ class ReferenceStore:
         Its fingerprint is a first step, the same for every time step of the scene.
 
         Args:
-          spec: specification of the scene.
-          size: size of the scene.
-          times: ascending times [s].
-          error: smallest relative error to be measured, if that takes no longer than a limit.
-          refined_error: the same where no motion for `error` is stored; `error` by default.
-          seconds: that limit, processor time [s]; MAX_SECONDS by default.
+            spec: specification of the scene.
+            size: size of the scene.
+            times: ascending times [s].
+            error: smallest relative error to be measured, if that takes no longer than a limit.
+            refined_error: the same where no motion for `error` is stored; `error` by default.
+            seconds: that limit, processor time [s]; MAX_SECONDS by default.
 
         Raises:
-          InputError: the scene cannot be built.
-          NotConverged: not even two step sizes could be compared.
+            InputError: the scene cannot be built.
+            NotConverged: not even two step sizes could be compared.
         """
         path = self.folder / f"converged-{_build_motion_name(spec, size, times)}.npz"
         witness = self._compute_contact_fingerprint(spec, size, times[-1])
@@ -290,16 +290,17 @@ class ReferenceStore:
         Eighths of t_end are tried, then those of a quarter of it, and so on, within MAX_SECONDS altogether.
 
         Args:
-          spec: specification of the scene.
-          size: size of the scene.
-          t_end: longest time [s].
-          error: relative error to be measured.
+            spec: specification of the scene.
+            size: size of the scene.
+            t_end: longest time [s].
+            error: relative error to be measured.
 
-        Returns: the motion at that time, and why the time is not longer; empty at t_end.
+        Returns:
+            The motion at that time, and why the time is not longer; empty at t_end.
 
         Raises:
-          InputError: the scene cannot be built.
-          NotConverged: there is no such time.
+            InputError: the scene cannot be built.
+            NotConverged: there is no such time.
         """
         if found := self._find_stored_horizon(spec, size, t_end, error):
             return found, ""

@@ -34,9 +34,9 @@ def compute_position_error(p: Positions, reference: Positions, free_vertices: ND
     """Return |p - reference|_F [m] over the free vertices, the error by which methods are compared.
 
     Args:
-      p: positions (n, 3) [m].
-      reference: positions of the reference (n, 3) [m].
-      free_vertices: indices of the vertices that count.
+        p: positions (n, 3) [m].
+        reference: positions of the reference (n, 3) [m].
+        free_vertices: indices of the vertices that count.
     """
     return float(np.linalg.norm((p - reference)[free_vertices]))
 
@@ -48,13 +48,13 @@ class ReferenceTrajectory:
     Norms are Frobenius norms over the free vertices.
 
     Attributes:
-      times: times (k,) [s].
-      free_vertices: indices of the vertices that are not pinned.
-      positions: positions (k, n, 3) [m].
-      velocities: velocities (k, n, 3) [m/s].
-      displacement: displacement from the start (k,) [m].
-      disagreement: difference of the two methods (k,), relative to the displacement.
-      growth: size of a perturbation of the start (k,), relative to the displacement; 0 where none was estimated.
+        times: times (k,) [s].
+        free_vertices: indices of the vertices that are not pinned.
+        positions: positions (k, n, 3) [m].
+        velocities: velocities (k, n, 3) [m/s].
+        displacement: displacement from the start (k,) [m].
+        disagreement: difference of the two methods (k,), relative to the displacement.
+        growth: size of a perturbation of the start (k,), relative to the displacement; 0 where none was estimated.
     """
 
     times: NDArray[np.float64]
@@ -118,12 +118,12 @@ def integrate_motion(
     """Integrate the motion of a scene whose pins are exact.
 
     Args:
-      scene: scene with exact pins.
-      times: ascending times after the start [s].
-      report_progress: called at each evaluation of the forces.
+        scene: scene with exact pins.
+        times: ascending times after the start [s].
+        report_progress: called at each evaluation of the forces.
 
     Raises:
-      NotIntegrable: the scene has no equations of motion.
+        NotIntegrable: the scene has no equations of motion.
     """
     alone = OdeField(scene)
     start, atol = alone.initial_state, INTEGRATION_RTOL * (scene.mesh.bounding_box_diagonal or 1.0)

@@ -66,9 +66,9 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
     """Self-converged reference trajectory.
 
     Attributes:
-      disagreement: difference (k,) of the two limits, or the last change of BDF2 by step halving, if larger.
-      step: last step size [s].
-      last_change: last change of either integrator by step halving, at the end, relative to the displacement.
+        disagreement: difference (k,) of the two limits, or the last change of BDF2 by step halving, if larger.
+        step: last step size [s].
+        last_change: last change of either integrator by step halving, at the end, relative to the displacement.
     """
 
     step: float
@@ -129,14 +129,14 @@ def compute_self_converged(
     """Compute a self-converged motion at given times.
 
     Args:
-      bound: builds the scene from a step size and an integrator.
-      frame: approximate first step size [s].
-      times: ascending times [s], each a multiple of the step size.
-      error: smallest relative error to be measured, if that takes no longer than `seconds`.
-      seconds: limit on the processor time [s].
+        bound: builds the scene from a step size and an integrator.
+        frame: approximate first step size [s].
+        times: ascending times [s], each a multiple of the step size.
+        error: smallest relative error to be measured, if that takes no longer than `seconds`.
+        seconds: limit on the processor time [s].
 
     Raises:
-      NotConverged: not even two step sizes could be compared.
+        NotConverged: not even two step sizes could be compared.
     """
     steps, began = max(1, round(times[-1] / frame)), thread_time()
     before: dict[str, _SampledMotion] | None = None
@@ -168,11 +168,11 @@ class _SampledMotion:
     """A sampled motion.
 
     Attributes:
-      free_vertices: indices of the free vertices.
-      start_positions: positions at the start (n, 3) [m].
-      positions: positions (k, n, 3) [m].
-      velocities: velocities (k, n, 3) [m/s].
-      is_solved: whether each step was solved to SOLVED_STOP_RULE, or to round-off.
+        free_vertices: indices of the free vertices.
+        start_positions: positions at the start (n, 3) [m].
+        positions: positions (k, n, 3) [m].
+        velocities: velocities (k, n, 3) [m/s].
+        is_solved: whether each step was solved to SOLVED_STOP_RULE, or to round-off.
     """
 
     free_vertices: NDArray[np.int64]

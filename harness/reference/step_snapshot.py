@@ -50,12 +50,12 @@ class StepSnapshot:
     """One step of a reference run.
 
     Attributes:
-      frame: step number, from 1.
-      problem: step problem with exact pins, whose initial guess is the current positions.
-      end_motion: motion at the step's end.
-      digest: 12 hex digits of a hash of the problem's arrays, of the gradient at the current positions, which
-        represents the energies, and of the origin of the snapshot.
-      acceleration: acceleration at the step's end (n, 3) [m/s^2], None where the integrator provides none.
+        frame: step number, from 1.
+        problem: step problem with exact pins, whose initial guess is the current positions.
+        end_motion: motion at the step's end.
+        digest: 12 hex digits of a hash of the problem's arrays, of the gradient at the current positions, which
+          represents the energies, and of the origin of the snapshot.
+        acceleration: acceleration at the step's end (n, 3) [m/s^2], None where the integrator provides none.
     """
 
     frame: int
@@ -81,13 +81,13 @@ def build_exact_scene(
     """Build the scene with all of its pins exact.
 
     Args:
-      spec: specification of the scene.
-      size: size of the scene.
-      integrator: name of the integrator.
-      show_warnings: whether warnings of the scene are shown.
+        spec: specification of the scene.
+        size: size of the scene.
+        integrator: name of the integrator.
+        show_warnings: whether warnings of the scene are shown.
 
     Raises:
-      InputError: the scene cannot be built.
+        InputError: the scene cannot be built.
     """
     scene = build_scene(spec, size, integrator, log_warnings=show_warnings)
     vertices = scene.system.pins.vertices
@@ -100,17 +100,18 @@ def run_reference(
     """Take converged steps up to a number of steps.
 
     Args:
-      scene: scene with exact pins.
-      solver: solver of the steps.
-      num_steps: number of the last step.
-      frames: steps to return; the snapshot steps if empty.
-      initial_state: state from which to continue; the start of the scene if omitted.
+        scene: scene with exact pins.
+        solver: solver of the steps.
+        num_steps: number of the last step.
+        frames: steps to return; the snapshot steps if empty.
+        initial_state: state from which to continue; the start of the scene if omitted.
 
-    Returns: the steps by frame, and for all steps (num_steps,) the decrease of the objective [J] from the current
-      positions to the solution, nan before the initial state.
+    Returns:
+        The steps by frame, and for all steps (num_steps,) the decrease of the objective [J] from the current
+        positions to the solution, nan before the initial state.
 
     Raises:
-      RunFailed: a step does not converge.
+        RunFailed: a step does not converge.
     """
     stored: dict[int, SimulationStep] = {}
     violence, keep = np.full(num_steps, np.nan), set(frames)
@@ -141,8 +142,8 @@ def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dic
     """Select the frames of SNAPSHOT_NAMES in a run.
 
     Args:
-      violence: decrease of the objective [J] of the first steps (frames,).
-      num_steps: number of steps of the run.
+        violence: decrease of the objective [J] of the first steps (frames,).
+        num_steps: number of steps of the run.
     """
     first = min(2, num_steps)
     return {
@@ -174,8 +175,8 @@ def save_snapshot(step: SimulationStep, origin: str) -> tuple[StepSnapshot, Arra
     """Convert a step to a snapshot and to the arrays that are saved.
 
     Args:
-      step: step of the reference run.
-      origin: description of the source of the step.
+        step: step of the reference run.
+        origin: description of the source of the step.
     """
     problem, now = step.problem, step.state.motion
     system, start = problem.system, problem.step_start

@@ -35,10 +35,10 @@ class StepVerifier:
         """Create a verifier for a scene.
 
         Args:
-          scene: scene of the run.
-          reference: positions (frames, n, 3) [m], nan from the frame on in which there is none; None without a
-            reference.
-          is_minimiser: whether the solver minimises the step's objective.
+            scene: scene of the run.
+            reference: positions (frames, n, 3) [m], nan from the frame on in which there is none; None without a
+              reference.
+            is_minimiser: whether the solver minimises the step's objective.
         """
         self._stationarity = StationarityEvaluator()
         self._sizes = measure_component_sizes(scene.system, scene.mesh.rest_positions)
@@ -95,12 +95,13 @@ def compute_reference_positions(
     """Compute positions of a run with steps solved to round-off.
 
     Args:
-      scene: scene that is stepped.
-      solver: solver of the steps.
-      initial_guess: name of the initial guess.
-      frames: number of steps.
+        scene: scene that is stepped.
+        solver: solver of the steps.
+        initial_guess: name of the initial guess.
+        frames: number of steps.
 
-    Returns: positions (frames, n, 3) [m], nan from the first step on that does not end at a stationary point.
+    Returns:
+        Positions (frames, n, 3) [m], nan from the first step on that does not end at a stationary point.
     """
     judge, found = (
         StepVerifier(scene, None, is_minimiser=True),

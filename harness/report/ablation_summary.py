@@ -67,8 +67,9 @@ def select_kind(rows: Sequence[ResultRow], kind: str) -> list[ResultRow]:
 def largest_known_error(rows: Sequence[ResultRow]) -> tuple[float, str]:
     """Return the largest known error of the scene and its source.
 
-    Returns: the displacement error [mean rest lengths] and a phrase that names its source; (nan, "") if no error is
-    known.
+    Returns:
+        The displacement error [mean rest lengths] and a phrase that names its source; (nan, "") if no error is
+        known.
     """
     known = [(row["displacement_max"], row["name"]) for row in select_kind(rows, "error") if row["status"] == "ok"]
     size, name = max(known, default=(float("nan"), ""))

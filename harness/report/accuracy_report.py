@@ -25,6 +25,7 @@ def draw_accuracy_report(folder: Path, files: Iterable[Path] | None = None) -> l
     Args:
         folder: results of one config.
         files: files of rows to include; None for all.
+
     Raises:
         InputError: if there are no rows.
     """

@@ -108,7 +108,10 @@ def compare_benchmarks(baseline: Path, new: Path, console: Console) -> Regressio
         baseline: pytest-benchmark file of the old version.
         new: pytest-benchmark file of the new version.
         console: console that the table is printed on.
-    Returns: the verdict of all benchmarks; a new one has none.
+
+    Returns:
+        The verdict of all benchmarks; a new one has none.
+
     Raises:
         InputError: if pytest-benchmark did not write one of the files.
     """

@@ -50,6 +50,7 @@ def write_bibtex(path: Path, references: Iterable[str | None]) -> Path:
     Args:
         path: target file.
         references: references as JSON, or None.
+
     Raises:
         WriteError: if the file cannot be written.
     """

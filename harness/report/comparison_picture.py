@@ -83,6 +83,7 @@ def draw_comparison_picture(replays: Mapping[str, RecordingReplay], path: Path) 
     Args:
         replays: runs by label; the label is shown where the solver's name is ambiguous.
         path: target file.
+
     Raises:
         RunFailed: if the system cannot draw.
         ValueError: if there are no replays.

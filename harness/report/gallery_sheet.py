@@ -151,6 +151,7 @@ def draw_gallery_sheet(tiles: Sequence[SceneTile], path: Path, title: str, facts
         path: target file.
         title: title of the sheet.
         facts: phrases at the foot, before processor and commit.
+
     Raises:
         RunFailed: if the system cannot draw.
     """

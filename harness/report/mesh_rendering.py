@@ -209,6 +209,7 @@ class OffscreenRenderer:
         height: height of the pictures [pixels].
         mesh_lines: pixels per vertex from which on mesh lines are drawn.
         background: background colour; None for a transparent background without a shadow.
+
     Raises:
         RunFailed: if the system cannot draw.
     """
@@ -258,7 +259,9 @@ class OffscreenRenderer:
             view: camera.
             extra_solids: solids that are drawn in addition to the obstacles.
             coloured_points: pairs of points (q, 3) and their colour.
-        Returns: pixels (height, width, 3), or 4 channels without a background.
+
+        Returns:
+            Pixels (height, width, 3), or 4 channels without a background.
         """
         plotter = self._plotter
         plotter.clear_actors()

@@ -76,7 +76,9 @@ def build_obstacle_mesh(
         time: time [s].
         framed_points: points (q, 3) [m] relative to `origin`; of a plane only the part below them is built.
         origin: point that `framed_points` and the returned points are relative to (3,) [m].
-    Returns: the mesh, or None for the level ground.
+
+    Returns:
+        The mesh, or None for the level ground.
     """
     made = _MESH_MAKERS[obstacle.kind](obstacle, framed_points + origin)
     if made is None:

@@ -155,6 +155,7 @@ def save_page(page: Figure, path: Path, *, used_height: float = PAGE_HEIGHT, sou
         path: target file.
         used_height: height that is drawn on [pixels from the top]; the empty part below is cropped.
         sources: digest of what is drawn, stored in the file (`springbench.harness.report.picture_sources`).
+
     Raises:
         WriteError: if the file cannot be written.
     """

@@ -13,7 +13,9 @@ def compute_spring_strain(replay: RecordingReplay, frame: int) -> NDArray[np.flo
     Args:
         replay: recording.
         frame: index among the recorded frames.
-    Returns: strains (m,); 0 where the rest length is 0.
+
+    Returns:
+        Strains (m,); 0 where the rest length is 0.
     """
     i, j = replay.springs.T
     p = replay.positions[frame].astype(np.float64)

@@ -50,6 +50,7 @@ def inspect_recordings(
         export: mesh file of that frame; its suffix determines the format.
         csv: file for the scalars in long form.
         console: console that the summary is printed on.
+
     Raises:
         InputError: if a file is not a recording, a frame is missing, a suffix is unknown, or `export` or `csv` is given
             for several recordings.

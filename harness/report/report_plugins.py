@@ -44,6 +44,7 @@ def run_reports(names: Iterable[str], table: pa.Table, folder: Path, seconds: fl
         table: rows of the sweep.
         folder: folder of the sweep's results.
         seconds: time limit of a plug-in [s]; None for the default of 600 s, which is also the maximum.
+
     Raises:
         RunFailed: if a report fails.
     """

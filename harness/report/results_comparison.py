@@ -89,7 +89,10 @@ def compare_results(
         new: folder or archive of the new results.
         console: console that the table is printed on.
         reference_solver: times are divided by those of this solver, so that they are comparable between machines.
-    Returns: the verdict of all runs that both have. A run that became slower, or that fails now, fails.
+
+    Returns:
+        The verdict of all runs that both have. A run that became slower, or that fails now, fails.
+
     Raises:
         InputError: if there are no results, or none of the reference solver.
     """

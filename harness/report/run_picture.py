@@ -82,7 +82,9 @@ def layout_frames(final: float, full_run: float, earlier: int) -> tuple[PixelBox
         final: width / height of the final frame.
         full_run: width / height of all frames together.
         earlier: number of earlier frames.
-    Returns: the box of the final frame, and those of the earlier ones.
+
+    Returns:
+        The box of the final frame, and those of the earlier ones.
     """
     if not earlier:
         return PixelBox(_FRAMES_LEFT, _FRAMES_TOP, _FRAMES_RIGHT - _FRAMES_LEFT, _FRAMES_HEIGHT), []
@@ -119,6 +121,7 @@ def draw_run_picture(replay: RecordingReplay, path: Path, *, camera: tuple[float
         replay: recording.
         path: target file.
         camera: azimuth and elevation [degrees]; None to choose them by the scene's shape.
+
     Raises:
         RunFailed: if the system cannot draw.
     """

@@ -75,6 +75,7 @@ def draw_scene_preview(
         notes: further possible selections, as pairs of kind and description.
         path: target file.
         camera: azimuth and elevation [degrees]; None to choose them by the mesh's shape.
+
     Raises:
         RunFailed: if the system cannot draw.
     """

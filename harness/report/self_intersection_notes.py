@@ -18,7 +18,9 @@ def describe_self_intersection(replay: RecordingReplay, frames: Iterable[int]) -
     Args:
         replay: recording.
         frames: indices of the frames to test.
-    Returns: at most one phrase; empty if self-contact was simulated or there is no surface.
+
+    Returns:
+        At most one phrase; empty if self-contact was simulated or there is no surface.
     """
     if not len(replay.triangles) or replay.properties.get(INTERSECTION_FREE_PROPERTY, True):
         return []

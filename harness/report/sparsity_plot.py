@@ -30,7 +30,9 @@ def draw_sparsity(matrices: Mapping[str, csr_array], path: Path, title: str, fac
         path: target file.
         title: title of the picture.
         facts: phrases below the title.
-    Returns: the path.
+
+    Returns:
+        The path.
     """
     shapes = np.array([matrix.shape for matrix in matrices.values()], float)
     across = PAGE_WIDTH - 2 * _LEFT - _GAP * (len(shapes) - 1)

@@ -86,6 +86,7 @@ def run_query(sql: str, results: Path, *, max_rows: int = MAX_SHOWN_ROWS, cpu_se
         results: folder of results.
         max_rows: maximum number of rows of the result.
         cpu_seconds: limit of the processor time [s].
+
     Raises:
         InputError: if there are no rows, if the query exceeds a limit, or, with DuckDB's message, if it is invalid.
     """

@@ -23,7 +23,9 @@ def draw_device_sheets(results: Path) -> Iterator[tuple[Path | None, list[str]]]
 
     Args:
         results: folder of results, or the folder of one sweep.
-    Yields: the PNG file, or None if no run on a device reached its residual; and sentences on the sweep's rows.
+
+    Yields:
+        The PNG file, or None if no run on a device reached its residual; and sentences on the sweep's rows.
     """
     for rows in row_store.find_row_folders(results, "rows"):
         folder = rows.parent
@@ -46,7 +48,9 @@ def draw_hard_case_sheets(
     Args:
         results: folder of results, or the folder of one sweep.
         find_stale: returns the ids of those runs in a sweep's folder that other code than the current version executed.
-    Yields: each PNG file and its runs.
+
+    Yields:
+        Each PNG file and its runs.
     """
     for rows in row_store.find_row_folders(results, "rows"):
         folder = rows.parent

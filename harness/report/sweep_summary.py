@@ -213,7 +213,8 @@ def describe_losses(
         integrator, damping, friction: shares of the provided energy.
         by_engine: whether the integrator's share includes unconverged solves.
 
-    Returns: a sentence without its full stop.
+    Returns:
+        A sentence without its full stop.
     """
     others = [(damping, "damping effects"), (friction, "friction")]
     effects = " and ".join(f"{what} {_format_share(share)}" for share, what in others if share >= NOTABLE_SHARE / 2)

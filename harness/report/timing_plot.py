@@ -22,7 +22,9 @@ def write_timing_plot(rows: pa.Table, folder: Path) -> list[Path]:
     Args:
         rows: rows of the sweep.
         folder: folder that the files are written to.
-    Returns: the paths of the pictures.
+
+    Returns:
+        The paths of the pictures.
     """
     return draw_timing_plot(rows, folder / "timing.png", folder.name)
 

@@ -41,7 +41,9 @@ def write_validation_page(rows: Sequence[dict[str, Any]], solver: str, folder: P
         rows: rows of `springbench validate`.
         solver: name of the solver.
         folder: existing folder.
-    Returns: the paths of the files.
+
+    Returns:
+        The paths of the files.
     """
     paths = [folder / f"validation.{suffix}" for suffix in ("json", "md")]
     listed = [{key: value for key, value in row.items() if key not in ("positions", "triangles")} for row in rows]

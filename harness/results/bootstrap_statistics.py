@@ -51,7 +51,9 @@ def estimate_added_time(more: ArrayLike) -> ConfidenceInterval:
 
     Args:
         more: added times (rounds, frames).
-    Returns: estimate and interval, in the unit of the times.
+
+    Returns:
+        Estimate and interval, in the unit of the times.
     """
     frames = tuple(np.asarray(more, float).T)
 
@@ -66,7 +68,9 @@ def compute_min_seconds(steps: Iterable[tuple[int, float]]) -> dict[int, float]:
 
     Args:
         steps: pairs of a frame and its seconds in one round.
-    Returns: least seconds by frame.
+
+    Returns:
+        Least seconds by frame.
     """
     seconds: dict[int, float] = {}
     for frame, taken in steps:

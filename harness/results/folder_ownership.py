@@ -42,7 +42,10 @@ def claim_folder(folder: Path, config: Path) -> Path:
     Args:
         folder: results folder.
         config: file of the config, which must exist.
-    Returns: the folder.
+
+    Returns:
+        The folder.
+
     Raises:
         InputError: if the folder belongs to another config.
     """

@@ -60,7 +60,10 @@ def encode_rows(rows: Iterable[RowValues], schema: pa.Schema = RUN_SCHEMA) -> by
     Args:
         rows: mappings of column names to values.
         schema: Arrow schema.
-    Returns: content of the file.
+
+    Returns:
+        Content of the file.
+
     Raises:
         ValueError: if a row has a column that the schema lacks.
     """
@@ -110,7 +113,10 @@ def read_rows(
         promote: "permissive" allows columns of one name to differ in type.
         with_unit_names: whether to append the column `row_store.FILE_COLUMN` with the names of the units.
         on_invalid: called for each unit with an invalid value (`row_validation`), which is then omitted.
-    Returns: the rows.
+
+    Returns:
+        The rows.
+
     Raises:
         InputError: for all damaged, foreign or empty files; without on_invalid also for invalid values.
     """
@@ -147,6 +153,7 @@ def limit_read_memory(units: Sequence[Path]) -> Generator[None]:
 
     Args:
         units: row files of the units; their sizes determine the limit.
+
     Raises:
         InputError: if reading exceeds the limit.
     """
@@ -292,7 +299,10 @@ def read_first_rows(
         columns: columns to return, which the schema has.
         schema: columns that the result has at least.
         required_columns: columns of the schema without which a row is invalid.
-    Returns: by path, the values of the first row, or a description of what is wrong with the unit.
+
+    Returns:
+        By path, the values of the first row, or a description of what is wrong with the unit.
+
     Raises:
         InputError: for a damaged packed file.
     """

@@ -72,7 +72,9 @@ def compute_max_strain(frames: NDArray[np.int64], strains: NDArray[np.float64]) 
     Args:
         frames: frame numbers (k,); frame 0 is the start and is excluded.
         strains: largest strain of each frame (k,).
-    Returns: maximum, or NaN without a frame after the start.
+
+    Returns:
+        maximum, or NaN without a frame after the start.
     """
     after = strains[frames > 0]
     return float(after.max()) if len(after) else float("nan")

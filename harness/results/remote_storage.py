@@ -46,7 +46,9 @@ def sync_results(context: typer.Context, value: Path | str) -> Path:
     Args:
         context: context of the command.
         value: local path or URL.
-    Returns: the local folder.
+
+    Returns:
+        The local folder.
     """
     if isinstance(value, Path):
         return value
@@ -111,6 +113,7 @@ class RemoteStorage:
 
         Args:
             only_rows: whether to download only files of rows.
+
         Raises:
             InputError: if the storage cannot be read.
         """

@@ -45,7 +45,9 @@ def find_row_folders(above: Path, name: str, depth: str = "**/") -> list[Path]:
         above: folder to search.
         name: name of the row folders, such as `rows`.
         depth: glob prefix of the search.
-    Returns: sorted paths.
+
+    Returns:
+        Sorted paths.
     """
     packed = (path.with_suffix("") for path in above.glob(f"{depth}{name}.parquet"))
     return sorted({*above.glob(f"{depth}{name}/"), *packed})
@@ -127,7 +129,10 @@ def group_units(paths: Iterable[Path]) -> tuple[list[UnitGroup], list[int]]:
 
     Args:
         paths: row files of the units.
-    Returns: the groups, and the indices of units that are evidently not files of rows.
+
+    Returns:
+        The groups, and the indices of units that are evidently not files of rows.
+
     Raises:
         InputError: for a damaged packed file.
     """

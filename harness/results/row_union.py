@@ -100,6 +100,7 @@ def build_union(
         paths: row files of the units.
         schema: columns that the union has at least.
         promote: mode of Arrow's schema unification.
+
     Raises:
         SchemaMismatch: if the units cannot be read together.
         InputError: for a damaged packed file.
@@ -166,7 +167,10 @@ def read_table(
         required_columns: columns that no row may lack.
         max_rows: maximum number of rows of one unit.
         promote: mode of Arrow's schema unification.
-    Returns: the rows, and the index of each row's unit (n,).
+
+    Returns:
+        The rows, and the index of each row's unit (n,).
+
     Raises:
         SchemaMismatch: if a unit is damaged, empty or too long, or lacks a required column.
     """
@@ -217,7 +221,10 @@ def query_first_rows(
         columns: columns to return.
         schema: columns that the union has at least.
         required_columns: columns that no row may lack.
-    Returns: values by the index of the unit.
+
+    Returns:
+        Values by the index of the unit.
+
     Raises:
         SchemaMismatch: if the units cannot be read together.
     """

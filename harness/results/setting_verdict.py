@@ -46,10 +46,10 @@ class SettingAssessment:
     """Assessment of a given setting.
 
     Attributes:
-      setting: the given setting.
-      substep_change, iteration_change: change of the motion with at least twice the substeps or iterations; None where
-        that was not simulated, or does not apply.
-      effective_stiffness: ratio of the true sag to that of the setting; None where nothing sags.
+        setting: the given setting.
+        substep_change, iteration_change: change of the motion with at least twice the substeps or iterations; None where
+          that was not simulated, or does not apply.
+        effective_stiffness: ratio of the true sag to that of the setting; None where nothing sags.
     """
 
     setting: StepSetting
@@ -69,13 +69,13 @@ class SettingResult:
     """Result of one setting.
 
     Attributes:
-      setting: substeps and iterations.
-      error: relative error over the whole motion; infinite where it failed or is the reference itself.
-      max_strain: largest strain of a spring after any frame.
-      energy_drift: energy at the end, minus that of the reference, over its largest kinetic energy.
-      frame_seconds: median processor time of a frame [s].
-      reason: why it failed; empty otherwise.
-      positions: sampled positions (k, n, 3) [m]; empty where it failed.
+        setting: substeps and iterations.
+        error: relative error over the whole motion; infinite where it failed or is the reference itself.
+        max_strain: largest strain of a spring after any frame.
+        energy_drift: energy at the end, minus that of the reference, over its largest kinetic energy.
+        frame_seconds: median processor time of a frame [s].
+        reason: why it failed; empty otherwise.
+        positions: sampled positions (k, n, 3) [m]; empty where it failed.
     """
 
     setting: StepSetting
@@ -112,13 +112,13 @@ class ConvergenceStudy:
     """Settings around given ones, with their errors.
 
     Attributes:
-      solver: name of the solver or engine.
-      error_requested: relative error that counts as converged.
-      reference: what the errors are measured against, in words.
-      results: result of each setting.
-      assessments: assessment of each given setting, in the order in which they were given.
-      largest_difference: largest difference of the motions of two given settings; None if fewer than two succeeded.
-      min_error: smallest error that can be measured against the reference.
+        solver: name of the solver or engine.
+        error_requested: relative error that counts as converged.
+        reference: what the errors are measured against, in words.
+        results: result of each setting.
+        assessments: assessment of each given setting, in the order in which they were given.
+        largest_difference: largest difference of the motions of two given settings; None if fewer than two succeeded.
+        min_error: smallest error that can be measured against the reference.
     """
 
     solver: str
@@ -159,10 +159,10 @@ class ConvergenceStudy:
         The error is taken to be proportional to a power of the number of substeps or iterations.
 
         Args:
-          max_error: relative error.
+            max_error: relative error.
 
         Returns:
-          The cheaper one of more substeps and more iterations; None where errors fall too slowly to decide.
+            The cheaper one of more substeps and more iterations; None where errors fall too slowly to decide.
         """
         known = {result.setting: result.error for result in self.results if 0.0 < result.error < inf}
         if not known:
@@ -281,8 +281,8 @@ def list_settings(given: Sequence[StepSetting], num_doublings: int) -> list[Step
     They combine all given numbers, and those by powers of two below the smallest and above the largest.
 
     Args:
-      given: given settings.
-      num_doublings: how often the numbers are halved and doubled.
+        given: given settings.
+        num_doublings: how often the numbers are halved and doubled.
     """
     substeps, iterations = (_extend_numbers(numbers, num_doublings) for numbers in zip(*given, strict=True))
     found = [StepSetting(s, i) for s in substeps for i in iterations]
@@ -293,12 +293,12 @@ def find_doubled(settings: Iterable[StepSetting], given: StepSetting, name: str)
     """Return the setting that differs in one number, which is at least twice that of a given one.
 
     Args:
-      settings: settings of a map.
-      given: given setting.
-      name: `substeps` or `iterations`.
+        settings: settings of a map.
+        given: given setting.
+        name: `substeps` or `iterations`.
 
     Returns:
-      The one with the smallest such number; None if there is none.
+        The one with the smallest such number; None if there is none.
     """
     number: int = getattr(given, name)
     more = [one for one in settings if getattr(one, name) >= 2 * number > 0 and one._replace(**{name: number}) == given]
@@ -311,8 +311,8 @@ def find_largest_difference(
     """Return the two settings whose motions differ most; None if fewer than two succeeded.
 
     Args:
-      results: results of settings.
-      measure: relative difference of two motions (k, n, 3) [m].
+        results: results of settings.
+        measure: relative difference of two motions (k, n, 3) [m].
     """
     pairs = combinations([result for result in results if not result.reason], 2)
     found = [SettingDifference(a.setting, b.setting, measure(a.positions, b.positions)) for a, b in pairs]

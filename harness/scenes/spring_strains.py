@@ -22,11 +22,12 @@ def compute_strains(
     """Compute the strains of springs and of vertices.
 
     Args:
-      p: positions (n, 3) [m].
-      springs: vertex pairs (m, 2).
-      rest_lengths: rest lengths (m,) [m].
+        p: positions (n, 3) [m].
+        springs: vertex pairs (m, 2).
+        rest_lengths: rest lengths (m,) [m].
 
-    Returns: strains of the springs (m,), and for each vertex (n,) the one of largest magnitude among its springs.
+    Returns:
+        Strains of the springs (m,), and for each vertex (n,) the one of largest magnitude among its springs.
     """
     of_spring, of_vertex = np.empty(len(rest_lengths)), np.zeros(len(p))
     _strains_kernel(p.copy(), springs, rest_lengths, of_spring, of_vertex)

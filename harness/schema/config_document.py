@@ -89,7 +89,9 @@ class ConfigDocument:
             model: pydantic model.
             data: plain data.
             at: location of the data in the document.
-        Returns: the model instance, or None if there are mistakes.
+
+        Returns:
+            The model instance, or None if there are mistakes.
         """
         try:
             return model.model_validate_json(json.dumps(data), strict=True, context={"folder": self.path.parent})
@@ -136,7 +138,9 @@ class ConfigDocument:
             table: known names.
             tag: key that selects the name, such as `kind`.
             at: location of the data in the document.
-        Returns: (name, other keys), or None after a mistake was added.
+
+        Returns:
+            (name, other keys), or None after a mistake was added.
         """
         if not is_mapping(data) or not isinstance(data.get(tag), str):
             place = (*at, tag) if is_mapping(data) and tag in data else at

@@ -75,16 +75,16 @@ class Trajectory:
     """A motion within an error tolerance.
 
     Attributes:
-      positions: positions (k + 1, n, 3) [m] at the start and at the end of each of k frames.
-      velocities: velocities (k + 1, n, 3) [m/s] at the same times.
-      num_accepted_steps: number of accepted steps.
-      num_rejected_steps: number of rejected steps.
-      num_factorisations: number of factorisations.
-      num_iterations: number of iterations of the steps' solves.
-      step_size_range: smallest and largest step size [s].
-      wall_seconds: wall time [s], without the preparation of the first steps.
-      frame_seconds: wall time (k,) [s] in which each frame was computed; frames of one step share its time equally.
-      cpu_seconds: processor time [s] of this thread, including preparation.
+        positions: positions (k + 1, n, 3) [m] at the start and at the end of each of k frames.
+        velocities: velocities (k + 1, n, 3) [m/s] at the same times.
+        num_accepted_steps: number of accepted steps.
+        num_rejected_steps: number of rejected steps.
+        num_factorisations: number of factorisations.
+        num_iterations: number of iterations of the steps' solves.
+        step_size_range: smallest and largest step size [s].
+        wall_seconds: wall time [s], without the preparation of the first steps.
+        frame_seconds: wall time (k,) [s] in which each frame was computed; frames of one step share its time equally.
+        cpu_seconds: processor time [s] of this thread, including preparation.
     """
 
     positions: Positions
@@ -124,9 +124,9 @@ class Stepper(Protocol):
         The error of a step of size h is of order h^(order + 1). Fixed step sizes are not increased beyond the largest.
 
         Args:
-          setting: present setting.
-          ratio: new error over present error.
-          order: measured order of convergence; the theoretical one if omitted.
+            setting: present setting.
+            ratio: new error over present error.
+            order: measured order of convergence; the theoretical one if omitted.
         """
         order = order or self.order
         if self.has_fixed_step:
@@ -139,13 +139,13 @@ class Stepper(Protocol):
         """Integrate the motion up to the end time.
 
         Args:
-          setting: error tolerance [m] or number of steps relative to the smallest number.
-          cpu_limit: limit on the processor time [s].
-          observe: called after each accepted step; after each frame that the solver integrates itself.
+            setting: error tolerance [m] or number of steps relative to the smallest number.
+            cpu_limit: limit on the processor time [s].
+            observe: called after each accepted step; after each frame that the solver integrates itself.
 
         Raises:
-          TimeBudgetExceeded: the limit is exceeded.
-          StepSizeUnderflow: the tolerance would need steps below the minimum step size.
+            TimeBudgetExceeded: the limit is exceeded.
+            StepSizeUnderflow: the tolerance would need steps below the minimum step size.
         """
         ...
 
@@ -186,10 +186,10 @@ class AdaptiveImplicitStepper(Stepper):
     """Adaptive stepping by an integrator with an embedded error estimate.
 
     Attributes:
-      build_scene: builds the scene with a given step size [s].
-      solver: solver of the steps.
-      t_end: end time [s].
-      frames: number of frames up to the end time.
+        build_scene: builds the scene with a given step size [s].
+        solver: solver of the steps.
+        t_end: end time [s].
+        frames: number of frames up to the end time.
     """
 
     build_scene: Callable[[float], Scene]
@@ -368,12 +368,13 @@ def interpolate_hermite(before: Motion, after: Motion, h: float, part: float) ->
     """Interpolate a motion within a step by cubic Hermite polynomials of the motions at both ends.
 
     Args:
-      before: motion at the start.
-      after: motion at the end.
-      h: step size [s].
-      part: fraction of the step.
+        before: motion at the start.
+        after: motion at the end.
+        h: step size [s].
+        part: fraction of the step.
 
-    Returns: the motion, whose positions are accurate to order 3.
+    Returns:
+        The motion, whose positions are accurate to order 3.
     """
     (p, v), (q, w), s = before, after, part
     if s == 1.0:

@@ -77,13 +77,13 @@ class LocalErrorStopRule:
         """Start with no history.
 
         Args:
-          auto: limit of the iterations.
-          scene: scene that is stepped.
-          now: motion at the start.
-          frames: number of steps up to the end.
+            auto: limit of the iterations.
+            scene: scene that is stepped.
+            now: motion at the start.
+            frames: number of steps up to the end.
 
         Raises:
-          Unsupported: the step size is not constant.
+            Unsupported: the step size is not constant.
         """
         if scene.alternate_scene:
             raise Unsupported("tolerance: auto differences steps of one length, and the scene alternates two; give one")

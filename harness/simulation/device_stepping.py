@@ -85,7 +85,8 @@ def wrap_device_solver(prepared: PreparedSolver) -> DevicePreparedSolver | None:
 def compute_event_seconds(marks: SolveEvents | None) -> dict[str, float]:
     """Compute the times [s] of a step's kernels and transfers by events on the stream.
 
-    Returns: columns; empty without events.
+    Returns:
+        columns; empty without events.
     """
     if marks is None:
         return {}

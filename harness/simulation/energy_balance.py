@@ -140,8 +140,8 @@ class EnergyGrowth(NamedTuple):
     """Energy growth without a source.
 
     Attributes:
-      first_frame: first frame after which energy has grown.
-      max_ratio: largest ratio of gain to available energy.
+        first_frame: first frame after which energy has grown.
+        max_ratio: largest ratio of gain to available energy.
     """
 
     first_frame: int
@@ -336,14 +336,14 @@ class StepDissipation(NamedTuple):
     """Energies after a step and its dissipation by cause, each [J]; None where the cause cannot be separated.
 
     Attributes:
-      kinetic_energy: of all vertices without an exact pin.
-      potential_energy: springs, loads, penalty pins and all other potentials; loads relative to the start.
-      provided_energy: energy of the start, released by loads, and positive work of sources, up to this step.
-      source_work: work of sources in the step.
-      dissipation_damping, dissipation_friction, dissipation_integrator, dissipation_solve: in the step.
-      dissipation_engine: by integrator and solves together, where a solver iterates within the frames it integrates.
-      balance_error: change of the energy in the step that these terms do not explain; of frames that the solver
-        integrated, the error of the work by quadrature.
+        kinetic_energy: of all vertices without an exact pin.
+        potential_energy: springs, loads, penalty pins and all other potentials; loads relative to the start.
+        provided_energy: energy of the start, released by loads, and positive work of sources, up to this step.
+        source_work: work of sources in the step.
+        dissipation_damping, dissipation_friction, dissipation_integrator, dissipation_solve: in the step.
+        dissipation_engine: by integrator and solves together, where a solver iterates within the frames it integrates.
+        balance_error: change of the energy in the step that these terms do not explain; of frames that the solver
+          integrated, the error of the work by quadrature.
     """
 
     kinetic_energy: float
@@ -697,7 +697,7 @@ class FrameDissipation:
     A step belongs to the frame in which it ends. A frame in which none ends has the energies of the one before it.
 
     Attributes:
-      by_frame: dissipation of each frame, from 1.
+        by_frame: dissipation of each frame, from 1.
     """
 
     def __init__(self, frame_seconds: float) -> None:
@@ -741,8 +741,8 @@ def compute_frame_balances(scene: Scene, motions: Iterable[Motion]) -> Iterator[
     """Yield the balance after each frame of a motion, however it was integrated.
 
     Args:
-      scene: the scene with the integrator `substepping`, whose time step is the frame.
-      motions: motion after each frame.
+        scene: the scene with the integrator `substepping`, whose time step is the frame.
+        motions: motion after each frame.
     """
     balance, state = EnergyBalance(scene), build_initial_state(scene)
     for motion in motions:

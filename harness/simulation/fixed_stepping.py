@@ -28,10 +28,10 @@ class FixedImplicitStepper(Stepper):
     """Stepping by an integrator with a fixed step size.
 
     Attributes:
-      build_scene: builds the scene with a given step size [s].
-      solver: solver of the steps.
-      t_end: end time [s].
-      frames: number of frames up to the end time; the setting is the number of steps of each, at least one.
+        build_scene: builds the scene with a given step size [s].
+        solver: solver of the steps.
+        t_end: end time [s].
+        frames: number of frames up to the end time; the setting is the number of steps of each, at least one.
     """
 
     build_scene: Callable[[float], Scene]

@@ -47,8 +47,8 @@ class ConvergenceTrace:
     """Convergence of a solve at the iterates 1, 2, ...
 
     Attributes:
-      residuals: |p - previous p|_Q [J^(1/2)] over the unpinned vertices.
-      objective: objective [J].
+        residuals: |p - previous p|_Q [J^(1/2)] over the unpinned vertices.
+        objective: objective [J].
     """
 
     residuals: list[float]
@@ -76,10 +76,10 @@ def trace_convergence(
     """Trace the convergence of a solve over a number of iterations.
 
     Args:
-      prepared: prepared solver.
-      problem: step problem.
-      norm: norm of the residuals.
-      iterations: number of iterations.
+        prepared: prepared solver.
+        problem: step problem.
+        norm: norm of the residuals.
+        iterations: number of iterations.
     """
     residuals, objective = list[float](), list[float]()
     previous = problem.initial_guess.copy()
@@ -113,19 +113,19 @@ def observe_run(
     """Simulate a run's frames and return the solution columns of its rows by frame.
 
     Args:
-      scene: scene that is stepped.
-      prepared: prepared solver.
-      settings: settings of the time stepping.
-      recorder: recorder of every frame and of the convergence in the frames `convergence_frames`.
-      convergence_frames: frames whose convergence is recorded.
-      positions_out: output array for the positions after each step, (frames, n, 3) [m].
-      sample_frame: called with each frame and its positions (n, 3) [m].
-      verify_step: returns the accuracy columns of each step.
-      tick: called with the name of the pass after each step.
-      clock: context within which each step is computed.
+        scene: scene that is stepped.
+        prepared: prepared solver.
+        settings: settings of the time stepping.
+        recorder: recorder of every frame and of the convergence in the frames `convergence_frames`.
+        convergence_frames: frames whose convergence is recorded.
+        positions_out: output array for the positions after each step, (frames, n, 3) [m].
+        sample_frame: called with each frame and its positions (n, 3) [m].
+        verify_step: returns the accuracy columns of each step.
+        tick: called with the name of the pass after each step.
+        clock: context within which each step is computed.
 
     Raises:
-      StepError: a step failed, or, caused by DivergenceError, the energy diverges.
+        StepError: a step failed, or, caused by DivergenceError, the energy diverges.
     """
     found: dict[int, dict[str, Any]] = {}
     energy = EnergyBalance(scene)
@@ -182,10 +182,10 @@ def build_solution_columns(
     """Build the solution columns of a step's rows.
 
     Args:
-      scene: scene that is stepped.
-      step: completed step.
-      terms: terms of the objective [J].
-      residual: residual norm [J^(1/2)] at the step's positions.
+        scene: scene that is stepped.
+        step: completed step.
+        terms: terms of the objective [J].
+        residual: residual norm [J^(1/2)] at the step's positions.
     """
     p, s = step.positions, step.solution
     return {
@@ -227,9 +227,9 @@ def compute_penetration(scene: Scene, p: Positions, time: float) -> float | None
     """Compute the largest depth [m] of a vertex inside an obstacle; None without obstacles.
 
     Args:
-      scene: scene with obstacles.
-      p: positions (n, 3) [m].
-      time: time [s].
+        scene: scene with obstacles.
+        p: positions (n, 3) [m].
+        time: time [s].
     """
     contacts = [energy for energy in scene.system.energies if isinstance(energy, HalfSpaceContact)]
     inside = [-one.signed_distance(p, time).min(initial=0.0) for contact in contacts for one in contact.obstacles]
@@ -240,11 +240,12 @@ def count_intersections(scene: Scene, p: Positions, time: float) -> int | None:
     """Count the edge-triangle intersections of the mesh with itself and with obstacle surfaces.
 
     Args:
-      scene: scene with obstacles.
-      p: positions (n, 3) [m].
-      time: time [s].
+        scene: scene with obstacles.
+        p: positions (n, 3) [m].
+        time: time [s].
 
-    Returns: their number; None where no effect prevents intersections.
+    Returns:
+        Their number; None where no effect prevents intersections.
     """
     return (
         sum(len(one.find_intersections(p, time)) for one in scene.intersection_checks)
@@ -309,10 +310,11 @@ def compute_max_length_error(scene: Scene, p: Positions) -> float | None:
     """Compute the largest error of an exact length, relative to its maximum length.
 
     Args:
-      scene: scene with the lengths.
-      p: positions (n, 3) [m].
+        scene: scene with the lengths.
+        p: positions (n, 3) [m].
 
-    Returns: the error, None without exact lengths.
+    Returns:
+        The error, None without exact lengths.
     """
     errors = [
         np.abs(length_errors(lengths, p) / lengths.max_length).max(initial=0.0)
@@ -325,12 +327,12 @@ def require_finite(columns_by_frame: Mapping[int, dict[str, Any]], *, is_minimis
     """Require finite columns of each frame, and set columns that do not apply to None.
 
     Args:
-      columns_by_frame: columns by frame.
-      is_minimiser: whether the solver has a residual.
-      has_rtol: whether it has a relative tolerance, which uses the initial residual.
+        columns_by_frame: columns by frame.
+        is_minimiser: whether the solver has a residual.
+        has_rtol: whether it has a relative tolerance, which uses the initial residual.
 
     Raises:
-      StepError: caused by DivergenceError, where a column is infinite or NaN.
+        StepError: caused by DivergenceError, where a column is infinite or NaN.
     """
     known = {"residual": is_minimiser, "residual_last": is_minimiser, "residual_initial": is_minimiser and has_rtol}
     for frame, columns in columns_by_frame.items():

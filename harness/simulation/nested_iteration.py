@@ -26,10 +26,10 @@ class CoarseLevel:
     """A scene on a coarser mesh with a prepared solver.
 
     Attributes:
-      scene: scene on the coarser mesh.
-      prepared: its prepared solver.
-      restriction: weights (coarse, fine).
-      prolongation: weights (fine, coarse).
+        scene: scene on the coarser mesh.
+        prepared: its prepared solver.
+        restriction: weights (coarse, fine).
+        prolongation: weights (fine, coarse).
     """
 
     scene: Scene
@@ -42,9 +42,9 @@ class CoarseLevel:
         """Build the transfer between two scenes that differ only in mesh size.
 
         Args:
-          fine: scene on the finer mesh.
-          coarse: scene on the coarser mesh.
-          prepared: solver prepared for the coarser scene.
+            fine: scene on the finer mesh.
+            coarse: scene on the coarser mesh.
+            prepared: solver prepared for the coarser scene.
         """
         a, b = fine.mesh.rest_positions, coarse.mesh.rest_positions
         return cls(coarse, prepared, build_interpolation(a, b), build_interpolation(b, a))

@@ -34,10 +34,10 @@ class StepResult(NamedTuple):
     """Result of a step.
 
     Attributes:
-      stages: problem and solution of each stage.
-      end: end of the step.
-      iteration_counts: number of iterations of each solve.
-      friction_rounds: friction rounds of the worst stage.
+        stages: problem and solution of each stage.
+        end: end of the step.
+        iteration_counts: number of iterations of each solve.
+        friction_rounds: friction rounds of the worst stage.
     """
 
     stages: tuple[tuple[StepProblem, Solution], ...]
@@ -72,9 +72,9 @@ class StageSequence:
         """Solve all stages of the step.
 
         Args:
-          prepared: solver prepared for the scene's system.
-          stop: stop rule of each solve.
-          guess: function that sets the initial guess of a problem.
+            prepared: solver prepared for the scene's system.
+            stop: stop rule of each solve.
+            guess: function that sets the initial guess of a problem.
         """
         found, counts, unknown = list[tuple[StepProblem, Solution]](), list[int](), next(self._unknowns)
         friction = list[FrictionConvergence]()
@@ -102,8 +102,8 @@ class StageSequence:
         """Build a stage's problem, with the current positions as initial guess.
 
         Args:
-          stage: stage of the integrator.
-          expected: expected solution (n, 3) [m]; extrapolated from the motion if omitted.
+            stage: stage of the integrator.
+            expected: expected solution (n, 3) [m]; extrapolated from the motion if omitted.
         """
         scene, system = self.scene, self.scene.system
         until = self.time + stage.stage_fraction * system.time_step

@@ -55,11 +55,12 @@ class _SubsteppingSolver(Protocol):
         """Integrate one frame.
 
         Args:
-          problem: step problem of the frame.
-          h: first step size [s].
+            problem: step problem of the frame.
+            h: first step size [s].
 
-        Returns: positions [m] and velocities [m/s] at the frame's end, and the number of accepted steps, the number of
-          rejected steps and the last step size [s].
+        Returns:
+            Positions [m] and velocities [m/s] at the frame's end, and the number of accepted steps, the
+            number of rejected steps and the last step size [s].
         """
         ...
 
@@ -72,7 +73,7 @@ class AdaptiveSubstepping(_SubsteppingSolver, Protocol):
         """Return the solver with an error tolerance [m] of each step.
 
         Raises:
-          Unsupported: the method has no error estimate.
+            Unsupported: the method has no error estimate.
         """
         ...
 

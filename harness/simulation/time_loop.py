@@ -37,11 +37,11 @@ class MotionState:
     """State between two steps.
 
     Attributes:
-      motion: motion at the start of the next step.
-      previous_motion: motion one step earlier, filtered; None where there is none.
-      index: index of the last step, 0 at the start.
-      acceleration: acceleration (n, 3) [m/s^2] at `motion`, None where it is unknown.
-      warm_start: warm-start data of the last step's solution.
+        motion: motion at the start of the next step.
+        previous_motion: motion one step earlier, filtered; None where there is none.
+        index: index of the last step, 0 at the start.
+        acceleration: acceleration (n, 3) [m/s^2] at `motion`, None where it is unknown.
+        warm_start: warm-start data of the last step's solution.
     """
 
     motion: Motion
@@ -56,14 +56,14 @@ class SimulationStep:
     """A completed step.
 
     Attributes:
-      problem: step problem; that of the last stage in a step of several stages.
-      solution: its solution.
-      state: state after the step.
-      iteration_counts: number of iterations of each solve.
-      stages: problem and solution of each stage, in order.
-      stop_rule: stop rule of each solve.
-      friction_rounds: friction rounds of the step.
-      local_error: error of the motion by an embedded method, None without one.
+        problem: step problem; that of the last stage in a step of several stages.
+        solution: its solution.
+        state: state after the step.
+        iteration_counts: number of iterations of each solve.
+        stages: problem and solution of each stage, in order.
+        stop_rule: stop rule of each solve.
+        friction_rounds: friction rounds of the step.
+        local_error: error of the motion by an embedded method, None without one.
     """
 
     problem: StepProblem
@@ -104,12 +104,12 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
     """Build the problem of the next step, or of its first stage.
 
     Args:
-      scene: scene that is stepped.
-      state: state at the start of the step.
-      initial_guess: a key of `INITIAL_GUESSES`, or COARSE_TO_FINE, which solves the step on a coarser mesh.
+        scene: scene that is stepped.
+        state: state at the start of the step.
+        initial_guess: a key of `INITIAL_GUESSES`, or COARSE_TO_FINE, which solves the step on a coarser mesh.
 
     Raises:
-      Unsupported: there is no coarser mesh.
+        Unsupported: there is no coarser mesh.
     """
     usual = scene.integrator
     if not isinstance(usual, SingleStageIntegrator):
@@ -205,15 +205,15 @@ def simulate_scene(
     """Iterate over the steps from a state up to a frame, each computed on demand.
 
     Args:
-      scene: scene that is stepped.
-      prepared: result of `prepare`.
-      stop: stop criterion of the solves.
-      initial_guess: name of the initial guess.
-      frames: number of the last step.
-      initial_state: state to start from; the scene's start if omitted.
+        scene: scene that is stepped.
+        prepared: result of `prepare`.
+        stop: stop criterion of the solves.
+        initial_guess: name of the initial guess.
+        frames: number of the last step.
+        initial_state: state to start from; the scene's start if omitted.
 
     Raises:
-      Unsupported: the automatic tolerance does not support the scene.
+        Unsupported: the automatic tolerance does not support the scene.
     """
     initial_state = initial_state or build_initial_state(scene)
     step = _step_single_stage if isinstance(scene.integrator, SingleStageIntegrator) else _step_stages

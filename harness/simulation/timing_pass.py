@@ -67,12 +67,12 @@ class TimingSample:
     """One measured time.
 
     Attributes:
-      phase: name of the phase.
-      frame: frame, None where there is none.
-      round: number of the round.
-      seconds: wall time [s] per call.
-      num_calls: number of calls.
-      device_columns: columns of a device: times of a step by events, and its state after the round.
+        phase: name of the phase.
+        frame: frame, None where there is none.
+        round: number of the round.
+        seconds: wall time [s] per call.
+        num_calls: number of calls.
+        device_columns: columns of a device: times of a step by events, and its state after the round.
     """
 
     phase: str
@@ -98,11 +98,11 @@ class RunMeasurement:
     """Result of the timed passes.
 
     Attributes:
-      prepared: prepared solver.
-      timings: all times.
-      watches: watch over the times of each phase, and over those of the steps of each round.
-      final_positions: final positions (n, 3) [m], None without timed passes.
-      clock: without timed passes, the stopwatch of the steps of the instrumentation pass.
+        prepared: prepared solver.
+        timings: all times.
+        watches: watch over the times of each phase, and over those of the steps of each round.
+        final_positions: final positions (n, 3) [m], None without timed passes.
+        clock: without timed passes, the stopwatch of the steps of the instrumentation pass.
     """
 
     prepared: PreparedSolver
@@ -123,16 +123,16 @@ def measure_run(
     """Prepare the solver cold and warm, then time phases and steps.
 
     Args:
-      scene: scene that is stepped.
-      solver: solver of the steps.
-      settings: settings of the time stepping.
-      tick: called with the name of the pass after each step.
+        scene: scene that is stepped.
+        solver: solver of the steps.
+        settings: settings of the time stepping.
+        tick: called with the name of the pass after each step.
 
     Raises:
-      Unsupported: the solver does not support the scene.
-      NotPositiveDefinite: a matrix is not positive definite.
-      StepError: a step failed.
-      RunFailed: the solver violates its contract.
+        Unsupported: the solver does not support the scene.
+        NotPositiveDefinite: a matrix is not positive definite.
+        StepError: a step failed.
+        RunFailed: the solver violates its contract.
     """
     timings: list[TimingSample] = []
     watches: dict[tuple[str, int | None], PhaseWatch] = {}
@@ -226,13 +226,13 @@ def iterate_steps(
     """Iterate over the run's steps, each computed within the clock.
 
     Args:
-      scene: scene that is stepped.
-      prepared: prepared solver.
-      settings: settings of the time stepping.
-      clock: context within which each step is computed.
+        scene: scene that is stepped.
+        prepared: prepared solver.
+        settings: settings of the time stepping.
+        clock: context within which each step is computed.
 
     Raises:
-      StepError: a step failed, or, caused by DivergenceError, a position is not finite.
+        StepError: a step failed, or, caused by DivergenceError, a position is not finite.
     """
     run = simulate_scene(
         scene, prepared, settings.stop_criterion, initial_guess=settings.initial_guess, frames=settings.frames

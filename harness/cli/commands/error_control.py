@@ -91,7 +91,8 @@ def run_error_control(
         rerun: whether to try all methods, even those that were expensive according to stored rows.
         rejected_options: other options on the command line, which are not supported here.
 
-    Returns: whether energy has grown only by its sources, and the verification passes if there is one.
+    Returns:
+        Whether energy has grown only by its sources, and the verification passes if there is one.
 
     Raises:
         InputError: an option is invalid.

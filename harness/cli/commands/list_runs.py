@@ -109,7 +109,8 @@ def collect_varied_settings(runs: Sequence[RunSpec]) -> dict[str, list[str]]:
     Args:
         runs: runs of one sweep.
 
-    Returns: a value for each run by column; empty for a parameter that the run's solver does not have.
+    Returns:
+        A value for each run by column; empty for a parameter that the run's solver does not have.
     """
     from springbench.harness.config.run_options import RUN_OPTIONS
 

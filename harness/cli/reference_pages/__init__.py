@@ -55,6 +55,7 @@ def write_stale_pages(pages: Mapping[str, str], folder: Path) -> list[Path]:
     Args:
         pages: texts by file name.
         folder: folder of the files, created if missing.
+
     Raises:
         WriteError: if a file cannot be written.
     """

@@ -108,7 +108,8 @@ def run_ablation(
         rerun_stale: whether to repeat it if it was measured by other source code.
         isolated: see `springbench.harness.experiments.experiment_units.execute_units`.
 
-    Returns: the file of rows.
+    Returns:
+        The file of rows.
 
     Raises:
         InputError: the scene or an option is invalid.

@@ -113,7 +113,8 @@ def measure_all_overheads(
         rerun_stale: whether to repeat units measured by other source code.
         isolated: see `springbench.harness.experiments.experiment_units.execute_units`.
 
-    Returns: the files of rows.
+    Returns:
+        The files of rows.
 
     Raises:
         InputError: the scene has no effect to measure, or no fixed time step.

@@ -239,7 +239,8 @@ def load_published_runs(
         print_message: prints a remark.
         with_user_code: whether to include runs that need code from the archive.
 
-    Returns: the runs, and failed or inconclusive claims on the names of runs.
+    Returns:
+        The runs, and failed or inconclusive claims on the names of runs.
     """
     runs: list[PublishedRun] = []
     claims: list[VerifiedClaim] = []

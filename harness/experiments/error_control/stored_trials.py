@@ -65,7 +65,8 @@ def select_best_predicted(
         stored_trials: rows of earlier trials.
         error: relative error to reach.
 
-    Returns: the nearest error, and integrators with solvers; none where no stored error is similar.
+    Returns:
+        The nearest error, and integrators with solvers; none where no stored error is similar.
     """
     nearest = min(
         (row["error_requested"] for row in stored_trials),

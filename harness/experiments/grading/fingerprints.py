@@ -69,11 +69,11 @@ class NamedMistake:
     """A mistake and how well it fits.
 
     Attributes:
-      name: short name.
-      description: what the program does.
-      remedy: what to look at.
-      fit: part of the deviation that it explains, at most 1.
-      deviation: remaining deviation D.
+        name: short name.
+        description: what the program does.
+        remedy: what to look at.
+        fit: part of the deviation that it explains, at most 1.
+        deviation: remaining deviation D.
     """
 
     name: str
@@ -88,14 +88,14 @@ class ProgramFingerprint:
     """The programs that are closest to a submission.
 
     Attributes:
-      deviation: deviation D of the closest correct program.
-      noise: share of the stored digits in D.
-      correct_program: the closest correct program in words.
-      iterations: number of iterations of local-global that fits best; None for the minimum.
-      closest: mistakes, closest first; empty where a correct program explains the submission.
-      mistake: the mistake that is named; None where there is none.
-      alike: names of mistakes that are indistinguishable from the named one in this scene.
-      invisible: names of mistakes that have no effect on this scene.
+        deviation: deviation D of the closest correct program.
+        noise: share of the stored digits in D.
+        correct_program: the closest correct program in words.
+        iterations: number of iterations of local-global that fits best; None for the minimum.
+        closest: mistakes, closest first; empty where a correct program explains the submission.
+        mistake: the mistake that is named; None where there is none.
+        alike: names of mistakes that are indistinguishable from the named one in this scene.
+        invisible: names of mistakes that have no effect on this scene.
     """
 
     deviation: float
@@ -117,9 +117,9 @@ class _Comparison(NamedTuple):
     """Steps to be predicted.
 
     Attributes:
-      steps: the steps.
-      scales: scale (s,) [m] of each.
-      noise: share of the stored digits in D.
+        steps: the steps.
+        scales: scale (s,) [m] of each.
+        noise: share of the stored digits in D.
     """
 
     steps: StepBatch
@@ -138,9 +138,9 @@ class FingerprintFinder:
         """Prepare the programs.
 
         Args:
-          scene: scene of the terms below.
-          terms: terms of the scene.
-          required_iterations: iterations that a step should have; None for convergence.
+            scene: scene of the terms below.
+            terms: terms of the scene.
+            required_iterations: iterations that a step should have; None for convergence.
         """
         self._scene, self._terms, self._required = scene, terms, required_iterations
         self._start = build_initial_state(scene).motion.positions
@@ -155,8 +155,8 @@ class FingerprintFinder:
         """Find the closest programs.
 
         Args:
-          submission: positions.
-          find_minimum: finds the minimum of a step's objective in the basin of some positions.
+            submission: positions.
+            find_minimum: finds the minimum of a step's objective in the basin of some positions.
         """
         with np.errstate(all="ignore"):
             return self._find_fingerprint(submission, find_minimum)

@@ -35,13 +35,13 @@ class GradeRequest:
     """What is graded against.
 
     Attributes:
-      spec: the scene.
-      size: mesh size.
-      required_iterations: iterations of a step that are required; None for convergence.
-      first_frame: number of the first stored frame, 0 or 1; None to detect the start.
-      rest: file of rest positions in the order of the submission; None for none.
-      array: name of the array in .npz files.
-      seconds: time limit [s] of the minima, and of the integrated motion.
+        spec: the scene.
+        size: mesh size.
+        required_iterations: iterations of a step that are required; None for convergence.
+        first_frame: number of the first stored frame, 0 or 1; None to detect the start.
+        rest: file of rest positions in the order of the submission; None for none.
+        array: name of the array in .npz files.
+        seconds: time limit [s] of the minima, and of the integrated motion.
     """
 
     spec: SceneSpec
@@ -58,15 +58,15 @@ class PositionGrade:
     """The grade of one submission.
 
     Attributes:
-      submission: the positions.
-      steps: verdicts on the steps.
-      quantities: energy, momentum, strain and intersections.
-      shares: errors against the integrated motion.
-      shares_note: why errors are missing; empty if none are.
-      fingerprint: the closest programs; None for scenes with other terms.
-      fingerprint_note: why there is none.
-      kind: one of the kinds above.
-      verdict: the verdict in words.
+        submission: the positions.
+        steps: verdicts on the steps.
+        quantities: energy, momentum, strain and intersections.
+        shares: errors against the integrated motion.
+        shares_note: why errors are missing; empty if none are.
+        fingerprint: the closest programs; None for scenes with other terms.
+        fingerprint_note: why there is none.
+        kind: one of the kinds above.
+        verdict: the verdict in words.
     """
 
     submission: SubmittedMotion
@@ -111,8 +111,8 @@ class SceneGrader:
     """Grades submissions of one scene; references are computed once.
 
     Attributes:
-      request: what is graded against.
-      scene: the scene, built.
+        request: what is graded against.
+        scene: the scene, built.
     """
 
     request: GradeRequest

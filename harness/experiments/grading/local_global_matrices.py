@@ -42,18 +42,18 @@ class LocalGlobalMatrices(NamedTuple):
     """Matrices and vectors of one iteration.
 
     Attributes:
-      E: springs (m, 2), vertex pairs.
-      A: signed incidence (m, n).
-      C: selection of the pins (q, n).
-      M: masses (n, n) [kg].
-      Q: system matrix (n, n) [N/m].
-      k: stiffnesses (m,) [N/m].
-      r: rest lengths (m,) [m].
-      p: positions (n, 3) [m] at which d is evaluated.
-      y: constant part of the right-hand side (n, 3) [N].
-      d: directions times rest lengths (m, 3) [m].
-      b: right-hand side (n, 3) [N].
-      terms: the terms of the scene.
+        E: springs (m, 2), vertex pairs.
+        A: signed incidence (m, n).
+        C: selection of the pins (q, n).
+        M: masses (n, n) [kg].
+        Q: system matrix (n, n) [N/m].
+        k: stiffnesses (m,) [N/m].
+        r: rest lengths (m,) [m].
+        p: positions (n, 3) [m] at which d is evaluated.
+        y: constant part of the right-hand side (n, 3) [N].
+        d: directions times rest lengths (m, 3) [m].
+        b: right-hand side (n, 3) [N].
+        terms: the terms of the scene.
     """
 
     E: NDArray[np.int64]
@@ -84,12 +84,12 @@ def build_local_global_matrices(scene: Scene, frame: int = 1, initial_guess: str
     """Build the matrices of the first iteration of a step.
 
     Args:
-      scene: scene of springs, masses, forces and pins.
-      frame: number of the step; earlier ones have ASSIGNMENT_ITERATIONS iterations each.
-      initial_guess: positions at which the step starts, a key of `INITIAL_GUESSES`.
+        scene: scene of springs, masses, forces and pins.
+        frame: number of the step; earlier ones have ASSIGNMENT_ITERATIONS iterations each.
+        initial_guess: positions at which the step starts, a key of `INITIAL_GUESSES`.
 
     Raises:
-      InputError: the scene has other terms.
+        InputError: the scene has other terms.
     """
     terms = collect_spring_terms(scene)
     Q = terms.build_system_matrix()

@@ -44,12 +44,12 @@ class StepBatch(NamedTuple):
     """Some steps of a submission, all arrays (s, n, 3) [m], and forces and pins of the scene's problems.
 
     Attributes:
-      previous: p^(t-dt).
-      current: p^t.
-      target: inertial target.
-      force: external forces [N].
-      pin_targets: (s, q, 3) [m].
-      after: p, which programs are to predict.
+        previous: p^(t-dt).
+        current: p^t.
+        target: inertial target.
+        force: external forces [N].
+        pin_targets: (s, q, 3) [m].
+        after: p, which programs are to predict.
     """
 
     previous: Positions
@@ -69,22 +69,22 @@ class AssignmentProgram:
     """The assignment's program, or one with a mistake.
 
     Attributes:
-      edges: springs (m, 2).
-      rest_length: (m,) [m].
-      rest_direction: (m, 3).
-      system_stiffness, side_stiffness: K_Q, K_b (m,) [N/m].
-      system_mass, target_mass: M_Q, M_y (n,) [kg].
-      system_step, target_step: dt_Q, dt_y [s].
-      pinned: vertices of the pins (q,).
-      system_weight, side_weight: w_Q, w_b (q,) [N/m].
-      pin_places: places (n, 3) [m] of pins that are not the scene's; None for the scene's pins.
-      map_force: F.
-      map_target: inertial target (n, 3) [m], of target, p^t and p^(t-dt).
-      uses_iterate: whether the target uses the iterate instead of p^t.
-      compute_directions: d.
-      explicit_at: positions at which an explicit step has its spring forces, "current" (p^t) or "previous"
-        (p^(t-dt)); "" for an implicit step.
-      initial_guess: "current" or "target".
+        edges: springs (m, 2).
+        rest_length: (m,) [m].
+        rest_direction: (m, 3).
+        system_stiffness, side_stiffness: K_Q, K_b (m,) [N/m].
+        system_mass, target_mass: M_Q, M_y (n,) [kg].
+        system_step, target_step: dt_Q, dt_y [s].
+        pinned: vertices of the pins (q,).
+        system_weight, side_weight: w_Q, w_b (q,) [N/m].
+        pin_places: places (n, 3) [m] of pins that are not the scene's; None for the scene's pins.
+        map_force: F.
+        map_target: inertial target (n, 3) [m], of target, p^t and p^(t-dt).
+        uses_iterate: whether the target uses the iterate instead of p^t.
+        compute_directions: d.
+        explicit_at: positions at which an explicit step has its spring forces, "current" (p^t) or "previous"
+          (p^(t-dt)); "" for an implicit step.
+        initial_guess: "current" or "target".
     """
 
     edges: NDArray[np.int64]
@@ -203,12 +203,12 @@ class ProgramMistake:
     """A mistake, as changes of the correct program or of its output.
 
     Attributes:
-      name: short name, in tables.
-      description: what the program does, as a sentence without its subject.
-      remedy: what to look at.
-      variants: programs with the mistake, each made of the correct one and the rest positions (n, 3) [m].
-      is_late: whether the positions are one frame late.
-      axes: orders of the axes in which the positions are written.
+        name: short name, in tables.
+        description: what the program does, as a sentence without its subject.
+        remedy: what to look at.
+        variants: programs with the mistake, each made of the correct one and the rest positions (n, 3) [m].
+        is_late: whether the positions are one frame late.
+        axes: orders of the axes in which the positions are written.
     """
 
     name: str

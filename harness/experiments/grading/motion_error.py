@@ -50,13 +50,13 @@ class ErrorShares(NamedTuple):
     """Errors after a step, relative to the displacement.
 
     Attributes:
-      step: number of the step.
-      time: [s].
-      total: error of the submission.
-      time_step_share: error of implicit Euler itself.
-      solver_share: distance from implicit Euler solved to round-off.
-      reference_error: bound on the error of the reference itself.
-      reference_kind: integrated, or self-converged where there is contact.
+        step: number of the step.
+        time: [s].
+        total: error of the submission.
+        time_step_share: error of implicit Euler itself.
+        solver_share: distance from implicit Euler solved to round-off.
+        reference_error: bound on the error of the reference itself.
+        reference_kind: integrated, or self-converged where there is contact.
     """
 
     step: int

@@ -29,11 +29,11 @@ class MotionQuantities(NamedTuple):
     """Quantities after each step, arrays (k,), with the start first (k + 1,) for energies and strains.
 
     Attributes:
-      energy: kinetic and potential energy less the work of constant forces [J].
-      kinetic_energy: [J].
-      max_strain: largest magnitude of a spring's strain.
-      momentum_error: relative violation of the balance of momentum; None with pins or obstacles, which take momentum.
-      intersections: numbers of intersections of edges with triangles by step; empty without surfaces.
+        energy: kinetic and potential energy less the work of constant forces [J].
+        kinetic_energy: [J].
+        max_strain: largest magnitude of a spring's strain.
+        momentum_error: relative violation of the balance of momentum; None with pins or obstacles, which take momentum.
+        intersections: numbers of intersections of edges with triangles by step; empty without surfaces.
     """
 
     energy: NDArray[np.float64]

@@ -46,11 +46,11 @@ class PositionSequence:
     """Positions over time as read from a file.
 
     Attributes:
-      source: the file or folder.
-      positions: (k, n, 3) [m].
-      frames: frame numbers (k,) that the file states, None where it states none.
-      times: times (k,) [s] that the file states, None where it states none.
-      notes: sentences on what was assumed to read the file.
+        source: the file or folder.
+        positions: (k, n, 3) [m].
+        frames: frame numbers (k,) that the file states, None where it states none.
+        times: times (k,) [s] that the file states, None where it states none.
+        notes: sentences on what was assumed to read the file.
     """
 
     source: Path
@@ -64,12 +64,12 @@ def read_position_file(path: Path, num_vertices: int, array: str = DEFAULT_ARRAY
     """Read positions over time.
 
     Args:
-      path: file or folder.
-      num_vertices: number of vertices of the scene.
-      array: name of the array in an .npz file.
+        path: file or folder.
+        num_vertices: number of vertices of the scene.
+        array: name of the array in an .npz file.
 
     Raises:
-      InputError: the file is missing, broken, or has other vertices.
+        InputError: the file is missing, broken, or has other vertices.
     """
     if not path.exists():
         raise InputError(InputMistake(f"there is no such file; {_describe_formats()}", path))

@@ -28,14 +28,14 @@ class SpringTerms:
     """The terms of a scene, as arrays.
 
     Attributes:
-      edges: E, vertex pairs (m, 2).
-      stiffness: k (m,) [N/m].
-      rest_length: r (m,) [m].
-      rest_direction: directions (m, 3) of springs of zero length.
-      mass: (n,) [kg].
-      time_step: dt [s].
-      pinned: pinned vertices (q,), in the order of the rows of C.
-      weight: w (q,) [N/m], infinite for exact pins.
+        edges: E, vertex pairs (m, 2).
+        stiffness: k (m,) [N/m].
+        rest_length: r (m,) [m].
+        rest_direction: directions (m, 3) of springs of zero length.
+        mass: (n,) [kg].
+        time_step: dt [s].
+        pinned: pinned vertices (q,), in the order of the rows of C.
+        weight: w (q,) [N/m], infinite for exact pins.
     """
 
     edges: NDArray[np.int64]
@@ -93,7 +93,7 @@ def collect_spring_terms(scene: Scene) -> SpringTerms:
     """Collect the terms of a scene.
 
     Raises:
-      InputError: the scene has terms that the formulas do not have.
+        InputError: the scene has terms that the formulas do not have.
     """
     system = scene.system
     others = [type(energy).__name__ for energy in system.energies if not isinstance(energy, Springs)]
@@ -147,11 +147,11 @@ def build_step_problem(
     """Build the problem of the step that follows two positions.
 
     Args:
-      scene: scene with implicit Euler.
-      current: p^t (n, 3) [m].
-      previous: p^(t-dt) (n, 3) [m].
-      index: number of the last step, 0 at the start.
-      initial_guess: a key of `INITIAL_GUESSES`.
+        scene: scene with implicit Euler.
+        current: p^t (n, 3) [m].
+        previous: p^(t-dt) (n, 3) [m].
+        index: number of the last step, 0 at the start.
+        initial_guess: a key of `INITIAL_GUESSES`.
     """
     if initial_guess not in INITIAL_GUESSES:
         initial_guess = "previous"

@@ -50,13 +50,13 @@ class StepVerdict:
     """Verdict on one step.
 
     Attributes:
-      step: number of the step, from 1.
-      residual: relative to the residual at the step's start.
-      residual_floor: residual that the stored digits, and the iteration of friction, allow.
-      gap: energy gap relative to that of the step's start; None where no minimum was computed.
-      gap_floor: energy gap that the stored digits, and the iteration of friction, allow.
-      distance: distance to the minimum relative to the mesh; None likewise.
-      flaw: why the minimum is not certified; empty if it is.
+        step: number of the step, from 1.
+        residual: relative to the residual at the step's start.
+        residual_floor: residual that the stored digits, and the iteration of friction, allow.
+        gap: energy gap relative to that of the step's start; None where no minimum was computed.
+        gap_floor: energy gap that the stored digits, and the iteration of friction, allow.
+        distance: distance to the minimum relative to the mesh; None likewise.
+        flaw: why the minimum is not certified; empty if it is.
     """
 
     step: int

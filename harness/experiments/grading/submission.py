@@ -44,8 +44,8 @@ class StoredPrecision(NamedTuple):
     """Rounding error of stored coordinates.
 
     Attributes:
-      absolute: error [m] of decimals.
-      relative: error of digits, relative to the largest coordinate.
+        absolute: error [m] of decimals.
+        relative: error of digits, relative to the largest coordinate.
     """
 
     absolute: float
@@ -61,12 +61,12 @@ class SubmittedMotion:
     """Positions of a scene's steps.
 
     Attributes:
-      source: the file or folder.
-      positions: (k + 2, n, 3) [m]: one step before the start, the start, and after each of k steps.
-      has_start: whether the submission contains the start itself; otherwise it is the scene's.
-      precision: error of coordinates by the digits that are stored.
-      notes: sentences on frame numbers, vertex order and precision.
-      time_step: [s].
+        source: the file or folder.
+        positions: (k + 2, n, 3) [m]: one step before the start, the start, and after each of k steps.
+        has_start: whether the submission contains the start itself; otherwise it is the scene's.
+        precision: error of coordinates by the digits that are stored.
+        notes: sentences on frame numbers, vertex order and precision.
+        time_step: [s].
     """
 
     source: Path
@@ -94,8 +94,8 @@ class VertexMatch(NamedTuple):
     """Order of a submission's vertices and axes.
 
     Attributes:
-      vertices: for each vertex of the scene that of the submission (n,).
-      axes: for each axis of the scene that of the submission.
+        vertices: for each vertex of the scene that of the submission (n,).
+        axes: for each axis of the scene that of the submission.
     """
 
     vertices: NDArray[np.int64]
@@ -113,13 +113,13 @@ def align_submission(
     """Give positions the frame numbers and the vertex order of a scene.
 
     Args:
-      scene: scene that was simulated.
-      read: positions as read.
-      first_frame: number of the first positions, 0 for the start; None to compare them with the start.
-      rest: rest positions (n, 3) [m] in the submission's order; None to compare the start, if it is there.
+        scene: scene that was simulated.
+        read: positions as read.
+        first_frame: number of the first positions, 0 for the start; None to compare them with the start.
+        rest: rest positions (n, 3) [m] in the submission's order; None to compare the start, if it is there.
 
     Raises:
-      InputError: the rest positions are not those of the scene, or frames or times are not those of its steps.
+        InputError: the rest positions are not those of the scene, or frames or times are not those of its steps.
     """
     start, notes = build_initial_state(scene).motion.positions, list(read.notes)
     p, mistake = read.positions, lambda problem: InputError(InputMistake(problem, read.source))

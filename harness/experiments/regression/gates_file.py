@@ -97,6 +97,7 @@ def run_gates_file(
         budget: seconds of a test without a budget of its own.
         print_message: receives one line per result.
         alpha: error probability of all tests together.
+
     Raises:
         InputError: for a mistake in the file, or if the answers differ.
     """

@@ -60,7 +60,9 @@ def open_revisions(checkout: Path, revision: str) -> tuple[GitRevision, GitRevis
     Args:
         checkout: folder of the checkout.
         revision: commit, branch or tag.
-    Returns: the checkout and the revision.
+
+    Returns:
+        The checkout and the revision.
     """
     commit = resolve_commit(checkout, revision)
     tree = prepare_worktree(checkout, commit)

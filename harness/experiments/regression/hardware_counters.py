@@ -32,7 +32,9 @@ def count_events(work: Callable[[], object], event: tuple[int, int] = INSTRUCTIO
     Args:
         work: function to call.
         event: type and config of perf.
-    Returns: the count, or None if the counter is unavailable.
+
+    Returns:
+        The count, or None if the counter is unavailable.
     """
     handle, _ = _open_counter(event)
     if handle is None:

@@ -38,6 +38,7 @@ def require_agreement(new: ArrayLike, old: ArrayLike, rtol: float = DEFAULT_AGRE
         new: points (n, d), or an array of any other shape.
         old: answer of the baseline, of the same shape.
         rtol: tolerance relative to the size of `old`, its largest extent along an axis; 0 requires equal numbers.
+
     Raises:
         AnswersDiffer: if the shapes or the numbers differ, or a number is NaN.
     """

@@ -71,7 +71,9 @@ class PairedBenchmark:
             budget: seconds; --paired-benchmark-budget by default.
             alpha: probability of a wrong verdict; 0.1 % by default.
             extra_info: stored in the benchmark's JSON.
-        Returns: the result, or None if nothing is timed.
+
+        Returns:
+            The result, or None if nothing is timed.
         """
         from springbench.harness.experiments.regression.abba_benchmark import iterate_paired_benchmark
         from springbench.harness.experiments.regression.confidence_sequence import DEFAULT_ALPHA, SequentialTest
@@ -142,7 +144,9 @@ class PairedBenchmark:
             budget: seconds; --paired-benchmark-budget by default.
             size: mesh size; the scene's default if omitted.
             options: options of a run: max_iterations, rtol, frames, integrator, time_step, initial_guess.
-        Returns: the result, or None if nothing is timed.
+
+        Returns:
+            The result, or None if nothing is timed.
         """
         from springbench.harness.config.shipped_configs import resolve_scene_path
         from springbench.harness.execution.machine_info import limit_threads

@@ -82,6 +82,7 @@ def build_config_requests(revisions: Sequence[GitRevision], config: Path, option
         revisions: the two revisions.
         config: file of the scene or sweep.
         options: options of the runs.
+
     Raises:
         InputError: if a revision fails, or if the lists differ.
     """
@@ -110,6 +111,7 @@ def build_gate_requests(revisions: Sequence[GitRevision], name: str) -> list[Wor
     Args:
         revisions: the two revisions.
         name: part of the names.
+
     Raises:
         InputError: if no gate matches, or if one revision lacks it.
     """
@@ -140,6 +142,7 @@ def compare_revisions(
         requests: work to compare.
         options: limits of the comparison.
         print_message: receives one line per result, and estimates of the remaining time.
+
     Raises:
         InputError: if the work fails, or if the answers differ.
     """
@@ -189,7 +192,10 @@ def start_revisions(
         request: work to prepare.
         options: limits of the comparison.
         print_message: receives differences of deterministic counts.
-    Yields: the two programs.
+
+    Yields:
+        The two programs.
+
     Raises:
         InputError: if the work fails, or if the answers differ.
     """

@@ -91,6 +91,7 @@ class RevisionProcess:
         Args:
             command: name of the request.
             arguments: its arguments, which JSON can represent.
+
         Raises:
             InputError: with the worker's message, or if its process has ended.
         """
@@ -134,7 +135,9 @@ class RevisionProcess:
         Args:
             num_calls: number of calls.
             clock: cpu or wall.
-        Returns: seconds.
+
+        Returns:
+            seconds.
         """
         return self.send_request("time_calls", num_calls=num_calls, clock=clock)["seconds"]
 
@@ -206,7 +209,9 @@ def describe_changes(new: dict[str, int], old: dict[str, int]) -> list[str]:
     Args:
         new: counts of this checkout.
         old: counts of the revision.
-    Returns: one text per difference.
+
+    Returns:
+        One text per difference.
     """
     allowed = {name: INSTRUCTION_RTOL * old[name] if name == "instructions" else 0 for name in old}
     both = [name for name in old if name in new and abs(new[name] - old[name]) > allowed[name]]

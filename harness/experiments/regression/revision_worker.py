@@ -73,7 +73,9 @@ class RevisionWorker:
             num_frames: maximum number of steps.
             injected_slowdown: extra work, as a fraction of the run's iterations.
             positions: path of the file.
-        Returns: deterministic counts, suitable clock and number of steps.
+
+        Returns:
+            Deterministic counts, suitable clock and number of steps.
         """
         run = _load_runs(config, run_options)[index]
         threads = 1 if run.threads == "auto" else run.threads  # the number of idle cores varies

@@ -55,7 +55,9 @@ def prepare_solver_pair(
         baseline: solver to compare with.
         size: mesh size; the scene's default if omitted.
         options: options of a run, such as max_iterations and rtol.
-    Raises: InputError, Unsupported, NotPositiveDefinite.
+
+    Raises:
+        InputError, Unsupported, NotPositiveDefinite.
     """
     first, second = (_prepare_steps(scene, given, size, options) for given in (solver, baseline))
     for steps in (first, second):

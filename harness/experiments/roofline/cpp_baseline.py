@@ -77,7 +77,8 @@ class CppBaseline:
     def step(self, iterations: int) -> list[float]:
         """Compute one step with a number of iterations, from the initial guess.
 
-        Returns: wall seconds of the whole step, of its local steps, and of its global steps. Raises RunFailed.
+        Returns:
+            Wall seconds of the whole step, of its local steps, and of its global steps. Raises RunFailed.
         """
         assert self._process.stdin is not None
         try:

@@ -38,7 +38,9 @@ def performance_ratios(table: AccuracyData, target: float) -> dict[str, FloatArr
     Args:
         table: data of an accuracy measurement.
         target: energy gap.
-    Returns: ratios (problems,); infinite where the gap is not reached.
+
+    Returns:
+        Ratios (problems,); infinite where the gap is not reached.
     """
     found = solvable_races(table, target)
     return _compute_ratios(
@@ -52,7 +54,9 @@ def data_profile_ratios(table: AccuracyData, target: float) -> dict[str, FloatAr
     Args:
         table: data of an accuracy measurement.
         target: energy gap.
-    Returns: ratios (problems,), for the problems where the baseline was measured.
+
+    Returns:
+        Ratios (problems,), for the problems where the baseline was measured.
     """
     units = [(race, median_iteration_seconds(race, baseline_solver(table))) for race in solvable_races(table, target)]
     known = [(race, unit) for race, unit in units if np.isfinite(unit)]

@@ -17,7 +17,9 @@ def draw_snapshot_meshes(table: AccuracyData, results: Path, folder: Path) -> di
         table: data of an accuracy measurement.
         results: folder of the results.
         folder: folder that the pictures are written to.
-    Returns: the pictures by the digest of their problem; empty if the system cannot draw or nothing was recorded.
+
+    Returns:
+        The pictures by the digest of their problem; empty if the system cannot draw or nothing was recorded.
     """
     if opengl_probe.find_opengl_problem() is not None:
         return {}

@@ -46,7 +46,9 @@ def find_time_to_accuracy(curve: ConvergenceCurve, target: float) -> TimeToAccur
     Args:
         curve: convergence of a solver.
         target: energy gap.
-    Returns: the iteration and its time; None if the gap is not reached, the run failed or was not timed.
+
+    Returns:
+        The iteration and its time; None if the gap is not reached, the run failed or was not timed.
     """
     at = np.flatnonzero(curve.gap <= target)
     if not len(at) or curve.status in FATAL_STATUSES:

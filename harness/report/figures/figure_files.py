@@ -35,6 +35,7 @@ def write_figure(
         stem: path of the files without suffix.
         title: title of the figure.
         options: options of the figure.
+
     Raises:
         WriteError: if a file cannot be written.
     """
@@ -72,6 +73,7 @@ def write_images(
         options: options of the figure.
         dpi: resolution of images [dots per inch].
         sources: digest of the data, stored in PNG files.
+
     Raises:
         WriteError: if a file cannot be written.
     """

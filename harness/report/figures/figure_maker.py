@@ -47,6 +47,7 @@ def make_figure(
         find_stale: see `FigureKind.list_panels`.
         folder: folder that the files are written to.
         options: options of the figure.
+
     Raises:
         InputError: if the results contain nothing of the kind, if no panel matches a selector, if curves and maps are
             selected together, or if the text does not fit the width.

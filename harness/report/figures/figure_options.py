@@ -61,6 +61,7 @@ def parse_figure_options(
         panels: selectors separated by commas.
         has_title: whether the figure has a title and a line on the machine.
         is_transparent: whether the background is transparent.
+
     Raises:
         InputError: with all mistakes in the options.
     """

@@ -47,6 +47,7 @@ def select_entries(entries: Sequence[PanelEntry], selectors: Sequence[tuple[str,
     Args:
         entries: available panels.
         selectors: parts of panel names.
+
     Raises:
         InputError: if a selector matches nothing, or if there are too many panels for a figure.
     """

@@ -140,6 +140,7 @@ def render_page(template: Path, queries: PublishedQueries) -> RenderedPage:
     Args:
         template: file with the suffix TEMPLATE_SUFFIX.
         queries: the published set.
+
     Raises:
         InputError: a mistake in the template; the message names it and the line.
     """

@@ -26,6 +26,7 @@ def write_script(path: Path, name: str, value: Any) -> Path:
         path: target file.
         name: name of the value.
         value: value that can be represented as JSON.
+
     Raises:
         ValueError: if the value cannot be represented as JSON.
     """
@@ -39,6 +40,7 @@ def write_json_script(path: Path, name: str, value: str) -> Path:
         path: target file.
         name: name of the value.
         value: JSON.
+
     Raises:
         WriteError: if the file cannot be written.
     """

@@ -39,7 +39,9 @@ def write_last_frames(
         data_folder: folder of the page's data of this sweep.
         units: units of rows, whose names are those of their recordings.
         print_message: prints a remark.
-    Returns: the units with a script.
+
+    Returns:
+        The units with a script.
     """
     there: set[str] = set()
     for unit in units:
@@ -67,7 +69,9 @@ def write_solves(
         data_folder: folder of the page's data of this sweep.
         table: data of an accuracy measurement.
         print_message: prints a remark.
-    Returns: the names of the scripts by their recordings.
+
+    Returns:
+        The names of the scripts by their recordings.
     """
     written: dict[str, str] = {}
     for problem in table.problems:
@@ -87,7 +91,9 @@ def write_recordings(folder: SweepFolder, data_folder: Path, recordings: Mapping
         folder: folder of the sweep's results.
         data_folder: folder of the page's data of this sweep.
         recordings: titles by path of the recording.
-    Returns: the names of the scripts by their recordings.
+
+    Returns:
+        The names of the scripts by their recordings.
     """
     there = {name: f"recordings/{Path(name).stem}" for name in recordings if (folder.path / name).is_file()}
     for name in there:

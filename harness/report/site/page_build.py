@@ -46,6 +46,7 @@ def update_page(
         with_recordings: whether recordings, and meshes drawn from them, are converted to scripts.
         with_viewer: whether Rerun's viewer is added.
         print_message: prints a remark.
+
     Raises:
         InputError: if there are no rows.
         WriteError: if a file cannot be written.

@@ -94,6 +94,7 @@ def write_recording(recording: Path, script: Path, title: str) -> Path:
         recording: recording.
         script: target file.
         title: heading of the recording in the page.
+
     Raises:
         InputError: if the recording cannot be read.
         WriteError: if the file cannot be written.

@@ -52,6 +52,7 @@ def read_run_rows(folder: SweepFolder, on_invalid: Callable[[InputMistake], None
     Args:
         folder: folder of the sweep's results.
         on_invalid: called for each invalid unit.
+
     Raises:
         InputError: if rows are damaged.
     """

@@ -119,7 +119,9 @@ class MachineLimits:
             threads: number of threads.
             working_set: size [bytes].
             kernel: name of the microbenchmark.
-        Returns: bytes per second.
+
+        Returns:
+            Bytes per second.
         """
         at = sorted(self._best[threads, kernel].items())
         known, rates = np.log(np.array(at)).T

@@ -133,7 +133,8 @@ def check_parts(num_vertices: int, pairs: IndexArray, support: MeshSupport | Non
 def guess_unit(extent: float) -> tuple[str, float] | None:
     """Guess the unit of a mesh from its largest extent, in units of the file.
 
-    Returns: the unit and its metres; None if metres are plausible, or no unit gives the extent of a cloth.
+    Returns:
+        The unit and its metres; None if metres are plausible, or no unit gives the extent of a cloth.
     """
     if extent <= 0.0 or _MIN_EXTENT <= extent <= _MAX_EXTENT:
         return None

@@ -198,7 +198,8 @@ def find_flat_faces(points: PointArray, polygons: IndexArray) -> NDArray[np.bool
 def drop_degenerate_cells(cells: MeshCells) -> tuple[MeshCells, dict[str, int]]:
     """Join repeated corners of faces, and drop faces without area and other cells that name a vertex twice.
 
-    Returns: the other cells, and the numbers of changes with their descriptions.
+    Returns:
+        The other cells, and the numbers of changes with their descriptions.
     """
     faces: dict[int, list[tuple[IndexArray, IndexArray]]] = {}
     joined = dropped = 0
