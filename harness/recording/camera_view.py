@@ -126,7 +126,7 @@ class ViewExtent:
         Args:
             strain_range: strain at the ends of the colour scale.
             strain_limits: smallest and largest strain of a spring. Where one is outside the scale, the strip ends in a
-              tip labelled with that strain.
+                tip labelled with that strain.
         """
         sight = self._select_view()
         (x, y, distance), near = sight.place, sight.near

@@ -41,7 +41,7 @@ class ForceArrows:
         Args:
             frame: frame index.
             p: positions (n, 3) [m].
-            forces: forces (n, 3) [N] by name; a subset of the vertices is drawn where more than MAX_ARROWS carry a force.
+            forces: forces (n, 3) [N] by name; of more than MAX_ARROWS vertices with a force, a subset is drawn.
             times: builds the time columns from frame indices.
         """
         for name, force in forces.items():

@@ -62,7 +62,7 @@ class MinimumCertificate:
         positions: positions (n, 3) [m], read-only; all other attributes refer to this point.
         objective: value g [J].
         newton_step_length: length [m] of the next Newton step at the vertex where it is largest, infinite where the
-          Hessian has no factor.
+            Hessian has no factor.
         min_eigenvalue: smallest eigenvalue of the Hessian without the exactly pinned vertices [N/m].
         eigenvalue_uncertainty: bound on its uncertainty [N/m].
         position_tolerance: CERTIFIED_RTOL times the size of each vertex's component (n,) [m].

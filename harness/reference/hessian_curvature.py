@@ -50,7 +50,7 @@ class SplitHessian(NamedTuple):
     Attributes:
         sparse: S (3 f, 3 f).
         columns: V (3 f, r), with r = 0 where all energies have sparse Hessians (see
-        `springbench.solvers.objective.woodbury`).
+            `springbench.solvers.objective.woodbury`).
     """
 
     sparse: csr_array

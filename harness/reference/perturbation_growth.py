@@ -60,7 +60,7 @@ class PerturbationGrowth:
         times: sample times (k,) [s].
         displacement: displacement from the start (k,) [m], Frobenius norm over the free vertices.
         growth_factor: size (k,) of a perturbation that was 1e-12 of the mesh size at the start, relative to the
-          displacement, at most 1.
+            displacement, at most 1.
         scale: root mean square displacement of a free coordinate at the end [m].
     """
 

@@ -191,7 +191,7 @@ class ReferenceStore:
             report_progress: called with the progress of an integration.
             growth_end: time [s] up to which the growth of a perturbation is estimated; the last time by default.
             contact_error: relative error for which a motion with contact is refined if none is stored; `error` by
-              default.
+                default.
 
         Raises:
             InputError: the scene cannot be built.

@@ -54,7 +54,7 @@ class StepSnapshot:
         problem: step problem with exact pins, whose initial guess is the current positions.
         end_motion: motion at the step's end.
         digest: 12 hex digits of a hash of the problem's arrays, of the gradient at the current positions, which
-          represents the energies, and of the origin of the snapshot.
+            represents the energies, and of the origin of the snapshot.
         acceleration: acceleration at the step's end (n, 3) [m/s^2], None where the integrator provides none.
     """
 

@@ -37,7 +37,7 @@ class StepVerifier:
         Args:
             scene: scene of the run.
             reference: positions (frames, n, 3) [m], nan from the frame on in which there is none; None without a
-              reference.
+                reference.
             is_minimiser: whether the solver minimises the step's objective.
         """
         self._stationarity = StationarityEvaluator()

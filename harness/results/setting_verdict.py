@@ -47,8 +47,8 @@ class SettingAssessment:
 
     Attributes:
         setting: the given setting.
-        substep_change, iteration_change: change of the motion with at least twice the substeps or iterations; None where
-          that was not simulated, or does not apply.
+        substep_change, iteration_change: change of the motion with at least twice the substeps or iterations; None
+            where that was not simulated, or does not apply.
         effective_stiffness: ratio of the true sag to that of the setting; None where nothing sags.
     """
 

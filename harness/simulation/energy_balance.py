@@ -343,7 +343,7 @@ class StepDissipation(NamedTuple):
         dissipation_damping, dissipation_friction, dissipation_integrator, dissipation_solve: in the step.
         dissipation_engine: by integrator and solves together, where a solver iterates within the frames it integrates.
         balance_error: change of the energy in the step that these terms do not explain; of frames that the solver
-          integrated, the error of the work by quadrature.
+            integrated, the error of the work by quadrature.
     """
 
     kinetic_energy: float

@@ -62,8 +62,8 @@ class PhaseWatch:
     """Sum of wall and CPU time over repeated contexts.
 
     Attributes:
-        num_threads: number of threads that may compute. While all of them do, the process uses this many CPU seconds per
-          second; while one does, it is the calling thread, which uses one.
+        num_threads: number of threads that may compute. While all of them do, the process uses this many CPU seconds
+            per second; while one does, it is the calling thread, which uses one.
         wall_seconds: total wall time [s].
         num_entries: number of contexts.
         process_seconds: total CPU time [s] of the process.

@@ -34,8 +34,9 @@ class DeviceSolverState(SolverState):
 
     Attributes:
         uploads: the arrays of its step.
-        row_vertices: (n,), the vertex of each row.
-        is_stalled: whether the last iteration moved nothing.
+        stream: stream of the copies and kernels.
+        order: (n,), the vertex of each row.
+        stalled: whether the last iteration moved nothing.
         residual_of_positions: returns the residual [J^(1/2)] at positions; nan for a method that does not minimise.
     """
 
@@ -237,7 +238,7 @@ class MinimisingSolver(DeviceSolver):
     Attributes:
         uploaded_network: the network on the device.
         metric, objective: for residuals, on the host.
-        touches: whether the method supports contact and requires the start of a step.
+        supports_contact: whether the method supports contact and requires the start of a step.
     """
 
     uploaded_network: UploadedNetwork

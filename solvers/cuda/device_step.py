@@ -52,7 +52,7 @@ class RowData(NamedTuple):
     """Data of each row (n,) on the device.
 
     Attributes:
-        row_vertices: the vertex.
+        vertex_indices: the vertex.
         pin_indices: index of its pin, -1 for none.
         inertia_diagonal: c m/dt^2 [N/m].
         pin_weight: weight of a penalty pin [N/m].
@@ -71,9 +71,10 @@ class UploadedNetwork:
     """A network on a device.
 
     Attributes:
-        device_edges, row_data: of the network.
+        host_network: the network on the host.
+        stream: stream of the copies and kernels.
+        device_edges, row_data: edges and rows of the network.
         anchor_stiffness: (f,), sum of all anchors of a row [N/m].
-        axis: (m, 3), of the edges as prepared.
     """
 
     host_network: DeviceNetwork

@@ -100,8 +100,8 @@ def build_linear_solver(
         Q: symmetric positive definite matrix (n, n).
         linear: name of the solver, or "auto".
         precision: precision of the factor.
-        memory_limit: bytes that the solver may allocate in addition to Q; default by
-        `springbench.solvers.linalg.memory`.
+        memory_limit: bytes that the solver may allocate in addition to Q; the default is that of
+            `springbench.solvers.linalg.memory`.
 
     Returns:
         The solver, and a description with the reason for its selection.

@@ -49,7 +49,7 @@ class PsdProjection:
 
     Attributes:
         use_absolute: whether eigenvalues are replaced by absolute values instead of clamped.
-        vertex_mask: mask of the vertices (n,) whose elements are projected; None for all.
+        _vertex_mask: mask of the vertices (n,) whose elements are projected; None for all.
     """
 
     def __init__(self, *, use_absolute: bool = False, vertex_mask: NDArray[np.bool_] | None = None) -> None:

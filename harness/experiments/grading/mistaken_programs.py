@@ -83,7 +83,7 @@ class AssignmentProgram:
         uses_iterate: whether the target uses the iterate instead of p^t.
         compute_directions: d.
         explicit_at: positions at which an explicit step has its spring forces, "current" (p^t) or "previous"
-          (p^(t-dt)); "" for an implicit step.
+            (p^(t-dt)); "" for an implicit step.
         initial_guess: "current" or "target".
     """
 

@@ -106,7 +106,7 @@ class _ProjectedEdges:
         edges: (m, 2) vertex indices.
         stiffness: (m,) [N/m].
         min_length, max_length: (m,) [m], bounds of the lengths at which an edge has no energy.
-        direction: (m, 3), unit vectors for edges of zero length.
+        rest_direction: (m, 3), unit vectors for edges of zero length.
     """
 
     edges: NDArray[np.int64]

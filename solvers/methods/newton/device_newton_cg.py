@@ -111,7 +111,7 @@ def prepare_newton_cg(
 class PreparedNewtonCG(MinimisingSolver):
     """Newton-CG, prepared on a device, with the levels of the preconditioner on host and device.
 
-    `forcing` and `most` are the arguments of the preparation, `columns` the device columns of rows.
+    `forcing` and `most` are the arguments of the preparation, `device_columns` the columns of the device in rows.
     """
 
     uploaded_network: UploadedNetwork
@@ -143,12 +143,10 @@ class _NewtonCGState(DeviceSolverState):
     """State of a Newton-CG solve, in rows on the device.
 
     Attributes:
-        p, q: (n, 3), current point and trial.
-        g: gradient at p (f, 3).
-        z: preconditioned negative gradient.
-        d, s, y, w: (f, 3), solution, direction, its product and preconditioned residual of conjugate gradients.
-        floor: g H^-1 g [J] of round-off.
-        product: g'z [J] at p.
+        _p, _q: (n, 3), current point and trial.
+        _g: gradient at the current point (f, 3).
+        _z: preconditioned negative gradient.
+        _d, _s, _y, _w: (f, 3), solution, direction, its product and preconditioned residual of conjugate gradients.
     """
 
     def __init__(self, made: PreparedNewtonCG) -> None:

@@ -137,8 +137,15 @@ def predict_step(
     Args:
         h: substep [s].
         remaining_fraction: part of the step after this substep.
+        vertex_data: pins of the vertices, by rows.
         start_positions: (n, 3) [m], where pins start.
         pin_targets: (q, 3) [m], where pins end.
+        vertex_compliance: inverse stiffness of inertia, pins and forms of each row (n,) [m/N].
+        force: constant force (n, 3) [N].
+        v: velocities (n, 3) [m/s].
+        before: receives the positions at the start of the substep (n, 3) [m].
+        x: positions (n, 3) [m], overwritten by the prediction.
+        u: displacement from x (n, 3) [m], set to 0.
     """
     i = cuda.grid(1)
     while i < x.shape[0]:

@@ -153,7 +153,8 @@ class PreparedAugmentedVertexBlockDescent(IterativeSolver):
     """AVBD, prepared for a system.
 
     Attributes:
-        made: vertex block descent of the other energies, with the initial stiffness of the edges in its majorant.
+        vertex_block_descent: vertex block descent of the other energies, with the initial stiffness of the edges in its
+            majorant.
         augmented_edges: constrained edges, and springs with ramped stiffness.
         min_stiffness, max_stiffness: (m,) [N/m], bounds of the edges' stiffness.
         exact_mask: (m,), whether an edge is constrained.

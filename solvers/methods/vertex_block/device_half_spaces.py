@@ -43,10 +43,10 @@ class ObstacleBodies(NamedTuple):
 
     Attributes:
         low, high: (o, 3) [m], corners of the rounded boxes.
-        radius: (o,) [m], including the thickness.
-        margin: (o,) [m].
-        friction: (o,), Coulomb coefficients.
-        creep: (o,) [m/s], sliding speed below which friction counts as sticking.
+        spectral_radius: (o,) [m], radius of the rounded boxes, including the thickness.
+        force_margin: (o,) [m], distance within which an obstacle gets a half-space.
+        friction_coefficient: (o,), Coulomb coefficients.
+        eps_v: (o,) [m/s], sliding speed below which friction counts as sticking.
         stiffness: (o, n) [N/m], of each row.
     """
 
@@ -146,13 +146,18 @@ def build_half_spaces(vertex, p, v, dt, when, square, frames, bodies, found, rou
     See `springbench.solvers.contact.half_space.half_space_potential`.
 
     Args:
+        vertex: vertex of each row (n,).
         p: positions [m] at the start of the step, by vertices.
         v: velocities [m/s] at the start of the step, by vertices.
+        dt: step size [s].
         when: time of the stage within the step, 1 at its end.
         square: largest squared speed.
         frames: (o, 2, 4, 3), frames of the obstacles.
+        bodies: the obstacles.
         found: a view of `spaces`.
-        rounds: whether friction uses the normal forces at `pressed` (n, 3) [m], by vertices.
+        rounds: whether friction uses the normal forces at `pressed`.
+        pressed: positions of these normal forces (n, 3) [m], by vertices.
+        spaces: receives the half-spaces.
     """
     work = cuda.local.array((5, 3), np.float64)
     i, many = cuda.grid(1), bodies.spectral_radius.shape[0]

@@ -138,11 +138,12 @@ class DeviceSweepState(DeviceSolverState):
     """State of a VBD solve on the device.
 
     Attributes:
-        x: (n + 2, 4), the reference in float64 [m].
-        u: the displacement from the reference [m].
-        older, before: displacements of the previous iterate and of the start of the sweep [m].
-        force: (3, lanes), negative gradient at the reference [N].
-        rows: (n, 3), the current positions, written on demand.
+        _reference: (n + 2, 4), the reference in float64 [m].
+        _displacement: (n + 2, 4), displacement from the reference [m].
+        _previous_iterate, _sweep_start: (n + 2, 4), displacements of the previous iterate and of the start of the
+            sweep [m].
+        _force: (3, lanes), negative gradient at the reference [N].
+        _rows: (n, 3), the current positions, written on demand.
     """
 
     def __init__(self, made: PreparedDeviceVertexBlockDescent) -> None:

@@ -136,11 +136,23 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
         padding_row, far, anchor_stiffness, majorant, force, u, before,
     ):  # fmt: skip
-        """Move the vertices of a colour, lanes `begin` to `end`, each to a lower energy.
+        """Move the vertices of a colour, each to a lower energy.
 
         Args:
+            begin, end: range of lanes of the colour.
+            own: row of each lane (lanes,), `padding_row` for none.
+            start: first entry of each packet of lanes (packets + 1,).
+            neighbour: row at the other end of each entry and lane, `far` for none.
+            kind: offset of each entry's parameters in `weights`.
+            weights: pull and stiffness of each lane of a parameter set [N/m].
+            spring: spring of each entry and lane.
+            direction: unit vectors for springs of zero length (m, 3).
+            arrows: (3, entries), spring vectors at the reference [m].
+            padding_row: row of lanes without a vertex.
+            far: row of the other end of padding springs.
             anchor_stiffness, majorant: (lanes,) [N/m], anchor stiffness and majorant.
             force: (3, lanes) [N], negative gradient at the reference.
+            u: displacements from the reference [m], updated.
             before: receives the displacements before the sweep.
         """
         t = begin + cuda.grid(1)
@@ -226,8 +238,23 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         It is evaluated in float64, from the stored u and spring vectors, so that decisions do not depend on round-off.
 
         Args:
+            own: row of each lane (lanes,), `padding_row` for none.
+            start: first entry of each packet of lanes (packets + 1,).
+            neighbour: row at the other end of each entry and lane, `far` for none.
+            kind: offset of each entry's parameters in `weights`.
+            weights: pull and stiffness of each lane of a parameter set [N/m].
+            spring: spring of each entry and lane.
+            direction: unit vectors for springs of zero length (m, 3).
+            arrows: (3, entries), spring vectors at the reference [m].
+            padding_row: row of lanes without a vertex.
+            far: row of the other end of padding springs.
             free: number of rows, from the first one, that may move.
+            anchor_stiffness: (lanes,) [N/m].
+            force: (3, lanes) [N], negative gradient at the reference.
+            u: displacements from the reference [m].
             condition: index in `control`; the kernel runs if IS_REQUESTED is positive, or EXTRAPOLATION above one.
+            control: scalars of the iteration.
+            sums: receives the sum of each block [J].
         """
         shared_sums = cuda.shared.array(THREADS, float64)
         t, inside = cuda.grid(1), cuda.threadIdx.x
@@ -280,6 +307,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         Args:
             radius: rho.
             at_before, at_new: sums of the objective, if requested.
+            control: scalars of the iteration, updated.
         """
         shared_sums = cuda.shared.array((2, THREADS), float64)
         inside = cuda.threadIdx.x

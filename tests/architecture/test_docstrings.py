@@ -1,0 +1,120 @@
+"""Docstrings of functions state every parameter, by its name, in sections of one form."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import pytest
+from springbench.harness.cli.main import app
+
+from tests.architecture.test_vocabulary import ROOT, parse_sources
+
+SECTIONS = ("Args", "Attributes", "Returns", "Yields", "Raises", "Example")
+_ENTRY = re.compile(r"(\*{0,2}\w+(?:(?:, | and )\*{0,2}\w+)*):(?: |$)")
+
+
+class DocumentedFunction(NamedTuple):
+    """A function or method with a docstring: file, name, parameters without `self`, and the docstring."""
+
+    file: str
+    name: str
+    is_public: bool
+    parameters: list[str]
+    docstring: str
+
+
+def find_functions(tree: ast.AST, file: str, is_public: bool = True) -> Iterator[DocumentedFunction]:
+    """Yield the documented functions of a module and of its classes, without those inside functions."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.ClassDef):
+            yield from find_functions(node, file, is_public and not node.name.startswith("_"))
+        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            if docstring := ast.get_docstring(node):
+                public = is_public and (not node.name.startswith("_") or node.name.startswith("__"))
+                yield DocumentedFunction(file, node.name, public, list_parameters(node.args), docstring)
+        elif isinstance(node, ast.If | ast.With | ast.Try):
+            yield from find_functions(node, file, is_public)
+
+
+def list_parameters(arguments: ast.arguments) -> list[str]:
+    """List the names of all parameters but `self` and `cls`."""
+    named = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
+    others = filter(None, (arguments.vararg, arguments.kwarg))
+    return [one.arg for one in (*named, *others) if one.arg not in ("self", "cls")]
+
+
+def read_section(docstring: str, title: str) -> list[str] | None:
+    """Return the lines of a section without its indentation, None if there is no such section."""
+    found = re.search(rf"^{title}:\n((?:(?:    .*)?\n?)*)", docstring, re.MULTILINE)
+    return found and re.sub(r"^    ", "", found[1].rstrip(), flags=re.MULTILINE).split("\n")
+
+
+def list_entries(lines: list[str]) -> list[str]:
+    """List the names that the entries of a section describe; an entry without a name is listed as it is."""
+    names: list[str] = []
+    for line in lines:
+        if line and not line.startswith(" "):
+            entry = _ENTRY.match(line)
+            names += [name.lstrip("*") for name in re.split(", | and ", entry[1])] if entry else [line]
+    return names
+
+
+@pytest.fixture(scope="module")
+def functions() -> list[DocumentedFunction]:
+    found = (find_functions(one.tree, one.path.relative_to(ROOT).as_posix()) for one in parse_sources())
+    return [one for functions in found for one in functions]
+
+
+def test_public_functions_with_several_parameters_describe_them(functions: list[DocumentedFunction]) -> None:
+    """Commands are exempt: their options have texts of their own, and their docstring is their help."""
+    commands = {getattr(command.callback, "__name__", "") for command in app.registered_commands}
+    several = [one for one in functions if one.is_public and len(one.parameters) > 1 and one.name not in commands]
+    assert len(several) > 1000
+    assert not [one[:2] for one in several if read_section(one.docstring, "Args") is None]
+
+
+def test_the_described_arguments_are_the_parameters(functions: list[DocumentedFunction]) -> None:
+    described = ((one, read_section(one.docstring, "Args")) for one in functions)
+    named = ((one, list_entries(lines)) for one, lines in described if lines is not None)
+    assert not [(*one[:2], names) for one, names in named if sorted(names) != sorted(one.parameters)]
+
+
+def test_sections_have_one_form() -> None:
+    """A section follows a blank line, and its text is indented below its title."""
+    inline = re.compile(rf"^(?:{'|'.join(SECTIONS)}): |(?<!\n)\n(?:{'|'.join(SECTIONS)}):$", re.MULTILINE)
+    assert not [
+        f"{one.path.relative_to(ROOT)}: {docstring.splitlines()[0]}"
+        for one in parse_sources()
+        for node in ast.walk(one.tree)
+        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef | ast.Module)
+        and (docstring := ast.get_docstring(node) or "")
+        and inline.search(docstring)
+    ]
+
+
+def test_described_attributes_are_defined() -> None:
+    """Every name in the section `Attributes` of a class is a name in the body of that class or of a base class."""
+    missing: list[str] = []
+    classes = {
+        node.name: node for one in parse_sources() for node in ast.walk(one.tree) if isinstance(node, ast.ClassDef)
+    }
+    for name, node in classes.items():
+        lines = read_section(ast.get_docstring(node) or "", "Attributes")
+        bases = [node, *(classes[base.id] for base in node.bases if isinstance(base, ast.Name) and base.id in classes)]
+        names = {found for base in bases for found in list_attributes(base)}
+        missing += [f"{name}.{entry}" for entry in list_entries(lines or []) if entry not in names]
+    assert not missing
+
+
+def list_attributes(node: ast.ClassDef) -> Iterator[str]:
+    """Yield the names that a class defines: fields, methods, and attributes of `self`."""
+    for part in ast.walk(node):
+        if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store):
+            yield part.id
+        elif isinstance(part, ast.Attribute) and isinstance(part.ctx, ast.Store):
+            yield part.attr
+        elif isinstance(part, ast.FunctionDef):
+            yield part.name
