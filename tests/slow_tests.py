@@ -42,8 +42,8 @@ SLOW_NAME_PARTS = (
 
 LONG_NAME_PARTS = (
     *("test_no_client_without_the_certificate", "test_each_run_is_done_by_one_of_two_commands"),
-    *("goes_on_where_it_was[without pictures]", "says_whose_it_is[entry-point]"),
-    *("[100000 brackets]", "[10001 keys]", "is_said_to_be[topology-degree-1000]", "never_passes_it[0.0-pncg]"),
+    *("resumes_where_it_was[without pictures]", "names_its_origin[entry-point]"),
+    *("[100000 brackets]", "[10001 keys]", "stationary_as_reported[topology-degree-1000]", "never_passes_it[0.0-pncg]"),
     "serves_all_steps_of_a_system[cloth large enough for threads",
     *("refuse_by_name[anderson-dashpots]", "refuse_by_name[numba-dashpots]", "refuse_by_name[avbd-rayleigh]"),
     *(
@@ -51,21 +51,21 @@ LONG_NAME_PARTS = (
         "test_a_full_disk_is_a_failure_and",
         "test_a_balloon_of_a_thousand_vertices",
     ),
-    *("is_free_and_the_way_to_it[newton]",),
+    *("the_path_to_it_are_intersection_free[newton]",),
     *("blocks of 3000 bytes-supernodal", "test_a_program_that_takes_twice_as_long", "in_any_order_of_imports"),
-    *("test_a_config_next_to_files_of_these_names", "it_is_said_to_be[effects-dashpots-1e12]"),
-    "test_an_impact_that_the_steps_do_not_resolve_has_no_truth",
-    *("what_failed_is_done_again[200k]", "test_pictures_are_drawn_later_without", "is_recorded[nothing]"),
+    *("test_a_config_next_to_files_of_these_names", "is_as_stationary_as_reported[effects-dashpots-1e12]"),
+    "test_an_impact_that_the_steps_do_not_resolve_has_no_reference",
+    *("failed_runs_are_repeated[200k]", "test_pictures_are_drawn_later_without", "is_recorded[nothing]"),
     *(
-        "a_drawing_process_that_is_lost",
+        "a_lost_drawing_process",
         "whichever_method_wins[chain-5-0.5-0.0001]",
         "whichever_method_wins[chain-5-0.5-0.001]",
         "whichever_method_wins[single-spring",
     ),
     *(
         "an_example_runs[own_report]",
-        "has_order_1[surface-contact]",
-        "has_order_1[self-contact]",
+        "have_order_1[surface-contact]",
+        "have_order_1[self-contact]",
     ),
     *(
         "its_files_and_nothing_else[without pictures]",

@@ -58,7 +58,7 @@ def parsed(texts: Iterable[tuple[str, str]]) -> Trees:
     return {module: ast.parse(text) for module, text in texts}
 
 
-def test_no_file_meets_two_classes_of_one_name() -> None:
+def test_no_file_refers_to_two_classes_of_one_name() -> None:
     modules = (
         (".".join(("springbench", *path.relative_to(ROOT).with_suffix("").parts)), path.read_text()) for path in FILES
     )

@@ -41,7 +41,7 @@ def find_definitions(path: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("question", ANSWERS)
-def test_a_question_is_answered_by_a_folder_and_a_file(question: str) -> None:
+def test_a_question_leads_to_a_folder_and_a_file(question: str) -> None:
     path, _, definition = ANSWERS[question].partition(":")
     assert path.count("/") <= 3, "a file of a package, or of a folder that a listing of two levels shows"
     assert definition in find_definitions(ROOT / path)

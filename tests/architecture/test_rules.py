@@ -28,7 +28,7 @@ def import_contracts(tree: Path) -> str:
     return "" if result.returncode == 0 else result.stdout + result.stderr
 
 
-def test_the_code_keeps_the_rules_of_the_linter():
+def test_the_code_passes_the_linter():
     assert ruff() == []
 
 

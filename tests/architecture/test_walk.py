@@ -155,7 +155,7 @@ def test_calls_lead_down_the_rows_and_up_to_what_was_passed_down(walk: list[Call
     assert {(call.by, call.of) for call in walk if row(call.of) < row(call.by)} == set(GIVEN)
 
 
-def test_a_solve_takes_nothing_of_the_harness_along(walk: list[Call]):
+def test_a_solve_calls_nothing_of_the_harness(walk: list[Call]):
     up = {
         (call.by, call.of)
         for call in walk
@@ -164,7 +164,7 @@ def test_a_solve_takes_nothing_of_the_harness_along(walk: list[Call]):
     assert up <= set(GIVEN)
 
 
-def test_a_run_comes_by_its_stations_in_the_order_of_the_page(walk: list[Call]):
+def test_a_run_passes_its_stations_in_the_order_of_the_page(walk: list[Call]):
     assert [module for module in dict.fromkeys(call.of for call in walk) if module in STATIONS] == list(STATIONS)
     # A config is bound once to be checked, and a run once.
     assert [
@@ -187,7 +187,7 @@ def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
     assert len(before) <= 1555, "1,550 when this was counted last, friction and the balances of energy among them"
 
 
-def test_the_specification_of_a_run_comes_through_few_files_and_seldom_back_up(walk: list[Call]):
+def test_the_specification_of_a_run_passes_few_files_and_seldom_returns_to_one(walk: list[Call]):
     """From the config to the rows: which modules hand it to each other, one stay for each that it comes to."""
     handovers = [call for call in walk if call.is_handover and "springbench.harness.report" not in call.by + call.of]
     stays = [handovers[0].by]

@@ -72,7 +72,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         verdict = "pass" if ratio["high"] <= target else "fail" if ratio["low"] > target else "inconclusive"
         and_limit = f", limit {limit:.3g}" if goal else ""
         terminalreporter.write_line(
-            f"{one.name.removeprefix('test_the_gate_holds'):48} {ratio['median']:9.3g} [{ratio['low']:.3g}, "
+            f"{one.name.removeprefix('test_the_gate_passes'):48} {ratio['median']:9.3g} [{ratio['low']:.3g}, "
             f"{ratio['high']:.3g}], target {target:.3g}: {verdict}{and_limit}"
         )
 
@@ -102,6 +102,6 @@ def pytest_benchmark_update_machine_info(machine_info: dict[str, Any]) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Without timing, gates of accuracy are deselected: their solves take seconds, and nothing is compared."""
     if config.option.benchmark_disable and not config.option.benchmark_enable:
-        idle = [item for item in items if item.name.startswith("test_the_gate_holds[accuracy-")]
+        idle = [item for item in items if item.name.startswith("test_the_gate_passes[accuracy-")]
         config.hook.pytest_deselected(items=idle)
         items[:] = [item for item in items if item not in idle]

@@ -21,7 +21,7 @@ def marks(gate: Gate) -> list[pytest.MarkDecorator]:
 
 
 @pytest.mark.parametrize("gate", [pytest.param(gate, id=gate.name, marks=marks(gate)) for gate in ALL])
-def test_the_gate_holds(gate: Gate, benchmark: BenchmarkFixture, paired_benchmark: PairedBenchmark):
+def test_the_gate_passes(gate: Gate, benchmark: BenchmarkFixture, paired_benchmark: PairedBenchmark):
     with limit_threads(THREADS):
         candidate = gate.candidate()
         if gate.tolerance is None and benchmark.disabled:

@@ -7,7 +7,7 @@ from springbench.solvers.simd import llvm_vectors
 from tests.bench.vectors import CASES, of_springs
 
 
-def test_every_file_of_vectors_is_measured_but_what_they_share():
+def test_every_file_of_vectors_is_measured_except_shared_ones():
     solvers = Path(llvm_vectors.__file__).parents[1]
     files = {path.stem for path in solvers.glob("simd/*.py")} | {
         path.stem for path in solvers.glob("methods/**/*_packets.py")

@@ -200,14 +200,14 @@ def test_methods_that_do_not_minimise_have_work_and_no_curves(home: Home) -> Non
     assert all(row["error"] > 0.0 for row in work)
 
 
-def test_what_is_done_is_not_done_again(home: Home) -> None:
+def test_completed_measurements_are_not_repeated(home: Home) -> None:
     before = home.written()
     assert home.run() == 0
     assert home.written() == before
 
 
 @pytest.mark.parametrize("after", [1, 4, 7])
-def test_a_config_that_was_stopped_goes_on_where_it_was(home: Home, tmp_path: Path, after: int) -> None:
+def test_an_interrupted_config_resumes_where_it_was(home: Home, tmp_path: Path, after: int) -> None:
     stopped = Home(tmp_path / "home")
     with pytest.raises(KeyboardInterrupt):
         stopped.run(SilentDisplay(stop_after=after))
@@ -228,7 +228,7 @@ def test_a_changed_request_replaces_the_earlier_one(tmp_path: Path) -> None:
     assert {len(row["seconds"]) for row in made.rows("curve")} == {1}
 
 
-def test_what_is_no_longer_requested_stays_and_is_not_counted(tmp_path: Path) -> None:
+def test_results_no_longer_requested_remain_and_are_not_counted(tmp_path: Path) -> None:
     made = Home(tmp_path, CONFIG.partition("work:")[0])
     made.run()
     before = set(made.written())
@@ -242,7 +242,7 @@ def test_what_is_no_longer_requested_stays_and_is_not_counted(tmp_path: Path) ->
     assert "snapshot" in parquet_rows.read_rows(files, ACCURACY_SCHEMA)["kind"].to_pylist()
 
 
-def test_moments_that_are_one_step_are_measured_once(tmp_path: Path) -> None:
+def test_snapshots_of_one_step_are_measured_once(tmp_path: Path) -> None:
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, peak]", "[2, early, middle]"))
     (tmp_path / "cloth.yaml").write_text(SCENE.replace("frames: 8", "frames: 2"))
     made.run()

@@ -87,7 +87,7 @@ def measured(scene: Path) -> list[Path]:
     return sorted((scene.parent / "results").glob("*/accuracy/*-work-*.parquet"))
 
 
-def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: Path) -> None:
+def test_the_cheapest_method_within_the_error_is_recommended_and_verified(scene: Path) -> None:
     said = list[str]()
     found, count = recommend(scene, 0.1, print_message=said.append)
     assert count == len(measured(scene)) <= COUNT
@@ -117,7 +117,7 @@ def test_the_cheapest_that_keeps_to_the_error_is_recommended_and_checked(scene: 
     assert other.verdict.startswith("not as predicted")
 
 
-def test_what_was_measured_is_not_measured_again(scene: Path) -> None:
+def test_stored_measurements_are_not_repeated(scene: Path) -> None:
     first, _ = recommend(scene, 0.1)
     again, count = recommend(scene, 0.1)
     assert count == 0
@@ -125,7 +125,7 @@ def test_what_was_measured_is_not_measured_again(scene: Path) -> None:
 
 
 @pytest.mark.long
-def test_what_was_measured_of_another_scene_or_on_another_machine_is_no_answer(scene: Path) -> None:
+def test_measurements_of_another_scene_or_machine_are_not_reused(scene: Path) -> None:
     recommend(scene, 0.1)
     scene.write_text(SCENE.replace("200", "210"))
     assert recommend(scene, 0.1)[1] > 0
@@ -155,7 +155,7 @@ def test_an_error_that_no_method_reaches_is_reported_with_the_nearest(scene: Pat
     assert "use a larger --error or a shorter --t-end" in str(raised.value)
 
 
-def test_a_search_time_that_is_used_up_is_stated_and_the_search_goes_on_from_there(scene: Path) -> None:
+def test_an_exhausted_search_time_is_stated_and_the_search_resumes_from_there(scene: Path) -> None:
     with pytest.raises(RunFailed, match=rf"settings remain \(0 of {COUNT} settings measured; 6 not: the time"):
         recommend(scene, 0.1, search_time=1e-9)
     found, count = recommend(scene, 0.1)
@@ -165,7 +165,7 @@ def test_a_search_time_that_is_used_up_is_stated_and_the_search_goes_on_from_the
 
 @pytest.mark.parametrize("option", ["error", "t_end", "time_limit", "search_time"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf")])
-def test_what_is_no_number_above_zero_is_a_mistake(scene: Path, option: str, value: float) -> None:
+def test_a_value_that_is_not_positive_is_a_mistake(scene: Path, option: str, value: float) -> None:
     with pytest.raises(InputError, match="expected a number above 0"):
         recommend(scene, **{"error": 0.1, option: value})
 

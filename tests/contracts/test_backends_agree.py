@@ -111,7 +111,7 @@ def test_backends_agree_on_random_networks(seed):
 
 @pytest.mark.skipif(not ASSIGNMENT.is_dir(), reason="the assignment's scenes are not beside the repository")
 @pytest.mark.parametrize("name", ["single-spring-horizontal", "horizontal-chain", "net"])
-def test_backends_agree_on_the_assignments_small_scenes(name):
+def test_backends_agree_on_the_small_scenes_of_the_assignment(name):
     made = assignment_scene(name)
     found = [simulate_trajectory(made, backend, 100, initial_guess="assignment") for backend in WAYS]
     assert apart(found) <= AGREEMENT * made.mesh.bounding_box_diagonal

@@ -117,7 +117,7 @@ class Sweep(NamedTuple):
         return " ".join(words.split())
 
 
-def test_a_scheduler_that_is_killed_ends_the_command_with_that_and_the_next_does_the_rest(tmp_path: Path):
+def test_a_killed_scheduler_ends_the_command_with_that_reason_and_the_next_command_does_the_rest(tmp_path: Path):
     sweep = Sweep.made(tmp_path)
     with farm(tmp_path / "one") as first:
         client = sweep.begin(first.address)

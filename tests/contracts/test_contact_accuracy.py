@@ -94,7 +94,7 @@ def test_an_error_that_cannot_be_measured_is_a_mistake_of_the_user(
 
 
 @pytest.mark.long
-def test_a_run_to_an_error_keeps_to_it_by_the_reference_whose_bound_counts(drop: Path, tmp_path: Path) -> None:
+def test_a_run_to_an_error_meets_it_relative_to_the_reference_whose_bound_counts(drop: Path, tmp_path: Path) -> None:
     answer = CliRunner().invoke(app, ["run", "drop.yaml", "--error", "0.05", "--verify"])
     assert answer.exit_code == 0, answer.output
     rows = parquet_rows.read_rows((tmp_path / "results" / "drop" / "accuracy").glob("*.parquet"), ACCURACY_SCHEMA)
@@ -124,7 +124,7 @@ def test_a_sweep_to_an_error_measures_it_by_the_reference_and_refuses_what_canno
 
 
 @pytest.mark.long
-def test_a_method_is_recommended_that_keeps_to_the_error_whatever_the_reference_errs(drop: Path) -> None:
+def test_the_recommended_method_meets_the_error_whatever_the_error_of_the_reference(drop: Path) -> None:
     lines, results = list[str](), drop.parent / "results"
     found = recommend_method(
         drop,

@@ -117,7 +117,7 @@ LOCKS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("lock", LOCKS)
-def test_what_lies_in_the_place_of_the_lock_is_a_mistake(home: Path, lock: str):
+def test_a_file_in_place_of_the_lock_is_a_mistake(home: Path, lock: str):
     (home / "victim").write_text("precious")
     path = home / "results" / "sweep" / ".lock"
     replaced(path, LOCKS[lock])
@@ -138,7 +138,7 @@ def test_two_configs_of_one_name_do_not_share_their_results(home: Path):
     assert attempt(home, ["run", "--in-process", "other/sweep.yaml"]).code == 0
 
 
-def test_an_answer_is_text_and_no_markup(home: Path):
+def test_query_output_is_text_and_not_markup(home: Path):
     parquet_rows.write_rows(
         home / "results/sweep/rows/x.parquet", [{"scene": "[red]x[/nothing]", "status": "ok", "run_id": "\x1b[2J"}]
     )

@@ -112,7 +112,7 @@ def end(case: Case, integrator: str, steps: int, seconds: float = END) -> np.nda
     return last.positions
 
 
-def test_every_effect_states_it() -> None:
+def test_every_effect_states_its_maximum_order() -> None:
     stated = {name: load_target(target).max_convergence_order for name, target in EFFECT_CLASSES.items()}
     assert {name for name, order in stated.items() if isinf(order)} == set(SMOOTH)
     assert {name for name, order in stated.items() if order == 1.0} == set(ROUGH)
@@ -123,7 +123,7 @@ def test_every_effect_states_it() -> None:
     [pytest.param(i, marks=[pytest.mark.long] * (i not in MEASURED)) for i in INTEGRATORS if i != "substepping"],
 )
 @pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.long] * (e == "gas")) for e in SMOOTH])
-def test_integrators_keep_their_order_up_to_it(effect, integrator):
+def test_integrators_have_their_order_up_to_that_of_the_effect(effect, integrator):
     order, case = INTEGRATORS[integrator].order, SMOOTH[effect]
     errors = [truth(effect).measure_error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)]
     stated = min(order, load_target(EFFECT_CLASSES[effect]).max_convergence_order)
@@ -132,7 +132,7 @@ def test_integrators_keep_their_order_up_to_it(effect, integrator):
 
 
 @pytest.mark.parametrize("effect", ROUGH)
-def test_what_begins_within_steps_has_order_1(effect):
+def test_effects_that_begin_within_steps_have_order_1(effect):
     case = ROUGH[effect]
     others = tuple(one for one in case.effects if one["kind"] != effect)
     true = end(case, "implicit-euler", 768, ROUGH_END)

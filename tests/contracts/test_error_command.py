@@ -113,7 +113,7 @@ class Boosting(AdaptiveSubstepper):
         return replace(found, velocities=3.0 * found.velocities)
 
 
-def test_a_motion_that_gains_energy_says_so_in_its_row_and_its_exit_code(tmp_path, monkeypatch):
+def test_an_energy_gain_is_reported_in_the_row_and_the_exit_code(tmp_path, monkeypatch):
     few = [("substepping", SolverSpec("dormand-prince-8", {}))]
     module = "springbench.harness.experiments.error_control.candidate_methods"
     monkeypatch.setattr(f"{module}.list_candidate_methods", lambda: few)
@@ -146,7 +146,7 @@ def test_the_rows_of_a_sweep_to_an_error_have_the_energy_of_each_frame(tmp_path,
     assert {row["status"] for row in rows} == {"energy-growth"}
 
 
-def test_what_rows_measured_before_tell_to_be_dear_is_not_tried_again(tmp_path, monkeypatch):
+def test_a_method_that_stored_rows_show_to_be_expensive_is_not_tried_again(tmp_path, monkeypatch):
     few = [
         ("substepping", SolverSpec(name, {})) for name in ("velocity-verlet", "blanes-moan-4", "rodas")
     ]  # the last is dear

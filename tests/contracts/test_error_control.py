@@ -104,7 +104,7 @@ def test_a_tolerance_is_changed_by_the_order_of_a_step():
     assert way.scale_setting(1e-3, 0.1, 1.0) == pytest.approx(1e-5)
 
 
-def test_frames_lie_on_the_motion_though_steps_are_longer_than_they_are():
+def test_frames_are_on_the_motion_though_steps_are_longer_than_they_are():
     path = implicit(SWINGING, "esdirk-4").integrate_motion(3e-4)
     assert path.step_size_range[1] > END / FRAMES
     truth = integrate_motion(build_scene(SWINGING, 5, "substepping"), list(np.linspace(0.0, END, FRAMES + 1)[1:]))
@@ -225,7 +225,7 @@ def test_the_estimated_growth_is_that_of_perturbed_integrations(spec, size, end)
     )  # over some orders of magnitude
 
 
-def test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known():
+def test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_predictable():
     one, other = (estimate_growth(CRUMPLING.with_time_step(h), 9, 3.0) for h in (1 / 30, 1 / 240))
     np.testing.assert_array_equal(one.growth_factor, other.growth_factor)
     assert one.growth_factor[-1] == 1.0
@@ -254,7 +254,7 @@ def test_long_steps_that_an_error_allows_cause_no_warning(caplog: pytest.LogCapt
         assert "a time step of 20 s is long" in caplog.text, "as it is of steps that somebody states"
 
 
-def test_an_error_below_round_off_is_refused_with_the_one_that_can_be_had():
+def test_an_error_below_round_off_is_refused_with_the_attainable_one():
     pendulum = ErrorTarget.from_scene(load_scene(SCENES / "single-spring.yaml"), 2, 1.0)
     assert (
         estimate_growth(pendulum.scene, 2, 1.0).min_error < 1e-9
@@ -277,7 +277,7 @@ def test_what_only_round_off_moves_is_at_rest(tmp_path):
             ask()
 
 
-def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():
+def test_the_pattern_of_the_jacobian_contains_all_nonzeros():
     scene = build_scene(
         chain(SpringsEffect(stretch=40.0), DashpotsEffect(stretch=1.0), GravityEffect(), HELD), 5, "newmark"
     )
@@ -291,7 +291,7 @@ def test_the_pattern_of_the_jacobian_holds_all_that_differs_from_zero():
     assert not found.all()
 
 
-def test_ways_are_what_solvers_and_integrators_say_of_themselves():
+def test_candidate_methods_follow_from_the_properties_of_solvers_and_integrators():
     assert {(integrator, solver.name) for integrator, solver in list_candidate_methods()} == {
         *((integrator, solver) for solver in ("lbfgs", "newton") for integrator in ("esdirk-4", "midpoint")),
         *(("substepping", solver) for solver in OWN),
@@ -305,7 +305,7 @@ def test_ways_are_what_solvers_and_integrators_say_of_themselves():
         (AirDragEffect(drag_law="quadratic", coefficient=0.5), "forces of place, speed and time"),
     ],
 )
-def test_methods_that_would_lose_their_order_without_telling_are_named_with_the_reason(effect, what):
+def test_methods_that_would_lose_their_order_silently_are_named_with_the_reason(effect, what):
     fixed = () if effect is MOVED else (HELD,)
     messages, error_target = list[str](), ErrorTarget(chain(SpringsEffect(stretch=40.0), effect, *fixed), 5, 0.1, 2)
     found = prepare_candidate_methods(error_target, messages.append)

@@ -83,7 +83,7 @@ def test_the_order_is_measured_and_the_cost_predicted_by_it(monkeypatch):
     assert by_name["second"][1] == pytest.approx(171 * 1e-2, rel=0.1)
 
 
-def test_ways_are_sorted_chosen_and_printed_by_one_statistic(monkeypatch):
+def test_candidate_methods_are_sorted_chosen_and_printed_by_one_statistic(monkeypatch):
     messages = list[str]()
     ways = {f"w{k}": Formula(lambda steps: 1.0 / steps**2, 1e-3 * cost) for k, cost in enumerate((3.0, 1.0, 2.0))}
     answer = found(monkeypatch, 1e-2, messages, **ways)

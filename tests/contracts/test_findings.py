@@ -43,7 +43,7 @@ def test_there_are_few_findings() -> None:
 
 
 @pytest.mark.parametrize("page", FINDINGS, ids=name_page)
-def test_a_finding_has_question_set_up_figure_answer_and_limits(page: Path) -> None:
+def test_a_finding_has_question_set_up_figure_result_and_limits(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert [part for part in PARTS if part not in text] == []
     assert len(re.findall(r"!\[", text)) == 1

@@ -67,7 +67,7 @@ SIZES = ["200k", *(pytest.param(size, marks=pytest.mark.long) for size in ("8k",
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_full_disk_is_said_by_name_and_what_failed_is_done_again(size: str, config: Path, tmp_path: Path):
+def test_a_full_disk_is_reported_by_name_and_failed_runs_are_repeated(size: str, config: Path, tmp_path: Path):
     results = tmp_path / "disk"
     with small_disk(results, size):
         result = start(config, results)
@@ -98,7 +98,7 @@ def test_a_limit_to_the_size_of_files_is_no_outcome_of_a_run_either(config: Path
 
 
 @pytest.mark.long
-def test_it_ends_at_once(config: Path, tmp_path: Path):
+def test_a_limit_to_the_size_of_files_ends_the_run_at_once(config: Path, tmp_path: Path):
     before = os.times()
     test_a_limit_to_the_size_of_files_is_no_outcome_of_a_run_either(config, tmp_path)
     after = os.times()

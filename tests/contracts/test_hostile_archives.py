@@ -39,7 +39,7 @@ def test_a_hostile_archive_is_not_confirmed(name: str, good: Content, tmp_path: 
 
 
 @pytest.mark.parametrize("name", each(RAW))
-def test_what_is_no_archive_of_ours_is_refused(name: str, tmp_path: Path):
+def test_an_archive_of_another_program_is_refused(name: str, tmp_path: Path):
     (tmp_path / "x.zip").write_bytes(RAW[name]())
     require_answer(attempt(tmp_path, ["verify-archive", "x.zip"]), 1, 2)
 
@@ -47,7 +47,7 @@ def test_what_is_no_archive_of_ours_is_refused(name: str, tmp_path: Path):
 @pytest.mark.parametrize(
     "what", ["/dev/zero", "/dev/null", "pipe", "folder", "none", "loop", "/dev/zero/a", "a" * 5000]
 )
-def test_what_is_no_file_is_refused(what: str, tmp_path: Path):
+def test_a_path_that_is_not_a_file_is_refused(what: str, tmp_path: Path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "loop").symlink_to("loop")
@@ -55,7 +55,7 @@ def test_what_is_no_file_is_refused(what: str, tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", each(FOLDERS))
-def test_hostile_results_are_answered_by_all_commands(name: str, tmp_path: Path):
+def test_all_commands_report_hostile_results(name: str, tmp_path: Path):
     def made(number: int) -> Path:
         folder = tmp_path / str(number)
         folder.mkdir()

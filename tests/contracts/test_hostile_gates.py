@@ -54,7 +54,7 @@ def test_a_hostile_table_is_refused_by_name(name: str, folder: Path):
 
 
 @pytest.mark.parametrize("name", each(RECORDS))
-def test_a_hostile_record_is_answered(name: str, folder: Path):
+def test_a_hostile_record_ends_with_a_message(name: str, folder: Path):
     put(folder / "hostile.json", RECORDS[name])
     require_answer(attempt(folder, ["regress", "hostile.json", "--baseline", "hostile.json"]), 0, 2, 3)
     require_answer(attempt(folder, ["regress", "--history", "hostile.json"]), 2, 3)

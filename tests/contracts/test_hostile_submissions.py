@@ -34,7 +34,7 @@ def write_files(folder: Path, line: str) -> None:
 
 
 @pytest.mark.parametrize("name", mark_rare_cases(CASES, QUICK))
-def test_a_hostile_submission_is_answered_by_a_message(name: str, tmp_path: Path):
+def test_a_hostile_submission_ends_with_a_message(name: str, tmp_path: Path):
     case = CASES[name]
     inside = tmp_path / "inside"
     inside.mkdir()

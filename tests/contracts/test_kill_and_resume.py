@@ -186,7 +186,7 @@ def test_a_sweep_leaves_its_files_and_nothing_else(undisturbed: Undisturbed):
     assert undisturbed.sweep.files() == expected
 
 
-def test_a_killed_sweep_goes_on_where_it_was(undisturbed: Undisturbed, tmp_path: Path):
+def test_a_killed_sweep_resumes_where_it_was(undisturbed: Undisturbed, tmp_path: Path):
     """It is killed at seeded moments; if it comes to its end before that, a new one begins."""
     chance, case, kills, lasts = random.Random(2013), undisturbed.case, 0, undisturbed.seconds
     sweep, complete = case.write(tmp_path / "0"), {}
@@ -209,7 +209,7 @@ def test_a_killed_sweep_goes_on_where_it_was(undisturbed: Undisturbed, tmp_path:
     pytest.fail("it comes to its end before it can be killed")
 
 
-def test_ctrl_c_says_how_to_go_on(tmp_path: Path):
+def test_ctrl_c_states_how_to_resume(tmp_path: Path):
     sweep = Sweep.write(tmp_path / "home", "sparse, numba", pictures=False)
     process = subprocess.Popen(
         [sys.executable, "-m", "springbench", *sweep.arguments],

@@ -102,6 +102,6 @@ def test_the_extras_repeat_dependencies_of_the_complete_installation():
     assert set(project["dependencies"]) - set(light) == {line for extra in LIGHT_EXTRAS for line in extras[extra]}
 
 
-def test_a_light_installation_keeps_markers_and_leaves_out_extras():
+def test_a_light_installation_preserves_markers_and_omits_extras():
     lines = ["a>=1; python_version < '4'", "b-c<2", "d==1", "d==1; extra == 'record'", 'e; extra == "gates"']
     assert list_light_requirements(lines) == ["a>=1; python_version < '4'", "b-c<2"]

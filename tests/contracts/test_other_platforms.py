@@ -128,7 +128,7 @@ def test_a_kernel_is_stored_without_locks(monkeypatch: pytest.MonkeyPatch, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-def test_the_memory_is_known_without_sysconf(monkeypatch: pytest.MonkeyPatch):
+def test_the_memory_is_measured_without_sysconf(monkeypatch: pytest.MonkeyPatch):
     import psutil  # it needs sysconf itself, on Linux
 
     known = platform_calls.measure_memory()

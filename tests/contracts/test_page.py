@@ -164,7 +164,7 @@ def test_it_loads_runs_and_plots_on_demand(tab: Tab, page: str):
     assert shown.get_by_role("row").count() < 60, "only what is in sight is made"
 
 
-def test_the_table_sorts_filters_and_says_so_in_the_url(tab: Tab, page: str):
+def test_the_table_sorts_and_filters_and_its_url_states_both(tab: Tab, page: str):
     shown = tab.open(page, "runs")
     shown.get_by_role("button", name="ms a step", exact=True).click()
     assert tab.view() == "#runs?sort=step"
@@ -190,7 +190,7 @@ def test_the_table_sorts_filters_and_says_so_in_the_url(tab: Tab, page: str):
     assert again.get_by_label("Solver").input_value() == "newton"
 
 
-def test_a_run_says_what_it_was_and_how_to_repeat_it_by_keys_alone(tab: Tab, page: str):
+def test_a_run_states_its_settings_and_its_command_by_keys_alone(tab: Tab, page: str):
     shown = tab.open(page, "runs?solver=numba&sort=step")
     shown.get_by_role("grid").focus()
     shown.keyboard.press("ArrowDown")
@@ -211,7 +211,7 @@ def test_a_run_says_what_it_was_and_how_to_repeat_it_by_keys_alone(tab: Tab, pag
     assert "times as long as the first" in shown.inner_text("table")
 
 
-def test_every_view_says_by_which_code_and_machine(tab: Tab, studies: str):
+def test_every_view_states_code_and_machine(tab: Tab, studies: str):
     tab.open(studies)
     for name, view in VIEWS.items():
         said = tab.go(view).inner_text("main")

@@ -97,7 +97,7 @@ def test_all_pages_together_are_short() -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.parent in (GENERATED, *GUIDES)], ids=name_page)
-def test_the_first_line_says_who_reads_the_page(page: Path) -> None:
+def test_the_first_line_states_the_readers_of_the_page(page: Path) -> None:
     text = re.sub(r"\A<!-- Made by .*-->\n", "", page.read_text(encoding="utf-8"))
     title, first = text.split("\n\n")[:2]
     assert title.startswith("# ")

@@ -148,7 +148,7 @@ def plugin_folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("way", mark_rare_cases(WAYS, ["beside", "entry-point"]))
-def test_a_sweep_runs_own_code_and_says_whose_it_is(way: str, plugin_folder: Path, installed: Path):
+def test_a_sweep_runs_user_code_and_names_its_origin(way: str, plugin_folder: Path, installed: Path):
     (plugin_folder / "installed").symlink_to(installed)
     for mark in [*plugin_folder.rglob("*.was-run"), *installed.rglob("*.was-run")]:
         mark.unlink()
@@ -209,7 +209,7 @@ def test_a_changed_file_is_another_run(plugin_folder: Path):
     assert "missing" in springbench(plugin_folder, "list", sweep.name)
 
 
-def test_opened_or_not_a_run_has_one_name_and_one_code(plugin_folder: Path):
+def test_a_run_has_one_name_and_one_code_with_and_without_imported_plugins(plugin_folder: Path):
     sweep = configs(plugin_folder, WAYS["beside"])
     closed, opened = (load_config(sweep, imports_code=opens).list_runs()[0] for opens in (False, True))
     assert closed.build_identity() == opened.build_identity()
@@ -318,7 +318,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("part", "name"), WRONG)
-def test_what_a_name_leads_to_is_checked_when_it_is_run(part: str, name: str, plugin_folder: Path):
+def test_the_target_of_a_name_is_checked_when_it_is_run(part: str, name: str, plugin_folder: Path):
     sweep = configs(plugin_folder, WAYS["beside"] | {part: name})
     assert load_config(sweep, imports_code=False).list_runs()
     with pytest.raises(InputError) as caught:

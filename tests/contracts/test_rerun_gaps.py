@@ -77,7 +77,7 @@ def test_the_public_call_for_layouts_leaves_threads_that_nothing_ends(tmp_path: 
     assert found > 0, "send_blueprint leaves no threads any more: call it instead"
 
 
-def test_no_public_call_lets_go_of_a_stream_whose_writer_has_died(tmp_path: Path):
+def test_no_public_call_releases_a_stream_whose_writer_has_died(tmp_path: Path):
     # Way round: `PartialFile` retains such a stream, by `Py_IncRef`, and takes back its clean-up at exit.
     assert said(DEAD, tmp_path / "a.rrd"), (
         "disconnect does not wait for a dead writer any more: call it, and keep nothing"

@@ -94,7 +94,7 @@ def begun() -> tuple[Scene, MotionState]:
 
 
 @pytest.mark.parametrize("name", TAKE)
-def test_every_iterate_and_the_path_to_it_are_free(name):
+def test_every_iterate_and_the_path_to_it_are_intersection_free(name):
     made, state = begun()
     stated = build_problem(made, state, "inertial")
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
@@ -194,7 +194,7 @@ def test_an_iterate_without_contact_counts_only_where_its_path_is_free():
     assert not certificate.is_idle_at(np.full_like(p, np.nan))
 
 
-def test_two_free_sheets_that_collide_keep_their_momentum():
+def test_two_free_sheets_that_collide_conserve_momentum():
     made = build_test_scene(StackMesh(layer_spacing=0.05), SpringsEffect(stretch=100.0, shear=20.0), APART, size=5)
     p, v = made.mesh.rest_positions, np.zeros_like(made.mesh.rest_positions)
     v[len(p) // 2 :] = (0.1, -2.0, 0.0)
@@ -220,7 +220,7 @@ STARTS = {
 
 
 @pytest.mark.parametrize("name", STARTS)
-def test_a_start_that_is_not_free_is_refused_with_the_pairs(name):
+def test_an_intersecting_start_is_refused_with_the_pairs(name):
     begin, words = STARTS[name]
     made = build_test_scene(StackMesh(layer_spacing=0.2), SpringsEffect(stretch=100.0), APART, size=3)
     (check,) = APART.build_contribution(made.mesh, made.system.mass, 1 / 30).scene_checks
@@ -242,7 +242,7 @@ def test_exact_pins_that_move_are_refused():
 
 
 @pytest.mark.parametrize("name", ["midpoint", "sdirk-2", "generalised-alpha"])
-def test_integrators_whose_unknowns_lie_elsewhere_are_refused(name):
+def test_integrators_whose_stages_are_at_other_times_are_refused(name):
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 0.02, "frames": 1, "path": "scene.yaml"}
     spec = SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=1.0), APART)})
     with pytest.raises(InputError, match=f"end of a step, and {name} has other unknowns"):

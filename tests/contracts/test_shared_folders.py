@@ -78,7 +78,7 @@ def claimed_elsewhere(folder: Path, unit: Path) -> subprocess.Popen[str]:
     return other
 
 
-def test_a_claim_holds_against_others_and_goes_with_its_process(tmp_path: Path):
+def test_a_claim_excludes_others_and_ends_with_its_process(tmp_path: Path):
     unit, free = tmp_path / "a.parquet", tmp_path / "b.parquet"
     claims = UnitClaims(tmp_path, [unit, free])
     other = claimed_elsewhere(tmp_path, unit)
@@ -91,7 +91,7 @@ def test_a_claim_holds_against_others_and_goes_with_its_process(tmp_path: Path):
     claims.close()
 
 
-def test_what_its_claimant_has_done_is_done_though_the_claim_remains(tmp_path: Path):
+def test_a_unit_that_its_claimant_completed_is_done_though_the_claim_remains(tmp_path: Path):
     unit = tmp_path / "a.parquet"
     claims, other = UnitClaims(tmp_path, [unit]), claimed_elsewhere(tmp_path, unit)
     parquet_rows.write_rows(unit, [{"run_id": "x"}])
@@ -102,7 +102,7 @@ def test_what_its_claimant_has_done_is_done_though_the_claim_remains(tmp_path: P
     claims.close()
 
 
-def test_what_somebody_else_has_done_since_is_left_to_that(tmp_path: Path):
+def test_a_unit_that_another_process_completed_since_is_not_repeated(tmp_path: Path):
     unit = tmp_path / "a.parquet"
     claims = UnitClaims(tmp_path, [unit])
     parquet_rows.write_rows(unit, [{"run_id": "x"}])
@@ -111,7 +111,7 @@ def test_what_somebody_else_has_done_since_is_left_to_that(tmp_path: Path):
     claims.close()
 
 
-def test_a_process_that_packs_a_folder_has_it_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_process_that_packs_a_folder_has_exclusive_access(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(folder_locks, "_LOCK_TIMEOUT", 0.0)
     with (
         folder_locks.lock_folder_shared(tmp_path),

@@ -164,7 +164,7 @@ def test_each_phase_does_what_it_returns(solver, problem):
 
 @over(FLOAT64)
 @problems
-def test_a_global_phase_solves_for_what_its_right_hand_side_says(solver, problem):
+def test_a_global_phase_solves_for_its_right_hand_side(solver, problem):
     """Q times what the global phase gives is the right-hand side that each backend states."""
     prepared = solver.prepare(problem.system)
     system, free = problem.system, problem.system.free_vertices
@@ -245,7 +245,7 @@ def test_the_reported_residual_is_the_length_of_the_last_step_in_the_norm_of_the
 
 
 @solvers
-def test_the_facts_are_whole_numbers_by_name(solver):
+def test_the_stats_are_whole_numbers_by_name(solver):
     facts = solver.prepare(build_random_problem(0).system).stats
     assert not solver.is_minimiser or facts["nnz_system"] > 0
     assert all(float(value).is_integer() for value in facts.values())

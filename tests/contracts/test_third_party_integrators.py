@@ -43,7 +43,7 @@ def test_cvode_follows_the_motion_to_its_tolerance(name):
     assert fine < 0.1 * coarse
 
 
-def test_a_peer_that_is_not_installed_is_a_row_that_says_which_command_installs_it(monkeypatch):
+def test_a_third_party_integrator_that_is_not_installed_is_a_row_that_names_the_command_to_install_it(monkeypatch):
     monkeypatch.setattr(third_party_integrators, "find_spec", lambda name: None)
     error_target = ErrorTarget.from_scene(load_scene(SPRING), 2, 0.1)
     seen = compute_predictability_horizon(error_target, 1e-2, lambda line: None)

@@ -165,7 +165,7 @@ def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.Monk
     assert str(os.getpid()) not in workers
 
 
-def test_a_drawing_process_that_is_lost_fails_the_command_and_keeps_what_was_measured(
+def test_a_lost_drawing_process_fails_the_command_and_preserves_the_measurements(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     from springbench.harness.report import sweep_pictures

@@ -84,7 +84,7 @@ def test_it_ends_where_the_processor_does() -> None:
     ],
     ids=["strain limits", "contact", "gas", "factor", "block-jacobi"],
 )
-def test_what_it_does_not_know_it_refuses_by_name(
+def test_unsupported_features_are_refused_by_name(
     make: Callable[[], StepProblem], preconditioner: PreconditionerName, named: str
 ) -> None:
     with pytest.raises(Unsupported, match=f"device: cuda: .*({named})"):

@@ -40,7 +40,7 @@ METHODS: dict[str, Callable[[], Any]] = {
 
 @pytest.mark.parametrize("name", PROBLEMS)
 @pytest.mark.parametrize("method", METHODS)
-def test_it_is_the_oracles(name: str, method: str) -> None:
+def test_the_residual_is_that_of_the_reference_evaluator(name: str, method: str) -> None:
     """At the guess, and at points near it."""
     problem = PROBLEMS[name]()
     if (method == "vbd" and "dashpots" in name) or (method != "vbd" and "sphere" in name):

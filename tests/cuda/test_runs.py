@@ -39,7 +39,7 @@ def ran(folder: Path) -> tuple[Result, list[list[dict[str, Any]]]]:
     return result, found
 
 
-def test_rows_tell_of_the_device_and_timed_steps_ask_for_no_residual(
+def test_rows_name_the_device_and_timed_steps_request_no_residual(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     requests, timed = list[float](), list[tuple[int, int]]()
@@ -92,7 +92,7 @@ for kind in (OutOfMemory, Lost):
     ],
     ids=["memory", "lost"],
 )
-def test_a_device_that_fails_is_a_row_and_the_sweep_goes_on(
+def test_a_device_failure_is_a_row_and_the_sweep_continues(
     error: Exception, said: str, lost: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(where, "_DEVICE_FAILURES", [])

@@ -77,7 +77,7 @@ def test_iterates_are_those_of_the_processor(make: Callable[[], StepProblem], ra
 
 
 @pytest.mark.parametrize("name", STARTS)
-def test_wherever_it_begins_it_descends(name: str) -> None:
+def test_iterations_descend_from_any_start(name: str) -> None:
     problem = build_first_problem(SCENE_BUILDERS["chain"]("exact"))
     start = STARTS[name](vertex_terms.apply_exact_pins(problem.initial_guess, problem), np.random.default_rng(0))
     problem = replace(problem, initial_guess=vertex_terms.apply_exact_pins(start, problem))
@@ -147,6 +147,6 @@ def test_a_residual_may_end_it_after_each_few_iterations() -> None:
     assert found.residual <= tolerance * processor.residual_at(problem, problem.current_positions)
 
 
-def test_what_it_cannot_take_is_named() -> None:
+def test_unsupported_features_are_named() -> None:
     with pytest.raises(Unsupported, match=r"StrainLimits.*without `device: cuda`"):
         on_device(build_first_problem(cloth_with(STRAIN_LIMIT_EFFECT)))

@@ -67,7 +67,7 @@ def test_bits_and_velocities_do_not_depend_on_observers(method: Callable[..., An
         np.testing.assert_array_equal(solved.velocity, replayed.velocity)
 
 
-def test_solves_of_one_system_take_turns() -> None:
+def test_solves_of_one_system_may_be_interleaved() -> None:
     one, other = build_random_problem(0), build_random_problem(0)
     other = replace(other, inertial_target=-other.inertial_target)
     prepared = Xpbd(device="cuda").prepare(one.system)
@@ -80,6 +80,6 @@ def test_solves_of_one_system_take_turns() -> None:
 
 
 @methods
-def test_what_it_does_not_know_it_refuses_by_name(method: Callable[..., Any]) -> None:
+def test_unsupported_features_are_refused_by_name(method: Callable[..., Any]) -> None:
     with pytest.raises(Unsupported, match="supports springs only; the scene has Bending"):
         method(device="cuda").prepare(cloth_with(BENDING_EFFECT).system)

@@ -36,7 +36,7 @@ ARCHIVE = (
         "harness/experiments/archive/result_merge.py",
         "_read_start_time(heads[pair[0]]), reverse=True\n        )",
         "_read_start_time(heads[pair[0]]), reverse=False)",
-        (f"{_MERGED}::test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name",),
+        (f"{_MERGED}::test_a_run_that_was_done_twice_has_both_rows_and_the_newer_has_its_name",),
     ),
     Mutation(
         "published-from-anywhere",
@@ -50,21 +50,21 @@ ARCHIVE = (
         "harness/experiments/archive/archive_verification.py",
         "wrong = _find_differences([(row, of_place[_row_key(row)]) for row in original.rows], names)",
         "wrong = _find_differences([], names)",
-        (f"{_PUBLISHED}::test_a_forged_column_does_not_hold",),
+        (f"{_PUBLISHED}::test_a_forged_column_is_refuted",),
     ),
     Mutation(
         "any-times-are-verified",
         "harness/experiments/archive/archive_verification.py",
         "MAX_RATIO_SAME_MACHINE, MAX_SECONDS_RATIO = 1.25, 3.0",
         "MAX_RATIO_SAME_MACHINE, MAX_SECONDS_RATIO = 1.25, 3e6",
-        (f"{_PUBLISHED}::test_a_forged_column_does_not_hold",),
+        (f"{_PUBLISHED}::test_a_forged_column_is_refuted",),
     ),
     Mutation(
         "names-are-not-verified",
         "harness/experiments/archive/archive_verification.py",
         "wrong = _find_differences([(row, requested) for row in published_run.rows], requested)",
         "wrong = _find_differences([(row, row) for row in published_run.rows], requested)",
-        (f"{_PUBLISHED}::test_a_forged_column_does_not_hold",),
+        (f"{_PUBLISHED}::test_a_forged_column_is_refuted",),
     ),
     Mutation(
         "locks-that-are-links",

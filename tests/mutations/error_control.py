@@ -9,7 +9,7 @@ _CONTROLLER = "solvers/model/integrators/step_size_controller.py"
 _CONTROLLERS = "tests/unit/test_step_size_controller.py"
 _FORMULAS = "tests/contracts/test_error_search.py"
 _ASKED = "tests/contracts/test_error_control.py"
-_GROWS = f"{_ASKED}::test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_known"
+_GROWS = f"{_ASKED}::test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_predictable"
 
 _TABLE = (
     (

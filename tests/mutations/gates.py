@@ -49,7 +49,7 @@ GATES = (
         "harness/experiments/regression/program_pair.py",
         "float(np.ptp(points, axis=0).max(initial=0.0)) if points.size",
         "float(np.abs(points).max(initial=0.0)) if points.size",
-        ("tests/unit/test_pytest_plugin.py::test_answers_are_compared_in_their_own_size",),
+        ("tests/unit/test_pytest_plugin.py::test_solutions_are_compared_relative_to_their_size",),
     ),
     Mutation(
         "an-interval-too-narrow",

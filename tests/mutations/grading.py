@@ -16,7 +16,7 @@ _TABLE = (
         f"{_FOLDER}/submission.py",
         "first_frame = 0 if is_start else 1",
         "first_frame = 1",
-        f"{_GRADE}::test_vertices_in_another_order_are_matched_by_frame_0_and_the_output_says_so",
+        f"{_GRADE}::test_vertices_in_another_order_are_matched_by_frame_0_and_the_output_states_it",
     ),
     (
         "grade-order-inverted",

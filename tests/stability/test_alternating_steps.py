@@ -63,7 +63,7 @@ def test_an_integrator_of_two_steps_of_one_length_is_refused():
         prepare(made("bdf2"), NewtonSolver())
 
 
-def test_each_step_is_judged_by_the_matrix_of_its_length():
+def test_each_step_is_verified_with_the_matrix_of_its_length():
     scene = made("midpoint")
     judge = StepVerifier(scene, None, is_minimiser=True)
     for step in simulate_scene(

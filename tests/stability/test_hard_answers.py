@@ -49,7 +49,7 @@ def answers(case: str, stop: StopRule) -> tuple[StepProblem, dict[str, Solution]
 
 
 @cases
-def test_an_answer_is_as_stationary_as_it_is_said_to_be(case: str):
+def test_a_solution_is_as_stationary_as_reported(case: str):
     stated, found = answers(case, STOP)
     oracle = ReferenceEvaluator(stated.system)
     for name, solution in found.items():

@@ -136,7 +136,7 @@ def test_backends_agree_on_a_hard_case(case: Case):
 
 
 @backends
-def test_a_long_run_comes_to_rest_where_the_statics_say(backend):
+def test_a_long_run_comes_to_rest_in_the_static_shape(backend):
     made = SCENE_BUILDERS["chain"](1e10)
     p = simulate_trajectory(made, backend, 1500, iterations=30)
     assert np.isfinite(p).all()

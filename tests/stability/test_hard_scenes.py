@@ -199,5 +199,5 @@ def test_the_sweep_runs_every_case_by_every_solver():
 
 
 @cases
-def test_a_case_says_why_it_is_hard(case: str):
+def test_a_case_states_why_it_is_hard(case: str):
     assert len(load_scene(CASES[case]).description.split()) >= 5

@@ -141,7 +141,7 @@ def test_a_hessians_factor_that_does_not_fit_is_refused(solver: Solver, monkeypa
         solver.prepare(system)
 
 
-def test_what_no_linear_solver_holds_is_refused_with_what_each_needs():
+def test_a_matrix_too_large_for_every_linear_solver_is_refused_with_the_memory_that_each_needs():
     with pytest.raises(
         Unsupported, match=r"does not fit in 100 KiB of memory: supernodal needs [\d.]+ MiB .* cg needs"
     ):

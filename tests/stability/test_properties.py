@@ -73,7 +73,7 @@ def test_iterates_are_finite_and_descend(name: str, case: Case):
 @steady
 @EXAMPLES
 @given(case=networks(), turn=st.integers(0, 2**16), mirror=st.booleans())
-def test_what_is_turned_shifted_or_mirrored_moves_as_before(name: str, case: Case, turn: int, mirror: bool):
+def test_rotated_shifted_and_mirrored_scenes_have_the_same_motion(name: str, case: Case, turn: int, mirror: bool):
     problem = case.problem()
     other, moved = turned(problem, turn, mirror)
     np.testing.assert_allclose(ends(name, other), moved(ends(name, problem)), rtol=0, atol=tolerance(case))
@@ -82,7 +82,9 @@ def test_what_is_turned_shifted_or_mirrored_moves_as_before(name: str, case: Cas
 @steady
 @EXAMPLES
 @given(case=networks(), order=st.integers(0, 2**16))
-def test_the_numbering_of_vertices_and_springs_and_their_direction_mean_nothing(name: str, case: Case, order: int):
+def test_the_motion_does_not_depend_on_the_numbering_or_direction_of_vertices_and_springs(
+    name: str, case: Case, order: int
+):
     problem = case.problem()
     other, moved = renumbered(problem, order)
     np.testing.assert_allclose(ends(name, other), moved(ends(name, problem)), rtol=0, atol=tolerance(case))
@@ -91,7 +93,7 @@ def test_the_numbering_of_vertices_and_springs_and_their_direction_mean_nothing(
 @minimisers
 @EXAMPLES
 @given(case=networks())
-def test_units_of_length_time_and_mass_mean_nothing(name: str, case: Case):
+def test_the_motion_does_not_depend_on_the_units_of_length_time_and_mass(name: str, case: Case):
     """Powers of two change no bit, so nothing but an absolute constant in a solver could change a digit."""
     problem, length, time, mass = case.problem(), 2.0**10, 2.0**-6, 2.0**4
     springs = springs_of(problem)
@@ -123,7 +125,7 @@ def test_the_same_step_twice_has_the_same_bits(name: str, case: Case):
 @pytest.mark.parametrize("name", GLOBAL)
 @EXAMPLES
 @given(case=networks())
-def test_what_nothing_holds_keeps_its_momentum(name: str, case: Case):
+def test_a_free_body_conserves_momentum(name: str, case: Case):
     problem = replace(case, pinned=0).problem()
     mass, dt = problem.system.mass[:, None], problem.system.time_step
     free = replace(problem, external_force=np.zeros_like(problem.external_force))
@@ -136,7 +138,7 @@ def test_what_nothing_holds_keeps_its_momentum(name: str, case: Case):
 @pytest.mark.parametrize("name", GLOBAL)
 @EXAMPLES
 @given(case=networks())
-def test_what_flies_freely_at_rest_length_goes_on(name: str, case: Case):
+def test_a_free_body_at_rest_length_moves_uniformly(name: str, case: Case):
     free, wanted = case.flying()
     atol = 100 * EPS * case.worst * np.abs(wanted).max()
     np.testing.assert_allclose(ends(name, free), wanted, rtol=0, atol=atol)

@@ -107,7 +107,7 @@ CHANGES: dict[str, Callable[[StepProblem, int], tuple[StepProblem, Map]]] = {
 @pytest.mark.parametrize("change", CHANGES)
 @EXAMPLES
 @given(case=networks(), seed=st.integers(0, 2**16))
-def test_what_is_changed_in_description_alone_ends_at_the_same_minimum(name: str, change: str, case: Case, seed: int):
+def test_equivalent_descriptions_end_at_the_same_minimum(name: str, change: str, case: Case, seed: int):
     case = for_method(name, case)
     given = settled(case, case.problem())
     other, moved = CHANGES[change](given.problem, seed)
@@ -118,7 +118,7 @@ def test_what_is_changed_in_description_alone_ends_at_the_same_minimum(name: str
 @converging
 @EXAMPLES
 @given(case=networks(pinned=0))
-def test_what_nothing_holds_keeps_its_momentum(name: str, case: Case):
+def test_a_free_body_conserves_momentum(name: str, case: Case):
     case = for_method(name, case)
     free = case.problem()
     free = replace(free, external_force=np.zeros_like(free.external_force))
@@ -132,7 +132,7 @@ def test_what_nothing_holds_keeps_its_momentum(name: str, case: Case):
 @converging
 @EXAMPLES
 @given(case=networks())
-def test_what_flies_freely_at_rest_length_goes_on(name: str, case: Case):
+def test_a_free_body_at_rest_length_moves_uniformly(name: str, case: Case):
     case = for_method(name, case)
     free, wanted = case.flying()
     atol = 100 * EPS * case.worst * np.abs(wanted).max()

@@ -128,7 +128,7 @@ def test_a_method_without_a_factor_leaves_a_saddle_for_a_minimum(solver: Solver,
 
 
 @saddles
-def test_a_solve_that_may_not_leave_a_saddle_says_so(saddle: str, monkeypatch):
+def test_a_solve_that_may_not_leave_a_saddle_reports_it(saddle: str, monkeypatch):
     _, given = at_a_saddle(saddle, "implicit-euler")
     prepared = Lbfgs().prepare(given.system)
     no_iteration = prepared.solve(given, replace(STOP_AT_SADDLE, max_iterations=1))

@@ -30,7 +30,7 @@ def made(sweeps: int):
 
 
 @pytest.mark.parametrize("sweeps", [2, 4])
-def test_its_matrix_does_so_many_sweeps_of_jacobis_method(sweeps):
+def test_its_matrix_applies_the_given_number_of_jacobi_sweeps(sweeps):
     Q, S = made(sweeps)
     b = np.random.default_rng(0).normal(size=len(Q))
     x = np.zeros_like(b)

@@ -107,7 +107,7 @@ def pairs(*ratios: float) -> tuple[Callable[..., object], list[float]]:
         ),  # two processes of the same code may differ by where their memory lies
     ],
 )
-def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[float, ...], answer: RegressionVerdict):
+def test_a_slowdown_is_accepted_if_a_second_start_confirms_it(ratios: tuple[float, ...], answer: RegressionVerdict):
     start, started = pairs(*ratios)
     found = run_confirmed_benchmark(start, RULE, time_budget=60.0)  # type: ignore[arg-type]
     assert found.verdict is answer
@@ -115,7 +115,7 @@ def test_a_slowdown_is_believed_when_a_second_start_has_it_too(ratios: tuple[flo
     assert (found.interval.low, found.interval.high) == (pytest.approx(min(ratios)), pytest.approx(max(ratios)))
 
 
-def test_the_budget_is_that_of_both_races(monkeypatch: pytest.MonkeyPatch):
+def test_the_budget_is_that_of_both_comparisons(monkeypatch: pytest.MonkeyPatch):
     slow = run_confirmed_benchmark(pairs(1.06, 1.05)[0], RULE, time_budget=60.0)  # type: ignore[arg-type]
     budgets: list[float] = []
 
@@ -143,7 +143,7 @@ def test_programs_are_restarted_as_long_as_a_comparison_lasts(monkeypatch: pytes
     )
 
 
-def test_pairs_that_differ_all_their_lives_decide_nothing_together(monkeypatch: pytest.MonkeyPatch):
+def test_process_pairs_that_differ_permanently_decide_nothing_together(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark.RESTART_SECONDS", 0.0)
     start, _ = pairs(*[1.05, 1.0] * 10_000)
     found = run_confirmed_benchmark(start, RULE, time_budget=0.05)  # type: ignore[arg-type]
@@ -170,7 +170,7 @@ def test_pairs_that_differ_all_their_lives_decide_nothing_together(monkeypatch: 
         ),
     ],
 )
-def test_a_result_says_what_was_found(
+def test_a_result_states_what_was_measured(
     answer: RegressionVerdict, limit: float, interval: tuple[float, float, float], said: str
 ):
     turn = TimedBlock("ABBA", (1.0, 1.0, 1.0, 1.0))

@@ -131,7 +131,7 @@ def test_pairs_are_reported_under_both_names(ablation_rows):
     assert both == pytest.approx(one, rel=1e-9)  # round-off of a step at rest
 
 
-def test_a_scene_that_cannot_be_without_an_effect_says_so(tmp_path: Path):
+def test_a_scene_that_requires_an_effect_states_it(tmp_path: Path):
     ablation_rows = rows_of(HELD, tmp_path, max_iterations=5)
     assert by_name(ablation_rows)["springs"]["status"] == "unsolvable"
     assert "impossible without it (" in describe_effect(by_name(ablation_rows)["springs"], ablation_rows)
@@ -200,14 +200,14 @@ def test_the_verdict_follows_from_the_numbers(change: dict, said: str):
     assert describe_effect(ROW | change, [WHOLE, *ERRORS]) == said
 
 
-def test_where_no_error_is_known_the_verdict_does_not_judge():
+def test_without_an_error_the_verdict_is_left_open():
     unknown = [row | {"status": "failed", "reason": "lost", "displacement_max": None} for row in ERRORS]
     assert describe_effect(ROW, [WHOLE, *unknown]).endswith("by how much the scene is wrong anyway is not known")
     assert "error of the solver: unknown (lost)" in summarise_ablation([WHOLE, *unknown])
 
 
 @pytest.mark.usefixtures("without_workers")
-def test_the_command_says_what_it_found_and_leaves_rows_and_a_picture(tmp_path: Path):
+def test_the_command_prints_its_results_and_writes_rows_and_a_picture(tmp_path: Path):
     for handler in list((log := logging.getLogger("springbench")).handlers):  # of another test, written elsewhere
         log.removeHandler(handler)
     (scene := tmp_path / "cloth.yaml").write_text(CLOTH)

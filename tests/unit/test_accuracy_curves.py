@@ -105,7 +105,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize(("iterate", "status", "reason"), ENDS.values(), ids=ENDS)
-def test_a_curve_says_how_it_ended(iterate: Callable[[int], Positions], status: str, reason: str) -> None:
+def test_a_curve_states_its_termination_reason(iterate: Callable[[int], Positions], status: str, reason: str) -> None:
     found = curve(Scripted(iterate))
     assert found.status == status
     assert reason in found.reason
@@ -129,7 +129,7 @@ def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> N
     assert found.seconds[-1, 0] >= 0.02 * found.iterate_indices[-1]
 
 
-def test_grades_are_the_oracles_and_stamps_ascend_in_each_round() -> None:
+def test_scores_are_those_of_the_reference_and_time_stamps_ascend_in_each_round() -> None:
     prepared = SparseLocalGlobal().prepare(PROBLEM.system)
     found = curve(prepared, max_iterations=120, num_rounds=3)
     assert found.iterate_indices == [number for number in range(121) if is_scored_iteration(number)]
@@ -143,7 +143,7 @@ def test_grades_are_the_oracles_and_stamps_ascend_in_each_round() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-3, 2.0])
-def test_stamps_that_another_clock_does_not_bear_out_are_a_failure(
+def test_time_stamps_that_another_clock_contradicts_are_a_failure(
     scale: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(convergence_curves, "perf_counter", lambda: scale * perf_counter())
@@ -176,14 +176,14 @@ STARTED = replace(FLAT, current_positions=FLAT.current_positions + np.array([[0.
 """A step whose current positions are near the saddle at which FLAT's are."""
 
 
-def test_a_solver_that_sits_on_a_saddle_is_named_so_and_has_not_converged() -> None:
+def test_a_solver_that_ends_at_a_saddle_is_reported_so_and_has_not_converged() -> None:
     found = at_a_saddle(lambda number: FLAT.current_positions)
     assert found.stationarity[-1] <= convergence_curves.STATIONARITY_TOLERANCE
     assert found.status == "saddle"
     assert "saddle, where the curvature is -" in found.reason
 
 
-def test_a_solver_that_leaves_a_saddle_goes_on_to_its_minimum() -> None:
+def test_a_solver_that_leaves_a_saddle_continues_to_its_minimum() -> None:
     above = refine_minimum(FLAT, FLAT.current_positions, NewtonSolver()).positions
     found = at_a_saddle(lambda number: FLAT.current_positions if number < 3 else above)
     assert (found.status, found.iterate_indices[-1]) == ("ok", 3)

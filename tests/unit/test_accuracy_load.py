@@ -80,7 +80,7 @@ def test_a_study_of_work_has_all_combinations(folder: Path) -> None:
     assert len(units) == len(found)
 
 
-def test_what_two_studies_ask_for_is_measured_as_the_first_says(folder: Path) -> None:
+def test_a_unit_of_two_studies_is_measured_with_the_settings_of_the_first(folder: Path) -> None:
     twice = CONFIG.replace("work:", "  - {scene: cloth, size: 4, snapshot: early, solver: newton, rounds: 2}\nwork:")
     once, both = loaded(folder, CONFIG), loaded(folder, twice)
     assert [(u.build_file_stem(), u.measurement) for u in both.curves] == [
@@ -88,7 +88,7 @@ def test_what_two_studies_ask_for_is_measured_as_the_first_says(folder: Path) ->
     ]
 
 
-def test_a_unit_keeps_its_file_and_changes_its_id_where_it_is_measured_otherwise(folder: Path) -> None:
+def test_a_unit_with_other_settings_has_the_same_file_and_another_id(folder: Path) -> None:
     accuracy = loaded(folder, CONFIG)
     for unit in (accuracy.curves[0], accuracy.work[0]):
         other = replace(unit, measurement=replace(unit.measurement, rounds=9))

@@ -104,7 +104,9 @@ def test_set_up_is_spread_over_the_steps(tmp_path: Path) -> None:
     ("status", "seconds"),
     [("diverged", inf), ("failed", inf), ("unsupported", inf), ("time-limit", 4.8e-4), ("no-progress", 4.8e-4)],
 )
-def test_failures_reach_nothing_and_limits_keep_what_came_before(tmp_path: Path, status: str, seconds: float) -> None:
+def test_failures_reach_nothing_and_time_limits_preserve_earlier_iterates(
+    tmp_path: Path, status: str, seconds: float
+) -> None:
     rows = [
         row | {"status": status} for row in made.build_curve_rows("net", 10, "early", "numba") if row["kind"] == "curve"
     ]
@@ -133,7 +135,7 @@ def test_a_solver_in_another_minimum_never_reaches_the_gaps_below_it(tmp_path: P
         pytest.param({}, "", id="certified"),
     ],
 )
-def test_a_reference_that_is_not_certified_says_so_and_is_not_used(tmp_path: Path, change: dict, doubt: str) -> None:
+def test_an_uncertified_reference_is_reported_and_not_used(tmp_path: Path, change: dict, doubt: str) -> None:
     problem, minimum = made.build_snapshot_rows("net", 10, "early")
     found = table(tmp_path, [problem, minimum | change, *made.build_curve_rows("net", 10, "early", "numba")])
     assert (doubt in found.problems[0].uncertified_reason) if doubt else not found.problems[0].uncertified_reason
@@ -142,7 +144,7 @@ def test_a_reference_that_is_not_certified_says_so_and_is_not_used(tmp_path: Pat
     assert ("References that are not certified" in summarise_findings(found)) == bool(doubt)
 
 
-def test_crossings_name_who_overtakes_whom_and_both_times(tmp_path: Path) -> None:
+def test_crossings_name_both_solvers_and_both_times(tmp_path: Path) -> None:
     # To 3e-1 sparse takes 16 iterations of 40 us and newton 2 of 400 us; to 1e-1 they take 32 and 3.
     assert describe_crossings(net(tmp_path, "sparse", "newton").curves) == [
         "at 3e-1 sparse is the fastest: 640 µs",
@@ -174,7 +176,7 @@ def test_what_the_first_guess_has_already_is_not_contested(tmp_path: Path) -> No
     assert is_contested(race, 0.1)
 
 
-def test_profiles_count_failures_as_never_and_leave_out_who_was_not_tried_everywhere(tmp_path: Path) -> None:
+def test_profiles_count_failures_as_never_and_omit_solvers_not_tried_everywhere(tmp_path: Path) -> None:
     rows = [*made.build_snapshot_rows("net", 10, "early"), *made.build_snapshot_rows("net", 20, "early")]
     for size in (10, 20):
         rows += made.build_curve_rows("net", size, "early", "numba")
@@ -204,7 +206,7 @@ def test_growth_is_the_power_of_the_vertices(tmp_path: Path) -> None:
     assert isnan(growth["lbfgs"].exponent), "two sizes tell no power"
 
 
-def test_the_front_holds_what_nothing_beats_and_the_default_is_found(tmp_path: Path) -> None:
+def test_the_front_contains_undominated_solvers_and_the_default_is_found(tmp_path: Path) -> None:
     works = table(tmp_path, list(made.build_work_rows("net", 10))).work_points
     best = pareto_front(works)
     assert [w.seconds_per_simulated_second for w in best] == sorted(w.seconds_per_simulated_second for w in best)
@@ -284,7 +286,7 @@ def test_every_failure_is_reported_with_its_reason(tmp_path: Path) -> None:
     ]
 
 
-def test_a_folder_without_rows_is_a_mistake_that_says_what_to_do(tmp_path: Path) -> None:
+def test_a_folder_without_rows_is_a_mistake_with_a_remedy(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="springbench accuracy"):
         read_accuracy(tmp_path)
     (tmp_path / "accuracy").mkdir()

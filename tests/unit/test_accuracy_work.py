@@ -86,7 +86,7 @@ def test_each_round_has_a_time_and_their_median_is_the_cost(trajectory: Referenc
     assert found["seconds_per_simulated_second"] == np.median(found["seconds"]) / HORIZON
 
 
-def test_seconds_that_another_clock_does_not_bear_out_are_a_failure(
+def test_seconds_that_another_clock_contradicts_are_a_failure(
     trajectory: ReferenceTrajectory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(clock_module, "perf_counter", lambda: perf_counter() / 1000)
@@ -102,7 +102,7 @@ LOST = [
 
 
 @pytest.mark.parametrize(("change", "status", "reason"), LOST, ids=[status for _, status, _ in LOST])
-def test_what_goes_wrong_is_a_status_with_a_reason(
+def test_a_failure_is_a_status_with_a_reason(
     trajectory: ReferenceTrajectory, change: dict[str, Any], status: str, reason: str
 ) -> None:
     found = row(replace(UNIT, **change), trajectory)

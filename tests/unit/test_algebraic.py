@@ -42,7 +42,7 @@ def truth() -> ReferenceTrajectory:
 
 @pytest.mark.parametrize("steps", [24, 96])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "midpoint", "newmark", "sdirk-3", "esdirk-4"])
-def test_solves_add_little_to_the_steps_own_error_and_do_little_besides(integrator, steps, truth):
+def test_solves_add_little_to_the_error_of_the_step_with_few_iterations(integrator, steps, truth):
     auto, converged = run(integrator, steps, AutoTolerance(200)), run(integrator, steps, StopRule(200, 1e-12))
     own = truth.measure_error(0, converged[-1].positions)
     away = np.linalg.norm(auto[-1].positions - converged[-1].positions) / truth.displacement[0]

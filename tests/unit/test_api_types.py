@@ -74,6 +74,6 @@ class Mine:
     """Arguments that a user might pass as a solver."""
 
 
-def test_a_class_in_a_sweep_is_answered_by_how_to_name_it():
+def test_a_class_in_a_sweep_is_refused_with_the_name_to_use():
     with pytest.raises(InputError, match=r'solvers\[1\]: got the class Mine; expected .* "./test_api_types.py:Mine"'):
         springbench.run_config({"scenes": ["a.yaml"], "solvers": ["sparse", Mine]}, name="a")  # type: ignore[list-item]

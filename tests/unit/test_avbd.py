@@ -113,7 +113,7 @@ def limited() -> Scene:
     )
 
 
-def test_exact_limits_hold_and_pull_only_where_they_are_reached():
+def test_exact_limits_are_satisfied_and_pull_only_where_they_are_reached():
     bound = limited()
     lengths, slack = concatenate_constraints(bound.system.length_constraints), np.empty(0)
     for step in simulate_scene(
@@ -130,7 +130,7 @@ def test_exact_limits_hold_and_pull_only_where_they_are_reached():
 
 
 @pytest.mark.parametrize("bound", [chain(9, mass=1.0), limited()], ids=["chain", "limits"])
-def test_the_judge_finds_a_minimum_where_it_ends_and_nowhere_else(bound):
+def test_the_verifier_finds_a_minimum_at_the_solution_and_nowhere_else(bound):
     stated = build_first_problem(bound)
     judge, p = StepVerifier(bound, None, is_minimiser=True), solved(stated).positions
     assert judge.measure_stationarity(stated, p).above_roundoff < 1e-7
@@ -214,7 +214,7 @@ def test_multipliers_of_a_hanging_chain_are_what_hangs_below():
     )
 
 
-def test_multipliers_of_limits_pull_where_a_limit_holds_and_nowhere_else():
+def test_multipliers_of_limits_pull_where_a_limit_is_active_and_nowhere_else():
     """One vertex between two pins, pulled along the line to beyond one limit: that edge pulls, the other is slack."""
     ends = PinsEffect.model_validate({"parts": ["ends"], "weight": "exact"})
     limits = StrainLimitsEffect.model_validate({"stiffness": "exact", "max_stretch": 1.05})
@@ -235,7 +235,7 @@ def test_multipliers_of_limits_pull_where_a_limit_holds_and_nowhere_else():
 
 
 @pytest.mark.parametrize("stabilisation", [0.0, 0.25, 1.0])
-def test_a_stabilised_step_keeps_that_part_of_the_error_it_begins_with(stabilisation):
+def test_a_stabilised_step_leaves_that_fraction_of_the_initial_error(stabilisation):
     """A link of 1 m that begins 0.1 m too long ends at 1 m and that part of 0.1 m."""
     stated = build_first_problem(chain(2, mass=1.0))
     begun = stated.step_start.positions.copy()
@@ -295,7 +295,7 @@ def _at(stated: StepProblem, part: float) -> StepProblem:
 
 
 @pytest.mark.parametrize("case", HARD)
-def test_hard_cases_keep_their_lengths(case):
+def test_hard_cases_preserve_exact_lengths(case):
     stated = HARD[case]()
     found = solved(stated, 50_000, 1e-9)
     lengths = concatenate_constraints(stated.system.length_constraints)
@@ -340,7 +340,7 @@ def test_a_solver_prepared_without_the_harness_is_refused_too():
         ({"spectral_radius": 1.0}, "spectral_radius"),
     ],
 )
-def test_settings_that_mean_nothing_are_named(settings, said):
+def test_invalid_settings_are_named(settings, said):
     with pytest.raises(ValueError, match=f"^{said}: should be"):
         Avbd(**settings)
 

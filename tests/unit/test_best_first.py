@@ -87,7 +87,7 @@ def test_the_choice_is_that_of_a_full_search():
     assert measured < 0.5 * 200 * len(specs())
 
 
-def test_one_known_to_be_cheap_leaves_out_the_methods_that_are_slower_at_once():
+def test_a_method_stored_as_cheap_excludes_slower_methods_at_once():
     rows = {key(one): {"status": "ok", "error": 1.0, "seconds_per_simulated_second": 10.0} for one in specs()}
     measure = Measured(rows)
     omitted = search_grid(specs(), 1e-2, 1.0, measure, 60.0)

@@ -103,7 +103,7 @@ def test_the_hessian_is_the_derivative_of_the_gradient(problem):
 
 
 @problems
-def test_a_minimum_is_certified_by_the_oracle(problem):
+def test_a_minimum_is_certified_by_the_reference_evaluator(problem):
     for found in find_minima(problem, NewtonSolver()).minima:
         assert found.is_certified
         assert found.objective == problem.value(found.positions)
@@ -131,7 +131,7 @@ def test_no_neighbour_of_a_minimum_is_lower(problem):
 
 
 @problems
-def test_newtons_steps_go_on_to_round_off_from_wherever_a_solver_left_them(problem):
+def test_newton_steps_continue_to_round_off_from_any_solution(problem):
     best = find_minima(problem, NewtonSolver()).lowest_minimum
     for size in (1e-5, 1e-8):
         start = best.positions + size * np.random.default_rng(1).normal(size=best.positions.shape)
@@ -207,7 +207,7 @@ def test_minima_are_found_once(tmp_path):
     assert not again.positions.flags.writeable
 
 
-def test_minima_are_known_by_where_they_lie():
+def test_minima_are_identified_by_their_positions():
     problem = snap_through()
     above = find_minima(problem, NewtonSolver()).lowest_minimum
     below = refine_minimum(problem, lower(above.positions), NewtonSolver())
@@ -261,7 +261,7 @@ def test_a_start_that_is_shaken_is_certified_by_no_eigenvalue_of_another_point(t
         assert abs(found.min_eigenvalue - least) <= found.eigenvalue_uncertainty
 
 
-def test_a_classification_lets_no_valley_in(tmp_path):
+def test_a_classification_excludes_valleys(tmp_path):
     store, one = standing(tmp_path)
     assert not store.classify_minimum(one, one.problem.current_positions).is_certified
     assert store.find_minima(one).minima == ()
@@ -296,7 +296,7 @@ def test_minima_that_were_stored_with_less_than_a_certificate_are_found_again(tm
     assert "eigenvalue_uncertainty" in np.load(path)
 
 
-def test_a_minimum_that_is_not_known_well_says_by_how_much():
+def test_an_inaccurate_minimum_states_its_error():
     problem = PROBLEMS["cloth"]()
     best = find_minima(problem, NewtonSolver()).lowest_minimum
     assert "next step" in replace(best, kind=INACCURATE).describe_flaw

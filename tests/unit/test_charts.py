@@ -78,7 +78,7 @@ def find_frame(chart: ChartDescription, subject: str) -> ChartFrame:
     return next(frame for frame in chart.frames if frame.subject.startswith(subject))
 
 
-def test_doubtful_references_early_ends_and_other_minima_are_stated(table: AccuracyData) -> None:
+def test_uncertain_references_early_ends_and_other_minima_are_stated(table: AccuracyData) -> None:
     chart = build_accuracy_chart("convergence", table)
     doubtful, other, sure = (find_frame(chart, words) for words in ("net 6, peak", "net 12", "net 24"))
     said = " ".join(doubtful.notes)

@@ -53,7 +53,7 @@ def test_the_estimate_tends_to_the_radius_of_convergence_and_not_beyond(name):
 
 
 @problems
-def test_the_residual_shrinks_as_the_radius_promises(name):
+def test_the_residual_shrinks_as_the_radius_predicts(name):
     problem = PROBLEMS[name]()
     prepared = Chebyshev().prepare(problem.system)
     end = prepared.solve(problem, StopRule(6000, 1e-11))

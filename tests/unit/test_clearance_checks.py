@@ -52,13 +52,13 @@ def test_a_ball_that_approaches_is_found_like_a_path_to_it():
 
 
 @pytest.mark.parametrize("motion", [None, ACROSS, ROUND, SMOOTH])
-def test_a_path_next_to_a_ball_is_free(motion: KeyFrameMotion | None):
+def test_a_path_next_to_a_ball_is_intersection_free(motion: KeyFrameMotion | None):
     other = SphereObstacle(center=(2.0, 5.0, 0.0), radius=0.1)
     assert find_first_violation(other.build_obstacle(), None, POINT, motion, LIMIT) is None
 
 
 @pytest.mark.parametrize("motion", [ACROSS, ROUND, SMOOTH])
-def test_no_point_is_faster_than_is_said(motion: KeyFrameMotion):
+def test_no_point_is_faster_than_the_bound(motion: KeyFrameMotion):
     times = np.linspace(0.0, 1.0, 1001)
     way = np.array([motion.transform_points(POINT, t)[0] for t in times])
     fastest = np.linalg.norm(np.diff(way, axis=0), axis=1).max() / times[1]

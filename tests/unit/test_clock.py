@@ -49,7 +49,7 @@ LIES = {
 
 
 @pytest.mark.parametrize(("watch", "reported"), LIES.values(), ids=LIES)
-def test_times_that_another_clock_did_not_see_are_refused(watch: PhaseWatch, reported: float) -> None:
+def test_times_that_another_clock_does_not_confirm_are_refused(watch: PhaseWatch, reported: float) -> None:
     with pytest.raises(RunFailed, match="the times of step add up to"):
         watch.build_columns("step", [reported / 4] * 4)
 
@@ -95,7 +95,9 @@ HONEST = {
 
 
 @pytest.mark.parametrize(("watch", "reported"), HONEST.values(), ids=HONEST)
-def test_times_that_another_clock_saw_are_believed_and_both_are_reported(watch: PhaseWatch, reported: float) -> None:
+def test_times_that_another_clock_confirms_are_accepted_and_both_are_reported(
+    watch: PhaseWatch, reported: float
+) -> None:
     columns = watch.build_columns("step", [reported / 2] * 2)
     assert columns == {
         "wall_seconds_check": watch.wall_seconds,
@@ -105,7 +107,7 @@ def test_times_that_another_clock_saw_are_believed_and_both_are_reported(watch: 
     }
 
 
-def test_both_of_two_threads_that_were_stopped_for_half_the_time_are_found_out() -> None:
+def test_both_of_two_threads_stopped_for_half_the_time_are_detected() -> None:
     assert PhaseWatch(num_threads=2, wall_seconds=1.0, process_seconds=1.0, thread_seconds=0.5).build_columns(
         "step", [1.0]
     )["preempted"]
@@ -142,7 +144,7 @@ print(watch.build_columns("step", [watch.wall_seconds])["preempted"], watch.pree
 """
 
 
-def test_a_process_that_was_stopped_says_so() -> None:
+def test_a_process_that_was_stopped_is_reported() -> None:
     child = subprocess.Popen([sys.executable, "-c", STOPPED], stdout=subprocess.PIPE, text=True)
     _, status = os.waitpid(child.pid, os.WUNTRACED)
     assert os.WIFSTOPPED(status)
@@ -184,6 +186,6 @@ def test_a_phase_that_computes_is_timed(call: Any) -> None:
 
 
 @pytest.mark.parametrize("call", DOES_NOT.values(), ids=DOES_NOT)
-def test_a_phase_that_computes_nothing_is_found_out(call: Any) -> None:
+def test_a_phase_that_computes_nothing_is_detected(call: Any) -> None:
     with pytest.raises(RunFailed, match="the phase global does nothing"):
         check_phases(prepared(call), PROBLEM)

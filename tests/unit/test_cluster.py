@@ -67,7 +67,7 @@ def test_a_worker_without_a_plug_in_is_named_with_it(tmp_path: Path):
     assert "./mine.py:Mine" in str(refused.value)
 
 
-def test_a_worker_that_does_not_answer_is_reported():
+def test_a_worker_that_does_not_respond_is_reported():
     with pytest.raises(InputError, match=r"worker-0.*ModuleNotFoundError.*harness"):
         machines(Workers(ModuleNotFoundError("No module named 'harness'")))
 
@@ -83,7 +83,7 @@ def test_a_worker_that_is_lost_meanwhile_is_no_mistake():
 
 
 @pytest.mark.parametrize(("off", "words"), [(3600.0, "ahead"), (-3600.0, "behind"), (1.0, "")])
-def test_clocks_that_differ_are_said(off: float, words: str):
+def test_clocks_that_differ_are_reported(off: float, words: str):
     messages: list[str] = []
     machines(Workers((WorkerInfo.from_this_process()._replace(clock_seconds=time() + off), {})), say=messages.append)
     assert [words in line for line in messages] == [True] * bool(words)
@@ -98,7 +98,7 @@ def test_clocks_that_differ_are_said(off: float, words: str):
         ("absent.yaml", "expected a mapping"),
     ],
 )
-def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_missing_cluster_is_reported(on: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(dask_cluster, "CONNECT_TIMEOUT", 0.3)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=said), dask_cluster.connect_cluster(on, [], print):
@@ -113,9 +113,7 @@ def test_where_there_is_no_cluster_that_is_said(on: str, said: str, monkeypatch:
         ("{kind: HAND}", "expected a mapping"),
     ],
 )
-def test_a_batch_system_that_is_not_there_is_said(
-    described: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
+def test_a_missing_batch_system_is_reported(described: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     hand = SimpleNamespace(job_cls=SimpleNamespace(submit_command="submit-by-hand --now"))
     monkeypatch.setitem(sys.modules, "dask_jobqueue", SimpleNamespace(HANDCluster=hand))
     (tmp_path / "batch.yaml").write_text(described)

@@ -79,7 +79,7 @@ def test_the_local_step_is_that_of_the_energy(seed, scale):
     assert (np.abs(local(springs, p, y) - wanted) <= ROUND_OFF * (np.abs(y) + pull[:, None])).all()
 
 
-def test_springs_keep_their_weights_and_equal_ones_share_them():
+def test_springs_have_their_weights_and_equal_ones_share_them():
     rng = np.random.default_rng(0)
     for springs in (build_random_network(rng, 30, 90)[1], build_cloth(40).all_springs):
         n = int(springs.edges.max()) + 1
@@ -213,7 +213,7 @@ def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
     assert (found[0].residual, found[0].num_iterations) == (found[1].residual, found[1].num_iterations)
 
 
-def test_a_small_system_keeps_to_one_thread_and_says_so(monkeypatch):
+def test_a_small_system_uses_one_thread_and_states_it(monkeypatch):
     monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
     small, large = (CompiledLocalGlobal().prepare(build_cloth(size).system).description for size in (12, 60))
     assert small.endswith("; 1 of 2 threads: the system is too small for a second thread to pay")
@@ -222,7 +222,7 @@ def test_a_small_system_keeps_to_one_thread_and_says_so(monkeypatch):
 
 @direct
 @problems
-def test_the_residual_is_measured_over_the_vertices_that_no_pin_holds(solver, name):
+def test_the_residual_is_measured_over_unpinned_vertices(solver, name):
     problem = PROBLEMS[name]()
     system = problem.system
     prepared = solver.prepare(system)
@@ -250,7 +250,7 @@ def test_all_vertices_may_be_pinned_exactly():
         np.testing.assert_array_equal(found, problem.pin_targets)
 
 
-def test_a_prepared_solver_says_what_it_chose_and_counts_it():
+def test_a_prepared_solver_states_and_counts_what_it_chose():
     system = build_first_problem(build_cloth(8)).system
     for solver in DIRECT:
         prepared = solver.prepare(system)

@@ -50,7 +50,7 @@ METHODS: tuple[Solver, ...] = (CompiledLocalGlobal(), Anderson(), Chebyshev(), L
 
 
 @pytest.mark.parametrize("solver", METHODS, ids=repr)
-def test_an_energy_that_the_kernels_do_not_know_shows_in_the_choice(solver: Solver):
+def test_an_energy_that_the_kernels_do_not_support_is_stated_in_the_description(solver: Solver):
     known, unknown = (solver.prepare(system).description for system in (SYSTEM, foreign(SYSTEM)))
     assert "iterations compiled" in known
     assert "through Python" not in known
@@ -59,5 +59,5 @@ def test_an_energy_that_the_kernels_do_not_know_shows_in_the_choice(solver: Solv
 
 
 @pytest.mark.parametrize("solver", [CompiledLocalGlobal(linear_solver="cg"), Lbfgs(linear_solver="cg")], ids=repr)
-def test_a_linear_solver_that_is_called_from_python_shows_in_the_choice(solver: Solver):
+def test_a_linear_solver_called_from_python_is_stated_in_the_description(solver: Solver):
     assert "iterations through Python: this linear solver" in solver.prepare(SYSTEM).description

@@ -41,7 +41,7 @@ def sample(seed: int, slower: float = 1.0, noise: float = 0.02, *, bursts: bool 
     return np.log(slower * np.where(abba, outer, inner) / np.where(abba, inner, outer))
 
 
-def test_the_fewest_turns_that_refuse_are_those_of_the_martingale():
+def test_the_fewest_blocks_that_reject_are_those_of_the_martingale():
     # Exact integers: 2^n B(2 + k, 2 + n - k) / B(2, 2) = 6 * 2^n (k + 1)! (n - k + 1)! / (n + 3)!
     def martingale(n: int, k: int) -> float:
         return 6 * 2**n * factorial(k + 1) * factorial(n - k + 1) / factorial(n + 3)
@@ -55,7 +55,7 @@ def test_the_fewest_turns_that_refuse_are_those_of_the_martingale():
 
 
 @pytest.mark.parametrize("bursts", [False, True], ids=["calm", "bursty"])
-def test_looking_after_every_turn_is_wrong_as_rarely_as_stated(bursts: bool):
+def test_a_decision_after_every_block_errs_as_rarely_as_stated(bursts: bool):
     # The limit is the true ratio, so every answer is wrong. At an error of 5 % more than 71 of 1000 would come about
     # once in a thousand repetitions of this test (binomial); the seeds are fixed.
     rule = SequentialTest(1.0, alpha=0.05)
@@ -67,7 +67,7 @@ def test_looking_after_every_turn_is_wrong_as_rarely_as_stated(bursts: bool):
 
 
 @pytest.mark.parametrize("bursts", [False, True], ids=["calm", "bursty"])
-def test_the_interval_covers_the_truth_at_every_number_of_turns(bursts: bool):
+def test_the_interval_covers_the_true_ratio_at_every_number_of_blocks(bursts: bool):
     missed = 0
     for seed in range(200):
         x = sample(seed, 1.05, bursts=bursts)
@@ -85,7 +85,7 @@ def test_a_slowdown_is_found(slower: float, limit: float, within: int, bursts: b
     assert not any(answer is RegressionVerdict.PASS for answer, _ in found)
 
 
-def test_equal_programs_hold_and_none_fails():
+def test_equal_programs_pass_and_none_fails():
     found = [find_first_verdict(SequentialTest(1.03), sample(seed, bursts=seed % 2 == 0)) for seed in range(SAMPLES)]
     assert {answer for answer, _ in found} == {RegressionVerdict.PASS}
 
@@ -111,7 +111,7 @@ def test_the_first_verdict_is_that_of_a_test_after_each_block():
         assert find_first_verdict(rule, x) == (looked or (RegressionVerdict.INCONCLUSIVE, TURNS))
 
 
-def test_an_answer_is_what_the_interval_says():
+def test_a_verdict_follows_from_the_interval():
     for seed in range(20):
         x = sample(seed, 1.0 + 0.005 * seed)
         for n in (10, 20, 50, 400):
@@ -120,13 +120,13 @@ def test_an_answer_is_what_the_interval_says():
             assert (found.high < 1.03) == (answer is RegressionVerdict.PASS)
 
 
-def test_one_turn_that_was_disturbed_without_end_changes_nothing():
+def test_one_block_that_was_disturbed_without_end_changes_nothing():
     x = sample(1)
     x[7] = 1e300
     assert compute_interval(x).high < 1.01
 
 
-def test_a_smaller_error_takes_more_turns():
+def test_a_smaller_error_takes_more_blocks():
     needed = [compute_critical_count(100, alpha) for alpha in (0.05, 0.01, 0.001, 1e-6)]
     assert all(a < b for a, b in pairwise(needed))
 
@@ -141,6 +141,6 @@ def test_a_smaller_error_takes_more_turns():
         ({"max_ratio": 1.03, "alpha": 1.0}, "alpha: got 1.0"),
     ],
 )
-def test_a_rule_that_cannot_be_is_refused(given: dict[str, float], named: str):
+def test_an_impossible_rule_is_refused(given: dict[str, float], named: str):
     with pytest.raises(ValueError, match=named):
         SequentialTest(**given)

@@ -145,7 +145,7 @@ def test_each_mistake_names_its_key_and_the_nearest_line(case: str) -> None:
     assert list(map(str, document.build_error().mistakes)) == expected
 
 
-def test_a_sound_mapping_becomes_its_model() -> None:
+def test_a_valid_mapping_becomes_its_model() -> None:
     document = ConfigDocument(Path("c.yaml"), {})
     outer = document.validate_data(Outer, {"count": 3, "place": [0, 1, 2], "weight": "exact", "inner": {"width": 2}})
     assert outer == Outer(count=3, place=(0.0, 1.0, 2.0), weight="exact", inner=Inner(width=2.0))

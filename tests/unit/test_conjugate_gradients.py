@@ -107,7 +107,7 @@ def test_a_tolerance_in_positions_sees_through_the_units_of_rows():
     assert backward_error(Q, out, b) <= 1e-10
 
 
-def test_the_last_changes_tell_why_it_ended():
+def test_the_last_corrections_explain_the_termination():
     _, factor = solved(grid_matrix(60, 60), random_right_hand_sides(3600))
     assert len(factor.correction_ratios) == factor.num_iterations + 1
     assert factor.correction_ratios[-1].max() <= CG_RTOL < factor.correction_ratios[-2].max()
@@ -157,7 +157,7 @@ def test_gives_the_same_bits_whatever_the_number_of_threads():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_refuses_a_matrix_that_is_not_finite_and_says_where(value):
+def test_refuses_a_matrix_that_is_not_finite_and_states_where(value):
     Q = grid_matrix(5, 5)
     Q.data[Q.indptr[7]] = value
     with pytest.raises(NotPositiveDefinite, match=r"not finite in row 7\b"):
@@ -169,7 +169,7 @@ def test_names_a_vertex_of_negative_mass():
         ConjugateGradients(network_matrix([], 1.0, np.where(np.arange(50) == 31, -1.0, 1.0)))
 
 
-def test_refuses_a_sheet_that_nothing_holds():
+def test_refuses_an_unconstrained_sheet():
     Q = network_matrix(grid_springs(60, 60), 1.0, np.zeros(3600))
     with pytest.raises(NotPositiveDefinite, match="not positive definite"):
         solved(Q, random_right_hand_sides(3600))
@@ -185,7 +185,7 @@ def test_names_a_vertex_near_springs_that_push():
         solved(network_matrix(springs, k, diagonal), random_right_hand_sides(3600))
 
 
-def test_says_so_where_stiffnesses_lie_too_far_apart():
+def test_reports_stiffnesses_that_are_too_far_apart():
     springs, rng = grid_springs(100, 100), np.random.default_rng(0)
     Q = network_matrix(springs, 10.0 ** rng.uniform(0, 14, len(springs)), np.full(10000, 1e-3))
     with pytest.raises((Unsupported, NotPositiveDefinite), match="too far apart"):

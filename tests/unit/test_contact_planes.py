@@ -57,7 +57,7 @@ def test_a_half_space_has_the_start_on_its_outer_side_and_the_obstacle_on_the_ot
 
 
 @pytest.mark.parametrize("name", OBSTACLE_SPECS)
-def test_what_passes_by_is_let_pass_and_what_hits_is_stopped(name):
+def test_vertices_that_miss_an_obstacle_are_free_and_those_that_hit_it_are_stopped(name):
     energy = bound(build_contact(OBSTACLE_SPECS[name]), 400)
     (obstacle,) = energy.obstacles
     p, v = ways(obstacle)

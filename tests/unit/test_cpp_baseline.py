@@ -43,7 +43,7 @@ def test_without_a_compiler_it_is_unsupported(tmp_path: Path, monkeypatch: pytes
         compile_baseline(tmp_path)
 
 
-def test_what_the_compiler_says_is_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_output_of_the_compiler_is_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     compiler = tmp_path / "compiler"
     compiler.write_text("#!/bin/sh\necho 'baseline.cpp:17: fatal error: Eigen/Sparse: No such file' >&2\nexit 1\n")
     compiler.chmod(0o755)
@@ -72,7 +72,7 @@ def test_a_program_that_ends_early_is_a_failed_run(echo: Path, tmp_path: Path):
     running.kill()
 
 
-def test_exact_pins_are_not_its_kind(tmp_path: Path):
+def test_exact_pins_are_not_supported(tmp_path: Path):
     made = build_cloth(4, weight="exact")
     with pytest.raises(Unsupported, match="penalty"):
         CppBaseline(tmp_path / "none", build_first_problem(made), made.all_springs, tmp_path, "")
@@ -88,7 +88,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("tunables", ["", MALLOC_TUNABLES], ids=["default", "cheap temporaries"])
-def test_it_takes_the_same_steps_as_ours(program: Path, tmp_path: Path, tunables: str):
+def test_it_takes_the_same_steps_as_the_solver_in_python(program: Path, tmp_path: Path, tunables: str):
     made = build_cloth(12)
     stated = build_first_problem(made)
     ours = SparseLocalGlobal().prepare(made.system).solve(stated, StopRule(50)).positions

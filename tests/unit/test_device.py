@@ -101,7 +101,7 @@ class At:
         return event.when - self.when
 
 
-def test_events_tell_kernels_and_transfers_apart() -> None:
+def test_events_distinguish_kernels_and_transfers() -> None:
     durations = compute_event_seconds(SolveEvents(At(1.0), At(3.0), At(10.0), At(10.5)))
     assert durations == pytest.approx({"kernel_seconds": 7e-3, "transfer_seconds": 2.5e-3})
     assert compute_event_seconds(None) == {}, "of a device without a clock nothing is told"

@@ -85,7 +85,7 @@ def test_what_has_no_time_is_reported() -> None:
 
 
 @pytest.mark.parametrize("there", [True, False], ids=["measured", "no device"])
-def test_the_report_draws_it_and_the_page_says_it(there: bool, tmp_path: Path) -> None:
+def test_the_report_draws_the_ratio_and_the_page_states_it(there: bool, tmp_path: Path) -> None:
     failed = [*build_device_rows(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")]
     saved = MEASURED if there else failed
     write_device_results(tmp_path / "r" / "gpu", saved)

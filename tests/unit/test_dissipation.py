@@ -93,7 +93,7 @@ def size_of(found: StepDissipation) -> float:
     return sum(abs(value or 0.0) for value in found[:-1])
 
 
-def test_implicit_euler_dissipates_what_its_formula_says():
+def test_implicit_euler_dissipates_as_its_formula_states():
     """1/2 |v' - v|^2 m + U(p) - U(p') - grad U(p') . (p - p')."""
     scene = pendulum()
     springs = next(energy for energy in scene.system.energies if isinstance(energy, Springs))
@@ -120,7 +120,7 @@ def test_midpoint_dissipates_nothing_of_a_linear_motion():
         assert lost["implicit-euler"] > 0.03 * provided
 
 
-def test_damping_is_what_its_formula_says():
+def test_damping_dissipates_as_its_formula_states():
     """Dashpots c |n.v|^2 dt; drag of all vertices c m v^2 dt; a filter takes kinetic energy before the step."""
     (step, found), *_ = observe(
         pendulum(SPRINGS, PINNED, DashpotsEffect(stretch=2.0, scaling_rule="fixed"), velocity=(1, 0, 0)), 1
@@ -297,7 +297,7 @@ def test_the_balance_closes_on_every_shipped_scene(path: Path):
         assert abs(now.balance_error) <= ROUND_OFF * size_of(now)
 
 
-def test_the_summary_says_where_the_energy_went():
+def test_the_summary_states_where_the_energy_went():
     lost = {
         "dissipation_damping": 0.02,
         "dissipation_friction": 0.0,

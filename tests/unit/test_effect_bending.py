@@ -52,7 +52,7 @@ def test_a_cantilever_tends_to_the_beam_formula(width):
     np.testing.assert_allclose([error[0] / error[1], error[1] / error[2]], 2.0, rtol=0.1)
 
 
-def test_a_cantilever_clamped_half_way_between_its_pins_is_a_beam_to_a_thousandth():
+def test_a_cantilever_clamped_halfway_between_its_pins_is_a_beam_to_a_thousandth():
     # A hinge stands for the half cells on both of its sides, so the clamp is half a cell before the last pin.
     assert tip(64, 0.125) == pytest.approx(LOAD * (1 - 0.5 / 64) ** 4 / (8 * B), rel=1e-3)  # of order h^2
 
@@ -68,7 +68,7 @@ def test_a_cylinder_has_the_energy_of_its_curvature_along_the_lines_and_twice_th
     assert found == pytest.approx(1 + np.sin(np.deg2rad(2 * angle)) ** 2, rel=1.5 / 40)
 
 
-def test_bending_does_not_mind_where_a_surface_is_nor_how_it_stretches():
+def test_bending_does_not_depend_on_place_or_stretch_of_a_surface():
     mesh = GridMesh(plane="vertical").build_mesh(9)
     energy = Energy.from_rest_shape(mesh.rest_positions, mesh.triangles, B)
     affine = np.random.default_rng(0).normal(size=(3, 3))

@@ -71,7 +71,7 @@ def test_the_depth_is_that_of_the_steps_end_with_other_integrators(integrator):
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])
-def test_a_block_slides_where_the_slope_is_steeper_than_friction_holds(friction):
+def test_a_block_slides_on_a_slope_above_the_friction_angle(friction):
     made = build_sliding_block(1.05 * friction, friction)
     weight = made.system.mass / made.system.mass.sum()
     x = np.array([weight @ step.positions[:, 0] for step in collect_steps(made, 120)])
@@ -82,7 +82,7 @@ def test_a_block_slides_where_the_slope_is_steeper_than_friction_holds(friction)
 
 
 @pytest.mark.parametrize("friction", [0.2, 0.5])
-def test_a_block_rests_where_friction_holds(friction):
+def test_a_block_rests_on_a_slope_below_the_friction_angle(friction):
     made = build_sliding_block(0.95 * friction, friction)
     p = [step.positions for step in collect_steps(made, 120)]
     assert np.abs(p[-1] - p[-11]).max() <= 1.1 * 1e-5 * 10 / 60  # the creep, and what still rings

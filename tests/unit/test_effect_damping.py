@@ -161,7 +161,7 @@ def test_dashpots_conserve_angular_momentum_by_implicit_euler():
     assert energy[-1] < 0.5 * energy[0]
 
 
-def test_dashpots_let_a_rigid_motion_alone():
+def test_dashpots_do_not_affect_a_rigid_motion():
     made = build_test_scene(GridMesh(), DashpotsEffect(stretch=1e4), size=5, time_step=1e-3)
     velocity = np.array([1.0, 2.0, 0.0]) + np.cross([0.0, 3.0, 0.0], made.mesh.rest_positions)
     now = moving(made, velocity, 1)[-1]
@@ -177,7 +177,7 @@ def test_dashpots_let_a_rigid_motion_alone():
         AirDragEffect(coefficient=1e9),
     ],
 )
-def test_damping_beyond_all_measure_stops_motion_and_nothing_else(damping):
+def test_extreme_damping_stops_motion_and_nothing_else(damping):
     made = build_test_scene(
         GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), damping, PinsEffect(parts=("top",)), size=5
     )

@@ -39,11 +39,11 @@ INTEGRATORS = ("implicit-euler", "bdf2", "midpoint")
 @pytest.mark.parametrize(
     ("time", "height"), [(0.0, 0.0), (1.0, 0.0), (1.5, 1.5), (2.0, 3.0), (3.0, 2.0), (4.0, 1.0), (9.0, 1.0)]
 )
-def test_points_go_straight_from_key_to_key_and_rest_before_and_after(time, height):
+def test_points_move_straight_from_key_to_key_and_rest_before_and_after(time, height):
     np.testing.assert_allclose(LIFT.transform_points(POINTS, time), POINTS + np.array([0.0, height, 0.0]), rtol=1e-15)
 
 
-def test_a_smooth_motion_goes_through_its_keys_and_never_beyond():
+def test_a_smooth_motion_passes_its_keys_and_never_overshoots():
     smooth = LIFT.model_copy(update={"interpolation": "smooth"})
     times = np.linspace(0.0, 5.0, 501)
     heights = np.array([smooth.transform_points(POINTS, t)[0, 1] for t in times])
@@ -67,7 +67,7 @@ def test_a_turn_is_about_its_axis():
     )
 
 
-def test_a_turn_of_many_rounds_keeps_distances():
+def test_a_rotation_of_many_turns_preserves_distances():
     motion = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, angle=3600.0)), axis=(1.0, 2.0, 3.0))
     for t in (0.013, 0.4, 0.77):
         a, b = motion.transform_points(POINTS, t)
@@ -86,7 +86,7 @@ def test_a_turn_of_many_rounds_keeps_distances():
     ],
     ids=str,
 )
-def test_key_frames_that_mean_nothing_are_refused(data):
+def test_invalid_key_frames_are_refused(data):
     with pytest.raises(ValidationError):
         KeyFrameMotion.model_validate(data)
 
@@ -121,7 +121,7 @@ def test_a_chain_pulled_at_both_ends_gets_there():
     np.testing.assert_allclose(last.positions, made.mesh.rest_positions + np.array([1.0, 0.0, 0.0]), rtol=0, atol=1e-3)
 
 
-def test_pins_that_rest_and_pins_that_move_live_in_one_scene():
+def test_a_scene_may_have_resting_and_moving_pins():
     made = build_test_scene(
         GridMesh(), PinsEffect(parts=("bottom",)), PinsEffect(parts=("top",), weight="exact", motion=SWING), size=3
     )
@@ -174,7 +174,7 @@ def test_attachments_pull_to_the_points_that_they_name():
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_an_attachment_pulls_a_free_mass_behind_its_point_as_the_equation_of_motion_says(integrator):
+def test_an_attachment_pulls_a_free_mass_behind_its_point_by_the_equation_of_motion(integrator):
     """m x'' = -k (x - v t): x = v (t - sin(w t) / w)."""
     speed, w, seconds = 2.0, 5.0, 1.0
     motion = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=10.0, offset=(10 * speed, 0.0, 0.0))))
@@ -192,7 +192,7 @@ def test_an_attachment_pulls_a_free_mass_behind_its_point_as_the_equation_of_mot
         assert coarse / fine == pytest.approx(2**order, rel=0.15)  # the next order is w dt = 5 % and less
 
 
-def test_what_does_nothing_is_left_out_and_the_log_says_so(caplog):
+def test_an_effect_that_does_nothing_is_omitted_and_logged(caplog):
     with caplog.at_level(logging.INFO, "springbench"):
         made = build_test_scene(
             ChainMesh(),

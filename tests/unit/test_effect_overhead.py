@@ -38,7 +38,7 @@ def cloth(tmp_path: Path) -> Path:
     return path
 
 
-def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tmp_path: Path):
+def test_every_solver_has_an_overhead_of_each_effect_or_states_why_not(cloth: Path, tmp_path: Path):
     sweep = load_config(cloth, solvers=["newton", "dense"], rounds=4, rtol=1e-6, threads=1)
     paths = measure_all_overheads(sweep, tmp_path, create_display(get_error_console()), print_message, isolated=False)
     values = {(row["name"], row["solver"]): row for path in paths for row in read_ablation(path)}
@@ -61,12 +61,12 @@ def test_every_solver_has_a_price_of_each_effect_or_says_why_not(cloth: Path, tm
 
 
 @pytest.mark.parametrize("also", [["--with-pairs"], ["--solver", "newton"]], ids=" ".join)
-def test_what_is_of_one_solver_is_refused(cloth: Path, also: list[str]):
+def test_options_of_one_solver_are_refused(cloth: Path, also: list[str]):
     refused = CliRunner().invoke(app, ["ablate", str(cloth), "--all-solvers", *also])
     assert refused.exit_code == 2
     assert "cannot be combined with --solver or --with-pairs" in refused.output
 
 
-def test_a_scene_of_plain_effects_alone_has_no_price(cloth: Path):
+def test_a_scene_of_plain_effects_alone_has_no_overhead(cloth: Path):
     with pytest.raises(InputError, match="no effect that has a price"):
         list_measured_effects(select_effects(load_scene(cloth)))

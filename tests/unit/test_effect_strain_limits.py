@@ -57,7 +57,7 @@ def test_a_chain_at_its_limit_yields_by_the_force_over_the_stiffness():
     np.testing.assert_allclose(ratios(made, compute_rest_shape(made)), wanted, rtol=1e-8)  # of convergence
 
 
-def test_springs_within_their_limits_feel_nothing():
+def test_springs_within_their_limits_have_no_force():
     mesh = GridMesh().build_mesh(5)
     limits = StrainLimitsEffect(max_stretch=1.2, min_stretch=0.8, stiffness=100.0)
     (energy,) = limits.build_contribution(mesh, np.ones(len(mesh.rest_positions)), 0.1).energies
@@ -86,6 +86,6 @@ def test_a_spring_pressed_to_a_point_is_pushed_to_its_shortest_length():
 @pytest.mark.parametrize(
     "data", [{"max_stretch": 0.9}, {"min_stretch": 1.1}, {"max_stretch": 1.0, "min_stretch": 1.0}], ids=str
 )
-def test_limits_that_mean_nothing_are_refused(data):
+def test_invalid_limits_are_refused(data):
     with pytest.raises(ValidationError):
         StrainLimitsEffect.model_validate({"stiffness": 1.0, **data})

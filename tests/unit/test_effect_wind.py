@@ -119,7 +119,7 @@ def speeds(wind: WindEffect, times: np.ndarray) -> np.ndarray:
     return total / (RHO / 2 * AREA * uz)[:, None]
 
 
-def test_gusts_are_smooth_and_their_seed_is_all_their_chance():
+def test_gusts_are_smooth_and_determined_by_their_seed():
     times = np.linspace(0.0, 2.0, 201)
     one, again, other = (speeds(gusts(seed=seed), times) for seed in (3, 3, 4))
     np.testing.assert_array_equal(one, again)
@@ -190,7 +190,7 @@ def test_wind_of_nothing_leaves_nothing(wind):
     ],
     ids=str,
 )
-def test_keys_that_mean_nothing_are_refused(wind, key):
+def test_invalid_keys_are_refused(wind, key):
     with pytest.raises(ValidationError, match=f"`{key}` has no meaning"):
         WindEffect.model_validate(wind)
 

@@ -160,7 +160,7 @@ SELECTED = {
 
 
 @pytest.mark.parametrize("case", SELECTED)
-def test_pins_hold_what_their_selectors_name(case):
+def test_pins_fix_the_vertices_that_their_selectors_name(case):
     selectors, wanted = SELECTED[case]
     assert chosen(**selectors) == list(wanted)
 
@@ -246,7 +246,7 @@ def test_pins_that_do_not_fit_the_mesh_are_refused(case):
     [{}, {"stride": 1}, {"indices": [-1]}, {"parts": ["top"], "weight": 0}, {"parts": ["top"], "weight": "hard"}],
     ids=str,
 )
-def test_pins_that_mean_nothing_are_refused(data):
+def test_invalid_pins_are_refused(data):
     with pytest.raises(ValidationError):
         PinsEffect.model_validate(data)
 

@@ -55,12 +55,12 @@ def hessian(energy, p) -> np.ndarray:
     return blocks.reshape(n, n, 3, 3).transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
 
 
-def test_the_value_is_the_energys(begun):
+def test_the_value_is_that_of_the_energy(begun):
     energy, p, _ = begun
     assert energy.element_law.value(energy.elements, p) == pytest.approx(energy.value(p), rel=SUMS)
 
 
-def test_the_gradient_is_the_energys(begun):
+def test_the_gradient_is_that_of_the_energy(begun):
     energy, p, _ = begun
     found, wanted = np.zeros_like(p), np.zeros_like(p)
     energy.element_law.add_gradient(energy.elements, p, found)
@@ -68,19 +68,19 @@ def test_the_gradient_is_the_energys(begun):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
 
 
-def test_the_hessian_is_the_energys(begun):
+def test_the_hessian_is_that_of_the_energy(begun):
     energy, p, _ = begun
     wanted = csr_array(energy.hessian(p)).toarray()
     np.testing.assert_allclose(hessian(energy, p), wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
 
 
-def test_the_rise_is_the_difference_of_the_values(begun):
+def test_the_objective_change_is_the_difference_of_the_values(begun):
     energy, p, q = begun
     wanted, size = energy.value(q) - energy.value(p), energy.value(q) + energy.value(p)
     assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(wanted, rel=0, abs=SUMS * size)
 
 
-def test_the_rise_keeps_its_digits_where_values_have_none_left(begun):
+def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_digits(begun):
     energy, p, q = begun
     slope = np.zeros_like(p)
     energy.add_gradient(p, slope)
@@ -90,7 +90,7 @@ def test_the_rise_keeps_its_digits_where_values_have_none_left(begun):
     assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(wanted, rel=1e-5)
 
 
-def test_one_that_says_that_its_second_derivatives_are_constant_is_right(begun):
+def test_elements_have_constant_second_derivatives_exactly_where_declared(begun):
     energy, p, q = begun
     assert np.array_equal(hessian(energy, p), hessian(energy, q)) == energy.element_law.has_constant_hessian
 

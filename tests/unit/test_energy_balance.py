@@ -82,7 +82,7 @@ def led(step: SimulationStep, positions: Positions, velocity: Positions) -> Simu
     return replace(step, solution=replace(step.solution, positions=positions), state=replace(step.state, motion=now))
 
 
-def test_free_fall_by_implicit_euler_loses_what_its_formula_says():
+def test_free_fall_by_implicit_euler_loses_energy_as_its_formula_states():
     """v = g n dt and a fall of g dt^2 n (n + 1)/2: half of m g^2 dt^2 is lost a step."""
     for n, found in enumerate(balances(chain(GravityEffect()), 5), start=1):
         assert found.gain == pytest.approx(-0.5 * 2.0 * G**2 * DT**2 * n, rel=1e-9)
@@ -125,7 +125,7 @@ def drag(times: float) -> Scene:
     return replace(chain(), varying_forces=(lambda p, v, t: times / DT * (np.array([2.0, 0.0, 0.0]) - v),))
 
 
-def test_a_force_gives_its_work_at_the_mean_velocity():
+def test_a_force_does_work_at_the_mean_velocity():
     """From rest v' = u/2, so that two masses move by u dt/2, against 3/4 of the force that they start with."""
     (found,) = balances(drag(0.5), 1)
     work = 2.0 * (0.75 * 0.5 / DT * 2.0) * (0.5 * 2.0 * DT)
@@ -260,7 +260,7 @@ def done(folder: Path, solver: str, record: str, timing: str, integrator: str) -
 @pytest.mark.parametrize(
     ("record", "timing"), [pytest.param("true", "exclusive", marks=pytest.mark.slow), ("false", "none")]
 )
-def test_a_run_whose_energy_grows_says_so_in_all_rows(tmp_path: Path, record: str, timing: str):
+def test_a_run_whose_energy_grows_is_reported_in_all_rows(tmp_path: Path, record: str, timing: str):
     found, files = done(tmp_path, "newton", record, timing, "midpoint")
     assert {row["status"] for row in found} == {"energy-growth"}
     assert len(list_failed_runs(parquet_rows.read_rows([files.rows_path]))) == 1

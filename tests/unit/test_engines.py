@@ -87,7 +87,9 @@ def falling(problem: StepProblem) -> StepProblem:
 
 
 @engines
-def test_where_it_is_not_installed_the_reason_is_the_command_that_does_so(name: str, monkeypatch: pytest.MonkeyPatch):
+def test_an_engine_that_is_not_installed_gives_the_command_to_install_it_as_reason(
+    name: str, monkeypatch: pytest.MonkeyPatch
+):
     def none(module: str) -> None:
         raise ModuleNotFoundError(f"No module named {module!r}")
 
@@ -99,7 +101,7 @@ def test_where_it_is_not_installed_the_reason_is_the_command_that_does_so(name: 
 
 
 @engines
-def test_what_an_engine_cannot_express_it_refuses_by_name(name: str):
+def test_an_engine_refuses_unsupported_effects_by_name(name: str):
     engine = load_target(OPTIONAL_SOLVERS[name])()
     assert not is_minimiser(engine)
     with pytest.raises(Unsupported, match=rf"^{name}: expresses springs.* the scene has \w*Bending\w* as well"):
@@ -135,7 +137,7 @@ def semi_implicit(scene: Scene, stated: StepProblem, substeps: int, damping: flo
 
 
 @pytest.mark.parametrize(("integrator", "damping"), [("Euler", 0.5), ("implicitfast", 0.0), ("implicit", 0.0)])
-def test_mujoco_steps_a_network_as_its_documentation_says(integrator: str, damping: float):
+def test_mujoco_steps_a_network_as_documented(integrator: str, damping: float):
     parts = (
         SpringsEffect(scaling_rule="fixed", stretch=300.0),
         DashpotsEffect(scaling_rule="fixed", stretch=damping),
@@ -188,7 +190,9 @@ def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
         ({"newton_solver": "xpbd", "iterations_per_substep": 1}, 7, "xpbd"),
     ],
 )
-def test_newton_physics_steps_springs_as_its_methods_say(parameters: dict[str, Any], substeps: int, wanted: str):
+def test_newton_physics_steps_springs_by_the_formulas_of_its_methods(
+    parameters: dict[str, Any], substeps: int, wanted: str
+):
     pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
     size, velocity = (2 if wanted == "xpbd" else 4), (0.3, 0.1, -0.2)  # its XPBD moves along all springs at once
     effects = SpringsEffect(stretch=500.0), GravityEffect(), pins
@@ -232,7 +236,7 @@ def test_all_of_a_net_is_one_colour_to_newton_physics_which_sees_no_springs():
         assert message in prepared.description
 
 
-def test_newton_physics_says_where_there_is_no_device():
+def test_newton_physics_reports_a_missing_device():
     warp = pytest.importorskip("warp", reason="the extra `newton` is not installed")
     if not warp.is_cuda_available():
         with pytest.raises(Unsupported, match="Warp finds no CUDA device"):
@@ -264,7 +268,7 @@ def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_num
 
 
 @engines
-def test_rows_tell_the_version_of_the_engine(name: str):
+def test_rows_state_the_version_of_the_engine(name: str):
     prepared = ready(name, made(*HANGING).system)
     package = load_target(OPTIONAL_SOLVERS[name]).solver_info.package_name
     version = json.loads(build_provenance_columns(SolverSpec(name, {}))["versions"])[package]

@@ -41,7 +41,9 @@ def test_a_ratio_is_of_the_best_settings_that_end_within_the_error(works: list[W
     assert found["net 9", 1e-6].time_ratio("mujoco") is None, "ours do not get there"
 
 
-def test_and_the_table_says_who_refuses_who_is_alone_and_who_does_not_get_there(works: list[WorkPoint]) -> None:
+def test_the_table_names_programs_that_refuse_that_have_no_rival_and_that_miss_the_error(
+    works: list[WorkPoint]
+) -> None:
     head, _, *rows = format_markdown_table(works)
     assert [cell.strip() for cell in head.split("|")[3:5]] == ["mujoco", "pypbd"]
     cells = {tuple(c.strip() for c in row.split("|")[1:3]): [c.strip() for c in row.split("|")[3:5]] for row in rows}
@@ -53,7 +55,7 @@ def test_and_the_table_says_who_refuses_who_is_alone_and_who_does_not_get_there(
     assert all(OWN_PROGRAM not in message for message in describe_best_settings(works))
 
 
-def test_a_front_holds_what_no_other_setting_of_the_program_beats(works: list[WorkPoint]) -> None:
+def test_a_front_contains_undominated_settings_of_the_program(works: list[WorkPoint]) -> None:
     best = pareto_fronts([work for work in works if work.mesh_label == "net 9"])
     assert list(best) == [OWN_PROGRAM, "mujoco", "pypbd"]
     assert [work.label for work in best[OWN_PROGRAM]] == [
@@ -64,7 +66,7 @@ def test_a_front_holds_what_no_other_setting_of_the_program_beats(works: list[Wo
     ]
 
 
-def test_each_mesh_has_a_panel_where_engines_and_ours_were_tried(tmp_path: Path) -> None:
+def test_each_mesh_has_a_panel_where_engines_and_own_solvers_were_tried(tmp_path: Path) -> None:
     panels = [*select_curve_plots(build_engine_chart(read_accuracy(synthetic_results.write_engine_results(tmp_path))))]
     assert [(one.group, one.name) for one in panels] == [(("engines",), ("net", "9")), (("engines",), ("stiff", "9"))]
     drawn = panels[1]

@@ -103,7 +103,7 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 
 
 @pytest.mark.parametrize("name", ["tsitouras-5", "dormand-prince-8"])
-def test_the_requested_error_steers_the_one_that_is_found(name):
+def test_the_requested_error_controls_the_measured_one(name):
     scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
     errors = [
         truth("none").measure_error(0, run(scene, prepared(name, scene, error_tolerance=requested), 3)[-1].positions)
@@ -179,7 +179,7 @@ def test_limits_of_stability_are_those_of_textbooks():
     np.testing.assert_allclose(TSITOURAS_5.stage_times[-1], 1.0, rtol=1e-14)
 
 
-def test_what_it_does_not_know_is_refused_by_name():
+def test_unsupported_effects_are_refused_by_name():
     scene = made(SOFT, DashpotsEffect(stretch=0.4), HELD)
     with pytest.raises(Unsupported, match=r"dormand-prince-8.*Dashpots"):
         prepared("dormand-prince-8", scene)
@@ -187,7 +187,7 @@ def test_what_it_does_not_know_is_refused_by_name():
         prepared("tsitouras-5", made(SOFT), error_tolerance=0.0)
 
 
-def test_an_error_that_no_step_keeps_ends_with_the_part_of_the_frame_that_was_reached():
+def test_an_error_that_no_step_meets_ends_with_the_fraction_of_the_frame_that_was_reached():
     scene = made(SOFT, GravityEffect(), HELD)
     broken = replace(scene, constant_force=np.full_like(scene.constant_force, np.nan))
     ready = prepared("tsitouras-5", broken)

@@ -46,7 +46,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_mistake_is_answered_with_what_was_wanted(results: Path, name: str, tmp_path: Path) -> None:
+def test_a_mistake_is_reported_with_the_expected_input(results: Path, name: str, tmp_path: Path) -> None:
     (kind, *more), *wanted = BAD[name]
     result = CliRunner().invoke(app, ["figure", kind, str(results), *more, "-o", str(tmp_path)])
     assert result.exit_code == 2, result.output

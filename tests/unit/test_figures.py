@@ -94,7 +94,7 @@ def test_no_type_of_a_figure_is_small_cut_or_covered(figures: dict[str, Figure],
 
 @pytest.mark.long
 @pytest.mark.parametrize(("width", "size"), [(60.0, 6.0), (180.0, 10.0)])
-def test_nor_at_other_widths(results: dict[str, Path], width: float, size: float) -> None:
+def test_no_type_is_small_cut_or_covered_at_other_widths(results: dict[str, Path], width: float, size: float) -> None:
     for kind in ("timing", "ablation"):
         figure, _ = compose_kind(kind, results[kind], FigureOptions(width_mm=width, font_size=size))
         assert find_layout_faults(figure) == []
@@ -230,6 +230,6 @@ def test_a_report_from_outside_is_a_kind_if_it_has_panels(
         found.list_panels(results["timing"], lambda _: ())
 
 
-def test_a_hollow_mark_keeps_its_colour() -> None:
+def test_a_hollow_mark_has_its_own_colour() -> None:
     filled, hollow = marker_style(SeriesStyle("#0072b2", "o")), marker_style(SeriesStyle("#0072b2", "o"), is_stale=True)
     assert (filled["mfc"], hollow["mfc"], hollow["mec"]) == ("#0072b2", "white", "#0072b2")

@@ -45,7 +45,9 @@ def priced(folder: Path, solvers: list[str], refused: str, codes: dict[str, str]
     return folder
 
 
-def test_the_dearest_effect_stands_first_all_last_and_round_off_of_one_is_no_price(tmp_path: Path) -> None:
+def test_the_most_expensive_effect_is_first_all_last_and_a_ratio_within_round_off_of_one_is_no_overhead(
+    tmp_path: Path
+) -> None:
     figure, (grid,) = compose_kind(
         "prices", priced(tmp_path, ["numba", "dense"], "dense", {"dense": "before"}), FigureOptions()
     )
@@ -59,7 +61,7 @@ def test_the_dearest_effect_stands_first_all_last_and_round_off_of_one_is_no_pri
     assert sum(line.get_marker() == "o" for line in figure.axes[0].lines) == 4
 
 
-def test_where_all_is_of_other_code_words_say_so_and_no_dots(tmp_path: Path) -> None:
+def test_results_of_other_code_alone_are_reported_in_words_without_dots(tmp_path: Path) -> None:
     codes: dict[str, str] = {"numba": "before", "dense": "before"}
     figure, _ = compose_kind("prices", priced(tmp_path, list(codes), "", codes), FigureOptions())
     said = " ".join(text.get_text() for text in visible_texts(figure))

@@ -24,7 +24,7 @@ from tests import synthetic_results as made
 from tests.figure_images import FIGURE_SOURCES, compose_kind
 
 
-def test_what_other_code_measured_is_hollow_and_reported(tmp_path: Path) -> None:
+def test_results_of_other_code_are_hollow_and_reported(tmp_path: Path) -> None:
     swept = made.write_sweep_results(tmp_path)
     older = {f"geometry-flat-newton-{size}" for size in (8, 16, 32)}
     figure, (panel,) = compose_kind("timing", swept, FigureOptions(), older)
@@ -42,7 +42,9 @@ def test_what_other_code_measured_is_hollow_and_reported(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("kind", ["timing", "hard", "ablation", "prices", "speed", "convergence", "winners", "engines"])
-def test_and_what_code_that_is_in_no_commit_did(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+def test_results_of_uncommitted_code_are_hollow_and_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
     monkeypatch.setitem(made.SHARED_COLUMNS, "commit", f"{'0' * 40}-dirty")
     monkeypatch.setitem(synthetic_accuracy_rows.MACHINE_COLUMNS, "commit", f"{'0' * 40}-dirty")
     figure, _ = compose_kind(kind, FIGURE_SOURCES[kind][1](tmp_path), FigureOptions())
@@ -50,7 +52,7 @@ def test_and_what_code_that_is_in_no_commit_did(tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("kind", ["convergence", "times", "work", "growth", "profiles", "liu2013"])
-def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
+def test_results_of_other_code_are_hollow_in_figures_of_accuracy(tmp_path: Path, kind: str) -> None:
     rows: list[dict[str, Any]] = []
     for size in (10, 24):
         rows += synthetic_accuracy_rows.build_snapshot_rows("net", size, "early")
@@ -74,7 +76,7 @@ def test_in_figures_of_accuracy_too(tmp_path: Path, kind: str) -> None:
         assert older == {"newton"}
 
 
-def test_and_in_those_of_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_of_other_code_are_hollow_in_figures_of_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = made.write_speed_results(tmp_path / "told")
     _, (panel,) = compose_kind("speed", folder, FigureOptions())
     assert {row["series"] for row in panel.csv_rows() if row["is_stale"]} == {"numba supernodal"}

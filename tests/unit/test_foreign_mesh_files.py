@@ -205,7 +205,7 @@ STAND_INS = {
     "name", ["mesh.obj", "mesh.ply", "mesh.stl", "mesh.vtk", "mesh.vtp", "mesh.msh", "mesh.json", "x.yaml"]
 )
 @pytest.mark.parametrize("case", STAND_INS)
-def test_what_stands_in_place_of_a_file_is_named(tmp_path, name, case):
+def test_a_folder_or_device_in_place_of_a_file_is_named(tmp_path, name, case):
     content, words = STAND_INS[case]
     path = tmp_path / name
     path.write_bytes(content)
@@ -289,7 +289,7 @@ def cut_copies(path: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize("name", WRITTEN)
 @pytest.mark.filterwarnings("ignore")
-def test_a_file_that_was_cut_is_said_to_be_cut(tmp_path, name):
+def test_a_cut_file_is_reported_as_cut(tmp_path, name):
     path = tmp_path / name
     mesh = meshio.Mesh(PLANE, [("triangle", FACES.astype(np.int32))])
     meshio.write(path, mesh, **WRITTEN[name])
@@ -309,7 +309,7 @@ def test_a_cut_legacy_vtk_file_of_surfaces_is_not_completed_by_arbitrary_numbers
 
 
 @pytest.mark.parametrize("text", ["v 0 0 0\nv 1 0 0\nv 1", "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1"])
-def test_a_cut_obj_is_said_to_end_within_a_line(tmp_path, text):
+def test_a_cut_obj_is_reported_to_end_within_a_line(tmp_path, text):
     path = tmp_path / "cut.obj"
     path.write_text(text)
     with pytest.raises(InputError, match="ends within this line: was it cut"):
@@ -320,7 +320,7 @@ def test_a_cut_obj_is_said_to_end_within_a_line(tmp_path, text):
     assert "was it cut" not in str(caught.value)
 
 
-def test_a_cut_json_scene_is_said_to_be_cut(tmp_path):
+def test_a_cut_json_scene_is_reported_as_cut(tmp_path):
     path = tmp_path / "scene.json"
     path.write_text('{"obj": "mesh.obj", "k": 1, "b": [1, 2')
     with pytest.raises(InputError, match="does not end with }: was it cut"):

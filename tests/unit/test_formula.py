@@ -32,7 +32,7 @@ def solver_with(**methods: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_formula_that_answers_wrongly_is_named_with_its_line(name: str):
+def test_a_formula_with_a_wrong_result_is_named_with_its_line(name: str):
     wrong, words = WRONG[name]
     line = inspect.getsourcelines(wrong)[1]
     stated = build_first_problem(build_cloth(4))
@@ -40,7 +40,7 @@ def test_a_formula_that_answers_wrongly_is_named_with_its_line(name: str):
         solver_with(next_iterate=wrong)().prepare(stated.system).solve(stated, StopRule(3))
 
 
-def test_a_class_without_a_formula_says_so():
+def test_a_class_without_a_formula_is_reported():
     with pytest.raises(TypeError, match="next_iterate"):
         solver_with()()
 

@@ -132,7 +132,7 @@ def test_surfaces_exert_coulombs_force_of_the_steps_own_pressure(solver):
 
 @pytest.mark.parametrize("surface", SURFACES)
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
-def test_surfaces_hold_below_the_angle_of_friction_and_let_go_above(surface, integrator):
+def test_surfaces_stick_below_the_angle_of_friction_and_slip_above(surface, integrator):
     run = steps(patch(STICKS, SURFACES[surface], integrator=integrator), 12, state=pressed())
     assert 0.0 < slid(run) < 12 / 60 * 1e-3
     made = patch(SLIPS, SURFACES[surface], integrator=integrator)
@@ -228,7 +228,7 @@ def test_rounds_are_done_where_friction_acts_and_nowhere_else():
     assert np.abs(last - run[1].positions).max() < 1e-3
 
 
-def test_rows_tell_the_rounds_and_what_they_left():
+def test_rows_state_the_friction_rounds_and_their_remaining_change():
     made = pebble(SLIPS)
     (step,) = steps(made, 1)
     row = build_solution_columns(
@@ -264,7 +264,7 @@ SLID, STUCK, BETWEEN = (2e-3, -2e-3), (1e-7, 1e-4), (1e-3, -1e-3)
 @pytest.mark.parametrize(
     ("cycle", "rounds", "end", "change"), [((SLID, STUCK), 4, STUCK, 1.0), ((SLID, BETWEEN, STUCK), 5, BETWEEN, 0.5)]
 )
-def test_rounds_that_repeat_end_where_most_friction_acts_and_say_what_is_left(cycle, rounds, end, change):
+def test_rounds_that_repeat_end_where_most_friction_acts_and_report_what_is_left(cycle, rounds, end, change):
     made = pebble(1e3)
     recited: Any = Recited(*cycle)
     solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "previous"), EXACTLY)

@@ -104,7 +104,7 @@ def assert_readable(page: Figure) -> None:
 
 
 @needs_opengl
-def test_the_sheet_has_a_tile_for_each_scene_and_says_what_drew_it(tmp_path: Path, pages: list[Figure]):
+def test_the_sheet_has_a_tile_for_each_scene_and_states_what_drew_it(tmp_path: Path, pages: list[Figure]):
     paths = [tmp_path / f"scene-{k}.yaml" for k in range(7)]
     for path in paths:
         path.write_text(SCENE)

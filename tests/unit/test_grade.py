@@ -213,7 +213,7 @@ def test_the_stored_digits_are_recognised(values, absolute, relative):
     assert found.relative == relative
 
 
-def test_vertices_in_another_order_are_matched_by_frame_0_and_the_output_says_so(tmp_path):
+def test_vertices_in_another_order_are_matched_by_frame_0_and_the_output_states_it(tmp_path):
     path, scene = load_case(tmp_path, "rope")
     grader = make_grader(path, first=None)
     order = np.array([3, 0, 4, 1, 2])
@@ -480,7 +480,7 @@ def test_programs_with_each_mistake_name_it(name, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["single-spring-horizontal", "horizontal-chain", "net"])
-def test_mistakes_on_the_published_scenes_are_named_or_said_to_be_invisible(name, tmp_path):
+def test_mistakes_on_the_published_scenes_are_named_or_reported_as_invisible(name, tmp_path):
     path = SHARED / f"{name}.json"
     if not path.exists():
         pytest.skip("the assignment's scenes are not part of this repository")

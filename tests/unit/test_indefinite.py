@@ -76,7 +76,7 @@ def curvatures(hessian) -> list[float]:
 
 
 @filters
-def test_a_spring_keeps_its_stiffness_and_its_lateral_part_is_filtered(name):
+def test_a_spring_retains_its_stiffness_and_its_lateral_part_is_filtered(name):
     step, at, diagonal = begun(compressed())
     hessian = step.hessian(at.positions)
     assert REGULARISATION_RULES[name]().factorise_hessian(hessian, at, diagonal) == 1
@@ -102,7 +102,7 @@ def test_a_block_is_filtered_in_its_own_axes(name):
 
 
 @filters
-def test_pairs_of_surfaces_are_filtered_so_too(name):
+def test_pairs_of_surfaces_are_filtered_too(name):
     energy, p, _ = build_touching_sheets()
     exact = energy.hessian_blocks(p)
     size = np.linalg.eigvalsh(exact.values)
@@ -201,7 +201,7 @@ def test_energies_without_elements_are_refused_by_name(rule):
         NewtonSolver(rule).prepare(made.system)
 
 
-def test_where_pairs_touch_a_hessian_becomes_exact_by_and_by():
+def test_the_hessian_of_touching_pairs_becomes_exact_progressively():
     step, at, diagonal = begun(compressed())
     rule, levels = ContactScheduleRule(), list[int | None]()
     for length in (0.05, 0.06, *[FIRST] * 4):

@@ -42,7 +42,7 @@ def printed(*paths: Path, **options: Any) -> str:
     return " ".join(out.getvalue().split())
 
 
-def test_an_inspection_says_what_is_in_a_recording(cloth: Path):
+def test_an_inspection_states_the_contents_of_a_recording(cloth: Path):
     text = printed(cloth)
     for words in (
         "cloth - test",
@@ -60,7 +60,7 @@ def test_an_inspection_says_what_is_in_a_recording(cloth: Path):
     assert "Not complete" not in text
 
 
-def test_an_inspection_says_that_a_run_was_stopped(cloth: Path):
+def test_an_inspection_reports_that_a_run_was_stopped(cloth: Path):
     os.truncate(cloth, int(0.7 * cloth.stat().st_size))
     assert "Not complete" in printed(cloth)
 
@@ -176,7 +176,7 @@ def test_recordings_side_by_side_can_be_inspected(cloth: Path, tmp_path: Path):
     ],
     ids=["frame", "frame-without-export", "suffix", "export-folder", "csv-folder"],
 )
-def test_a_mistake_is_answered_with_what_is_wanted(options: dict, message: str, cloth: Path, tmp_path: Path):
+def test_a_mistake_is_reported_with_the_expected_options(options: dict, message: str, cloth: Path, tmp_path: Path):
     placed = {key: tmp_path / value if isinstance(value, Path) else value for key, value in options.items()}
     with pytest.raises(InputError, match=message):
         printed(cloth, **placed)
@@ -212,7 +212,7 @@ def test_the_viewer_opens_the_recordings(cloth: Path, monkeypatch: pytest.Monkey
     assert files == [str(cloth)]
 
 
-def test_the_viewer_says_that_it_needs_a_display(cloth: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_viewer_reports_that_it_needs_a_display(cloth: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(module.sys, "platform", "linux")

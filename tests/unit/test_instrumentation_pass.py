@@ -26,7 +26,7 @@ effects:
 """
 
 
-def test_weight_points_down_and_what_a_plane_answers_points_up(tmp_path: Path):
+def test_weight_points_down_and_the_contact_force_of_a_plane_points_up(tmp_path: Path):
     """Each of two vertices of 1 kg that rest on a plane weighs 9.81 N, and is pushed up by as much."""
     (tmp_path / "scene.yaml").write_text(SCENE)
     (run,) = load_config(tmp_path / "scene.yaml", solvers=["newton"]).list_runs()

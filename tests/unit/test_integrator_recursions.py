@@ -118,7 +118,7 @@ def orbit(name: str, time_step: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", LINEAR)
-def test_a_circular_orbit_keeps_the_angular_momentum_that_the_method_leaves_it(name):
+def test_a_circular_orbit_has_the_angular_momentum_that_the_method_leaves_it(name):
     """Position and velocity turn by the same powers, so that L_n = |w_n|^2 omega."""
     # Rounded some tens of times, by some units of the last digit, and divided by dt in the velocity.
     np.testing.assert_allclose(orbit(name, DT), 4.0 * np.abs(powers(name, 4.0j * DT)) ** 2, rtol=1e-11)

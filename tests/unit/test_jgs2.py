@@ -72,7 +72,7 @@ def test_a_vertex_takes_the_best_step_along_its_turned_response(rings):
         np.testing.assert_allclose(out[i], -np.linalg.solve(U.T @ now @ U, U.T @ g), rtol=1e-10, atol=1e-13)
 
 
-def test_what_answers_from_the_whole_mesh_to_a_quadratic_objective_is_newtons_step():
+def test_a_response_of_the_whole_mesh_to_a_quadratic_objective_is_a_newton_step():
     springs = Springs.from_parts([e for e in HANGING.system.energies if isinstance(e, Springs)])
     soft = replace(springs, rest_length=np.zeros(len(springs.edges)))
     problem = replace(HANGING, system=replace(HANGING.system, energies=(soft,)))
@@ -102,7 +102,7 @@ def test_on_a_solid_at_small_displacements_it_converges_as_newtons_method_does()
 
 
 @pytest.mark.parametrize(("scene", "name"), [("contact", "HalfSpaceContact"), ("gas", "Gas")], ids=lambda x: x)
-def test_what_the_rest_shape_does_not_tell_is_refused_by_name(scene, name):
+def test_effects_that_the_rest_shape_does_not_determine_are_refused_by_name(scene, name):
     with pytest.raises(Unsupported, match=f"jgs2: .*{name}"):
         Jgs2().prepare(build_moving_problem(EFFECT_SCENES[scene]()).system)
 

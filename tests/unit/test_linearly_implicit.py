@@ -93,7 +93,7 @@ def test_the_linearised_step_has_the_order_of_its_integrator(name, integrator, e
 
 
 @pytest.mark.parametrize("name", ORDERS)
-def test_pins_that_move_evenly_keep_the_order(name):
+def test_pins_that_move_evenly_retain_the_order(name):
     wanted = integrate_motion(made(SOFT, GravityEffect(), EVENLY, integrator="esdirk-4"), [END])
     scene = made(SOFT, GravityEffect(), EVENLY)
     errors = [wanted.measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
@@ -140,7 +140,7 @@ def test_a_stiff_spring_does_not_ring_after_one_step(name, saved):
 
 
 @pytest.mark.parametrize("name", ORDERS)
-def test_the_requested_error_steers_the_one_that_is_found(name):
+def test_the_requested_error_controls_the_measured_one(name):
     scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
     requested = (1e-2, 1e-3, 1e-4, 1e-5)
     errors = [truth("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions) for e in requested]

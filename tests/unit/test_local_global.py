@@ -103,7 +103,7 @@ def test_iterations_end_where_the_gradient_vanishes(backend):
 
 
 @backends
-def test_every_iterate_moves_the_centre_of_mass_as_the_forces_say(backend):
+def test_every_iterate_moves_the_centre_of_mass_by_the_external_forces(backend):
     """1'A' = 0, so that springs drop out of the sum of all rows of Q p = A'K d + y, converged or not."""
     problem = build_random_problem(4, weights=())
     mass, dt = problem.system.mass, problem.system.time_step
@@ -156,7 +156,7 @@ def test_springs_in_two_energies_are_as_good_as_in_one(backend):
 
 @backends
 @pytest.mark.parametrize("count", [1, 3], ids="{} vertices".format)
-def test_vertices_without_springs_go_where_forces_send_them(backend, count):
+def test_vertices_without_springs_follow_the_external_forces(backend, count):
     problem = build_random_problem(7, n=count, m=0, weights=())
     mass, dt = problem.system.mass[:, None], problem.system.time_step
     (p,) = iterates(backend, problem, 1)
@@ -173,7 +173,7 @@ def test_a_system_without_any_energy_falls(backend):
     )
 
 
-def test_the_facts_count_what_is_stored():
+def test_the_stats_count_what_is_stored():
     problem = build_random_problem(9, n=10, m=0, weights=())
     edges = np.array([[i, i + 1] for i in range(9)])
     chain = Springs.from_rest_shape(np.zeros((10, 3)), edges, np.ones(9))
@@ -214,7 +214,7 @@ class ProjectiveWell(Well):
 
 
 @backends
-def test_an_energy_that_a_backend_does_not_know_is_refused_by_name(backend):
+def test_an_energy_that_a_backend_does_not_support_is_refused_by_name(backend):
     system = replace(build_random_problem(0).system, energies=(Well(),))
     with pytest.raises(Unsupported, match="Well"):
         backend.prepare(system)

@@ -65,7 +65,7 @@ def test_two_computers_of_one_kind_are_distinguished():
     ]
 
 
-def test_a_table_of_one_machine_says_so_once_and_names_it_in_no_row():
+def test_a_table_of_one_machine_names_it_once_and_in_no_row():
     one = [row | {"machine_id": "a" * 12} for row in two_machines()]
     text = printed(build_summary_table(table_of(one)))
     assert len(re.findall("machine aaaaaa", text)) == 1
@@ -91,7 +91,7 @@ def command(*arguments: object) -> str:
     return " ".join(result.output.split())
 
 
-def test_list_query_and_merge_say_it(tmp_path: Path):
+def test_list_query_and_merge_report_other_machines(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(scene())
     assert f"states are those on this machine, {describe_machine().machine_id:.6}" in command(
         "list", tmp_path / "cloth.yaml", "--results", tmp_path / "none"
@@ -110,7 +110,7 @@ def test_list_query_and_merge_say_it(tmp_path: Path):
     assert COMPARISON_NOTE in said
 
 
-def test_a_report_says_that_its_counts_may_be_compared():
+def test_a_report_states_that_its_counts_may_be_compared():
     assert "may be compared across machines" in printed(build_score_table([]))
 
 

@@ -45,7 +45,7 @@ def test_the_machine_is_described():
     assert here == machine_info.describe_machine()
 
 
-def test_the_machine_does_not_tell_its_host_name():
+def test_the_description_of_the_machine_omits_its_host_name():
     name = re.compile(rf"\b{re.escape(socket.gethostname())}\b")
     assert not [value for value in astuple(machine_info.describe_machine()) if name.search(str(value))]
 
@@ -131,7 +131,7 @@ with limit_threads({threads}):
 
 
 @pytest.mark.parametrize("threads", sorted({1, CORES}))
-def test_pinned_threads_hold_for_numba_and_every_blas(threads: int):
+def test_pinned_threads_apply_to_numba_and_every_blas(threads: int):
     # A fresh process, in which neither NumPy nor SciPy was loaded before the threads were pinned.
     completed = subprocess.run(
         [sys.executable, "-c", PINNED.format(threads=threads)], capture_output=True, text=True, check=True

@@ -65,7 +65,7 @@ def quiet(said: str) -> None:
         (lock_timing_shared, lock_timing_exclusive),
     ],
 )
-def test_who_is_timed_is_alone(mine: Callable[..., AbstractContextManager[None]], others: Callable[..., object]):
+def test_a_timed_run_is_exclusive(mine: Callable[..., AbstractContextManager[None]], others: Callable[..., object]):
     with mine(quiet):
         other = Other(others)  # type: ignore[arg-type]
         assert other.waits.wait(PATIENCE)
@@ -76,7 +76,7 @@ def test_who_is_timed_is_alone(mine: Callable[..., AbstractContextManager[None]]
     assert parse_activity_start(other.heard[0]) == parse_activity_end(other.heard[-1]) == WAITING
 
 
-def test_what_is_not_timed_is_done_side_by_side():
+def test_untimed_runs_are_concurrent():
     with lock_timing_shared(quiet):
         other = Other(lock_timing_shared)
         assert other.inside.wait(PATIENCE)
@@ -97,7 +97,7 @@ def test_timed_runs_have_priority_over_untimed_ones():
     untimed.leave.set()
 
 
-def test_who_gets_ready_goes_before_who_was_timed_and_two_get_ready_side_by_side():
+def test_preparation_precedes_timed_runs_and_two_preparations_are_concurrent():
     with TimingSession(quiet, exclusive=True) as mine, TimingSession(quiet, exclusive=True) as another:
         looks = Other(lock_timing_shared)
         assert looks.waits.wait(PATIENCE)
@@ -167,7 +167,7 @@ def at_core(tick: ProgressCallback) -> tuple[list[int], set[int], float, float]:
         return cores, os.sched_getaffinity(0), began, monotonic()
 
 
-def test_each_has_cores_of_its_own():
+def test_each_run_has_its_own_cores():
     task = PoolTask(partial(at_core), quiet, TaskLimits(PATIENCE))
     found = [value for _, value in run_tasks(3, int, [None] * 3, lambda number: task)]
     for cores, kept_to, began, end in found:

@@ -132,7 +132,7 @@ def test_stretched_cloth_and_blocks_tend_to_the_continuum_of_their_lattice(measu
 
 
 @pytest.mark.parametrize("t", [0.05, 1.0])
-def test_a_fold_stores_the_bending_energy_that_the_rule_promises(t):
+def test_a_fold_stores_the_bending_energy_of_the_rule(t):
     # a sheet folded along its middle column; the exact shortening replaces its leading order, which at
     # t = 1 rad is 1 % off: 2 (1 - cos(1/2)) = 0.2448 against 1/4, hence 4 % in energy; edge rows count fully
     size, bending = 21, 3e-4

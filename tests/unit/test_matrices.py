@@ -78,7 +78,7 @@ def networks(draw):
 
 @pytest.mark.parametrize("name", BY_HAND)
 @pytest.mark.parametrize("make", [dense_matrices, sparse_matrices])
-def test_a_matrix_is_what_one_works_out_by_hand(make, name):
+def test_matrices_are_those_computed_by_hand(make, name):
     made = make(SPRINGS, STIFFNESS, MASS, TIME_STEP, PINNED, WEIGHT)[name]
     np.testing.assert_array_equal(made.toarray() if isinstance(made, csr_array) else made, BY_HAND[name])
 

@@ -230,7 +230,7 @@ effects: [{kind: springs, scaling_rule: area, stretch: 500}, {kind: gravity}, {k
 """
 
 
-def test_a_run_says_the_modulus_and_its_anisotropy(tmp_path, caplog):
+def test_a_run_states_the_modulus_and_its_anisotropy(tmp_path, caplog):
     caplog.set_level("INFO")
     write_mesh(tmp_path, *irregular("union jack"))
     (tmp_path / "scene.yaml").write_text(SCENE)

@@ -107,7 +107,7 @@ def test_unused_vertices_stay_unless_they_are_dropped(tmp_path):
     assert mesh.format_file_numbers(0) == " (2 in the file)"
 
 
-def test_the_keys_hold_for_other_formats(tmp_path):
+def test_the_keys_apply_to_other_formats(tmp_path):
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, 0], [1, 0, 1], [0, 0, 1], [7, 7, 7]], float)
     path = tmp_path / "mesh.vtu"
     meshio.Mesh(points, [("triangle", np.array([[0, 1, 2], [3, 4, 5]]))]).write(path)

@@ -169,7 +169,7 @@ def test_a_mesh_of_nothing_is_refused(tmp_path, text, words):
 
 
 @pytest.mark.parametrize("name", ["missing.obj", "missing.ply", "missing.json", "folder.obj", "x" * 300, "a\0b.obj"])
-def test_what_is_no_file_is_refused(tmp_path, name):
+def test_a_path_that_is_not_a_file_is_refused(tmp_path, name):
     (tmp_path / "folder.obj").mkdir()
     with pytest.raises(InputError, match="give the path"):
         FileMesh(path=tmp_path / name).build_mesh(0)

@@ -107,7 +107,7 @@ def test_a_vertical_sheet_hangs_below_its_top(model):
 
 
 @pytest.mark.parametrize("model", [GridMesh, NetMesh])
-def test_a_horizontal_sheet_lies_level_around_the_origin(model):
+def test_a_horizontal_sheet_is_level_around_the_origin(model):
     mesh = model(width=2.0, height=1.0).build_mesh(5)
     assert not mesh.rest_positions[:, 1].any()
     assert mesh.mass_fractions @ mesh.rest_positions == pytest.approx([0, 0, 0], abs=ROUND_OFF)
@@ -158,7 +158,7 @@ def test_a_tower_tapers_and_stands_on_four_feet():
     assert np.ptp(mesh.rest_positions[mesh.parts["top"], 0]) == 0.5
 
 
-def test_a_stack_is_so_many_grids_each_turned_against_the_one_below():
+def test_a_stack_consists_of_grids_each_rotated_against_the_one_below():
     one, mesh = GridMesh().build_mesh(3), StackMesh(num_layers=3, layer_spacing=0.1, layer_angle=90.0).build_mesh(3)
     assert len(mesh.rest_positions) == StackMesh(num_layers=3).count_vertices(3) == 27
     for k in range(3):
@@ -188,7 +188,7 @@ def test_a_rope_is_a_chain_with_springs_that_resist_bending():
     assert mesh.dimension == 1
 
 
-def test_mass_goes_by_area_and_by_volume():
+def test_mass_is_proportional_to_area_or_volume():
     cloth, block = GridMesh(width=2.0, height=2.0).build_mesh(5), BlockMesh(height=1.0, depth=1.0).build_mesh(5)
     inner = np.setdiff1d(np.arange(25), cloth.parts["boundary"])
     assert cloth.mass_fractions[inner] == pytest.approx(1 / 16)  # six triangles of 1/32 give a third each

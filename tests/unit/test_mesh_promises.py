@@ -100,7 +100,7 @@ def test_parts_are_sorted_vertices(generator, size):
 
 
 @pytest.mark.parametrize(("generator", "size"), MESH_CASES)
-def test_arrays_have_the_promised_types_and_cannot_be_written_to(generator, size):
+def test_arrays_have_the_documented_types_and_are_read_only(generator, size):
     mesh = generator.build_mesh(size)
     assert mesh.rest_positions.dtype == np.float64
     assert mesh.rest_positions.flags.c_contiguous

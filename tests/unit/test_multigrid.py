@@ -78,7 +78,7 @@ def test_every_vertex_is_in_one_connected_aggregate():
         assert np.ptp(cols) <= 4
 
 
-def test_aggregates_lie_along_stiff_springs():
+def test_aggregates_extend_along_stiff_springs():
     springs = grid_springs(40, 40)
     along = springs[:, 1] - springs[:, 0] == 1
     of, count = aggregates(network_matrix(springs, np.where(along, 1e4, 1.0), np.full(1600, 1e-3)))
@@ -93,7 +93,7 @@ def test_vertices_that_smoothing_determines_are_in_no_aggregate():
     assert (of == -1).all()
 
 
-def test_weak_entries_go_to_the_diagonal_and_keep_the_sums_of_rows():
+def test_weak_entries_are_lumped_into_the_diagonal_and_row_sums_are_preserved():
     springs, rng = grid_springs(20, 20), np.random.default_rng(0)
     Q = network_matrix(springs, 10.0 ** rng.uniform(0, 6, len(springs)), np.ones(400))
     F = Q.copy()

@@ -43,7 +43,7 @@ def test_pytest_accepts_the_command_that_runs_the_tests():
     assert done.returncode == 0, done.stderr
 
 
-def test_what_stands_elsewhere_or_twice_is_refused(tmp_path: Path):
+def test_a_fragment_that_is_missing_or_repeated_is_refused(tmp_path: Path):
     mutation = replace(TABLE[0], file="here.py", fragment="x = 1")
     with pytest.raises(StaleMutation, match=r"there is no here\.py"):
         mutation.apply(tmp_path)

@@ -41,7 +41,7 @@ def made(name: str, system: System) -> PreparedLocalGlobal:
 
 @pytest.mark.parametrize("name", NATIVE)
 @pytest.mark.parametrize("weight", [1e10, "exact"])
-def test_its_iterates_are_those_of_the_others(name: str, weight: float | str):
+def test_iterates_are_those_of_the_other_backends(name: str, weight: float | str):
     scene = build_cloth(12, weight=weight)
     problem = build_first_problem(scene)
     ours = SparseLocalGlobal().prepare(scene.system)
@@ -87,7 +87,7 @@ class _Other:
 
 
 @pytest.mark.parametrize("name", NATIVE)
-def test_without_a_compiler_the_row_says_so(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_a_compiler_the_row_states_the_reason(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from springbench.harness.experiments.run_pipeline import execute_run
     from springbench.harness.experiments.sweep_plan import RunFiles
 
@@ -100,7 +100,7 @@ def test_without_a_compiler_the_row_says_so(name: str, tmp_path: Path, monkeypat
     assert "there is no C++ compiler" in row["reason"]
 
 
-def test_they_are_not_among_those_that_are_everywhere():
+def test_native_solvers_are_not_in_the_list_of_all_solvers():
     assert set(NATIVE) <= set(OPTIONAL_SOLVERS)
     assert not set(OPTIONAL_SOLVERS) & set(SOLVERS)
     assert all(read_solver_metadata(name)["is_minimiser"] for name in NATIVE)

@@ -35,7 +35,7 @@ def test_affine_motions_pass_between_meshes_without_change(tmp_path, mesh):
         np.testing.assert_allclose(weights @ (known @ turn + shift), wanted @ turn + shift, rtol=0, atol=1e-9)
 
 
-def test_vertices_that_both_meshes_have_keep_their_values(tmp_path):
+def test_common_vertices_of_both_meshes_retain_their_values(tmp_path):
     fine, coarse = (made(tmp_path, size=size).mesh.rest_positions for size in (9, 5))
     value = np.random.default_rng(0).normal(size=len(fine))
     where = [int(np.linalg.norm(fine - x, axis=1).argmin()) for x in coarse]
@@ -56,7 +56,7 @@ def test_the_guess_is_nearer_to_the_minimum_and_saves_iterations(tmp_path):
     np.testing.assert_array_equal(coarse.initial_guess, build_problem(scene, state, "coarse-to-fine").initial_guess)
 
 
-def test_it_goes_on_from_step_to_step(tmp_path):
+def test_nested_iteration_repeats_from_step_to_step(tmp_path):
     scene = made(tmp_path, integrator="bdf2")
     rule, ready = StopRule(2000, 1e-4), prepare(scene, Lbfgs())
     runs = [

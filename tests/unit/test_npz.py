@@ -119,7 +119,7 @@ def test_numbers_of_any_type_and_order_are_read_as_float64(tmp_path, dtype, orde
 
 
 @pytest.mark.parametrize("name", ["missing.npz", ".", "a\0b.npz"])
-def test_what_is_no_file_is_refused(tmp_path, name):
+def test_a_path_that_is_not_a_file_is_refused(tmp_path, name):
     with pytest.raises(InputError, match=r"is no file|cannot be read"):
         read_npz_array(tmp_path / name, "positions")
 

@@ -60,7 +60,7 @@ def with_links(problem: StepProblem, reach: float) -> StepProblem:
 
 
 @pytest.mark.parametrize("solver", ["newton", "newton-cg", "hybrid", "lbfgs"])
-def test_a_solver_says_which_energies_take_the_slow_path(solver):
+def test_a_solver_states_which_energies_take_the_slow_path(solver):
     problem, made = build_random_problem(2), load_target(SOLVERS[solver])()
     assert "Python" not in made.prepare(problem.system).description
     choice = made.prepare(with_links(problem, 0.5).system).description
@@ -105,20 +105,20 @@ def exact_hessian(problem: StepProblem, p: Positions) -> csr_array:
 
 
 @problems
-def test_the_gradient_is_the_oracles(problem):
+def test_the_gradient_is_that_of_the_reference_evaluator(problem):
     step, p, _ = stepped(problem)
     wanted = problem.gradient(p)
     np.testing.assert_allclose(step.gradient(p), wanted, rtol=0, atol=SUMS * np.abs(wanted).max(initial=1e4))
 
 
 @problems
-def test_the_rise_is_the_difference_of_the_oracles_values(problem):
+def test_the_objective_change_is_the_difference_of_the_reference_values(problem):
     step, p, q = stepped(problem)
     wanted = problem.value(q) - problem.value(p)
     assert step.objective_change(p, q)[0] == pytest.approx(wanted, rel=1e-9, abs=SUMS * problem.value_scale(p))
 
 
-def test_the_rise_keeps_its_digits_where_values_have_none_left():
+def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_digits():
     """A step of 1e-9 along the gradient: the rise is the slope, to as many digits as it is short."""
     problem = build_first_problem(build_cloth(7, "exact", stretch=1e6))
     step, p, _ = stepped(problem)
@@ -177,7 +177,7 @@ def test_without_negative_lateral_parts_springs_are_positive_semidefinite():
     assert hessian.factorise(0.0)
 
 
-def test_a_pattern_of_the_day_leaves_no_trace():
+def test_a_temporary_pattern_leaves_no_trace():
     near, far = (with_links(build_first_problem(build_cloth(7, "exact")), reach) for reach in (0.4, 0.9))
     whole = FixedObjective(near.system)
     fresh = FixedObjective(near.system)
@@ -196,7 +196,7 @@ def test_a_pattern_of_the_day_leaves_no_trace():
     np.testing.assert_array_equal(solved(fresh, near), first)
 
 
-def test_springs_of_no_length_have_the_curvature_that_the_energy_says():
+def test_springs_of_no_length_have_the_curvature_of_the_energy():
     p = np.zeros((3, 3))
     springs = Springs.from_rest_shape(
         np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0]]), np.array([[0, 1], [1, 2]]), np.ones(2)

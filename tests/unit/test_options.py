@@ -85,7 +85,7 @@ SWEEP = "scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [{}]\noptions: {{frames: 4, 
         ("rtol: automatic", "options.rtol"),
     ],
 )
-def test_what_an_error_or_auto_leaves_no_choice_of_is_refused(folder: Path, options: str, said: str) -> None:
+def test_an_option_that_an_error_or_auto_determines_is_refused(folder: Path, options: str, said: str) -> None:
     (folder / "sweep.yaml").write_text(SWEEP.format("newton", options))
     with pytest.raises(InputError) as refused:
         load_config(folder / "sweep.yaml")
@@ -102,7 +102,7 @@ def test_a_requested_error_next_to_stated_steps_is_one_run_and_has_no_part_in_th
     assert [run.build_identity() for run in runs if run.error_target is None] == [run.build_identity() for run in plain]
 
 
-def test_a_sweep_keeps_to_an_error_and_its_rows_say_what_it_took(folder: Path) -> None:
+def test_a_sweep_meets_an_error_and_its_rows_state_the_cost(folder: Path) -> None:
     (folder / "cloth.yaml").write_text(f"{CLOTH}  - {{kind: gravity}}\n  - {{kind: pins, parts: [top_corners]}}\n")
     (folder / "sweep.yaml").write_text(SWEEP.format("dormand-prince-8, xpbd", "error_target: 1e-3, pictures: false"))
     done = CliRunner().invoke(

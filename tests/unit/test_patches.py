@@ -89,7 +89,7 @@ def moved(rest: Positions, seed: int) -> Positions:
 
 
 @pytest.mark.parametrize("share", [0.0, MIN_GAP_FRACTION])
-def test_nothing_is_near_where_patches_say_so_however_fast_it_moves(made, share):
+def test_clearance_bounds_are_valid_at_any_speed(made, share):
     said, limits, near = 0, CollisionQuery(REACH, 0.3 * REACH, share), made.near_at_rest
     for seed in range(24):
         p = moved(made.rest_positions, seed)
@@ -150,7 +150,7 @@ def test_a_displacement_from_the_same_start_reuses_its_query(made):
     assert found is None or wanted is None or found.near_clearance == wanted.near_clearance
 
 
-def test_patches_that_are_not_doubted_have_nothing_near_in_them(made):
+def test_resolved_patches_contain_no_near_pairs(made):
     num_clear, patches, owner, limits = (
         0,
         made.patches,
@@ -239,7 +239,7 @@ def test_relative_displacement_is_the_diagonal_of_the_box_of_all_displacements(n
         assert max_relative_displacement(p, q) == np.inf
 
 
-def test_patches_of_a_stack_tell_nothing():
+def test_patches_of_a_stack_give_no_bounds():
     sheet = GridMesh().build_mesh(5)
     layers = [sheet.rest_positions + 0.5 * REACH * k * np.eye(3)[1] for k in range(30)]
     rest, each = np.concatenate(layers), len(sheet.rest_positions)

@@ -85,7 +85,7 @@ def of(measured: RunMeasurement, phase: str) -> list[TimingSample]:
     return [t for t in measured.timings if t.phase == phase]
 
 
-def test_each_phase_is_timed_as_often_as_it_says(seen):
+def test_each_phase_is_timed_as_often_as_reported(seen):
     _, measured, _ = seen
     counts = {phase: len(of(measured, phase)) for phase in ("prepare", "local", "global", ITERATION_PHASE, "step")}
     repeated = FRAMES * PHASE_REPEATS
@@ -101,7 +101,7 @@ def test_each_phase_is_timed_as_often_as_it_says(seen):
     assert [(t.frame, t.round) for t in of(measured, "step")] == [(f, r) for r in range(ROUNDS) for f in (1, 2, 3)]
 
 
-def test_times_hold_what_was_done_in_them(seen):
+def test_times_include_the_work_of_their_phase(seen):
     solver, measured, whole = seen
     repeats = [call for k, call in enumerate(solver.slept["local"]) if k % (PHASE_REPEATS + 2) >= 2]
     assert all(t.seconds >= slept for t, slept in zip(of(measured, "local"), repeats, strict=True))
@@ -121,7 +121,7 @@ def test_what_is_shown_between_steps_is_in_no_time(seen):
     assert sum(watch.wall_seconds for watch in measured.watches.values()) <= whole - shown
 
 
-def test_every_time_lies_within_what_its_watch_saw(seen):
+def test_every_time_is_within_the_time_of_its_watch(seen):
     _, measured, _ = seen
     assert set(measured.watches) == {("prepare", None), ("local", None), ("global", None), (ITERATION_PHASE, None)} | {
         ("step", round) for round in range(ROUNDS)
@@ -132,7 +132,7 @@ def test_every_time_lies_within_what_its_watch_saw(seen):
         assert total_seconds <= watch.wall_seconds * (1 + 5e-4)
 
 
-def test_rows_tell_both_clocks_and_that_a_solver_which_sleeps_was_interrupted(seen):
+def test_rows_state_both_clocks_and_mark_a_solver_that_sleeps_as_preempted(seen):
     _, measured, _ = seen
     for row in timing_pass.build_timing_rows(measured):
         assert row["wall_seconds_sum"] <= row["wall_seconds_check"] * (1 + 5e-4)
@@ -181,7 +181,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize(("phases", "iteration", "expected"), PARTS.values(), ids=PARTS)
-def test_rows_say_whether_phases_add_up_to_an_iteration(phases: dict[str, float], iteration: float, expected: bool):
+def test_rows_state_whether_phases_add_up_to_an_iteration(phases: dict[str, float], iteration: float, expected: bool):
     timings = [TimingSample("step", 1, 0, 40.0)]
     for frame in (1, 2, 3):
         slow = 50.0 if frame == 2 else 1.0  # one frame that was disturbed does not decide

@@ -49,7 +49,7 @@ def test_a_penalty_becomes_an_exact_pin_in_proportion_to_its_weight(backend):
 
 
 @backends
-def test_the_assignments_weight_holds_a_cloth_to_a_billionth(backend):
+def test_the_weight_of_the_assignment_pins_a_cloth_to_a_billionth(backend):
     made = build_cloth(8)
     problem = build_first_problem(made)
     p = backend.prepare(made.system).solve(problem, StopRule(50)).positions

@@ -146,7 +146,7 @@ def test_the_minimum_is_that_of_newtons_method(method, name):
 
 
 @others
-def test_what_lies_on_a_floor_is_at_a_minimum(name):
+def test_a_body_on_a_floor_is_at_a_minimum(name):
     """Which of them, friction leaves to the way there."""
     stated = given("contact")
     p = NewtonCG(preconditioner=name).prepare(stated.system).solve(stated, StopRule(500, 1e-9)).positions

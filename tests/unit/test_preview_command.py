@@ -27,7 +27,7 @@ effects:
 
 
 @pytest.mark.skipif(opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or "")
-def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
+def test_the_chosen_settings_are_printed_and_drawn(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     picture = tmp_path / "cloth.png"
     result = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(picture)])
@@ -46,7 +46,7 @@ def test_what_is_chosen_is_said_and_drawn(tmp_path: Path):
         assert int(((alike > 0.98) & (np.linalg.norm(hue, axis=2) > 0.3)).sum()) > 100
 
 
-def test_a_picture_that_is_none_is_refused(tmp_path: Path):
+def test_a_file_that_is_not_a_picture_is_refused(tmp_path: Path):
     (tmp_path / "cloth.yaml").write_text(SCENE)
     result = CliRunner().invoke(app, ["preview", str(tmp_path / "cloth.yaml"), "-o", str(tmp_path / "cloth.jpg")])
     assert result.exit_code != 0

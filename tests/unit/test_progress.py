@@ -65,7 +65,7 @@ def test_the_time_left_follows_from_the_runs_of_each_kind(kind: Callable[..., Pr
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_time_left_is_right_within_a_factor_of_two_from_half_way_on(clock: list[float], seed: int):
+def test_the_time_left_is_right_within_a_factor_of_two_from_halfway_on(clock: list[float], seed: int):
     """Runs of some solvers whose times vary by a factor of 1,000, as those of hard cases do."""
     chance = random.Random(seed)
     costs = [RunCost(f"solver {chance.randrange(10)}", chance.choice((9.0, 36.0, 1024.0))) for _ in range(300)]

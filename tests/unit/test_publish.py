@@ -72,7 +72,7 @@ def changed(archive: Path, into: Path, change: Callable[[dict[str, bytes]], None
 
 
 @pytest.mark.parametrize("name", ["x.zip", "packed.zip"])
-def test_what_was_published_comes_out_again(home: Path, name: str, tmp_path: Path):
+def test_published_archives_unpack_and_verify(home: Path, name: str, tmp_path: Path):
     with archive_verification.unpack_archive(home / name) as folder:
         subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
         assert archive_verification.verify_checksums(folder) == []
@@ -198,7 +198,7 @@ def with_rows_of(runs: list[PublishedRun], new: list[list[ResultRow]]) -> list[P
 
 
 @pytest.mark.parametrize("kind", FORGED)
-def test_a_forged_column_does_not_hold(kind: str, repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
+def test_a_forged_column_is_refuted(kind: str, repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
     runs, new = repeated
     honest = with_rows_of(runs, new)
     assert claims_of(honest, new) == []
@@ -214,7 +214,7 @@ def test_a_repetition_without_a_recording_has_another_id(repeated: tuple[list[Pu
     assert claims_of(with_rows_of(runs, new), renamed) == []
 
 
-def test_rows_that_are_missing_or_doubled_do_not_hold(repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
+def test_missing_or_repeated_rows_are_refuted(repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
     runs, new = repeated
     for one, here in zip(runs, new, strict=True):
         fewer = replace(one, rows=[row for row in here if row["phase"] != "step" or row["frame"] == 1])
@@ -245,7 +245,7 @@ def test_runs_that_no_config_requests_cannot_be_decided(home: Path, tmp_path: Pa
     assert "no repeat confirms these columns: " in result.output
 
 
-def test_rows_that_lie_under_true_checksums_do_not_hold(home: Path, tmp_path: Path):
+def test_false_rows_with_valid_checksums_are_refuted(home: Path, tmp_path: Path):
     def change(content: dict[str, bytes]) -> None:
         for name in [name for name in content if name.endswith(".parquet")]:
             (tmp_path / "x.parquet").write_bytes(content[name])

@@ -86,7 +86,7 @@ def test_an_inconclusive_session_has_an_exit_code_of_its_own(tmp_path: Path):
     assert "1 passed, 1 inconclusive" in said
 
 
-def test_answers_that_differ_fail_and_nothing_is_timed(tmp_path: Path):
+def test_solutions_that_differ_fail_and_nothing_is_timed(tmp_path: Path):
     test = "def test_it(paired_benchmark): paired_benchmark(spin(10, [0.0, 2.0]), spin(10, [0.0, 4.0]), max_ratio=9)"
     code, said, stored = session(tmp_path, test)
     assert code == 1
@@ -94,7 +94,7 @@ def test_answers_that_differ_fail_and_nothing_is_timed(tmp_path: Path):
     assert not stored
 
 
-def test_where_benchmarks_are_disabled_only_the_answers_are_compared(tmp_path: Path):
+def test_with_benchmarks_disabled_only_solutions_are_compared(tmp_path: Path):
     test = """
 def test_same(paired_benchmark): assert paired_benchmark(spin(10), spin(10), max_ratio=1e-6) is None
 def test_other(paired_benchmark): paired_benchmark(spin(10, 1.0), spin(10, 2.0), max_ratio=9)
@@ -208,6 +208,6 @@ def test_options_that_a_gates_file_sets_are_refused(tmp_path: Path):
         ([1.0, 2.0], [1.0], 0.1, r"shapes \(2,\) and \(1,\)"),
     ],
 )
-def test_answers_are_compared_in_their_own_size(new: Any, old: Any, rtol: float, message: str | None):
+def test_solutions_are_compared_relative_to_their_size(new: Any, old: Any, rtol: float, message: str | None):
     with pytest.raises(AnswersDiffer, match=message) if message else nullcontext():
         require_agreement(new, old, rtol)

@@ -53,6 +53,6 @@ def test_what_is_wrong_or_leaves_the_rows_is_the_users_mistake(results: Path, sq
     assert sorted(results.rglob("*")) == before
 
 
-def test_without_rows_the_answer_says_what_to_do(tmp_path: Path):
+def test_without_rows_the_message_states_what_to_do(tmp_path: Path):
     with pytest.raises(InputError, match="run a sweep first"):
         run_query("SELECT 1", tmp_path)

@@ -78,13 +78,13 @@ def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: f
 @pytest.mark.parametrize(
     ("ends", "labels"), [((-0.05, 0.39), ["to +39 %"]), ((-0.2, 0.05), ["to −20 %"]), ((-0.1, 0.1), [])]
 )
-def test_the_scale_ends_in_a_tip_with_a_figure_where_strain_lies_beyond(ends: tuple[float, float], labels: list[str]):
+def test_the_scale_ends_in_a_tip_with_a_figure_where_strain_exceeds_it(ends: tuple[float, float], labels: list[str]):
     strip, words = ViewExtent(MESHES_BY_KIND["cloth"].rest_positions).build_colour_scale(0.1, ends)
     assert listed(words.labels).tolist()[5:] == labels
     assert len(listed(strip.triangle_indices)) == 2 * (NUM_LEVELS - 1) + len(labels)
 
 
-def test_what_is_wide_and_low_stands_in_the_middle_of_the_room_above_the_scale():
+def test_a_wide_and_low_mesh_is_centred_above_the_scale():
     flat = np.array([[x, 0.0, z] for x in (0.0, 1.0) for z in (0.0, 1.0)])
     heights = height(ViewExtent(flat), flat)
     above, below = 1.0 - heights.max(), heights.min() + 0.72
@@ -98,7 +98,7 @@ def test_the_camera_ignores_positions_that_have_blown_up(bad: float):
     assert numbers(box.build_eye_controls().position) == pytest.approx(numbers(same.build_eye_controls().position))
 
 
-def test_the_camera_leaves_out_what_falls_away_and_says_so():
+def test_the_camera_omits_vertices_that_fall_away_and_reports_them():
     net = np.array([[x, y, 0.0] for x in (0.0, 0.5, 1.0) for y in (0.0, -0.5)])
     start = np.vstack([net, [[2.0, 0.0, 0.0]]])
     box, without = ViewExtent(start), ViewExtent(net)

@@ -77,7 +77,7 @@ def test_a_capsule_is_turned_from_the_axis_z_to_its_own(recorded: Path, k: int):
     np.testing.assert_allclose([start, end], obstacle.end_points, atol=1e-6)  # float32
 
 
-def test_what_moves_is_taken_along_in_each_frame_and_what_rests_is_not(recorded: Path):
+def test_moving_obstacles_have_a_transform_in_each_frame_and_resting_ones_none(recorded: Path):
     moved = rows(recorded, "/scene/obstacles/0-sphere")
     assert "translation" not in rows(recorded, "/scene/obstacles/1-capsule")
     centers = [
@@ -109,7 +109,7 @@ def test_a_recording_without_obstacles_has_no_trace_of_any(tmp_path: Path):
         assert list(source.iterate_chunks(content="/scene/obstacles/**")) == []
 
 
-def test_who_records_and_draws_scenes_without_obstacles_does_not_import_them():
+def test_recording_and_drawing_a_scene_without_obstacles_does_not_import_them():
     imports = "import sys, springbench.harness.experiments.run_pipeline, springbench.harness.report.run_picture"
     script = f"{imports}; sys.exit('springbench.harness.scenes.primitive_obstacles' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

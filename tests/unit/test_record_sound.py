@@ -44,7 +44,7 @@ def test_a_recording_checked_by_one_process_is_not_checked_again_by_another(reco
         require_intact(other, refuse)
 
 
-def test_notes_that_come_meanwhile_are_seen(recording: Path):
+def test_notes_added_meanwhile_are_read(recording: Path):
     other = recording.with_name("b.rrd")
     other.write_bytes(recording.read_bytes())
     require_intact(recording, refuse)
@@ -55,7 +55,7 @@ def test_notes_that_come_meanwhile_are_seen(recording: Path):
     require_intact(other, refuse)
 
 
-def test_a_recording_that_was_cut_or_changed_since_is_read_again_whatever_its_times_say(recording: Path):
+def test_a_recording_that_was_cut_or_changed_since_is_read_again_whatever_its_time_stamps(recording: Path):
     before, content = recording.stat(), recording.read_bytes()
     for changed in (content[:-100], content[:-100] + bytes(100)):
         recording.write_bytes(changed)

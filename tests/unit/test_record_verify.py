@@ -168,7 +168,7 @@ def test_positions_rounded_far_from_zero_are_refused(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("size", [1e-300, 1e-9, 1.0, 1e9, 1e300])
 @pytest.mark.parametrize("distance", [0.0, 3.0, 1e3, 1e7])
-def test_an_origin_is_near_its_mesh_and_keeps_what_is_relative_to_it(size: float, distance: float):
+def test_an_origin_is_near_its_mesh_and_preserves_relative_positions(size: float, distance: float):
     rest = size * (np.array([[0.0, 0, 0], [0.3, 0.9, 0], [0, 0, 0.1]]) + np.array([distance, -distance, 0]))
     origin, diagonal = compute_local_origin(rest), float(np.linalg.norm(np.ptp(rest / size, axis=0))) * size
     assert np.abs(rest - origin).max() <= 10 * diagonal, "a cell is less than 16 diagonals"

@@ -32,7 +32,7 @@ if __name__ == "__main__":
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
 @pytest.mark.parametrize("before", [False, True], ids=["the first", "after its parent"])
-def test_a_worker_that_records_keeps_no_threads(tmp_path: Path, before: bool) -> None:
+def test_a_worker_that_records_leaves_no_threads(tmp_path: Path, before: bool) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     env = os.environ | {"PYTHONPATH": str(ROOT)}

@@ -146,7 +146,7 @@ def test_counts(paired_benchmark):
 """
 
 
-def test_what_the_gates_store_can_be_compared_and_names_no_host(tmp_path: Path):
+def test_stored_gates_can_be_compared_and_name_no_host(tmp_path: Path):
     (tmp_path / "pytest.ini").write_text("[pytest]\naddopts = --benchmark-disable\n")
     (tmp_path / "test_counts.py").write_text(BENCHMARK)
     command = [

@@ -132,7 +132,7 @@ def test_other_threads_are_another_run(tmp_path: Path):
     ],
     ids=["missing", "text", "empty", "empty archive"],
 )
-def test_what_holds_no_results_is_the_users_mistake(make: Any, message: str, tmp_path: Path):
+def test_a_folder_without_results_is_the_users_mistake(make: Any, message: str, tmp_path: Path):
     good, bad = results(tmp_path / "good", {}), tmp_path / "bad"
     make(bad)
     for pair in ((good, bad), (bad, good)):

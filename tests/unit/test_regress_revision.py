@@ -91,7 +91,7 @@ def test_an_inconclusive_comparison_has_an_exit_code_of_its_own(repository: Path
     assert re.search(r"adding: inconclusive: \d+ blocks only", said), said
 
 
-def test_answers_that_differ_fail_before_anything_is_timed(repository: Path):
+def test_solutions_that_differ_fail_before_anything_is_timed(repository: Path):
     state(repository, answer=0.5)
     code, said = regress("--baseline", "HEAD", "-k", "adding")
     assert code == 2
@@ -110,7 +110,7 @@ def test_a_revision_that_cannot_be_run_gives_its_own_reason(repository: Path):
 
 
 @pytest.mark.long
-def test_a_revision_whose_libraries_cannot_be_had_does_not_build(repository: Path):
+def test_a_revision_whose_libraries_are_unavailable_does_not_build(repository: Path):
     project = '[project]\nname = "mine"\nversion = "{}"\ndependencies = [{}]\n'
     (repository / "pyproject.toml").write_text(project.format("0", '"no such thing !"'))
     commit(repository)

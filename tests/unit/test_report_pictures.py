@@ -322,7 +322,7 @@ LEFT_OUT = {
 
 
 @pytest.mark.parametrize(("vertices", "metres", "count"), LEFT_OUT.values(), ids=LEFT_OUT)
-def test_what_leaves_the_others_far_behind_is_not_framed(vertices: slice, metres: float, count: int) -> None:
+def test_vertices_far_from_the_others_are_not_framed(vertices: slice, metres: float, count: int) -> None:
     replay = falling(cloth(), vertices, metres)
     found = framed_vertex_mask(replay, range(8))
     assert np.flatnonzero(~found).tolist() == list(range(36))[vertices][:count]
@@ -340,7 +340,7 @@ SURFACES = {
 
 
 @pytest.mark.parametrize(("apart", "folded", "wanted"), SURFACES.values(), ids=SURFACES)
-def test_a_picture_says_of_a_surface_that_nothing_keeps_it_apart(apart: bool, folded: float, wanted: list[str]) -> None:
+def test_a_picture_states_that_a_surface_has_no_self_contact(apart: bool, folded: float, wanted: list[str]) -> None:
     """Folded: one corner of the cloth is pushed through its middle."""
     plain = cloth()
     positions = plain.positions.copy()
@@ -358,7 +358,7 @@ def test_a_picture_says_of_a_surface_that_nothing_keeps_it_apart(apart: bool, fo
 
 @needs_opengl
 @pytest.mark.slow
-def test_every_picture_of_a_surface_says_that_nothing_keeps_it_apart(words: list[str], tmp_path: Path) -> None:
+def test_every_picture_of_a_surface_states_that_it_has_no_self_contact(words: list[str], tmp_path: Path) -> None:
     replay = replace(cloth(frames=1), properties={**cloth().properties, "prevents_self_intersection": False})
     draw_run_picture(replay, tmp_path / "run.png")
     draw_comparison_picture({"a": replay}, tmp_path / "both.png")
@@ -384,7 +384,7 @@ def test_where_one_point_is_framed_the_start_gives_the_size() -> None:
 
 
 @needs_opengl
-def test_a_picture_says_how_many_vertices_are_outside(words: list[str], tmp_path: Path) -> None:
+def test_a_picture_states_how_many_vertices_are_outside(words: list[str], tmp_path: Path) -> None:
     replay = falling(cloth(), slice(3, 4), 44.0)
     draw_run_picture(replay, tmp_path / "run.png")
     assert sum("1 of 36 vertices is outside" in word for word in words) == 1, words
@@ -410,7 +410,7 @@ def test_positions_that_are_not_finite_are_reported_in_words(
 
 
 @needs_opengl
-def test_a_run_without_a_finite_frame_is_a_picture_that_says_so(words: list[str], tmp_path: Path) -> None:
+def test_a_run_without_a_finite_frame_is_a_picture_that_states_it(words: list[str], tmp_path: Path) -> None:
     draw_run_picture(broken(cloth(), 0), tmp_path / "run.png")
     assert "not finite from frame 0 on" in "\n".join(words)
     assert pixels(tmp_path / "run.png").shape == (PAGE_HEIGHT, PAGE_WIDTH, 3)

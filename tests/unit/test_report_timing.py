@@ -130,7 +130,7 @@ def test_a_run_is_summed_up_in_milliseconds() -> None:
     assert run.termination_reason == "max-iter", "one step of five was cut off"
 
 
-def test_runs_keep_the_order_of_their_rows() -> None:
+def test_runs_have_the_order_of_their_rows() -> None:
     table = rows(scenes=("net", "cloth"), sizes=(16, 8))
     order = list(dict.fromkeys(table["run_id"].to_pylist()))
     assert [run.run_id for run in read_run_times(table)] == order
@@ -166,7 +166,7 @@ def test_every_table_gives_a_plot_of_the_page_s_width(table: pa.Table, tmp_path:
         pytest.param(RUN_SCHEMA.empty_table(), id="no rows"),
     ],
 )
-def test_without_a_time_there_is_no_plot_and_an_old_one_goes(table: pa.Table, tmp_path: Path) -> None:
+def test_without_a_time_there_is_no_plot_and_an_old_one_is_removed(table: pa.Table, tmp_path: Path) -> None:
     (tmp_path / "time.png").write_bytes(b"of earlier rows")
     assert draw_timing_plot(table, tmp_path / "time.png", "Nothing") == []
     assert not list(tmp_path.iterdir())
@@ -184,7 +184,7 @@ def test_each_solver_is_a_curve_in_seconds_and_its_fitted_power_is_stated() -> N
     assert not any("powers" in note for note in frame.notes), "two sizes give none"
 
 
-def test_a_curve_whose_larger_sizes_failed_ends_in_a_cross_and_words_say_why() -> None:
+def test_a_curve_whose_larger_sizes_failed_ends_in_a_cross_with_the_reason() -> None:
     (frame,) = build_timing_chart(read_run_times(rows(failed=[(16, "dense"), (32, "dense"), (8, "xpbd")]))).frames
     assert {series.label: series.status for series in frame.series} == {
         "sparse": "ok",
@@ -269,7 +269,7 @@ def test_residuals_at_round_off_are_equal_and_their_runs_were_not_cut_short() ->
     assert learned_from(given_rows)[1].endswith("dense (its error is 700 times as large).")
 
 
-def test_judged_runs_are_compared_by_their_distance_from_the_reference() -> None:
+def test_verified_runs_are_compared_by_their_distance_from_the_reference() -> None:
     given_rows = rows(sizes=(20,), solvers=("sparse", "dense")).to_pylist()
     for row in given_rows:
         if row["phase"] == "step":
@@ -365,7 +365,7 @@ def test_a_sweep_ends_with_three_commands_and_one_link(tmp_path: Path) -> None:
     assert build_closing_lines(table, config, results, results / "q")[-1].endswith("/my%20results/index.html")
 
 
-def test_the_summary_marks_times_that_are_doubtful_and_says_why() -> None:
+def test_the_summary_marks_unreliable_times_and_states_why() -> None:
     given_rows = rows(sizes=(10,), solvers=("sparse",)).to_pylist()
     for row in given_rows:
         row["preempted"] = row["phase"] == "step" and row["frame"] == 2

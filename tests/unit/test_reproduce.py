@@ -137,7 +137,7 @@ def test_an_entry_is_verified_and_a_changed_one_is_not(
 
 
 @pytest.mark.slow
-def test_own_runs_stand_next_to_the_published_ones(tmp_path: Path) -> None:
+def test_own_runs_are_listed_next_to_the_published_ones(tmp_path: Path) -> None:
     published = publish_sweep(tmp_path, "exclusive")
     (dense,) = (
         one
@@ -164,7 +164,7 @@ def test_a_changed_table_is_refused(tmp_path: Path) -> None:
     assert "differs from its checksum in study.json" in result.output
 
 
-def test_an_unknown_study_is_answered_by_the_known_ones(tmp_path: Path) -> None:
+def test_an_unknown_study_is_refused_with_the_known_ones(tmp_path: Path) -> None:
     folder = tmp_path / "hard"
     folder.mkdir()
     metadata = {"config": "hard.yaml", "command": "springbench run hard.yaml", "is_timed": False, "runs": 1}

@@ -48,7 +48,7 @@ def test_all_runs_are_there_once_with_their_recordings_and_again_changes_nothing
     assert {path: path.stat().st_mtime_ns for path in two.rglob("*") if path.is_file()} == before
 
 
-def test_a_run_that_was_done_twice_keeps_both_rows_and_the_newer_its_name(two: Path):
+def test_a_run_that_was_done_twice_has_both_rows_and_the_newer_has_its_name(two: Path):
     (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
     rewritten(unit, started_at="2027-01-01T00:00:00+00:00", seconds=9.0)
     for order in (("a", "b"), ("b", "a")):

@@ -70,7 +70,7 @@ def test_all_damaged_units_of_many_are_named(sweep: Path):
 QUERY = "SELECT * FROM rows ORDER BY run_id, frame"
 
 
-def test_packed_rows_are_the_same_to_all_who_read(sweep: Path):
+def test_packed_rows_are_the_same_to_all_readers(sweep: Path):
     units = row_store.list_units(sweep / "rows")
     before, requested = format_rows(parquet_rows.read_rows(units)), repr(run_query(QUERY, sweep.parent).values)
     heads = parquet_rows.read_first_rows(units, ["source_fingerprint"])
@@ -134,7 +134,7 @@ def test_nothing_is_removed_where_the_packed_rows_differ_from_the_originals(
     assert {path: path.read_bytes() for path in sweep.rglob("*.parquet")} == before
 
 
-def test_columns_that_duckdb_cannot_tell_apart_are_read_by_their_exact_names(tmp_path: Path):
+def test_columns_that_duckdb_does_not_distinguish_are_read_by_their_exact_names(tmp_path: Path):
     units = write_dummy_runs(tmp_path / "sweep", 9, frames=1)
     for name in ("SIZE", "file_index"):
         for number, unit in enumerate(units):
@@ -143,7 +143,7 @@ def test_columns_that_duckdb_cannot_tell_apart_are_read_by_their_exact_names(tmp
         assert (read[name].to_pylist(), read["size"].to_pylist()) == (list(range(9)), [8 + k for k in range(9)])
 
 
-def test_a_run_that_is_done_again_takes_the_place_of_its_packed_rows_and_packing_goes_on(sweep: Path):
+def test_a_repeated_run_replaces_its_packed_rows_and_packing_continues(sweep: Path):
     compact_results(sweep, lambda line: None)
     unit = row_store.list_units(sweep / "rows")[0]
     number = int(unit.stem[-12:], 16)
@@ -196,7 +196,7 @@ def killed_at(call: int, sweep: Path) -> None:
     compact_results(sweep, lambda line: None)
 
 
-def test_packing_that_is_killed_at_any_moment_loses_and_doubles_nothing_and_goes_on(sweep: Path, tmp_path: Path):
+def test_packing_that_is_killed_at_any_time_loses_and_doubles_nothing_and_resumes(sweep: Path, tmp_path: Path):
     units = row_store.list_units(sweep / "rows")
     for unit in (*units[:2], *units[6:]):  # four are left, of three schemas
         unit.unlink()

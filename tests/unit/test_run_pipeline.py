@@ -15,7 +15,7 @@ from springbench.harness.simulation.instrumentation_pass import require_finite
 from springbench.harness.simulation.timing_pass import StepError
 
 
-def test_a_run_that_fails_now_keeps_nothing_of_when_it_did_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_that_fails_now_removes_its_earlier_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(
         "mesh: {kind: chain}\nmass: 1\ntime_step: 0.1\nframes: 2\ndefault_size: 3\neffects: [{kind: gravity}]\n"
     )

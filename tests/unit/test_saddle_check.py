@@ -62,7 +62,7 @@ def effect_steps(name: str) -> Iterator[tuple[StepProblem, Positions]]:
             yield heavy, p
 
 
-def test_where_the_bound_holds_no_eigenvalue_is_negative():
+def test_where_the_bound_is_satisfied_no_eigenvalue_is_negative():
     held = [(eigenvalues(problem, p)[0], is_bounded(problem, p)) for problem, p in random_steps()]
     assert all(least >= -ROUNDOFF for least, bounded in held if bounded)
     counts = sum(bounded for _, bounded in held), sum(least < -ROUNDOFF for least, _ in held)

@@ -64,7 +64,7 @@ def here() -> str:
     return os.getcwd()
 
 
-def test_it_answers_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
+def test_a_sandboxed_call_returns_its_result_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
     assert sandbox.call_in_sandbox(double, 21, limits=LIMITS) == 42
     sandbox.call_in_sandbox(print, "noise", limits=LIMITS)
     assert capfd.readouterr() == ("", "")
@@ -82,7 +82,7 @@ def test_it_answers_and_prints_nothing(capfd: pytest.CaptureFixture[str]):
         (panic, "index out of range"),
     ],
 )
-def test_what_it_does_not_answer_is_said_in_words_and_the_next_call_is_answered(function, why):
+def test_a_failed_call_is_reported_in_words_and_the_next_call_succeeds(function, why):
     with pytest.raises(sandbox.SandboxError) as caught:
         sandbox.call_in_sandbox(function, limits=SHORT if function is loop else LIMITS)
     assert why in str(caught.value)
@@ -95,7 +95,7 @@ def test_a_mistake_comes_with_its_place(tmp_path: Path):
     assert caught.value.mistakes == (InputMistake("is odd", tmp_path, 3, "key"),)
 
 
-def test_relative_paths_mean_what_they_mean_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_relative_paths_refer_to_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     assert sandbox.call_in_sandbox(here, limits=LIMITS) == os.getcwd()
 

@@ -108,7 +108,7 @@ def test_a_gravity_of_zero_is_none():
         (1.0, [SpringsEffect(stretch=1.0), SpringsEffect(stretch=2.0)], ""),
     ],
 )
-def test_what_is_allowed_and_seldom_meant_gets_a_warning(
+def test_unusual_valid_values_get_a_warning(
     time_step: float, effects: list[SpringsEffect], said: str, caplog: pytest.LogCaptureFixture
 ):
     with caplog.at_level("WARNING", logger="springbench"):

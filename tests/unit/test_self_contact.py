@@ -262,7 +262,7 @@ def test_a_common_motion_bounds_no_step():
     assert contact.collision_free_step_size(p, np.tile([1e3, 0.0, -1e3], (len(p), 1))) == 1.0
 
 
-def test_pairs_that_are_near_at_rest_keep_their_distance_in_proportion():
+def test_pairs_that_are_near_at_rest_preserve_their_distance_in_proportion():
     contact, _, triangles = build_touching_sheets()
     assert isinstance(contact.collision_mesh, CollisionMesh)
     fine = CollisionMesh.from_rest_shape(
@@ -395,7 +395,7 @@ def test_solves_with_the_same_pattern_positions_share_a_matrix():
     assert len({id(matrix) for matrix in matrices[False]}) == 3
 
 
-def test_memory_is_handed_out_again_when_no_one_holds_it():
+def test_memory_is_reused_when_nothing_refers_to_it():
     room = ReusableBuffer()
     one = room.acquire_array(5)
     one[:] = 1.0

@@ -52,7 +52,7 @@ def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_
         apart.require_accuracy(0.1)
 
 
-def test_an_impact_that_the_steps_do_not_resolve_has_no_truth():
+def test_an_impact_that_the_steps_do_not_resolve_has_no_reference():
     """The end is as far off as the chain has moved: what it gave back is the integrator's."""
     bouncing = thrown(SpringsEffect(stretch=400.0), floor(-0.05), velocity=(0.0, -2.0, 0.0))
     found = self_converged_trajectory.compute_self_converged(

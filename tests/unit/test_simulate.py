@@ -168,7 +168,7 @@ class Slow(Pushed):
         return super().solve(problem, stop)
 
 
-def test_a_steps_seconds_hold_its_solve_and_nothing_between_steps():
+def test_the_seconds_of_a_step_include_its_solve_and_nothing_between_steps():
     prepared, clock = Slow(), Stopwatch(PhaseWatch())
     run = iterate_steps(MADE, prepared, SteppingSettings(StopRule(), "previous", 3, 1), clock)
     for _ in range(3):

@@ -107,7 +107,7 @@ def test_causes_differ_in_more_than_numbers_and_names():
     assert [(cause["status"], cause["count"]) for cause in group_failures(failed)] == [("failed", 3), ("diverged", 1)]
 
 
-def test_all_that_is_shown_says_by_which_code_and_where(results: Path):
+def test_all_that_is_shown_states_code_and_machine(results: Path):
     for sweep in read(results, "index")["sweeps"]:
         assert sweep["provenance"], sweep["name"]
         for made in sweep["provenance"]:
@@ -249,7 +249,7 @@ def test_a_new_run_comes_to_the_page_of_a_thousand_within_its_time(tmp_path: Pat
     assert min(took) < room * goal
 
 
-def test_sweeps_that_were_never_taken_in_are_named(tmp_path: Path):
+def test_sweeps_that_were_never_included_are_named(tmp_path: Path):
     for name in ("one", "other"):
         synthetic_site_rows.write_site_results(tmp_path, 3, name)
     update_page(tmp_path, changed_folders=[tmp_path / "one"])
@@ -265,7 +265,7 @@ def test_one_sweep_s_folder_has_a_page_of_its_own(tmp_path: Path):
     assert (sweep["slug"], sweep["relative_url"], sweep["name"]) == ("this", "./", "made")
 
 
-def test_damaged_rows_keep_no_run_from_ending(tmp_path: Path):
+def test_damaged_rows_prevent_no_run_from_ending(tmp_path: Path):
     (tmp_path / "sweep" / "rows").mkdir(parents=True)
     (tmp_path / "sweep" / "rows" / "x.parquet").write_text("no rows")
     said: list[str] = []

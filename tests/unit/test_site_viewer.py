@@ -31,7 +31,7 @@ def test_the_viewer_is_the_one_that_the_page_was_written_for():
     assert version("rerun-sdk") == rerun_viewer.RERUN_VERSION, words
 
 
-def test_a_script_holds_its_recording_and_is_written_once(tmp_path: Path):
+def test_a_script_contains_its_recording_and_is_written_once(tmp_path: Path):
     recording = write_recording(tmp_path / "a.rrd", frame_count=3)
     script = rerun_viewer.write_recording(recording, tmp_path / "site" / "a.js", 'cloth "6"')
     name, value = script.read_text().removesuffix(";\n").split(" = ", 1)
@@ -98,7 +98,7 @@ def test_the_viewer_gets_a_theme_that_it_supports_and_is_hidden_until_a_recordin
 
 
 @pytest.mark.long
-def test_a_page_replays_recordings_from_the_file_system_and_says_what_it_lacks(tmp_path: Path):
+def test_a_page_replays_recordings_from_the_file_system_and_states_what_it_lacks(tmp_path: Path):
     page = site(tmp_path)
     ask = "([script, file]) => springbench.replay('id', script, {file})"
     with launch_chromium() as browser:

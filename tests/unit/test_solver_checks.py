@@ -34,7 +34,9 @@ def rows_of(made: PluginSweep, folder: Path) -> list[dict[str, Any]]:
     return execute_run(spec, RunFiles.for_run(spec, folder), lambda phase: None)
 
 
-def test_a_sound_solver_is_ok_and_graded_by_the_oracle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_correct_solver_is_ok_and_verified_by_the_reference_evaluator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     found = rows_of(write_plugin_solver(tmp_path, monkeypatch), tmp_path)
     assert {row["status"] for row in found} == {"ok"}
     graded = {row["frame"]: row["stationarity_audit"] for row in found if row["phase"] == "step"}
@@ -121,9 +123,7 @@ def test_what_a_solver_writes_to_while_it_prepares_itself_is_reported(tmp_path: 
     assert made.source_line("def prepare") in row["reason"]
 
 
-def test_a_solver_that_cannot_write_is_blamed_at_the_line_where_it_tried(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_solver_that_cannot_write_is_reported_with_its_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made = write_plugin_solver(
         tmp_path, monkeypatch, prepare_code="system.mass.flags.writeable = False; system.mass[:] = 2"
     )
@@ -184,7 +184,7 @@ class ClaimsNothingLeft(DelegatingSolver):
         return replace(self._prepared.solve(problem, stop), residual=0.0)
 
 
-def test_a_claim_is_not_compared_where_the_gradient_is_round_off():
+def test_a_reported_residual_is_not_compared_where_the_gradient_is_round_off():
     """At 3e12 N m round-off leaves a thousandth of the initial residual, which evaluations of it disagree about."""
     scene = build_scene(load_scene(CONFIGS / "hard" / "effects-bending-1e12.yaml"), 6)
     audited = AuditedSolver(ClaimsNothingLeft(prepare(scene, NewtonSolver())), NewtonSolver(), {1})
@@ -196,7 +196,7 @@ def test_a_claim_is_not_compared_where_the_gradient_is_round_off():
 @pytest.mark.parametrize(
     ("scene", "newton"), [(TURNING, 1e-6), (PRESTRESSED, 1.0)], ids=["springs that turn", "prestress"]
 )  # of an equilibrium round-off is left, of what was round-off before
-def test_of_a_solver_that_does_not_minimise_is_said_what_it_leaves_of_a_step(scene: str, newton: float, tmp_path: Path):
+def test_the_stationarity_of_a_solver_that_does_not_minimise_is_reported(scene: str, newton: float, tmp_path: Path):
     """XPBD ends elsewhere than at the minimum, however many iterations it takes."""
     (tmp_path / "scene.yaml").write_text(scene)
     (tmp_path / "rows").mkdir()

@@ -70,7 +70,7 @@ class Scripted:
         return np.array([[self.at, 0.0, 0.0], [self.at, 1.0, 0.0]])
 
 
-def test_candidates_take_turns():
+def test_candidates_are_interleaved():
     calls: list[str] = []
     found = measure_round_robin([Scripted("a", calls), Scripted("b", calls)], COUNTS, {}, budget=1.0)
     assert calls == ["prepare a", "prepare b"] * NUM_PREPARATIONS + ["a", "b"] * ROUNDS
@@ -84,7 +84,7 @@ def test_candidates_take_turns():
 @pytest.mark.parametrize(
     ("error", "status"), [(Unsupported("not for chains"), "unsupported"), (ZeroDivisionError("oh"), "failed")]
 )
-def test_one_that_fails_says_why_and_the_others_go_on(error: Exception, status: str):
+def test_a_candidate_that_fails_states_why_and_the_others_continue(error: Exception, status: str):
     calls: list[str] = []
     bad, good = measure_round_robin([Scripted("a", calls, fails=error), Scripted("b", calls)], COUNTS, {}, budget=1.0)
     assert [(row["phase"], row["status"]) for row in bad] == [("run", status)]
@@ -93,7 +93,7 @@ def test_one_that_fails_says_why_and_the_others_go_on(error: Exception, status: 
     assert {row["status"] for row in good} == {"ok"}
 
 
-def test_no_time_is_believed_of_one_that_ends_elsewhere():
+def test_times_of_a_candidate_with_another_solution_are_rejected():
     first, near, far = measure_round_robin(
         [Scripted("a", []), Scripted("b", [], at=1e-10), Scripted("c", [], at=1e-8)], COUNTS, {}, budget=1.0
     )
@@ -103,7 +103,7 @@ def test_no_time_is_believed_of_one_that_ends_elsewhere():
     assert "seconds" not in far[0]
 
 
-def test_one_that_would_take_too_long_is_left_out_with_a_row_that_says_so():
+def test_a_candidate_that_would_take_too_long_is_omitted_with_a_row_that_states_it():
     calls: list[str] = []
     slow = Scripted("a", calls)
     past = {format_candidate_name(slow.run): [PastTiming(4, prepare_seconds=1.0, iteration_seconds=1.0)]}
@@ -169,7 +169,7 @@ def test_an_entry_that_is_read_is_a_multiply_and_an_add_for_each_of_three_sides(
     assert set(count_operations({}, 10, 20)) == {"local"}
 
 
-def test_the_probes_do_what_they_count():
+def test_the_microbenchmarks_do_the_operations_that_they_count():
     found = list(stream_probes.build_probes((1 << 14, 1 << 16)))
     assert [p.name for p in found] == ["read", "triad"] * 2 + ["fma float64", "fma float32"]
     assert all(p.bytes_moved % p.working_set_bytes == 0 for p in found if p.name == "read")
@@ -202,7 +202,7 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     return load_sweep(tmp_path / "small.yaml")
 
 
-def test_a_folder_is_for_one_report_at_a_time(sweep, tmp_path: Path):
+def test_a_folder_admits_one_report_at_a_time(sweep, tmp_path: Path):
     (tmp_path / "out" / "rows").mkdir(parents=True)
     with lock_folder_exclusive(tmp_path / "out"), pytest.raises(InputError, match="another springbench"):
         run_roofline(sweep, tmp_path / "out", SilentDisplay(), print)
@@ -243,7 +243,7 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
     assert all((tmp_path / "out" / "rows").glob("*.parquet"))
 
 
-def test_a_time_that_another_clock_does_not_bear_out_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_time_that_another_clock_contradicts_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     def busy() -> None:
         began = thread_time()
         while thread_time() - began < 0.005:

@@ -69,7 +69,7 @@ def timed(solver: str, parameters: str, seconds: list[float], **columns: Any) ->
     ]
 
 
-def test_figures_say_how_near_the_binding_limit_is():
+def test_figures_state_how_near_the_binding_limit_is():
     rows = [
         *LIMITS,
         *timed("eigen", '{"temporaries": "default"}', [9.0, 8.0, 8.0]),

@@ -151,7 +151,7 @@ def test_each_spring_has_its_own_stiffness():
     assert springs.value(2 * rest) == 0.5 * 1 + 0.5 * 100
 
 
-def test_what_is_added_comes_on_top_and_vertices_without_springs_keep_theirs():
+def test_gradients_and_projections_are_added_to_the_output():
     springs, p = single(rest_length=1.0, length=1.5)
     for add in (springs.add_gradient, springs.add_projection):
         out = np.full((4, 3), 7.0)

@@ -56,7 +56,7 @@ def started(made: PluginSweep) -> dict[str, int]:
     }
 
 
-def test_run_says_which_rows_are_of_other_code_and_the_table_marks_them(done: PluginSweep):
+def test_a_run_names_rows_of_other_code_and_the_table_marks_them(done: PluginSweep):
     before = started(done)
     result = ran(done)
     assert "2 of 2 runs are there already" in result

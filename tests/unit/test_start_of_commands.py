@@ -45,7 +45,7 @@ def test_a_command_announces_itself_before_it_imports_anything_slow():
     os.close(screen)
 
 
-def test_an_activity_leaves_nothing_of_the_last_one_and_stands_in_no_file(monkeypatch: pytest.MonkeyPatch):
+def test_an_activity_replaces_the_last_one_and_is_in_no_file(monkeypatch: pytest.MonkeyPatch):
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return True

@@ -40,7 +40,7 @@ def positions(**keys) -> np.ndarray:
     ],
     ids=lambda value: value["kind"] if isinstance(value, dict) else "",
 )
-def test_a_start_is_where_its_kind_says(keys, wanted):
+def test_a_start_is_that_of_its_kind(keys, wanted):
     np.testing.assert_array_equal(positions(**keys), wanted)
 
 
@@ -51,7 +51,7 @@ def test_random_starts_fill_their_cube_and_follow_their_seed():
     assert np.abs(p - positions(kind="random", side_length=0.5, seed=1)).max() > 0.01
 
 
-def test_perturbed_starts_lie_about_as_far_off_as_they_say():
+def test_perturbed_starts_are_displaced_by_about_the_stated_distance():
     away = positions(kind="perturbed", standard_deviation=1e-3, seed=2) - REST
     assert 2e-4 < away.std() < 5e-3  # twelve normal numbers of deviation 1e-3
 
@@ -94,7 +94,7 @@ def test_a_scene_starts_as_stated_and_its_digest_includes_the_start(tmp_path: Pa
         (SCENE.format("{kind: merged, vertices: [1, 9]}"), "the mesh has the vertices 0 to 8"),
     ],
 )
-def test_a_start_that_means_nothing_is_refused(tmp_path: Path, text: str, needle: str):
+def test_an_invalid_start_is_refused(tmp_path: Path, text: str, needle: str):
     with pytest.raises(InputError) as caught:
         load_config(written(tmp_path, text))
     assert needle in str(caught.value)
@@ -133,13 +133,13 @@ def test_a_network_that_cannot_be_simulated_is_refused_with_its_place_and_a_reme
         assert needle in str(caught.value)
 
 
-def test_a_massless_vertex_that_a_pin_holds_is_welcome(tmp_path: Path):
+def test_a_massless_vertex_may_be_pinned(tmp_path: Path):
     text = NETWORK.format(f"{{kind: network, {PAIR}, mass: [1, 0]}}", "")
     pinned = text.replace("stretch: 1}]", "stretch: 1}, {kind: pins, indices: [1]}]")
     assert len(load_config(written(tmp_path, pinned)).list_runs()) == 1
 
 
-def test_a_network_is_what_it_was_written_as():
+def test_a_network_is_read_as_it_was_written():
     mesh = NetworkMesh(
         positions=((0, 0, 0), (3, 0, 0), (3, 4, 0)), springs=((0, 1), (1, 0)), bend=((0, 2),), mass=(1.0, 0.0, 3.0)
     ).build_mesh()

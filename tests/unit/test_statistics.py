@@ -10,7 +10,7 @@ from springbench.harness.results.bootstrap_statistics import (
 )
 
 
-def test_the_interval_holds_the_ratio_and_is_the_same_each_time():
+def test_the_interval_contains_the_ratio_and_is_the_same_each_time():
     theirs, ours = np.exp(0.1 * np.random.default_rng(1).standard_normal((2, 15)))
     found = estimate_ratio(3.0 * theirs, ours)
     assert found.low < found.estimate < found.high
@@ -37,7 +37,7 @@ def test_what_frames_add_is_added_up_however_unequal_they_are():
     assert estimate_added_time(more) == (0.1, 0.1, 0.1)
 
 
-def test_nine_of_ten_intervals_or_more_hold_what_is_true():
+def test_nine_of_ten_intervals_or_more_contain_the_true_ratio():
     rng = np.random.default_rng(2)
     found = [estimate_ratio(2.0 * t, o) for t, o in np.exp(0.1 * rng.standard_normal((200, 2, 15)))]
     # A percentile bootstrap of a median of 15 is known to be a little short of its 95 %.

@@ -83,7 +83,7 @@ def same(one: StepSnapshot, other: StepSnapshot) -> bool:
 
 
 @integrators
-def test_a_frozen_problem_comes_back_from_disk_to_the_last_bit(tmp_path, integrator: IntegratorName):
+def test_a_step_snapshot_is_restored_from_disk_to_the_last_bit(tmp_path, integrator: IntegratorName):
     taken = ReferenceStore(tmp_path).load_snapshots(SPEC, SIZE, integrator)
     found = ReferenceStore(tmp_path, Refuses()).load_snapshots(SPEC, SIZE, integrator)
     assert list(taken) == list(found) == ["early", "middle", "peak"]
@@ -96,7 +96,7 @@ def test_a_frozen_problem_comes_back_from_disk_to_the_last_bit(tmp_path, integra
 
 
 @integrators
-def test_a_frozen_problem_is_the_step_of_a_converged_run_with_exact_pins(tmp_path, integrator: IntegratorName):
+def test_a_step_snapshot_is_the_step_of_a_converged_run_with_exact_pins(tmp_path, integrator: IntegratorName):
     frozen = ReferenceStore(tmp_path).load_frames(SPEC, SIZE, [1, 5], integrator)
     scene = build_exact_scene(SPEC, SIZE, integrator)
     run = simulate_scene(
@@ -111,7 +111,7 @@ def test_a_frozen_problem_is_the_step_of_a_converged_run_with_exact_pins(tmp_pat
 
 
 @integrators
-def test_a_run_goes_on_from_a_frozen_step_as_if_it_had_never_stopped(tmp_path, integrator: IntegratorName):
+def test_a_run_resumes_from_a_step_snapshot_as_if_it_had_never_stopped(tmp_path, integrator: IntegratorName):
     """BDF2 needs the motion one step before as well, as the velocity filter left it."""
     at_once = ReferenceStore(tmp_path / "once").load_frames(SPEC, SIZE, [3, 4, 9], integrator)
     store = ReferenceStore(tmp_path / "bits")
@@ -141,7 +141,7 @@ def test_a_first_guess_beyond_an_obstacle_is_where_the_step_starts(tmp_path):
     np.testing.assert_array_equal(stated.initial_guess, state.motion.positions)
 
 
-def test_the_violent_moment_is_the_step_that_has_farthest_to_go():
+def test_the_peak_snapshot_is_the_step_with_the_largest_initial_gap():
     scene, length = build_exact_scene(SPEC, SIZE), 30  # it swings through its lowest point after half a second
     saved, violence = run_reference(scene, NewtonSolver(), length)
     run = list(
@@ -167,7 +167,7 @@ def test_the_violent_moment_is_the_step_that_has_farthest_to_go():
         (np.arange(60.0), (6, 30, 60)),
     ],
 )
-def test_moments_are_a_tenth_and_a_half_of_the_run_and_its_peak(violence, wanted):
+def test_snapshots_are_at_a_tenth_and_a_half_of_the_run_and_at_its_peak(violence, wanted):
     assert tuple(select_snapshot_frames(np.array(violence), len(violence)).values()) == wanted
 
 

@@ -151,7 +151,7 @@ def test_the_residual_leaves_pinned_vertices_out(backend):
 
 
 @backends
-def test_a_solve_that_diverged_says_so_and_does_not_pass_for_converged(backend):
+def test_a_solve_that_diverged_reports_it_and_does_not_pass_for_converged(backend):
     problem = build_random_problem(0, weights=())
     lost = np.full_like(problem.initial_guess, np.nan)
     solution = backend.prepare(problem.system).solve(replace(problem, initial_guess=lost), StopRule(4, 1e-3))

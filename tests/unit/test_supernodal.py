@@ -243,7 +243,7 @@ def test_separate_components_are_shared_out_too():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_refuses_a_matrix_that_is_not_finite_and_says_where(value):
+def test_refuses_a_matrix_that_is_not_finite_and_states_where(value):
     Q = sheet(5)
     Q.data[Q.indptr[7]] = value
     with pytest.raises(NotPositiveDefinite, match=r"not finite in row 7\b"):
@@ -256,7 +256,7 @@ def test_names_the_vertex_that_a_negative_mass_makes_indefinite():
         SupernodalCholesky(Q)
 
 
-def test_names_a_vertex_of_the_component_that_nothing_holds():
+def test_names_a_vertex_of_the_unconstrained_component():
     springs = [(i, i + 1) for i in range(199) if i != 99]
     diagonal = np.where(np.arange(200) < 100, 1.0, 0.0)
     Q = network(springs, np.random.default_rng(3).uniform(1, 2, 198), diagonal)

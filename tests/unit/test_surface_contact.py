@@ -215,7 +215,7 @@ def test_clearance_of_an_obstacle_far_away_is_nearly_its_distance_and_never_more
     assert compute_aabb_clearance((0, 20), (20, 40), p, p + np.eye(3)[1] * (p[:, 1:2] < 0.0) * 9.0, query) == 0.0
 
 
-def test_what_is_squeezed_between_obstacles_is_said():
+def test_a_vertex_squeezed_between_obstacles_is_reported():
     down = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.0, -5.0, 0.0))))
     press = PlaneObstacle(point=(0.0, 0.05, 0.0), normal=(0.0, -1.0, 0.0), motion=down)
     made = draped(PlaneObstacle(point=(0, -0.05, 0)), press, size=4)
@@ -233,12 +233,12 @@ def test_what_is_squeezed_between_obstacles_is_said():
         ),
     ],
 )
-def test_a_start_that_is_not_free_is_refused_with_the_pairs(obstacle, words):
+def test_an_intersecting_start_is_refused_with_the_pairs(obstacle, words):
     with pytest.raises(InputError, match=words):
         draped(obstacle)
 
 
-def test_surfaces_of_round_obstacles_lie_inside_by_no_more_than_is_said():
+def test_surfaces_of_round_obstacles_are_inside_by_at_most_the_stated_distance():
     rng = np.random.default_rng(0)
     for one in (OBSTACLES["sphere"], OBSTACLES["capsule"]):
         points, triangles = build_obstacle_surface(one, 1e-3, np.zeros((1, 3)))
@@ -311,7 +311,7 @@ def test_it_slides_above_the_angle_of_friction_and_rests_below_within_a_twentiet
         assert (slides[-1] - slides[39]) / (40 * DT) == pytest.approx(wanted, abs=0.01 * friction)
 
 
-def test_sheets_that_collide_with_friction_keep_their_momentum():
+def test_sheets_that_collide_with_friction_conserve_momentum():
     rough = SelfContactEffect(min_distance=0.01, friction=0.5)
     made = build_test_scene(StackMesh(layer_spacing=0.05), SpringsEffect(stretch=100.0, shear=20.0), rough, size=5)
     p, v = made.mesh.rest_positions, np.zeros_like(made.mesh.rest_positions)

@@ -134,7 +134,7 @@ def test_one_scene_is_solved_to_a_tolerance_by_the_recommended_solver_as_in_pyth
 
 
 @pytest.mark.parametrize("options", [{"max_iterations": 7}, {"rtol": None}, {"rtol": 1e-3}, {"error_target": 1e-2}])
-def test_what_is_stated_of_how_steps_end_means_what_it_means_in_a_sweep(folder: Path, options: dict[str, Any]) -> None:
+def test_stop_rules_in_python_have_the_meaning_that_they_have_in_a_sweep(folder: Path, options: dict[str, Any]) -> None:
     (run,) = load_config(folder / "cloth.yaml", sizes=[4], **options).list_runs()
     assert stop(run) == ("hybrid", options.get("max_iterations", 50), options.get("rtol"))
 
@@ -195,7 +195,7 @@ def test_pictures_are_no_part_of_the_run_id_for_they_are_drawn_from_recordings(f
 
 
 @pytest.mark.parametrize("change", SAME)
-def test_what_means_the_same_keeps_the_run_id(folder: Path, change: str) -> None:
+def test_equivalent_configs_have_the_same_run_id(folder: Path, change: str) -> None:
     assert identified(folder) == identified(folder, SAME[change])
 
 

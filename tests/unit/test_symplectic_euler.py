@@ -66,7 +66,7 @@ def spring(stretch: float = 500.0, time_step: float = 1e-3) -> tuple[Scene, floa
     return made, stretch**0.5
 
 
-def test_a_free_cloth_falls_as_its_substeps_say():
+def test_a_free_cloth_falls_by_the_recurrence_of_its_substeps():
     """v = -g t, and y after n substeps of h is -g h^2 n (n + 1)/2."""
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), size=6, time_step=DT)
     last = motions(made, np.zeros_like(made.mesh.rest_positions), 12, substeps=8)[-1]
@@ -178,7 +178,7 @@ def test_pins_move_evenly_and_have_that_velocity():
     np.testing.assert_allclose(solution.velocity[pins], np.tile([0.0, 0.3 * 30, 0.1 * 30], (2, 1)), rtol=1e-14)
 
 
-def test_pins_by_penalty_are_taken_as_exact_and_said_to_be():
+def test_penalty_pins_are_taken_as_exact_and_reported_as_such():
     by_penalty, exact = (ready(build_cloth(6, w).system) for w in (1e10, "exact"))
     assert by_penalty.num_substeps == exact.num_substeps
     assert "2 pins by penalty taken as exact" in by_penalty.description
@@ -210,7 +210,7 @@ def test_substeps_follow_from_the_stiffness(stretch):
         pytest.param(lambda s: replace(s, time_step=1e9), r"stable with 6.*e\+10 substeps", id="too many substeps"),
     ],
 )
-def test_what_it_cannot_do_is_said_before_any_work(change, message):
+def test_unsupported_features_are_refused_before_any_work(change, message):
     with pytest.raises(Unsupported, match=message):
         SymplecticEuler().prepare(change(build_random_problem(0).system))
 

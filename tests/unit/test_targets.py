@@ -115,7 +115,7 @@ def test_a_baseline_that_takes_too_long_is_a_bound(
     assert row["baseline_seconds"] > 0.0
 
 
-def test_a_verified_error_is_near_the_requested_one_or_a_note_says_why_not() -> None:
+def test_a_verified_error_is_near_the_requested_one_or_a_note_states_why_not() -> None:
     (one, *_) = load_targets(BENCH / "controlled.yaml").cases
 
     def is_met(error: float, seconds: float = 1.0, note: str = "") -> bool:

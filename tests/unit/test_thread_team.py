@@ -66,7 +66,7 @@ def test_each_task_is_done_once_a_phase_and_phases_do_not_mix(threads, tasks):
     np.testing.assert_array_equal(log, expected)
 
 
-def test_one_that_comes_when_all_is_done_does_nothing():
+def test_a_thread_that_arrives_after_the_last_task_does_nothing():
     team, log, counts = ThreadTeam.from_task_count(3), np.zeros(3, np.int64), np.zeros((2, 2), np.int64)
     begin(team)
     for k in range(2):

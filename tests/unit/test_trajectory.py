@@ -227,7 +227,7 @@ def test_a_trajectory_is_integrated_once_for_all_time_steps(tmp_path, monkeypatc
     ],
     ids=["stiffness", "speed", "size", "times"],
 )
-def test_another_question_has_another_trajectory(tmp_path, other, size, times):
+def test_other_settings_have_another_trajectory(tmp_path, other, size, times):
     store = ReferenceStore(tmp_path)
     one = store.load_trajectory(spec(ChainMesh(), *SWING), 3, TIMES, error=1e-3).positions
     two = store.load_trajectory(other, size, times, error=1e-3).positions

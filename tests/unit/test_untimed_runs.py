@@ -35,7 +35,7 @@ def executed(folder: Path, timing: str) -> tuple[list[dict[str, Any]], list[str]
     return execute_run(spec, files, messages.append), messages
 
 
-def test_a_rough_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_path: Path):
+def test_an_untimed_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_path: Path):
     (timed, _), (rough, passes) = executed(tmp_path, "exclusive"), executed(tmp_path, "none")
     assert [(row["phase"], row["frame"]) for row in rough] == [("prepare", None), ("step", 1), ("step", 2), ("step", 3)]
     assert passes.count("second pass") == 3
@@ -46,7 +46,7 @@ def test_a_rough_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_pat
     assert len({row["run_id"] for row in (timed[0], rough[0])}) == 2
 
 
-def test_certificates_count_the_frames_that_are_free(tmp_path: Path):
+def test_certificates_count_intersection_free_frames(tmp_path: Path):
     rows, _ = executed(tmp_path, "none")
     rows += [row | {"run_id": "other", "solver": "broken", "num_intersections": int(row["frame"] == 2)} for row in rows]
     rows.append(rows[0] | {"run_id": "none", "solver": "refuses", "phase": "run", "status": "unsupported"})
@@ -59,7 +59,7 @@ def test_certificates_count_the_frames_that_are_free(tmp_path: Path):
     assert found == {"newton": ("3", "3", "ok"), "broken": ("3", "2", "ok"), "refuses": ("", "0", "unsupported")}
 
 
-def test_a_rough_run_keeps_no_recording(tmp_path: Path):
+def test_an_untimed_run_writes_no_recording(tmp_path: Path):
     (tmp_path / "scene.yaml").write_text(SCENE)
     with pytest.raises(InputError, match=r"options: timing: .*set `record: false`|timing.*record: false"):
         load_config(tmp_path / "scene.yaml", timing="none")

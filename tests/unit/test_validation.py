@@ -117,7 +117,7 @@ ROWS = [
 ]  # fmt: skip
 
 
-def test_the_page_says_what_is_outside_a_band_and_what_springs_cannot_do(tmp_path: Path):
+def test_the_page_states_what_is_outside_a_band_and_what_springs_cannot_do(tmp_path: Path):
     page = format_validation_page(ROWS, "newton")
     assert "| a | x [m] | 1 | 1.025 | 0.025 | 0.03 | 1.00 of 1 | confirmed |" in page
     assert "| b | x [m] | 1 | | | | | refused |" in page

@@ -134,7 +134,7 @@ def test_a_scene_at_rest_stops_after_one_iteration(method):
 
 
 @methods
-def test_a_solve_that_diverged_says_so(method):
+def test_a_solve_that_diverged_reports_it(method):
     problem = build_random_problem(0, weights=())
     lost = replace(problem, initial_guess=np.full_like(problem.initial_guess, np.nan))
     solution = method.prepare(problem.system).solve(lost, StopRule(4, 1e-3))
@@ -148,7 +148,7 @@ def test_a_spectral_radius_is_less_than_one(radius):
         VertexBlockDescent(radius)
 
 
-def test_what_it_cannot_do_is_said_before_any_work():
+def test_unsupported_features_are_refused_before_any_work():
     system = build_random_problem(0).system
     with pytest.raises(Unsupported, match="Other"):
         VertexBlockDescent().prepare(replace(system, energies=(*system.energies, Other())))

@@ -45,7 +45,7 @@ def energy_index(energies: Sequence[Any]) -> int:
 
 
 @pytest.mark.parametrize("effect", ["strain limits", "dashpots"])
-def test_a_vertex_feels_what_the_oracle_says(effect):
+def test_the_force_on_a_vertex_is_that_of_the_reference_evaluator(effect):
     """Value, gradient, diagonal blocks of the Hessian, and the rise by a step of one vertex."""
     problem = build_moving_problem(build_effect_cloth(*EFFECTS[effect]))
     n = problem.system.num_vertices
@@ -111,6 +111,6 @@ def test_vertices_of_one_element_have_different_colours():
     assert all(bundle[int(made.row_of_vertex[i])] != bundle[int(made.row_of_vertex[j])] for i, j in ((0, 35), (5, 30)))
 
 
-def test_what_has_no_bound_on_its_curvature_is_refused_and_the_refusal_says_so():
+def test_an_energy_without_a_bound_on_its_curvature_is_refused_with_that_reason():
     with pytest.raises(Unsupported, match=r"Gas.*bound of the second derivatives"):
         VertexBlockDescent().prepare(EFFECT_SCENES["gas"]().system)

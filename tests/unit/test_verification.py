@@ -89,7 +89,7 @@ def walked(made: Scene, judge: StepVerifier, tolerance: float) -> list[dict]:
     return [judge(step) for step in steps]
 
 
-def test_the_doubt_of_a_curvature_is_four_roundings_of_its_sums():
+def test_the_uncertainty_of_a_curvature_is_four_roundings_of_its_sums():
     """Without springs the Hessian is m/dt^2: exact, the same everywhere, and so is |x|'|H||x|."""
     stated = build_first_problem(build_test_scene(ChainMesh(), GravityEffect(), size=2, mass=6.0, time_step=0.1))
     found = compute_curvature(stated, stated.current_positions)
@@ -230,7 +230,7 @@ SWEEP = "scenes: [scene.yaml]\nsolvers: [newton, xpbd, {name: numba, precision: 
 SWEEP += "options: {rtol: 1e-6, rounds: 1, verify: true, pictures: false, record: %s}\n"
 
 
-def test_a_judged_sweep_becomes_a_map_whose_cells_name_their_runs(tmp_path: Path):
+def test_a_verified_sweep_becomes_a_map_whose_cells_name_their_runs(tmp_path: Path):
     (tmp_path / "scene.yaml").write_text(SCENE)
     (tmp_path / "sweep.yaml").write_text(SWEEP % "true")
     for spec in load_config(tmp_path / "sweep.yaml").list_runs():
@@ -255,7 +255,7 @@ def test_a_judged_sweep_becomes_a_map_whose_cells_name_their_runs(tmp_path: Path
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_results_that_were_not_judged_are_refused(tmp_path: Path):
+def test_results_that_were_not_verified_are_refused(tmp_path: Path):
     (tmp_path / "rows").mkdir()
     row = {"run_id": "x", "scene": "net", "size": 4, "solver": "sparse", "started_at": "2026", "phase": "step"}
     parquet_rows.write_rows(tmp_path / "rows" / "x.parquet", [row | {"round": 0, "status": "ok"}])
@@ -277,7 +277,7 @@ def test_runs_of_a_solver_from_outside_may_give_different_parameters(tmp_path: P
     ]
 
 
-def test_a_run_that_fails_keeps_and_marks_its_recording_up_to_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_that_fails_retains_and_marks_its_recording_up_to_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "scene.yaml").write_text(SCENE)
     (spec,) = load_config(tmp_path / "scene.yaml", solvers=["sparse"]).list_runs()
     files = RunFiles.for_run(spec, tmp_path)

@@ -54,7 +54,7 @@ def written(path: Path, mode: str, compressor: str, wide: bool) -> Path:
 
 
 @pytest.mark.parametrize("mode", ["ascii", "binary", "base64", "raw"])
-def test_every_form_holds_the_same(tmp_path, mode):
+def test_every_encoding_has_the_same_contents(tmp_path, mode):
     for compressor, wide in product(("None", "ZLib", "LZMA"), (False, True)):
         read = vtp_reader.read_vtp(written(tmp_path / "mesh.vtp", mode, compressor, wide).read_bytes())
         np.testing.assert_array_equal(read.points, MESH.rest_positions)

@@ -67,7 +67,7 @@ def test_an_error_that_ends_an_experiment_ends_it():
         list(run_tasks(2, int, [None] * 4, lambda number: PoolTask(refuse, quiet, TaskLimits())))
 
 
-def test_what_a_piece_waits_for_others_does_not_count_for_its_limit():
+def test_the_time_that_a_task_waits_for_others_does_not_count_for_its_limit():
     workers = IsolatedWorker()
     assert workers.run_task(patient, quiet, TaskLimits(wall_seconds=2.5)) == "done"
     workers.stop_worker()

@@ -78,7 +78,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-def test_what_a_task_does_to_its_process_is_reported_and_the_next_one_is_done(case: Case, workers: IsolatedWorker):
+def test_a_failed_process_of_a_task_is_reported_and_the_next_task_is_done(case: Case, workers: IsolatedWorker):
     for _ in range(2):
         with pytest.raises(TaskFailure) as lost:
             workers.run_task(case.piece, quiet, case.limits)
@@ -100,23 +100,23 @@ def test_a_worker_that_died_in_between_is_replaced(workers: IsolatedWorker):
     assert workers.run_task(does.worker_pid, quiet, NONE) != first
 
 
-def test_a_piece_that_leaves_threads_behind_costs_its_worker(workers: IsolatedWorker):
+def test_a_task_that_leaves_threads_behind_ends_its_worker(workers: IsolatedWorker):
     first = workers.run_task(does.start_daemon_thread, quiet, NONE)
     assert workers.run_task(does.worker_pid, quiet, NONE) != first
 
 
-def test_a_piece_that_loses_the_device_costs_its_worker(workers: IsolatedWorker):
+def test_a_task_that_loses_the_device_ends_its_worker(workers: IsolatedWorker):
     """A process does not get it back: the next runs on it need another one."""
     first = workers.run_task(does.break_device, quiet, NONE)
     assert workers.run_task(does.worker_pid, quiet, NONE) != first
 
 
-def test_a_copy_that_a_piece_makes_of_its_process_answers_nothing(workers: IsolatedWorker):
+def test_a_fork_made_by_a_task_returns_nothing(workers: IsolatedWorker):
     first = workers.run_task(does.fork_process, quiet, NONE)
     assert workers.run_task(does.worker_pid, quiet, NONE) == first
 
 
-def test_memory_is_free_again_after_a_piece(workers: IsolatedWorker):
+def test_memory_is_free_again_after_a_task(workers: IsolatedWorker):
     with pytest.raises(TaskFailure):
         workers.run_task(does.exhaust_memory, quiet, TaskLimits(memory_gib=0.5))
     assert workers.run_task(does.exhaust_memory, quiet, NONE) == 2**11
@@ -137,7 +137,7 @@ def test_errors_that_end_an_experiment_come_back_as_they_were(error: Exception, 
     assert getattr(found.value, "mistakes", None) == getattr(error, "mistakes", None)
 
 
-def test_all_ticks_arrive_and_what_is_said_is_passed_on(
+def test_all_ticks_arrive_and_output_is_forwarded(
     workers: IsolatedWorker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     heard: list[str] = []
@@ -153,7 +153,9 @@ def test_all_ticks_arrive_and_what_is_said_is_passed_on(
     assert (tmp_path / "logs" / "said.txt").read_text() == 5000 * ("x" * 99 + "\n")
 
 
-def test_writing_much_costs_a_piece_little(workers: IsolatedWorker, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_much_output_takes_a_task_little_time(
+    workers: IsolatedWorker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     """18 kB take 4 us to write; a pipe of 64 kB that is read every 0.1 s makes it 28 ms."""
     assert workers.run_task(does.time_logging, quiet, TaskLimits(log_path=tmp_path / "said.txt")) < 5e-3
     assert (tmp_path / "said.txt").stat().st_size == 200 * 18_001
@@ -163,37 +165,37 @@ HOW = ["a child", "a session of its own", "an orphan"]
 
 
 @pytest.mark.parametrize("how", HOW)
-def test_what_a_piece_starts_ends_with_it(how: str, workers: IsolatedWorker):
+def test_processes_started_by_a_task_end_with_it(how: str, workers: IsolatedWorker):
     first = workers.run_task(partial(does.start_orphans, how), quiet, NONE)
     assert workers.run_task(partial(does.double_number, 21), quiet, NONE) == 42
     assert not psutil.pid_exists(first)
 
 
 @pytest.mark.parametrize("how", HOW)
-def test_what_a_piece_starts_ends_where_it_crashes(how: str, workers: IsolatedWorker, tmp_path: Path):
+def test_processes_started_by_a_task_end_when_it_crashes(how: str, workers: IsolatedWorker, tmp_path: Path):
     with pytest.raises(TaskFailure, match="SIGSEGV"):
         workers.run_task(partial(does.start_orphans_and_crash, how, tmp_path / "pid"), quiet, NONE)
     assert not psutil.pid_exists(int((tmp_path / "pid").read_text()))
 
 
-def test_the_memory_of_what_a_piece_starts_counts(workers: IsolatedWorker):
+def test_the_memory_of_processes_started_by_a_task_counts(workers: IsolatedWorker):
     with pytest.raises(TaskFailure, match=r"took more than 0.5 GiB with the processes it started"):
         workers.run_task(does.exhaust_memory_in_children, quiet, TaskLimits(60.0, 0.5))
 
 
-def test_a_piece_that_closes_all_files_is_lost_alone(workers: IsolatedWorker, capsys: pytest.CaptureFixture[str]):
+def test_a_task_that_closes_all_files_is_lost_alone(workers: IsolatedWorker, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(TaskFailure, match="ended its process"):
         workers.run_task(does.close_file_descriptors, quiet, TaskLimits(20.0))
     assert "Traceback" not in capsys.readouterr().err
     assert workers.run_task(partial(does.double_number, 21), quiet, NONE) == 42
 
 
-def test_a_changed_folder_stays_with_its_piece(workers: IsolatedWorker):
+def test_a_changed_folder_is_limited_to_its_task(workers: IsolatedWorker):
     workers.run_task(does.change_folder, quiet, NONE)
     assert workers.run_task(does.current_folder, quiet, NONE) == os.getcwd()
 
 
-def test_pieces_with_others_code_share_no_worker_with_pieces_without(workers: IsolatedWorker):
+def test_tasks_with_plugin_code_share_no_worker_with_tasks_without(workers: IsolatedWorker):
     def name(*own: str) -> int:
         going = workers.start_task(does.worker_pid, quiet, NONE, frozenset(own))
         while True:

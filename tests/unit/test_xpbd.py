@@ -84,7 +84,7 @@ def test_tension_begins_at_zero_in_each_step():
 
 
 @methods
-def test_a_free_cloth_falls_as_its_steps_say(method):
+def test_a_free_cloth_falls_by_the_recurrence_of_its_steps(method):
     """v = -g t, and y after n steps of h is -g h^2 n (n + 1)/2: of the substeps for small steps, else of dt."""
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), size=6, time_step=DT)
     frames, iterations = 12, 5
@@ -212,7 +212,7 @@ def without_mass(system: System) -> System:
         pytest.param(without_mass, r"1 of 12 have none and are not pinned \(3\)", id="no mass"),
     ],
 )
-def test_what_it_cannot_do_is_said_before_any_work(method, change, message):
+def test_unsupported_features_are_refused_before_any_work(method, change, message):
     with pytest.raises(Unsupported, match=message):
         method.prepare(change(build_random_problem(0).system))
 
@@ -254,7 +254,7 @@ def test_nothing_but_pins_needs_no_springs():
     )
 
 
-def test_stiff_springs_hold_primal_methods_up_and_heavy_ends_dual_ones():
+def test_stiff_springs_slow_primal_methods_and_heavy_ends_dual_ones():
     # Macklin, Erleben and Mueller 2020.
     plain, stiffer = hanging(1e3), hanging(1e3, stiffer=100.0)
     light, heavier = hanging(1e5), hanging(1e5, heavier=100.0)
