@@ -35,7 +35,7 @@ def build_device_rows(
     return [row | {"frame": frame, "seconds": seconds} | more for frame in (1, 2)]
 
 
-MEASURED = [
+DEVICE_ROWS = [
     *build_device_rows(0, "vbd", 10_000, 0.02, on=True),
     *(build_device_rows(1, "hybrid", 10_000, 0.01) + build_device_rows(2, "numba", 10_000, 0.5)),
     *(build_device_rows(3, "vbd", 100_000, 0.05, on=True) + build_device_rows(4, "hybrid", 100_000, 0.2)),
@@ -49,7 +49,7 @@ MEASURED = [
 """Runs to two residuals: to the first, a device pays from 100,000 vertices on."""
 
 
-def write_device_results(folder: Path, rows: list[dict[str, Any]] = MEASURED) -> Path:
+def write_device_results(folder: Path, rows: list[dict[str, Any]] = DEVICE_ROWS) -> Path:
     """Write rows as a sweep, one file for each run; returns the folder."""
     for unit in {row["run_id"] for row in rows}:
         path = folder / "rows" / f"{unit}.parquet"

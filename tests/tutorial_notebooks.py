@@ -22,7 +22,7 @@ import nbformat
 
 FOLDER = Path(__file__).resolve().parents[1] / "configs" / "tutorials"
 PAGES = sorted(page for page in FOLDER.glob("[0-9]-*.md"))
-MEASURED = "text measured"
+MEASURED_FENCE = "text measured"
 TIMEOUT_SECONDS = 900
 _FENCE = re.compile(r"^```(python|text(?: measured)?)\n(.*?)^```\n", re.MULTILINE | re.DOTALL)
 
@@ -113,7 +113,7 @@ def _read_output(cell: Any) -> str:
 def iterate_differences(expected: list[TutorialCell], found: list[TutorialCell]) -> Iterator[tuple[str, str, str]]:
     """Yield code, expected and found output of cells that print something else than the page shows."""
     for one, other in zip(expected, found, strict=True):
-        if one.output_fence != MEASURED and one.output != other.output:
+        if one.output_fence != MEASURED_FENCE and one.output != other.output:
             yield one.source, one.output, other.output
 
 

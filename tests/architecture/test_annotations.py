@@ -33,7 +33,7 @@ def unannotated(tree: ast.AST) -> Iterator[str]:
     for node in ast.iter_child_nodes(tree):
         if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield from unannotated(node)
-        elif not compiled(node):
+        elif not is_compiled(node):
             given = node.args
             named = [*given.posonlyargs, *given.args, *given.kwonlyargs, given.vararg, given.kwarg]
             free = (a.arg for a in named if a and a.annotation is None)
@@ -41,7 +41,7 @@ def unannotated(tree: ast.AST) -> Iterator[str]:
             yield from unannotated(node)
 
 
-def compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+def is_compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     decorators = (d.func if isinstance(d, ast.Call) else d for d in function.decorator_list)
     first = next((a.arg for a in function.args.args), "")
     return first in GENERATES or any(ast.unparse(d) in KERNELS for d in decorators)

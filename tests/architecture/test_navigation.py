@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-ANSWERS = {
+LOCATIONS = {
     "where is the time of impact computed?": "solvers/contact/ccd.py:pair_time_of_impact",
     "which file adds friction's Hessian?": "solvers/contact/potentials/friction.py:write_friction_hessian",
     "where does a row get its residual?": "harness/simulation/instrumentation_pass.py:compute_returned_residual",
@@ -40,8 +40,8 @@ def find_definitions(path: Path) -> list[str]:
     return [node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.ClassDef)]
 
 
-@pytest.mark.parametrize("question", ANSWERS)
+@pytest.mark.parametrize("question", LOCATIONS)
 def test_a_question_leads_to_a_folder_and_a_file(question: str) -> None:
-    path, _, definition = ANSWERS[question].partition(":")
+    path, _, definition = LOCATIONS[question].partition(":")
     assert path.count("/") <= 3, "a file of a package, or of a folder that a listing of two levels shows"
     assert definition in find_definitions(ROOT / path)

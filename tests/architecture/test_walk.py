@@ -32,7 +32,7 @@ ROWS = (
 )
 """Rows of the page, the uppermost first."""
 
-GIVEN = {
+PASSED_CALLBACKS = {
     (
         "springbench.harness.schema.config_document",
         "springbench.harness.scenes.vertex_selectors",
@@ -112,7 +112,7 @@ def is_handover(frame: FrameType) -> bool:
     return any(carries_specification(frame.f_locals[name]) for name in names if name != "self")
 
 
-def ours(frame: FrameType | None) -> FrameType | None:
+def find_project_frame(frame: FrameType | None) -> FrameType | None:
     """The nearest frame of the project's, from this one on upwards."""
     while frame and not frame.f_globals.get("__name__", "").startswith(
         ("springbench.harness.", "springbench.solvers.")
@@ -134,9 +134,9 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
         assert result.exit_code == 0, result.output
 
     def trace(frame: FrameType, event: str, argument: Any) -> None:
-        if event != "call" or ours(frame) is not frame or frame.f_code.co_name == "<module>":
+        if event != "call" or find_project_frame(frame) is not frame or frame.f_code.co_name == "<module>":
             return
-        above = ours(frame.f_back)
+        above = find_project_frame(frame.f_back)
         if above and (by := above.f_globals["__name__"]) != (of := frame.f_globals["__name__"]):
             sys.setprofile(None)
             calls.append(Call(by, of, frame.f_code.co_name, is_handover(frame)))
@@ -152,7 +152,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> list[Call]:
 
 
 def test_calls_lead_down_the_rows_and_up_to_what_was_passed_down(walk: list[Call]):
-    assert {(call.by, call.of) for call in walk if row(call.of) < row(call.by)} == set(GIVEN)
+    assert {(call.by, call.of) for call in walk if row(call.of) < row(call.by)} == set(PASSED_CALLBACKS)
 
 
 def test_a_solve_calls_nothing_of_the_harness(walk: list[Call]):
@@ -161,7 +161,7 @@ def test_a_solve_calls_nothing_of_the_harness(walk: list[Call]):
         for call in walk
         if call.by.startswith("springbench.solvers.") and call.of.startswith("springbench.harness.")
     }
-    assert up <= set(GIVEN)
+    assert up <= set(PASSED_CALLBACKS)
 
 
 def test_a_run_passes_its_stations_in_the_order_of_the_page(walk: list[Call]):

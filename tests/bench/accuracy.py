@@ -47,22 +47,22 @@ STEPS = 1920
 
 
 @dataclass(frozen=True, eq=False)
-class Scored:
+class ScoredStep:
     """A step to be solved from its first guess, and the error of positions (n, 3) [m]."""
 
     problem: StepProblem
     error: Callable[[Positions], float]
 
 
-def gap(spec: SceneSpec, size: int, frame: int, guess: str = "previous") -> Scored:
+def gap(spec: SceneSpec, size: int, frame: int, guess: str = "previous") -> ScoredStep:
     """A frozen step, graded by the energy gap; that of the first guess is 1."""
     frozen = STORE.load_frames(spec, size, [frame])[frame]
     lowest, problem = STORE.find_minima(frozen).lowest_minimum.objective, frozen.build_problem(guess)
     whole = problem.value(problem.initial_guess) - lowest
-    return Scored(problem, lambda p: (problem.value(p) - lowest) / whole)
+    return ScoredStep(problem, lambda p: (problem.value(p) - lowest) / whole)
 
 
-def stationary(spec: SceneSpec, frame: int) -> Scored:
+def stationary(spec: SceneSpec, frame: int) -> ScoredStep:
     """A frozen step, graded by the gradient's largest entry; that at the current positions is 1. Only where the Hessian
     is positive definite is an error finite."""
     problem = STORE.load_frames(spec, 0, [frame])[frame].problem
@@ -72,7 +72,7 @@ def stationary(spec: SceneSpec, frame: int) -> Scored:
     def error(p: Positions) -> float:
         return float(np.abs(problem.gradient(p)).max() / whole) if is_positive_definite(objective, p) else np.inf
 
-    return Scored(problem, error)
+    return ScoredStep(problem, error)
 
 
 def scene(name: str, **changed: float) -> SceneSpec:
@@ -93,7 +93,7 @@ def flag(stiffness: float | None = None) -> SceneSpec:
     )
 
 
-def reached(solver: str, scored: Scored, error: float, most: int) -> tuple[int, bool]:
+def count_iterations(solver: str, scored: ScoredStep, error: float, most: int) -> tuple[int, bool]:
     """After how many iterations a solve is at an error, to 2 %, and whether it is after `most`."""
     iterates, done = load_target(SOLVERS[solver])().prepare(scored.problem.system).iterates(scored.problem), 0
     while done < most:
@@ -105,7 +105,7 @@ def reached(solver: str, scored: Scored, error: float, most: int) -> tuple[int, 
     return most, False
 
 
-def solved(solver: str, scored: Scored, iterations: int) -> Work:
+def build_solve(solver: str, scored: ScoredStep, iterations: int) -> Work:
     """So many iterations; the last positions [m]."""
     prepared = load_target(SOLVERS[solver])().prepare(scored.problem.system)
     return lambda: prepared.solve(scored.problem, StopRule(iterations)).positions
@@ -121,7 +121,7 @@ _GOAL: Any = {
 
 
 def step_gates(
-    name: str, step: Callable[[], Scored], error: float, iterations: int | None = None, **limits: float
+    name: str, step: Callable[[], ScoredStep], error: float, iterations: int | None = None, **limits: float
 ) -> Iterator[Gate]:
     """The hybrid up to an error, compared with local-global: `iterations` of it, or up to the same error.
 
@@ -130,14 +130,14 @@ def step_gates(
 
     def candidate() -> Work:
         scored = step()
-        done, enough = reached("hybrid", scored, error, 1000)
+        done, enough = count_iterations("hybrid", scored, error, 1000)
         assert enough, f"the hybrid does not come to an error of {error:g}"
-        return solved("hybrid", scored, done)
+        return build_solve("hybrid", scored, done)
 
     def baseline(backend: str) -> Work:
         scored = step()
-        done = iterations or reached("numba", scored, error, ITERATIONS[backend])[0]  # both make the same iterates
-        return solved(backend, scored, done)
+        done = iterations or count_iterations("numba", scored, error, ITERATIONS[backend])[0]  # the same iterates
+        return build_solve(backend, scored, done)
 
     for backend, limit in limits.items():
         yield Gate(
@@ -164,7 +164,7 @@ SIZE, SECONDS = 9, 0.5
 """Of the scenes that are simulated."""
 
 
-def simulated(name: str, chosen: TimeStepping) -> Work:
+def build_simulation(name: str, chosen: TimeStepping) -> Work:
     """The whole simulation; the last positions [m]."""
     built = build_exact_scene(scene(name).with_time_step(1.0 / chosen.steps), SIZE, chosen.integrator)
     prepared, frames = prepare(built, load_target(SOLVERS[chosen.solver])()), round(SECONDS * chosen.steps)
@@ -183,18 +183,18 @@ def trajectory_gates(name: str, error: float, best: TimeStepping, **limits: floa
 
     def wrong(chosen: TimeStepping) -> float:
         return STORE.load_trajectory(scene(name), SIZE, [SECONDS], error=error).measure_error(
-            0, simulated(name, chosen)()
+            0, build_simulation(name, chosen)()
         )
 
     def candidate() -> Work:
         assert wrong(best) <= error, f"{best} errs by more than {error:g}"
-        return simulated(name, best)
+        return build_simulation(name, best)
 
     def baseline(backend: str) -> Work:
         # 30 steps a second and on, a fifth more each time; half of them are whole numbers, for half a second.
         euler = (TimeStepping("numba", STOP, "implicit-euler", 2 * round(15 * 1.2**k)) for k in count())
         chosen = next(chosen for chosen in euler if chosen.steps >= STEPS or wrong(chosen) <= error)
-        return simulated(name, TimeStepping(backend, STOP, chosen.integrator, chosen.steps))
+        return build_simulation(name, TimeStepping(backend, STOP, chosen.integrator, chosen.steps))
 
     for backend, limit in limits.items():
         yield Gate(

@@ -29,7 +29,7 @@ from springbench.harness.simulation.time_loop import simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.step_problem import StopRule
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 PRICES = Path(__file__).parents[2] / "configs" / "prices.yaml"
 STOP, NUM_REPEATS = StopRule(5000, 1e-6), 7
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     table = Table("a side", "iteration", "entries", "flops", "factor", "factorisations", "iterations", box=SIMPLE_HEAD)
     table.title = "bending over no bending, newton"
     with limit_threads(1):

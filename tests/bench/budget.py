@@ -55,11 +55,11 @@ LIMIT, SURE = 1.3, 0.95
 """Largest ratio; and part of the budget within which a median is for sure."""
 HOPELESS_TIME, HOPELESS_ERROR = 2.0, 1.2
 """Times the budget at which a method ends, and times the least error at which a choice takes no turns."""
-NUM_TURNS = 8
+NUM_INTERLEAVED = 8
 """Number of choices that take turns."""
 REFINEMENTS = (1, 2, 3, 4, 6, 8, 12, 16)
 """Numbers of steps relative to those of the scene's own time step."""
-STAGED = ["implicit-euler", "bdf2", "midpoint", "sdirk-2", "sdirk-4", "esdirk-4"]
+IMPLICIT_INTEGRATORS = ["implicit-euler", "bdf2", "midpoint", "sdirk-2", "sdirk-4", "esdirk-4"]
 
 
 class Question(NamedTuple):
@@ -105,7 +105,7 @@ def build_grid() -> list[dict[str, Any]]:
     return [
         {"solver": own, "max_iterations": 1, "integrator": ["substepping"]},
         {"solver": ["numba", "xpbd", "baraff-witkin", "vbd"], "max_iterations": [1, 2, 5, 10, 20]},
-        {"solver": ["newton", "lbfgs"], "rtol": [1e-1, 1e-2], "max_iterations": 100, "integrator": STAGED},
+        {"solver": ["newton", "lbfgs"], "rtol": [1e-1, 1e-2], "max_iterations": 100, "integrator": IMPLICIT_INTEGRATORS},
     ]
 
 
@@ -138,7 +138,7 @@ def screen(specs: Sequence[WorkSpec], trajectory: Any, question: Question, frame
     return [one for one in found if one.seconds <= LIMIT * question.budget]
 
 
-def take_turns(choices: Sequence[Choice], trajectory: Any, frame: float, rounds: int) -> list[Choice]:
+def measure_interleaved(choices: Sequence[Choice], trajectory: Any, frame: float, rounds: int) -> list[Choice]:
     """Repeat the measurements, one after the other in each round, and return the choices with their median times."""
     times = [[] for _ in choices]
     for _ in range(rounds):
@@ -147,7 +147,7 @@ def take_turns(choices: Sequence[Choice], trajectory: Any, frame: float, rounds:
     return [one._replace(seconds=median(seconds)) for one, seconds in zip(choices, times, strict=True)]
 
 
-class Answer(NamedTuple):
+class BudgetResult(NamedTuple):
     """The recommended choice, and the best in hindsight: surely within the budget, and by the median."""
 
     recommended: Choice
@@ -156,7 +156,7 @@ class Answer(NamedTuple):
     num_choices: int
 
 
-def answer(question: Question, rounds: int, search_time: float, results: Path) -> Answer:
+def evaluate_question(question: Question, rounds: int, search_time: float, results: Path) -> BudgetResult:
     """Recommend a method, and measure the fixed choices."""
     path, budget, t_end = SCENES / f"{question.scene}.yaml", question.budget, question.t_end
     scene, store = load_scene(path), open_reference_store(results)
@@ -172,19 +172,19 @@ def answer(question: Question, rounds: int, search_time: float, results: Path) -
     trajectory = load_reference_trajectory(specs[0], store)
     screened = screen(specs, trajectory, question, scene.time_step)
     answer = measure(found.best_method.work_spec, trajectory, scene.time_step)
-    hindsight = _keep_promising([answer, *screened], budget)
-    recommended, *others = take_turns([answer, *hindsight], trajectory, scene.time_step, rounds)
+    hindsight = _select_promising([answer, *screened], budget)
+    recommended, *others = measure_interleaved([answer, *hindsight], trajectory, scene.time_step, rounds)
     limit = max(budget, recommended.seconds)
     sure, within = (
         min((recommended, *(one for one in others if one.seconds <= part * limit)), key=_error) for part in (SURE, 1.0)
     )
-    return Answer(recommended, sure, within, len(specs))
+    return BudgetResult(recommended, sure, within, len(specs))
 
 
-def _keep_promising(choices: Sequence[Choice], budget: float) -> list[Choice]:
+def _select_promising(choices: Sequence[Choice], budget: float) -> list[Choice]:
     """Keep the choices that may be the best, the first one aside: none is left out for a time that scatters."""
     least = min(one.error for one in choices if one.seconds <= SURE * budget or one is choices[0])
-    return sorted((one for one in choices[1:] if one.error <= HOPELESS_ERROR * least), key=_error)[:NUM_TURNS]
+    return sorted((one for one in choices[1:] if one.error <= HOPELESS_ERROR * least), key=_error)[:NUM_INTERLEAVED]
 
 
 def _error(choice: Choice) -> float:
@@ -207,7 +207,7 @@ def main() -> None:
                 continue
             began = monotonic()
             try:
-                found = answer(one, options.rounds, options.search_time, Path(folder))
+                found = evaluate_question(one, options.rounds, options.search_time, Path(folder))
             except RunFailed as refused:
                 console.print(f"{one.scene}: {refused}")
                 is_missed = True

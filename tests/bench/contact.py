@@ -23,7 +23,7 @@ FAR = ContactEffect.model_validate(
 )
 
 
-def fallen(*effects: ContactEffect, size: int, frames: int) -> Work:
+def build_fall(*effects: ContactEffect, size: int, frames: int) -> Work:
     """Whole steps of the compiled backend; the last positions [m]."""
     given = SpringsEffect(stretch=1000.0), GravityEffect(), PinsEffect(parts=("top_corners",)), *effects
     spec = SceneSpec(mesh=GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=given, path=Path("sheet.yaml"))
@@ -37,8 +37,8 @@ def fallen(*effects: ContactEffect, size: int, frames: int) -> Work:
 CONTACT = (
     Gate(
         name="idle-contact-against-none-64",
-        candidate=lambda: fallen(FAR, size=64, frames=10),
-        baseline=lambda: fallen(size=64, frames=10),
+        candidate=lambda: build_fall(FAR, size=64, frames=10),
+        baseline=lambda: build_fall(size=64, frames=10),
         limit=1.05,
         goal=1.02,
         why="a promise: obstacles that are far away cost one test of a box, at most 2 % of a step; measured 1.01 to "

@@ -31,7 +31,7 @@ from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StopRule
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.contact_refinement import THICKNESSES, simulate_fall, successive_distances
 from tests.scene_builders import build_test_scene
 
@@ -118,7 +118,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), measure_physics()
+    begin, rows = describe_provenance(), measure_physics()
     table = Table("quantity", "thickness [m]", "friction", "value", "implicit Euler", "closed form", box=SIMPLE_HEAD)
     for row in rows:
         cells = (row.get(name) for name in ("thickness", "friction", "value", "discrete_form", "closed_form"))

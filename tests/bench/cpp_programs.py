@@ -26,7 +26,7 @@ from springbench.harness.simulation.time_loop import build_initial_state, build_
 from springbench.solvers.model.step_problem import Solver, StopRule
 from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, load_target
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "yardstick-cloth.yaml"
 PROGRAMS: dict[str, Solver] = {
@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     table = Table("a side", *(f"{name}, µs an iteration" for name in PROGRAMS), box=SIMPLE_HEAD)
     with limit_threads(1):
         for size in options.sizes:

@@ -40,7 +40,7 @@ from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.cuda.near import PRECISIONS, spacing
 
 SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "hanging-cloth.yaml"
@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("--save", type=Path)
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     given, rows, begun = parser.parse_args(), list[dict[str, Any]](), perf_counter()
-    begin = describe_moment()
+    begin = describe_provenance()
 
     def add(shared: dict[str, Any], new: Iterable[dict[str, Any]]) -> None:
         for row in new:

@@ -41,7 +41,7 @@ from springbench.solvers.methods.position_based.xpbd import PreparedXpbd, Xpbd
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StepProblem, StopRule
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.scene_builders import build_first_problem, build_test_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -56,7 +56,7 @@ CUBES = {"cube, 1 MPa, 11": (11, 1e6), "cube, 100 MPa, 11": (11, 1e8), "cube, 10
 LEVELS = (1e-2, 1e-3, 1e-6)
 MOST, STALL = {"xpbd": 20_000, "mgpbd": 60}, 500
 ALONE = "smoothing alone"
-MADE = {
+SOLVER_VARIANTS = {
     ALONE: MultigridXpbd(near_null_vectors=0),
     "equal tensions": MultigridXpbd(near_null_vectors=0),
     "near-kernel": MultigridXpbd(),
@@ -112,7 +112,7 @@ PROBLEMS: dict[str, Callable[[], StepProblem]] = {
 }
 
 
-class Reached(NamedTuple):
+class SolveProgress(NamedTuple):
     """misfit [J^(1/2)], positions (n, 3) [m], iterations of conjugate gradients in the last iteration, and what
     processor time all of them took [s]."""
 
@@ -122,7 +122,7 @@ class Reached(NamedTuple):
     seconds: float = 0.0
 
 
-def xpbd(stated: StepProblem) -> Iterator[Reached]:
+def xpbd(stated: StepProblem) -> Iterator[SolveProgress]:
     """XPBD, before its first iteration and after each."""
     made = Xpbd().prepare(stated.system)
     assert isinstance(made, PreparedXpbd)
@@ -131,23 +131,23 @@ def xpbd(stated: StepProblem) -> Iterator[Reached]:
     while True:
         p = run.positions
         stretched = root * (np.linalg.norm(p[i] - p[j], axis=1) - own.rest_length)
-        yield Reached(float(np.linalg.norm(stretched - run.spring_tensions / root)), p, 0, seconds)
+        yield SolveProgress(float(np.linalg.norm(stretched - run.spring_tensions / root)), p, 0, seconds)
         began = time.process_time()
         run.step_state()
         seconds += time.process_time() - began
 
 
-def mgpbd(stated: StepProblem, solver: MultigridXpbd) -> Iterator[Reached]:
+def mgpbd(stated: StepProblem, solver: MultigridXpbd) -> Iterator[SolveProgress]:
     """MGPBD, likewise; it ends where nothing moves any more."""
     run, moved, seconds = solver.prepare(stated.system).init_state(stated, stated.initial_guess), True, 0.0
     while moved:
-        yield Reached(float(np.linalg.norm(run.dual_residual)), run.positions, run.num_cg_iterations, seconds)
+        yield SolveProgress(float(np.linalg.norm(run.dual_residual)), run.positions, run.num_cg_iterations, seconds)
         began = time.process_time()
         moved = run.step_state()
         seconds += time.process_time() - began
 
 
-def course(run: Iterator[Reached], most: int) -> Course:
+def course(run: Iterator[SolveProgress], most: int) -> Course:
     """Until the last level is reached, or for so many iterations."""
     begin = next(run)
     found = Course([], [], begin.positions.copy(), [])
@@ -212,7 +212,7 @@ def setups(name: str) -> list[str]:
     """The row of a problem: iterations of conjugate gradients, and the megabytes of each."""
     stated = PROBLEMS[name]()
     row = [name]
-    for label, solver in MADE.items():
+    for label, solver in SOLVER_VARIANTS.items():
         made = solver.prepare(stated.system)
         run = made.init_state(stated, stated.initial_guess)
         A = made.dual_matrix(made.scaled_constraints(run.positions)[1])
@@ -237,8 +237,8 @@ def main() -> None:
         *("step", "springs", f"xpbd {by}", f"after {STALL}", "its error", f"mgpbd {by}", "its error"),
         *("linear iterations", "time, over xpbd's"),
     )
-    table = Table(*(("step", *MADE) if given.setup else columns), box=SIMPLE_HEAD)
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    table = Table(*(("step", *SOLVER_VARIANTS) if given.setup else columns), box=SIMPLE_HEAD)
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     with limit_threads(1):
         for name in given.names:
             if given.setup:

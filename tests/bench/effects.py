@@ -5,7 +5,7 @@
 
 The hanging cloth is simulated to a tolerance of 1e-6 (see
 `springbench.harness.experiments.ablation.iteration_overhead`). Each cell states the ratio, the time of an iteration and
-the limit of the ratio. `--contact-sizes` adds contact of surfaces with nothing near, by the solvers of CONTACT_SOLVED.
+the limit of the ratio. `--contact-sizes` adds contact of surfaces with nothing near, by the solvers of CONTACT_SOLVERS.
 These are the published studies of single effects and of all together:
 
     python -m tests.bench.effects --sizes 33 64 --contact-sizes 33 64 128 --publish results/published/prices
@@ -28,14 +28,14 @@ from springbench.harness.experiments.ablation.iteration_overhead import measure_
 from springbench.solvers.model.step_problem import StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 PRICES, CONTACT_PRICES = CONFIGS / "prices.yaml", CONFIGS / "prices-contact.yaml"
 STOP = StopRule(5000, 1e-6)
 
-SOLVED = ("newton", "hybrid", "newton-cg", "lbfgs", "vbd")
-CONTACT_SOLVED = ("newton", "hybrid", "lbfgs")
+DEFAULT_SOLVERS = ("newton", "hybrid", "newton-cg", "lbfgs", "vbd")
+CONTACT_SOLVERS = ("newton", "hybrid", "lbfgs")
 CHEAP, LINES, BENDING, IDLE, ALL = range(5)
 KINDS = {
     "air-drag": CHEAP, "attachments": CHEAP, "wind": CHEAP, "contact": IDLE, "strain-limits": LINES,
@@ -89,7 +89,7 @@ def describe_cell(row: dict[str, Any]) -> str:
 def main() -> None:
     """Print each effect as it is measured, then a table of each scene and size."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("solvers", nargs="*", default=SOLVED, metavar="SOLVER")
+    parser.add_argument("solvers", nargs="*", default=DEFAULT_SOLVERS, metavar="SOLVER")
     for name, given in (("--rounds", 3), ("--frames", 8)):
         parser.add_argument(name, type=int, default=given)
     parser.add_argument("--sizes", type=int, nargs="*", default=[33])
@@ -97,8 +97,8 @@ def main() -> None:
     parser.add_argument("--effects", nargs="*", default=SINGLE_EFFECTS)
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
-    contact_solvers = [solver for solver in options.solvers if solver in CONTACT_SOLVED]
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
+    contact_solvers = [solver for solver in options.solvers if solver in CONTACT_SOLVERS]
     parts = [(PRICES, size, options.effects, options.solvers) for size in options.sizes]
     parts += [(CONTACT_PRICES, size, CONTACT_EFFECTS, contact_solvers) for size in options.contact_sizes]
     with limit_threads(1):

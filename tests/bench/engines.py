@@ -41,7 +41,7 @@ ENGINES: tuple[tuple[str, dict[str, Any]], ...] = (
     *(("taichi", {"iterations_per_substep": one}) for one in (1, 4)),
     ("xpbd-small-steps", {}),
 )
-OURS = (("velocity-verlet", "substepping", StopRule(1)), ("hybrid", "implicit-euler", StopRule(200, 1e-6)))
+OWN_SOLVERS = (("velocity-verlet", "substepping", StopRule(1)), ("hybrid", "implicit-euler", StopRule(200, 1e-6)))
 FAR = 10.0
 
 
@@ -80,7 +80,7 @@ def rows(path: Path, size: int, frames: int, substeps: list[int]) -> Iterator[tu
         made = load_target(SOLVER_TABLE[name])(**parameters)
         words = " ".join(map(str, (name, *parameters.values())))
         yield words, *(cell(scene, made, StopRule(number), frames) for number in substeps)
-    for name, integrator, stop in OURS:
+    for name, integrator, stop in OWN_SOLVERS:
         yield (
             f"{name}, {integrator}",
             cell(

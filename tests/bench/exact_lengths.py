@@ -37,7 +37,7 @@ from springbench.solvers.model.energies import spring_energy
 from springbench.solvers.model.energies.augmented_lagrangian import concatenate_constraints, length_errors
 from springbench.solvers.model.step_problem import PreparedSolver, Solver, StepProblem, StopRule
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.scene_builders import build_test_scene
 
 CHAIN = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
@@ -174,7 +174,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin = describe_moment()
+    begin = describe_provenance()
     with limit_threads(1):
         tables = swinging(), ratios(), costs()
     for rows in tables:

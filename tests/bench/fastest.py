@@ -36,7 +36,7 @@ from springbench.harness.experiments.accuracy.step_scales import compute_vertex_
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, Unsupported
 from springbench.solvers.registry import SOLVER_TABLE, load_target
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 ROOT = Path(__file__).resolve().parents[2]
 TARGETS = {"gap": (1e-3, 1e-4, 1e-6), "error": (1e-3, 1e-6)}
@@ -49,7 +49,7 @@ HOPELESS = 3.0
 DRAWS, SHARE = 2000, 0.95
 
 
-class Racer(NamedTuple):
+class CandidateSolve(NamedTuple):
     """A method on a step: its name, what solves, after how many iterations it is at which gap, and seconds of that."""
 
     name: str
@@ -101,9 +101,9 @@ def grading(step: SnapshotEvaluation, problem: StepProblem, measure: str) -> Cal
     return lambda p: (problem.value(p) - lowest.objective) / scale
 
 
-def racer(
+def build_candidate(
     spec: CurveSpec, problem: StepProblem, graded: Callable[[Positions], float], targets: Sequence[float]
-) -> Racer | None:
+) -> CandidateSolve | None:
     """The first pass of a method, up to the last of the accuracies; None where it takes no such scene."""
     try:
         prepared = load_target(SOLVER_TABLE[spec.solver.name])(**spec.solver.parameters).prepare(problem.system)
@@ -122,10 +122,10 @@ def racer(
                 needs[target], seconds[target] = number, spent
         if len(needs) == len(targets) or spent > spec.measurement.time_limit or not np.isfinite(left):
             break
-    return Racer(spec.solver.name, prepared, needs, seconds)
+    return CandidateSolve(spec.solver.name, prepared, needs, seconds)
 
 
-def timed(prepared: PreparedSolver, problem: StepProblem, stamps: Sequence[int]) -> list[float]:
+def measure_iterate_seconds(prepared: PreparedSolver, problem: StepProblem, stamps: Sequence[int]) -> list[float]:
     """Seconds of the thread's processor time to each of these iterates, ascending."""
     wanted, found = set(stamps), dict[int, float]()
     gc.disable()  # a collection in the middle would be counted as the solver's
@@ -139,13 +139,15 @@ def timed(prepared: PreparedSolver, problem: StepProblem, stamps: Sequence[int])
     return [found[number] for number in stamps]
 
 
-def raced(racers: Sequence[Racer], problem: StepProblem, rounds: int) -> dict[str, dict[float, NDArray[np.float64]]]:
+def measure_interleaved(
+    racers: Sequence[CandidateSolve], problem: StepProblem, rounds: int
+) -> dict[str, dict[float, NDArray[np.float64]]]:
     """Seconds (rounds,) to each accuracy, of each method, interleaved, in one order and then in the other."""
     times: dict[str, dict[float, list[float]]] = {one.name: {target: [] for target in one.needs} for one in racers}
     for turn in range(-1, rounds):  # the first one warms up
         for one in racers if turn % 2 else racers[::-1]:
             stamps = sorted(set(one.needs.values()))
-            by_stamp = dict(zip(stamps, timed(one.prepared, problem, stamps), strict=True))
+            by_stamp = dict(zip(stamps, measure_iterate_seconds(one.prepared, problem, stamps), strict=True))
             for target, number in one.needs.items() if turn >= 0 else ():
                 times[one.name][target].append(by_stamp[number])
     return {name: {target: np.array(values) for target, values in of.items()} for name, of in times.items()}
@@ -177,14 +179,14 @@ def ratios(
     for guess in specs[0].initial_guesses:
         problem = step.step_snapshot.build_problem(guess)
         graded = grading(step, problem, measure)
-        racers = [found for spec in specs if (found := racer(spec, problem, graded, targets))]
+        racers = [found for spec in specs if (found := build_candidate(spec, problem, graded, targets))]
         least = {t: min((one.seconds[t] for one in racers if t in one.seconds), default=np.inf) for t in targets}
         near = [
             one
             for one in racers
             if one.needs and (one.name == name or any(s <= HOPELESS * least[t] for t, s in one.seconds.items()))
         ]
-        times = {name: {}} | raced(near, problem, rounds)
+        times = {name: {}} | measure_interleaved(near, problem, rounds)
         words = f"{step.case.title} {step.snapshot_name} {guess}"
         found = (ratio(words, target, name, times, draws) for target in targets)
         yield from (one for one in found if one is not None)
@@ -220,7 +222,7 @@ def main() -> None:
     parser.add_argument("--measure", choices=list(TARGETS), default="gap", help="what an accuracy is of")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     given = parser.parse_args()
-    begin, found, targets = describe_moment(), list[Ratio](), TARGETS[given.measure]
+    begin, found, targets = describe_provenance(), list[Ratio](), TARGETS[given.measure]
     print(row(f"step, first guess; {given.measure}", [f"{target:g}" for target in targets]))
     with limit_threads(1):
         for step, specs in steps(given.config, given.only):

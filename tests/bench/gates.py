@@ -81,7 +81,7 @@ def steps(scene: Scene, prepared: PreparedSolver, frames: int) -> list[Simulatio
     return list(simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=frames))
 
 
-def simulated(solver: str, size: int, frames: int) -> Work:
+def build_simulation(solver: str, size: int, frames: int) -> Work:
     """Whole steps through the harness; the last positions [m]."""
     scene = sheet(size)
     prepared = prepare(solver, scene)
@@ -90,7 +90,7 @@ def simulated(solver: str, size: int, frames: int) -> Work:
     )
 
 
-def solved(solver: str, size: int, frames: int) -> Work:
+def build_solve(solver: str, size: int, frames: int) -> Work:
     """The solver alone, on the problems that the harness states in the same steps; the last positions [m]."""
     scene = sheet(size)
     prepared = prepare(solver, scene)
@@ -104,7 +104,7 @@ def last(solutions: Iterable[Solution]) -> Positions:
     return solution.positions
 
 
-def projected(solver: str, size: int, repeats: int, **parameters: str) -> Work:
+def build_projection(solver: str, size: int, repeats: int, **parameters: str) -> Work:
     """The local step alone, at stretched positions; A'K d [N]."""
     scene = sheet(size)
     prepared = prepare(solver, scene, **parameters)
@@ -119,7 +119,7 @@ def projected(solver: str, size: int, repeats: int, **parameters: str) -> Work:
     return work
 
 
-def recorded(solver: str, size: int, frames: int) -> Work:
+def build_recording(solver: str, size: int, frames: int) -> Work:
     """Whole steps, each recorded, to a finished recording; the last positions [m]."""
     scene = sheet(size)
     prepared = prepare(solver, scene)
@@ -168,8 +168,8 @@ GATES = (
     Gate(
         short=True,
         name="numba-against-sparse-64",
-        candidate=lambda: simulated("numba", 64, frames=4),
-        baseline=lambda: simulated("sparse", 64, frames=4),
+        candidate=lambda: build_simulation("numba", 64, frames=4),
+        baseline=lambda: build_simulation("sparse", 64, frames=4),
         tolerance=1e-9,
         limit=0.3,
         guards=("test_matrices_have_as_many_entries_as_stored", "test_a_tolerance_takes_as_many_iterations_as_stored"),
@@ -177,8 +177,8 @@ GATES = (
     ),
     Gate(
         name="sparse-against-dense-24",
-        candidate=lambda: simulated("sparse", 24, frames=1),
-        baseline=lambda: simulated("dense", 24, frames=1),
+        candidate=lambda: build_simulation("sparse", 24, frames=1),
+        baseline=lambda: build_simulation("dense", 24, frames=1),
         tolerance=1e-9,
         limit=0.1,
         guards=("test_matrices_have_as_many_entries_as_stored", "test_a_tolerance_takes_as_many_iterations_as_stored"),
@@ -187,10 +187,10 @@ GATES = (
     Gate(
         short=True,
         name="compiled-local-step-against-numpy-64",
-        candidate=lambda: projected(
+        candidate=lambda: build_projection(
             "numba", 64, repeats=50, linear_solver="cholespy"
         ),  # whose local step can be called
-        baseline=lambda: projected("sparse", 64, repeats=50),
+        baseline=lambda: build_projection("sparse", 64, repeats=50),
         tolerance=1e-9,
         limit=0.2,
         guards=("test_a_step_allocates_as_many_arrays_as_stored",),
@@ -199,8 +199,8 @@ GATES = (
     Gate(
         short=True,
         name="harness-against-bare-solver-64",
-        candidate=lambda: simulated("numba", 64, frames=20),
-        baseline=lambda: solved("numba", 64, frames=20),
+        candidate=lambda: build_simulation("numba", 64, frames=20),
+        baseline=lambda: build_solve("numba", 64, frames=20),
         limit=1.1,
         goal=1.02,
         guards=("test_a_step_allocates_as_many_arrays_as_stored",),
@@ -209,8 +209,8 @@ GATES = (
     ),
     Gate(
         name="recording-against-simulating-alone-64",
-        candidate=lambda: recorded("numba", 64, frames=90),
-        baseline=lambda: simulated("numba", 64, frames=90),
+        candidate=lambda: build_recording("numba", 64, frames=90),
+        baseline=lambda: build_simulation("numba", 64, frames=90),
         limit=1.25,
         goal=1.10,
         guards=("test_a_recording_takes_at_most_20_bytes_a_vertex_and_frame",),

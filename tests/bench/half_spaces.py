@@ -38,7 +38,7 @@ from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.model.step_problem import Positions, StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 FLOORS: dict[str, tuple[Any, float | None]] = {
@@ -189,7 +189,7 @@ def main() -> None:
     parser.add_argument("--solvers", nargs="+", default=["hybrid", "newton"])
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     with limit_threads(1):
         for solver in options.solvers:
             rows += measure_solver(solver, options.size, options.block, options.frames, options.rounds)

@@ -34,7 +34,7 @@ from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.objective.psd_projection import ProjectedHessian, PsdProjection
 from springbench.solvers.objective.step_objective import Hessian
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 CONFIG = Path(__file__).parents[2] / "configs" / "hessians.yaml"
 SCENES = sorted((CONFIG.parent / "hessians").glob("*.yaml"))
@@ -54,7 +54,7 @@ class Tally:
 
 
 @contextmanager
-def counted() -> Iterator[list[int]]:
+def count_examined_elements() -> Iterator[list[int]]:
     """Yield a list that gains the number of elements that each projected Hessian examines."""
     examined: list[int] = []
     filtered = Hessian.project_to_psd
@@ -68,7 +68,7 @@ def counted() -> Iterator[list[int]]:
         yield examined
 
 
-def measured(path: Path) -> dict[IndefiniteStrategy, Tally]:
+def measure_strategies(path: Path) -> dict[IndefiniteStrategy, Tally]:
     """Solve a scene by each rule."""
     spec = load_scene(path)
     made = build_scene(spec, spec.default_size or 0)
@@ -83,7 +83,7 @@ def measured(path: Path) -> dict[IndefiniteStrategy, Tally]:
     for _ in range(spec.frames):
         for rule, run in runs.items():
             tally = tallies[rule]
-            with counted() as examined:
+            with count_examined_elements() as examined:
                 began = time.process_time()
                 solution = next(run).solution
                 tally.seconds += time.process_time() - began
@@ -106,7 +106,7 @@ def list_rows(path: Path, repeat: int) -> list[dict[str, Any]]:
             "examined_share": tally.examined / tally.elements,
             "cpu_seconds": tally.seconds,
         }
-        for rule, tally in measured(path).items()
+        for rule, tally in measure_strategies(path).items()
     ]
 
 
@@ -127,9 +127,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3, help="measurements of each scene")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    table, begin, rows = Table("scene", *RULES, box=SIMPLE_HEAD), describe_moment(), list[dict[str, Any]]()
+    table, begin, rows = Table("scene", *RULES, box=SIMPLE_HEAD), describe_provenance(), list[dict[str, Any]]()
     with limit_threads(1):
-        measured(options.scenes[0])  # compiles
+        measure_strategies(options.scenes[0])  # compiles
         for path in options.scenes:
             found = [row for repeat in range(options.repeats) for row in list_rows(path, repeat)]
             table.add_row(path.stem, *format_cells(found))

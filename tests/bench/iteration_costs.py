@@ -25,7 +25,7 @@ from springbench.harness.simulation.time_loop import build_initial_state, build_
 from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 CONFIG = Path(__file__).parents[2] / "configs" / "claims.yaml"
 METHODS: dict[str, dict[str, Any]] = {
@@ -83,7 +83,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin = describe_moment()
+    begin = describe_provenance()
     with limit_threads(1):
         rows = measure_scenes(options.repeats)
     table = Table("scene", "residual", "solver", "iterations", "ms", "µs an iteration", box=SIMPLE_HEAD)

@@ -32,7 +32,7 @@ from springbench.harness.simulation.time_loop import build_initial_state, build_
 from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 GROWTH = Path(__file__).parents[2] / "configs" / "growth-large.yaml"
 
@@ -93,7 +93,7 @@ def main() -> None:
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
     smallest: dict[tuple[str, str, str], Cost] = {}
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     print("run | vertices | prepare s | step s | wall s | iterations | residual | peak GiB | growth")
     for run in load_sweep(options.config).list_runs():
         title = f"{run.title} {run.initial_guess}"

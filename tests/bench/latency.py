@@ -30,7 +30,7 @@ from springbench.harness.console import get_output_console
 from springbench.harness.results import parquet_rows, run_schema
 from springbench.harness.results.published_set import TABLE_FILES
 
-from tests.bench.scripted_study import describe_moment, publish_tables
+from tests.bench.scripted_study import describe_provenance, publish_tables
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 QUICKSTART = CHECKOUT / "configs" / "quickstart.yaml"
@@ -364,7 +364,7 @@ def publish_measurements(measurements: Sequence[Mapping[str, Any]], folder: Path
     rows = sorted(stated, key=lambda one: (list(LATENCY_ROWS).index(one["row"]), one["repeat"]))
     table = pa.Table.from_pylist([dict(one) for one in rows], MEASUREMENT_SCHEMA)
     publish_tables(
-        folder, QUICKSTART, "python -m tests.bench.latency", {"measurements": table}, [begin, describe_moment()]
+        folder, QUICKSTART, "python -m tests.bench.latency", {"measurements": table}, [begin, describe_provenance()]
     )
 
 
@@ -381,7 +381,7 @@ def main() -> None:
         print(json.dumps(IN_PROCESS[options.in_process]()))
         return
     names = options.only or [name for name, row in LATENCY_ROWS.items() if not row.is_long]
-    measurements, begin = list[dict[str, Any]](), describe_moment()
+    measurements, begin = list[dict[str, Any]](), describe_provenance()
     with TemporaryDirectory() as temporary:
         warm = (options.results or Path(temporary)).resolve()
         for number, name in enumerate(names):

@@ -23,7 +23,7 @@ from springbench.harness.console import get_output_console
 from springbench.harness.experiments.ablation.ablation_unit import run_ablation
 from springbench.harness.report.ablation_summary import largest_known_error, read_ablation, select_kind
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.progress_displays import SilentDisplay
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=list(SCENE_SIZES), metavar="SCENE")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     table = Table("scene", "size", "own error", "without", "moves vertices by", box=SIMPLE_HEAD)
     for name in options.scenes:
         print(name, file=sys.stderr, flush=True)

@@ -51,10 +51,10 @@ from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.pairs import CONFIG, Folded, folded, seconds
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.pairs import CONFIG, FoldedSheet, fold_sheet, seconds
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
-OURS = ("hybrid", "newton", "lbfgs")
+OWN_SOLVERS = ("hybrid", "newton", "lbfgs")
 TOLERANCE, MOST = 1e-3, 500
 STRETCH, MASS, TIME_STEP, FAST = 1000.0, 0.3, 1 / 30, 0.1
 """[N/m], [kg], [s], [m/s]."""
@@ -62,7 +62,7 @@ STIFFNESS = 0.1
 """Of the barriers [N/m], soft enough for layers to be pressed well into their range."""
 
 
-def stated(made: Folded, contact: Energy) -> StepProblem:
+def build_step(made: FoldedSheet, contact: Energy) -> StepProblem:
     """The step. Vertices of the lowest layer are pinned exactly."""
     mesh, p = made.mesh, made.p
     springs = Springs.from_rest_shape(p, mesh.springs, np.full(len(mesh.springs), STRETCH))
@@ -90,7 +90,7 @@ class Blocks(NamedTuple):
         values[places[free, 1]] += self.values[free]
 
 
-class Found(NamedTuple):
+class IpctkTerms(NamedTuple):
     """What ipctk says at p: its collisions, their energy [J] and gradient (n, 3) [N]."""
 
     p: Positions
@@ -105,7 +105,7 @@ class Ipctk:
     neighbours: as of ours, whose matrix this has; spent: CPU time [s] by what it went into.
     """
 
-    def __init__(self, made: Folded, stiffness: float, surface: CollisionMesh) -> None:
+    def __init__(self, made: FoldedSheet, stiffness: float, surface: CollisionMesh) -> None:
         """stiffness: of our barrier [N/m], the force of which this one has in the middle of the range."""
         import ipctk
 
@@ -119,25 +119,25 @@ class Ipctk:
         middle, most = (t + 0.5 * r) ** 2 - t**2, (2.0 * t + r) * r
         slope = (most - middle) * (2.0 * np.log(middle / most) - most / middle + 1.0) * 2.0 * (t + 0.5 * r)
         self._potential = of.BarrierPotential(r, -stiffness * r * (0.5 + np.log(2.0)) / slope)
-        self._known: list[Found] = []
+        self._known: list[IpctkTerms] = []
         self._bent: tuple[Positions, Blocks] | None = None
         self.spent = defaultdict[str, float](float)
 
-    def _timed(self, name: str, work: Callable[[], Any]) -> Any:
+    def _measure(self, name: str, work: Callable[[], Any]) -> Any:
         begun = time.process_time()
         out = work()
         self.spent[name] += time.process_time() - begun
         return out
 
-    def _at(self, p: Positions) -> Found:
+    def _at(self, p: Positions) -> IpctkTerms:
         for found in self._known:
             if np.array_equal(found.p, p):
                 return found
         V, collisions = np.asfortranarray(p), self._of.NormalCollisions()
         args = (self._surface, V, self._reach, self._thickness, self._of.LBVH())
-        self._timed("pairs", lambda: collisions.build(*args))
-        value, gradient = self._timed("value and gradient", lambda: self._slopes(collisions, V))
-        found = Found(p.copy(), collisions, value, gradient.reshape(-1, 3))
+        self._measure("pairs", lambda: collisions.build(*args))
+        value, gradient = self._measure("value and gradient", lambda: self._slopes(collisions, V))
+        found = IpctkTerms(p.copy(), collisions, value, gradient.reshape(-1, 3))
         self._known = [*self._known[-1:], found]
         return found
 
@@ -156,7 +156,7 @@ class Ipctk:
         """See Energy; clamped."""
         of, V = self._of, np.asfortranarray(p)
         args = (self._at(p).collisions, self._surface, V, of.PSDProjectionMethod.CLAMP)
-        H = self._timed("Hessian", lambda: self._potential.hessian(*args))
+        H = self._measure("Hessian", lambda: self._potential.hessian(*args))
         return csr_array((H.data, H.indices, H.indptr), shape=H.shape)  # it is symmetric
 
     def hessian_blocks(self, p: Positions, keep: float = 0.0) -> Blocks:
@@ -180,7 +180,7 @@ class Ipctk:
     def collision_free_step_size(self, p: Positions, direction: Positions) -> float:
         """See `springbench.solvers.model.barrier_energy.BarrierEnergy`."""
         V, W = np.asfortranarray(p), np.asfortranarray(p + direction)
-        return self._timed("CCD", lambda: self._safe(V, W))
+        return self._measure("CCD", lambda: self._safe(V, W))
 
     def _safe(self, V: Any, W: Any) -> float:
         near = self._of.Candidates()
@@ -212,7 +212,7 @@ def newton_ipc(problem: StepProblem) -> Callable[[], Solved]:
     return solve
 
 
-def ours(problem: StepProblem, name: str) -> Callable[[], Solved | None]:
+def build_own_solve(problem: StepProblem, name: str) -> Callable[[], Solved | None]:
     """A solve by one of our solvers; None where it does not converge."""
     prepared = load_target(SOLVERS[name])().prepare(problem.system)
 
@@ -225,18 +225,18 @@ def ours(problem: StepProblem, name: str) -> Callable[[], Solved | None]:
 
 def measure_size(size: int, num_rounds: int) -> tuple[list[dict[str, Any]], dict[str, float]]:
     """Measure a size: a row for each round and solver, and the shares of Newton-IPC's time."""
-    made = folded(size)
+    made = fold_sheet(size)
     mesh, k = made.mesh, np.full(len(made.p), STIFFNESS)
     surface = CollisionMesh.from_rest_shape(
         mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, made.min_distance, made.dhat
     )
-    problem = stated(made, SelfContact(surface))
+    problem = build_step(made, SelfContact(surface))
     bare = replace(problem, system=without_barriers(problem.system))
     barrier = Ipctk(made, STIFFNESS, surface)
-    theirs = stated(made, barrier)
+    theirs = build_step(made, barrier)
     # All is done once, and so compiled and in the caches.
     there, count = newton_ipc(theirs)()
-    ends = {name: (ours(problem, name)(), ours(bare, name)())[0] for name in OURS}
+    ends = {name: (build_own_solve(problem, name)(), build_own_solve(bare, name)())[0] for name in OWN_SOLVERS}
     barrier.spent.clear()
     rows, total = list[dict[str, Any]](), 0.0
     for number in range(num_rounds):  # each prepares again: a step stores what it finds out about its matrix's pattern
@@ -245,7 +245,7 @@ def measure_size(size: int, num_rounds: int) -> tuple[list[dict[str, Any]], dict
         for name, end in ends.items():
             row = {"size": size, "solver": name, "round": number, "newton_ipc_iterations": count}
             if end is not None:
-                own, without_contact = seconds(ours(problem, name)), seconds(ours(bare, name))
+                own, without_contact = seconds(build_own_solve(problem, name)), seconds(build_own_solve(bare, name))
                 row |= {"num_iterations": end[1], "time_ratio": other / own, "contact_ratio": own / without_contact}
                 row |= {"end_distance": float(np.linalg.norm(end[0] - there, axis=1).max() / made.dhat)}
             rows.append(row)
@@ -259,7 +259,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options, console = parser.parse_args(), Console(highlight=False)
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     for size in options.sizes:
         with limit_threads(1):
             found, shares = measure_size(size, options.rounds)
@@ -268,7 +268,7 @@ def main() -> None:
             f"{size} x {size}: Newton-IPC in {found[0]['newton_ipc_iterations']} iterations; {describe_machine().cpu}"
         )
         table = Table(*columns, title=title, box=SIMPLE_HEAD)
-        for name in OURS:
+        for name in OWN_SOLVERS:
             own = [row for row in found if row["solver"] == name]
             if "time_ratio" not in own[0]:
                 table.add_row(name, f"not in {MOST}")

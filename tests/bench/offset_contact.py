@@ -46,7 +46,7 @@ from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
 from springbench.solvers.methods.vertex_block.vbd_offset_contact import OffsetContactDescent
 from springbench.solvers.model.step_problem import Positions, Solver, StepProblem, StopRule
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 SCENES: dict[str, tuple[str, int, int]] = {
@@ -267,7 +267,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, motions, steps, radii = describe_moment(), *(list[dict[str, Any]]() for _ in range(3))
+    begin, motions, steps, radii = describe_provenance(), *(list[dict[str, Any]]() for _ in range(3))
     with limit_threads(1):
         for name in options.scenes:
             reference = simulate_reference(name)

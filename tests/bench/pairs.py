@@ -33,14 +33,14 @@ from springbench.solvers.contact.collision_mesh import CollisionMesh
 from springbench.solvers.contact.contact_potential import SelfContact
 from springbench.solvers.model.step_problem import Positions
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 CONFIG = Path(__file__).parents[2] / "configs" / "contact.yaml"
 GAP, LAYERS = 0.004, 4
 """At 64 vertices a side [m]."""
 
 
-class Folded(NamedTuple):
+class FoldedSheet(NamedTuple):
     """mesh: at rest; p (n, 3) [m]: folded; d (n, 3) [m]: a step; min_distance, dhat [m]."""
 
     mesh: Mesh
@@ -50,7 +50,7 @@ class Folded(NamedTuple):
     dhat: float
 
 
-def folded(size: int) -> Folded:
+def fold_sheet(size: int) -> FoldedSheet:
     """Columns go to and fro, one layer above the other, vertex over vertex but for a little noise."""
     mesh, rng = GridMesh(diagonals="one").build_mesh(size), np.random.default_rng(0)
     gap, h, columns = GAP * 63 / (size - 1), 1 / (size - 1), -(-size // LAYERS)
@@ -59,10 +59,10 @@ def folded(size: int) -> Folded:
     rows = len(mesh.rest_positions) // size
     p = np.stack([np.tile(x, rows), np.tile(layer * gap, rows), mesh.rest_positions[:, 2]], axis=1)
     p += 0.02 * gap * rng.normal(size=p.shape)
-    return Folded(mesh, p, 0.3 * gap * rng.normal(size=p.shape), 0.25 * gap, gap)
+    return FoldedSheet(mesh, p, 0.3 * gap * rng.normal(size=p.shape), 0.25 * gap, gap)
 
 
-def ours(made: Folded) -> tuple[dict[str, Callable[[], object]], SelfContact]:
+def build_own_work(made: FoldedSheet) -> tuple[dict[str, Callable[[], object]], SelfContact]:
     """What is timed, by name."""
     mesh, p, d, thickness, reach = made
     k = np.ones(len(p))
@@ -79,10 +79,10 @@ def ours(made: Folded) -> tuple[dict[str, Callable[[], object]], SelfContact]:
         contact.add_gradient(q, np.zeros_like(q))
         return contact.value(q)
 
-    def bent() -> object:
+    def evaluate_hessian() -> object:
         return contact.hessian_blocks(next(places), 0.0)
 
-    def anew() -> float:
+    def evaluate_uncached() -> float:
         contact.candidate_caches.clear()
         return slopes()
 
@@ -91,14 +91,14 @@ def ours(made: Folded) -> tuple[dict[str, Callable[[], object]], SelfContact]:
         return contact.collision_free_step_size(p, d)
 
     return {
-        "value + gradient": anew,
+        "value + gradient": evaluate_uncached,
         "the same, pairs known": slopes,
-        "Hessian": bent,
+        "Hessian": evaluate_hessian,
         "candidates + safe step": step,
     }, contact
 
 
-def theirs(made: Folded) -> tuple[dict[str, Callable[[], object]], int]:
+def build_ipctk_work(made: FoldedSheet) -> tuple[dict[str, Callable[[], object]], int]:
     """The same by ipctk, and how many pairs it has in range."""
     import ipctk
 
@@ -117,7 +117,7 @@ def theirs(made: Folded) -> tuple[dict[str, Callable[[], object]], int]:
         potential.gradient(found, surface, V)
         return potential(found, surface, V)
 
-    def anew() -> float:
+    def evaluate_uncached() -> float:
         found = of.NormalCollisions()
         found.build(surface, V, reach, thickness, of.LBVH())
         return slopes(found)
@@ -128,7 +128,7 @@ def theirs(made: Folded) -> tuple[dict[str, Callable[[], object]], int]:
         return near.compute_collision_free_stepsize(surface, V, W, thickness, of.AdditiveCCD())
 
     return {
-        "value + gradient": anew,
+        "value + gradient": evaluate_uncached,
         "the same, pairs known": lambda: slopes(known),
         "Hessian": lambda: potential.hessian(known, surface, V, of.PSDProjectionMethod.CLAMP),
         "candidates + safe step": step,
@@ -149,11 +149,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options, console = parser.parse_args(), Console()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     with limit_threads(1):
         for size in options.sizes:
-            made = folded(size)
-            (one, contact), (other, pairs) = ours(made), theirs(made)
+            made = fold_sheet(size)
+            (one, contact), (other, pairs) = build_own_work(made), build_ipctk_work(made)
             table = Table("", "ipctk takes", "between", "ours [ms]", box=SIMPLE_HEAD)
             for name, work in one.items():
                 for one_of in (work, other[name]):  # compiled, and in the caches

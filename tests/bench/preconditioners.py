@@ -28,7 +28,7 @@ from springbench.solvers.methods.quasi_newton.nonlinear_cg import NonlinearCG
 from springbench.solvers.model.step_problem import Positions, Solver, StopRule
 from springbench.solvers.objective.step_objective import Hessian
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 CONFIG = Path(__file__).parents[2] / "configs" / "hessians.yaml"
 SCENES = tuple(CONFIG.with_suffix("") / f"{name}-pressed-0.yaml" for name in ("block", "cloth-100", "cloth-1e4"))
@@ -69,7 +69,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    table, begin, rows = Table("scene", "solver", *NAMES, box=SIMPLE_HEAD), describe_moment(), list[dict[str, Any]]()
+    table, begin, rows = Table("scene", "solver", *NAMES, box=SIMPLE_HEAD), describe_provenance(), list[dict[str, Any]]()
     with limit_threads(1):
         for path in options.scenes:
             for name, solver in SOLVERS.items():

@@ -34,7 +34,7 @@ from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
 from springbench.solvers.model.energies import spring_energy
 from springbench.solvers.model.step_problem import Solver, StepProblem, StopRule
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.scene_builders import build_first_problem, build_test_scene
 
 CHAIN = Path(__file__).parents[2] / "configs" / "scenes" / "chain.yaml"
@@ -83,7 +83,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     problems = {
         "stiffer springs": [hanging(1e3, stiffer=ratio) for ratio in RATIOS],
         "a heavier end": [hanging(1e5, heavier=ratio) for ratio in RATIOS],

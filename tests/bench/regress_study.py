@@ -43,7 +43,7 @@ from tests.bench.replay_study import (
     replay_comparison,
     replay_tests,
 )
-from tests.bench.scripted_study import describe_moment, publish_tables
+from tests.bench.scripted_study import describe_provenance, publish_tables
 
 app = typer.Typer(
     cls=ErrorReportingGroup,
@@ -199,7 +199,7 @@ def publish_rates(folder: Path, samples: Sequence[Path], rates: Sequence[dict[st
         "blocks": parquet_rows.read_rows(samples, RECORD_SCHEMA),
         "rates": pa.Table.from_pylist([rename_tools(row) for row in rates]),
     }
-    moments = [describe_moment() | {"load_average": row["load_average"]} for row in rates]
+    moments = [describe_provenance() | {"load_average": row["load_average"]} for row in rates]
     command = f"python -m tests.bench.regress_study replay {folder / TABLE_FILES['blocks']}"
     publish_tables(folder, Path("configs/scenes/hanging-cloth.yaml"), command, tables, moments)
 

@@ -18,7 +18,7 @@ from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.results.published_set import TABLE_FILES, compute_file_digest
 
 
-def describe_moment() -> dict[str, Any]:
+def describe_provenance() -> dict[str, Any]:
     """Describe machine, commit, date and load of this moment; a script calls it when it begins."""
     return build_provenance_columns() | {"load_average": os.getloadavg()[0]}
 
@@ -39,7 +39,7 @@ def publish_tables(
         config: config or scene that was measured.
         command: command that repeats the study.
         tables: tables by their names in TABLE_FILES.
-        moments: values of `describe_moment`, of which the first and the last give dates and load.
+        moments: values of `describe_provenance`, of which the first and the last give dates and load.
         is_timed: whether times are among the results.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -73,10 +73,10 @@ def publish_rows(
         config: config or scene that was measured.
         command: command that repeats the study.
         rows: one mapping for each measurement; a column that a row lacks is empty in it.
-        begin: value of `describe_moment` when the script began.
+        begin: value of `describe_provenance` when the script began.
         is_timed: whether times are among the results.
     """
     if folder:
         names = dict.fromkeys(name for row in rows for name in row)
         tables = {"measurements": pa.table({name: [row.get(name) for row in rows] for name in names})}
-        publish_tables(folder, config, command, tables, [begin, describe_moment()], is_timed=is_timed)
+        publish_tables(folder, config, command, tables, [begin, describe_provenance()], is_timed=is_timed)

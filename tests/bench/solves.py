@@ -41,7 +41,7 @@ def solves(factorise: Callable[[csr_array], LinearSolver], size: int, repeats: i
     return work
 
 
-def stepped(linear: LinearSolverName, size: int, repeats: int) -> Work:
+def build_steps(linear: LinearSolverName, size: int, repeats: int) -> Work:
     """Whole steps of the compiled backend with a linear solver, from the sheet at rest; the positions [m]."""
     scene = sheet(size)
     prepared = CompiledLocalGlobal(linear_solver=linear).prepare(scene.system)
@@ -66,8 +66,8 @@ def _gate(against: str, factorise: Callable[[csr_array], LinearSolver], size: in
 def _step_gate(size: int) -> Gate:
     return Gate(
         name=f"supernodal-step-against-cholespy-{size}",
-        candidate=lambda: stepped("supernodal", size, max(1, 64**2 // size**2)),
-        baseline=lambda: stepped("cholespy", size, max(1, 64**2 // size**2)),
+        candidate=lambda: build_steps("supernodal", size, max(1, 64**2 // size**2)),
+        baseline=lambda: build_steps("cholespy", size, max(1, 64**2 // size**2)),
         tolerance=1e-9,  # as above, in positions of a metre
         limit=0.8,
         guards=GUARDS,

@@ -29,7 +29,7 @@ from springbench.harness.simulation.time_loop import build_initial_state, build_
 from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 SCENE = Path(__file__).parents[2] / "configs" / "scenes" / "net.yaml"
 SIZE = 2
@@ -38,7 +38,7 @@ METHODS = (
     *("xpbd", "xpbd-small-steps", "symplectic-euler", "velocity-verlet", "newton", "newton-cg"),
 )
 """The methods with compiled iterations, and Newton's methods, whose iterations are compiled one by one."""
-WANTED_SECONDS = 30e-6
+MIN_SAMPLE_SECONDS = 30e-6
 MORE_ITERATIONS = 10
 BATCH_SOLVES = 50
 """Solves one after the other of which the time is measured together, as in a simulation, whose caches are warm."""
@@ -97,15 +97,15 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=40)
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin = describe_moment()
+    begin = describe_provenance()
     with limit_threads(1):
         rows = measure_methods(options.methods, options.repeats)
     table = Table("solver", "solve", "each further iteration", "to a tolerance", "step", title="microseconds")
     for row in rows:
         table.add_row(row["solver"], *(f"{1e6 * value:.1f}" for key, value in row.items() if key != "solver"))
     get_output_console().print(table)
-    over = [row["solver"] for row in rows if row["solve_seconds"] > WANTED_SECONDS]
-    get_output_console().print(f"above {1e6 * WANTED_SECONDS:g} microseconds a solve: {', '.join(over) or 'none'}")
+    over = [row["solver"] for row in rows if row["solve_seconds"] > MIN_SAMPLE_SECONDS]
+    get_output_console().print(f"above {1e6 * MIN_SAMPLE_SECONDS:g} microseconds a solve: {', '.join(over) or 'none'}")
     publish_rows(options.publish, SCENE, "python -m tests.bench.step_overhead", rows, begin)
 
 

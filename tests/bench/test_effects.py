@@ -8,12 +8,12 @@ from springbench.harness.execution.machine_info import limit_threads
 from springbench.harness.experiments.ablation.iteration_overhead import measure_overhead, prepare_scene
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.effects import GATES, KINDS, PRICES, SINGLE_EFFECTS, SOLVED, STOP
+from tests.bench.effects import GATES, KINDS, PRICES, SINGLE_EFFECTS, DEFAULT_SOLVERS, STOP
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("effect", [*SINGLE_EFFECTS, "all"])
-@pytest.mark.parametrize("solver", SOLVED)
+@pytest.mark.parametrize("solver", DEFAULT_SOLVERS)
 def test_an_effect_stays_below_its_limit(solver: str, effect: str):
     """By the lower end of the interval: a price that is beyond the limit for sure fails, noise does not."""
     made, scene = load_target(SOLVERS[solver])(), load_scene(PRICES)

@@ -21,8 +21,8 @@ from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCh
 from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.contact import FAR, fallen
-from tests.bench.gates import STOP, THREADS, prepare, record, sheet, simulated, steps
+from tests.bench.contact import FAR, build_fall
+from tests.bench.gates import STOP, THREADS, prepare, record, sheet, build_simulation, steps
 from tests.bench.solves import system_matrix
 from tests.scene_builders import SCENE_BUILDERS
 
@@ -108,12 +108,12 @@ def factorisations(monkeypatch: pytest.MonkeyPatch) -> Factorisations:
         found.separate += self.fronts.block_size > 1  # not that of Q, whose blocks are numbers
         return saved(self, *given)
 
-    def solve_anew(self: BlockCholesky, *given: Any) -> Any:
+    def factorise_and_solve(self: BlockCholesky, *given: Any) -> Any:
         found.once += 1
         return once(self, *given)
 
     monkeypatch.setattr(BlockCholesky, "factorise", factorise)
-    monkeypatch.setattr(BlockCholesky, "factorise_and_solve", solve_anew)
+    monkeypatch.setattr(BlockCholesky, "factorise_and_solve", factorise_and_solve)
     return found
 
 
@@ -172,12 +172,12 @@ def test_a_step_allocates_as_many_arrays_as_stored(solver: str, stated: int, sol
 
 
 def test_idle_contact_allocates_no_array_more():
-    assert arrays(fallen(FAR, size=64, frames=3), 64) == arrays(fallen(size=64, frames=3), 64)
+    assert arrays(build_fall(FAR, size=64, frames=3), 64) == arrays(build_fall(size=64, frames=3), 64)
 
 
 @pytest.mark.parametrize(("solver", "frames"), [("numba", 4), ("sparse", 2)])
 def test_the_same_work_retires_the_same_instructions(solver: str, frames: int):
-    work = simulated(solver, 16, frames)
+    work = build_simulation(solver, 16, frames)
     with limit_threads(THREADS):
         work()
         first, second = hardware_counters.count_events(work), hardware_counters.count_events(work)

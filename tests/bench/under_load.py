@@ -26,8 +26,8 @@ from tests.bench.contact import CONTACT
 from tests.bench.gates import GATES, THREADS, Gate
 from tests.bench.replay_study import run_background_load
 
-NAMED = {gate.name: gate for gate in (*GATES, *CONTACT)}
-ASKED = ("harness-against-bare-solver-64", "numba-against-sparse-64", "idle-contact-against-none-64")
+GATES_BY_NAME = {gate.name: gate for gate in (*GATES, *CONTACT)}
+MEASURED_GATES = ("harness-against-bare-solver-64", "numba-against-sparse-64", "idle-contact-against-none-64")
 
 
 def run_gate(gate: Gate, budget: float) -> BenchmarkResult:
@@ -42,19 +42,19 @@ def run_gate(gate: Gate, budget: float) -> BenchmarkResult:
 def main() -> None:
     """Print a row for each gate."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("gates", nargs="*", metavar="GATE", help=f"of {', '.join(NAMED)}")
+    parser.add_argument("gates", nargs="*", metavar="GATE", help=f"of {', '.join(GATES_BY_NAME)}")
     parser.add_argument("--times", type=int, default=50)
     parser.add_argument("--background-load", default="busy")
     parser.add_argument("--budget", type=float, default=10.0)
     options = parser.parse_args()
-    if unknown := sorted({*options.gates} - NAMED.keys()):
-        parser.error(f"{', '.join(unknown)}: no such gate; there are {', '.join(NAMED)}")
+    if unknown := sorted({*options.gates} - GATES_BY_NAME.keys()):
+        parser.error(f"{', '.join(unknown)}: no such gate; there are {', '.join(GATES_BY_NAME)}")
     console = Console(width=120)
-    found: dict[str, list[BenchmarkResult]] = {name: [] for name in options.gates or ASKED}
+    found: dict[str, list[BenchmarkResult]] = {name: [] for name in options.gates or MEASURED_GATES}
     with limit_threads(THREADS), run_background_load(options.background_load):
         for number in range(options.times):
             for name, results in found.items():
-                results.append(run_gate(NAMED[name], options.budget))
+                results.append(run_gate(GATES_BY_NAME[name], options.budget))
                 console.print(f"{number + 1} of {options.times}, {name}: {results[-1]}", style="dim")
     table = Table("gate", "limit", "fail", "pass", "inconclusive", "ratio", "median s", "load", box=SIMPLE_HEAD)
     for name, results in found.items():
@@ -67,7 +67,7 @@ def main() -> None:
             median(values)
             for values in zip(*((r.interval.ratio, r.elapsed_seconds, r.load_average) for r in results), strict=True)
         )
-        table.add_row(name, f"{NAMED[name].limit}", *counts, f"{ratio:.3f}", f"{seconds:.1f}", f"{load:.1f}")
+        table.add_row(name, f"{GATES_BY_NAME[name].limit}", *counts, f"{ratio:.3f}", f"{seconds:.1f}", f"{load:.1f}")
     console.print(table)
 
 

@@ -18,7 +18,7 @@ from springbench.harness.experiments.validation.validation_study import list_cas
 from springbench.harness.scenes.fabric_table import PUBLISHED_FABRICS, PublishedFabric
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 
 FABRICS = Path(__file__).parents[2] / "harness" / "scenes" / "fabric_table.py"
 """File that states the measured fabrics."""
@@ -72,7 +72,7 @@ def main() -> None:
     parser.add_argument("cases", nargs="*", default=list_case_names(), metavar="CASE")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     for row in measure_cases(options.cases):
         print(*(f"{value:.6g}" if isinstance(value, float) else value for value in row.values()), sep=", ", flush=True)
         rows.append(row)

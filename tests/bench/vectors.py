@@ -48,11 +48,11 @@ from springbench.solvers.model.step_problem import Positions
 
 from tests.bench import plain
 from tests.bench.gates import STOP, prepare, sheet
-from tests.bench.pairs import folded
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.pairs import fold_sheet
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.bench.solves import system_matrix
 
-SIZE, TURNS = 64, 40
+SIZE, NUM_BLOCKS = 64, 40
 SHEET_FILE = Path(__file__).with_name("gates.py")
 """File that states the measured sheet."""
 ROUND_OFF = 1e-5
@@ -73,29 +73,29 @@ class Case:
     found: tuple[int, ...]
 
 
-def recompiled(kernel: Any, plain: dict[str, Callable[..., Any]]) -> Any:
+def recompile_kernel(kernel: Any, plain: dict[str, Callable[..., Any]]) -> Any:
     """The kernel, to be called from Python, with what is plain in the place of what has these names."""
     function = kernel.py_func
     names: dict[str, Any] = {}
     for name in function.__code__.co_names:
         value = function.__globals__.get(name)
         if name in plain and value is not None:
-            names[name] = _compiled(plain[name])
+            names[name] = _compile_function(plain[name])
         elif isinstance(value, ModuleType) and value.__name__.startswith("springbench.solvers."):
             names[name] = ModuleType(name)
             found = {key: part for key, part in plain.items() if hasattr(value, key)}
-            vars(names[name]).update(vars(value) | {key: _compiled(part) for key, part in found.items()})
+            vars(names[name]).update(vars(value) | {key: _compile_function(part) for key, part in found.items()})
         elif (
             hasattr(value, "py_func")
             and value.__module__.startswith("springbench.solvers.")
             and _reaches(value, set(plain))
         ):
-            names[name] = recompiled(value, plain)
+            names[name] = recompile_kernel(value, plain)
     copy = FunctionType(function.__code__, function.__globals__ | names, function.__name__, function.__defaults__)
-    return _compiled(copy)
+    return _compile_function(copy)
 
 
-def _compiled(function: Callable[..., Any]) -> Any:
+def _compile_function(function: Callable[..., Any]) -> Any:
     options: Any = {"nogil": True, "_nrt": False}
     return njit(**options)(function)
 
@@ -110,18 +110,18 @@ def _reaches(kernel: Any, names: set[str], seen: frozenset[Any] = frozenset()) -
     )
 
 
-def given(
+def capture_arguments(
     module: Any, name: str, work: Callable[[], object], accepts: Callable[[tuple[Any, ...]], object] = bool
 ) -> tuple[Any, ...]:
     """The arguments of the last call of a kernel in a module while something is done, of those that are accepted."""
     kernel, calls = getattr(module, name), list[tuple[Any, ...]]()
 
-    def noted(*arguments: Any) -> Any:
+    def record_call(*arguments: Any) -> Any:
         calls.append(arguments)
         return kernel(*arguments)
 
-    noted.overloads = defaultdict(lambda: SimpleNamespace(entry_point=noted))  # pyright: ignore[reportFunctionMemberAccess]
-    setattr(module, name, noted)
+    record_call.overloads = defaultdict(lambda: SimpleNamespace(entry_point=record_call))  # pyright: ignore[reportFunctionMemberAccess]
+    setattr(module, name, record_call)
     try:
         work()
     finally:
@@ -138,7 +138,7 @@ def solving(solver: str) -> Callable[[], object]:
 
 def of_springs() -> Iterator[Case]:
     """Over bundles of eight vertices with their springs."""
-    state, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
+    state, window, _, _ = capture_arguments(accelerated_step, "run_solve", solving("lbfgs"))
     parts, p, out = state.spring_packets, window.trial_position, window.trial_descent.copy()
     whole = 0, len(parts.packet_start) - 1
     short = {"add_spring_projection": plain.refuse, "add_spring_forces": plain.refuse}
@@ -162,7 +162,7 @@ def of_springs() -> Iterator[Case]:
 
 def of_descent() -> Iterator[Case]:
     """Over the same bundles, with the objective."""
-    state, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
+    state, window, _, _ = capture_arguments(accelerated_step, "run_solve", solving("lbfgs"))
     descent = (
         state.spring_packets,
         state.objective_weights,
@@ -176,14 +176,14 @@ def of_descent() -> Iterator[Case]:
 
 def of_dots() -> Iterator[Case]:
     """Over the vectors of L-BFGS."""
-    _, window, _, _ = given(accelerated_step, "run_solve", solving("lbfgs"))
+    _, window, _, _ = capture_arguments(accelerated_step, "run_solve", solving("lbfgs"))
     both = {"ordered_dot": plain.dot, "ordered_dot_pair": plain.dots}
     yield Case("a step of L-BFGS", accelerated_descent.accept_trial, (window, window.correction.copy()), both, ())
 
 
 def of_vbd() -> Iterator[Case]:
     """Over colours."""
-    blocks, spaces, other, right, _, work, p, _ = given(vbd_sweeps, "run_iterations", solving("vbd"))
+    blocks, spaces, other, right, _, work, p, _ = capture_arguments(vbd_sweeps, "run_iterations", solving("vbd"))
     yield Case(
         "sweep",
         vbd_sweeps._sweep_vertices,
@@ -202,7 +202,7 @@ def of_supernodal() -> Iterator[Case]:
         def solve_system(precision: Any = precision) -> None:
             SupernodalCholesky(Q, precision=precision).solve(b, np.empty_like(b))
 
-        solve = given(supernodal_cholesky, "solve_from_arrays", solve_system)
+        solve = capture_arguments(supernodal_cholesky, "solve_from_arrays", solve_system)
         yield Case(f"solve, {precision}", triangular_solve.solve_from_arrays, solve, panel, (10,))
 
 
@@ -216,7 +216,8 @@ def of_block() -> Iterator[Case]:
         "backward_solve_tile": plain.solve_rows,
         "add_vector": plain.add,
     }
-    arguments = given(block_cholesky, "run_stages", solving("newton"), lambda call: len(call[2]))  # a factorisation
+    # The call that factorises.
+    arguments = capture_arguments(block_cholesky, "run_stages", solving("newton"), lambda call: len(call[2]))
     fronts, schedule, values, panels, x, *team = arguments
     yield Case("factorisation", block_multifrontal.run_stages, arguments, tiles, (3,))
     solve = fronts, factorisation_schedule.select_solve(schedule), values, panels, x, *team
@@ -231,7 +232,7 @@ def of_rows() -> Iterator[Case]:
         ("product with Q", "multiply_sparse_and_dot", (4,)),
         ("smoothing, float32", "chebyshev_step", (7, 9)),
     ):
-        arguments = given(multigrid_kernels, name, lambda: cg.solve(b, np.empty_like(b)))
+        arguments = capture_arguments(multigrid_kernels, name, lambda: cg.solve(b, np.empty_like(b)))
         yield Case(what, getattr(multigrid_kernels, name), arguments, rows, found)
 
 
@@ -243,7 +244,7 @@ def system() -> tuple[csr_array, Positions]:
 
 def of_eights() -> Iterator[Case]:
     """Over pairs of four layers that touch."""
-    made = folded(SIZE)
+    made = fold_sheet(SIZE)
     mesh, p = made.mesh, made.p
     surface = CollisionMesh.from_rest_shape(
         mesh.rest_positions,
@@ -282,7 +283,7 @@ CASES = {
 def ratio(case: Case) -> tuple[float, float, float]:
     """Plain over vectors: the median, and the interval around it. Raises AssertionError where they find otherwise."""
     assert _reaches(case.kernel, set(case.plain)), f"{case.what}: calls none of {sorted(case.plain)}"
-    kernels = [recompiled(case.kernel, names) for names in (case.plain, {})]
+    kernels = [recompile_kernel(case.kernel, names) for names in (case.plain, {})]
     saved, answers = [np.copy(case.arguments[k]) for k in case.found], []
     for kernel in kernels:
         for k, before in zip(case.found, saved, strict=True):
@@ -294,7 +295,7 @@ def ratio(case: Case) -> tuple[float, float, float]:
     once = min(_seconds(kernel, case, 3) for kernel in kernels)
     repeats = max(1, ceil(MIN_CALL_SECONDS / once / 2))
     turns = []
-    for order in islice(draw_block_orders(), TURNS):
+    for order in islice(draw_block_orders(), NUM_BLOCKS):
         seconds = tuple(_seconds(kernels["AB".index(who)], case, repeats) for who in order)
         turns.append(TimedBlock(order, seconds).log_ratio)
     found = compute_interval(turns)
@@ -317,7 +318,7 @@ def main() -> None:
     parser.add_argument("files", nargs="*", default=list(CASES), metavar="FILE")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    begin, rows = describe_moment(), list[dict[str, Any]]()
+    begin, rows = describe_provenance(), list[dict[str, Any]]()
     print(f"{describe_machine().cpu}, one thread, {SIZE} x {SIZE} vertices; load {getloadavg()[0]:.1f}\n")
     print("| file | what | plain Numba takes | between |\n|---|---|---|---|")
     with limit_threads(1):

@@ -46,7 +46,7 @@ def good_archive(folder: Path) -> Content:
         return {name: packed.read(name) for name in packed.namelist()}
 
 
-def zipped(content: Content) -> bytes:
+def build_archive(content: Content) -> bytes:
     """An archive with valid checksums, but where the content has its own."""
     sums = "".join(f"{sha256(data).hexdigest()}  {name}\n" for name, data in sorted(content.items()))
     file = io.BytesIO()
@@ -63,7 +63,7 @@ def table(**columns: Any) -> bytes:
     return file.getvalue()
 
 
-def rewritten(**given: Any) -> Callable[[Content], None]:
+def rewrite_columns(**given: Any) -> Callable[[Content], None]:
     """Columns with other values in all rows; a pyarrow array has a type of its own."""
 
     def change(content: Content) -> None:
@@ -143,39 +143,39 @@ CHANGES: dict[str, Callable[[Content], None]] = {
     "rows without rows": put(ROWS, table(run_id=pa.array([], pa.string()), status=pa.array([], pa.string()))),
     "rows without a phase": put(ROWS, table(run_id=["a"], status=["ok"])),
     "columns of one name": put(ROWS, table(**ONE)),  # see `doubled`
-    "a phase that is null": rewritten(phase=None),
-    "a frame that is null": rewritten(frame=None),
-    "a frame of 2**62": rewritten(frame=2**62),
-    "a negative frame": rewritten(frame=-5),
-    "a round that is null": rewritten(round=None),
-    "a round of 2**62": rewritten(round=2**62),
-    "a status that is null": rewritten(status=None),
-    "a status of its own": rewritten(status="splendid"),
-    "a run id that is null": rewritten(run_id=None),
-    "a run id that leads elsewhere": rewritten(run_id="../../../../../elsewhere/evil"),
-    "a run id that is a number": rewritten(run_id=pa.array([1.5, 2.5])),
-    "a size that is a text": rewritten(size=pa.array(["big", "small"])),
-    "a size below zero": rewritten(size=-1),
-    "a size of 2**62": rewritten(size=2**62),
-    "seconds that are words": rewritten(seconds=pa.array(["soon", "late"])),
-    "seconds that are null": rewritten(seconds=None),
-    "seconds of NaN": rewritten(seconds=float("nan")),
-    "seconds below zero": rewritten(seconds=-1.0),
-    "no digest": rewritten(positions_digest=None),
-    "a machine that is null": rewritten(machine_id=None),
-    "threads of 2**62": rewritten(threads=2**62),
-    "a time step of NaN": rewritten(time_step=float("nan")),
-    "a tolerance of infinity": rewritten(residual_rtol=float("inf")),
-    "a requested error of -1": rewritten(error_requested=-1.0),
-    "parameters that are no JSON": rewritten(parameters="{" * 10_000),
-    "a solver of markup": rewritten(solver="[bold]\x1b[2J<script>\n"),
-    "a scene of 10 MB": rewritten(scene="x" * 10_000_000),
-    "a nested column": rewritten(extra=pa.array([{"a": [1, 2], "b": {"c": 3}}, None])),
-    "a column called file": rewritten(file=pa.array(["a", "b"])),
-    "a column called file_index": rewritten(file_index=pa.array([7, 8])),
-    "a column called SIZE": rewritten(SIZE=pa.array([7, 8])),
-    "a column without a name": rewritten(**{"": pa.array([7, 8])}),
-    "2,000 columns": rewritten(**{f"c{k}": pa.array([k, k]) for k in range(2_000)}),
+    "a phase that is null": rewrite_columns(phase=None),
+    "a frame that is null": rewrite_columns(frame=None),
+    "a frame of 2**62": rewrite_columns(frame=2**62),
+    "a negative frame": rewrite_columns(frame=-5),
+    "a round that is null": rewrite_columns(round=None),
+    "a round of 2**62": rewrite_columns(round=2**62),
+    "a status that is null": rewrite_columns(status=None),
+    "a status of its own": rewrite_columns(status="splendid"),
+    "a run id that is null": rewrite_columns(run_id=None),
+    "a run id that leads elsewhere": rewrite_columns(run_id="../../../../../elsewhere/evil"),
+    "a run id that is a number": rewrite_columns(run_id=pa.array([1.5, 2.5])),
+    "a size that is a text": rewrite_columns(size=pa.array(["big", "small"])),
+    "a size below zero": rewrite_columns(size=-1),
+    "a size of 2**62": rewrite_columns(size=2**62),
+    "seconds that are words": rewrite_columns(seconds=pa.array(["soon", "late"])),
+    "seconds that are null": rewrite_columns(seconds=None),
+    "seconds of NaN": rewrite_columns(seconds=float("nan")),
+    "seconds below zero": rewrite_columns(seconds=-1.0),
+    "no digest": rewrite_columns(positions_digest=None),
+    "a machine that is null": rewrite_columns(machine_id=None),
+    "threads of 2**62": rewrite_columns(threads=2**62),
+    "a time step of NaN": rewrite_columns(time_step=float("nan")),
+    "a tolerance of infinity": rewrite_columns(residual_rtol=float("inf")),
+    "a requested error of -1": rewrite_columns(error_requested=-1.0),
+    "parameters that are no JSON": rewrite_columns(parameters="{" * 10_000),
+    "a solver of markup": rewrite_columns(solver="[bold]\x1b[2J<script>\n"),
+    "a scene of 10 MB": rewrite_columns(scene="x" * 10_000_000),
+    "a nested column": rewrite_columns(extra=pa.array([{"a": [1, 2], "b": {"c": 3}}, None])),
+    "a column called file": rewrite_columns(file=pa.array(["a", "b"])),
+    "a column called file_index": rewrite_columns(file_index=pa.array([7, 8])),
+    "a column called SIZE": rewrite_columns(SIZE=pa.array([7, 8])),
+    "a column without a name": rewrite_columns(**{"": pa.array([7, 8])}),
+    "2,000 columns": rewrite_columns(**{f"c{k}": pa.array([k, k]) for k in range(2_000)}),
     "200 GB of texts": put(ROWS, lambda: repeated_text(200_000, 1_000_000)),
     "2 million rows of a kB": put(ROWS, lambda: repeated_text(1_900_000, 1_000)),
     "3 million rows": put(ROWS, lambda: table(run_id=pa.nulls(3_000_000, pa.string()))),
@@ -210,11 +210,11 @@ def archive(name: str, good: Content, path: Path) -> None:
     content = dict(good)
     del content["SHA256SUMS"]
     CHANGES[name](content)
-    packed = zipped(content)
+    packed = build_archive(content)
     if name == "columns of one name":
         file = io.BytesIO()
         pq.write_table(pa.Table.from_arrays([pa.array(["a"])] * 2, names=["run_id", "run_id"]), file)
-        packed = zipped(content | {ROWS: file.getvalue()})
+        packed = build_archive(content | {ROWS: file.getvalue()})
     if name == "no sums":
         file = io.BytesIO()
         with zipfile.ZipFile(file, "w") as into:
@@ -252,7 +252,7 @@ def overlapping(copies: int = 500) -> bytes:
     return whole[:at] + directory + tail
 
 
-def patched(data: bytes, old: bytes, new: bytes) -> bytes:
+def patch_bytes(data: bytes, old: bytes, new: bytes) -> bytes:
     assert old in data
     return data.replace(old, new)
 
@@ -269,7 +269,7 @@ RAW: dict[str, Callable[[], bytes]] = {
     "entries that overlap": overlapping,
     "by lzma": lambda: entries(("SHA256SUMS", b"a"), method=zipfile.ZIP_LZMA),
     "by bzip2": lambda: entries(("SHA256SUMS", b"a"), method=zipfile.ZIP_BZIP2),
-    "encrypted": lambda: patched(
+    "encrypted": lambda: patch_bytes(
         entries(("SHA256SUMS", b"a")), b"PK\x01\x02\x14\x03\x14\0\0\0", b"PK\x01\x02\x14\x03\x14\0\x01\0"
     ),
     "names that lead elsewhere": lambda: entries(("../../evil", b"a"), ("/evil", b"a"), ("SHA256SUMS", b"")),
@@ -278,17 +278,17 @@ RAW: dict[str, Callable[[], bytes]] = {
     "a file and a folder of one name": lambda: entries(("a", b"a"), ("a/b", b"a")),
     "a folder and a file of one name": lambda: entries(("a/b", b"a"), ("a", b"a")),
     "a link for the sums": link_entry,
-    "a damaged sum": lambda: patched(entries(("SHA256SUMS", b"hello"), method=zipfile.ZIP_STORED), b"hello", b"jello"),
-    "a damaged stream": lambda: patched(
+    "a damaged sum": lambda: patch_bytes(entries(("SHA256SUMS", b"hello"), method=zipfile.ZIP_STORED), b"hello", b"jello"),
+    "a damaged stream": lambda: patch_bytes(
         entries(("SHA256SUMS", b"hello" * 9)), b"\xcbH\xcd\xc9\xc9", b"\xff\xff\xff\xff\xff"
     ),
-    "a name that is no UTF-8": lambda: patched(entries(("é" * 3, b"a")), "ééé".encode(), b"\xff\xfe\xff\xfe\xff\xfe"),
+    "a name that is no UTF-8": lambda: patch_bytes(entries(("é" * 3, b"a")), "ééé".encode(), b"\xff\xfe\xff\xfe\xff\xfe"),
     "a name twice": lambda: entries(("SHA256SUMS", b""), ("SHA256SUMS", b"b")),
     "210,000 files": lambda: entries(*((str(k), b"") for k in range(210_000)), method=zipfile.ZIP_STORED),
 }
 
 
-def replaced(place: str, make: Callable[[Path], object]) -> Callable[[Path], None]:
+def replace_path(place: str, make: Callable[[Path], object]) -> Callable[[Path], None]:
     """Something else in the place of a file or folder of the results."""
 
     def change(folder: Path) -> None:
@@ -315,7 +315,7 @@ def odd_unit(name: bytes) -> Callable[[Path], None]:
     return change
 
 
-def moved(name: bytes) -> Callable[[Path], None]:
+def rename_results(name: bytes) -> Callable[[Path], None]:
     return lambda folder: os.rename(folder / "results" / "sweep", os.path.join(os.fsencode(folder / "results"), name))
 
 
@@ -325,31 +325,31 @@ def other_type(folder: Path) -> None:
 
 
 FOLDERS: dict[str, Callable[[Path], None]] = {
-    "rows that are a file": replaced("sweep/rows", Path.touch),
-    "rows that are a pipe": replaced("sweep/rows", os.mkfifo),
-    "rows that are a link to a device": replaced("sweep/rows", link_to("/dev/zero")),
-    "rows that link to themselves": replaced("sweep/rows", link_to("rows")),
-    "a unit that is a pipe": replaced("sweep/rows/a.parquet", os.mkfifo),
-    "a unit that is a folder": replaced("sweep/rows/a.parquet", Path.mkdir),
-    "a unit that is a device": replaced("sweep/rows/a.parquet", link_to("/dev/zero")),
-    "a unit that is nothing": replaced("sweep/rows/a.parquet", link_to("none")),
-    "packed rows that are a pipe": replaced("sweep/rows.parquet", os.mkfifo),
-    "packed rows that are a folder": replaced("sweep/rows.parquet", Path.mkdir),
-    "packed rows that are a device": replaced("sweep/rows.parquet", link_to("/dev/zero")),
-    "a lock that is a pipe": replaced("sweep/.lock", os.mkfifo),
-    "a lock that is a link": replaced("sweep/.lock", link_to("../../sweep.yaml")),
-    "a lock that is a folder": replaced("sweep/.lock", Path.mkdir),
-    "a way that is a pipe": replaced("sweep/.config", os.mkfifo),
-    "a way that is a device": replaced("sweep/.config", link_to("/dev/zero")),
-    "a way that is a folder": replaced("sweep/.config", Path.mkdir),
-    "recordings that are a pipe": replaced("sweep/recordings", os.mkfifo),
-    "a recording that is a pipe": replaced("sweep/recordings/a.rrd", os.mkfifo),
-    "a recording that is a device": replaced("sweep/recordings/a.rrd", link_to("/dev/zero")),
-    "a picture that is a link": replaced("sweep/pictures/a.png", link_to("/etc/passwd")),
-    "a folder called as a column": moved(b"size=64"),
-    "a folder called as a pattern": moved(b"[a]*?"),
-    "a folder that is no UTF-8": moved(b"\xff\xfe"),
-    "a folder of two lines": moved(b"a\nb"),
+    "rows that are a file": replace_path("sweep/rows", Path.touch),
+    "rows that are a pipe": replace_path("sweep/rows", os.mkfifo),
+    "rows that are a link to a device": replace_path("sweep/rows", link_to("/dev/zero")),
+    "rows that link to themselves": replace_path("sweep/rows", link_to("rows")),
+    "a unit that is a pipe": replace_path("sweep/rows/a.parquet", os.mkfifo),
+    "a unit that is a folder": replace_path("sweep/rows/a.parquet", Path.mkdir),
+    "a unit that is a device": replace_path("sweep/rows/a.parquet", link_to("/dev/zero")),
+    "a unit that is nothing": replace_path("sweep/rows/a.parquet", link_to("none")),
+    "packed rows that are a pipe": replace_path("sweep/rows.parquet", os.mkfifo),
+    "packed rows that are a folder": replace_path("sweep/rows.parquet", Path.mkdir),
+    "packed rows that are a device": replace_path("sweep/rows.parquet", link_to("/dev/zero")),
+    "a lock that is a pipe": replace_path("sweep/.lock", os.mkfifo),
+    "a lock that is a link": replace_path("sweep/.lock", link_to("../../sweep.yaml")),
+    "a lock that is a folder": replace_path("sweep/.lock", Path.mkdir),
+    "a way that is a pipe": replace_path("sweep/.config", os.mkfifo),
+    "a way that is a device": replace_path("sweep/.config", link_to("/dev/zero")),
+    "a way that is a folder": replace_path("sweep/.config", Path.mkdir),
+    "recordings that are a pipe": replace_path("sweep/recordings", os.mkfifo),
+    "a recording that is a pipe": replace_path("sweep/recordings/a.rrd", os.mkfifo),
+    "a recording that is a device": replace_path("sweep/recordings/a.rrd", link_to("/dev/zero")),
+    "a picture that is a link": replace_path("sweep/pictures/a.png", link_to("/etc/passwd")),
+    "a folder called as a column": rename_results(b"size=64"),
+    "a folder called as a pattern": rename_results(b"[a]*?"),
+    "a folder that is no UTF-8": rename_results(b"\xff\xfe"),
+    "a folder of two lines": rename_results(b"a\nb"),
     "a unit called as a pattern": odd_unit(b"[*]?.parquet"),
     "a unit that is no UTF-8": odd_unit(b"\xff.parquet"),
     "a unit of two lines": odd_unit(b"a\nb.parquet"),

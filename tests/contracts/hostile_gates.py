@@ -8,12 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.contracts.hostile import BOMB
-from tests.contracts.hostile_more import stored
+from tests.contracts.hostile_more import build_benchmark_file
 
 TABLE = "gates:\n  - {scene: good.yaml, solver: sparse, baseline: dense, max_ratio: 1}\n"
 
 
-def given(**values: str) -> str:
+def build_gate_table(**values: str) -> str:
     """A table of one gate with these keys."""
     keys = {"scene": "good.yaml", "solver": "sparse", "baseline": "dense", "max_ratio": "1"} | values
     return "gates:\n  - {" + ", ".join(f"{key}: {value}" for key, value in keys.items()) + "}\n"
@@ -25,32 +25,32 @@ TABLES: dict[str, str | bytes | Callable[[Path], object]] = {
     "no gates": "gates: []\n",
     "gates of a word": "gates: fast\n",
     "gates of gates": "gates: [[[]]]\n",
-    "an unknown key": given(maxratio="1"),
-    "a scene that is missing": given(scene="none.yaml"),
-    "a scene of a device": given(scene="/dev/zero"),
-    "a scene of a pipe": given(scene="pipe"),
-    "a scene that is a sweep": given(scene="sweep.yaml"),
-    "a scene of code": given(scene="'!!python/name:os.system'"),
-    "a solver that is missing": given(solver="fastest-of-all"),
-    "a solver of a list": given(solver="[sparse]"),
-    "a solver without a name": given(solver="{max_iterations: 3}"),
-    "a parameter that is missing": given(solver="{name: sparse, speed: 9}"),
-    "code that is missing": given(solver="./none.py:Solver"),
-    "code elsewhere": given(solver="./../../etc/passwd.py:Solver"),
-    "a limit of zero": given(max_ratio="0"),
-    "a limit of NaN": given(max_ratio=".nan"),
-    "a limit of 1e999": given(max_ratio="1e999"),
-    "an agreement of 2": given(agreement_rtol="2"),
-    "an agreement of NaN": given(agreement_rtol=".nan"),
-    "a size of 1e9": given(size="1e9"),
-    "a size of zero": given(size="0"),
-    "no iterations": given(max_iterations="0"),
-    "a tolerance below zero": given(rtol="-1"),
-    "frames of 1e9": given(frames="1e9"),
-    "a clock of another kind": given(clock="sun"),
-    "a budget of NaN": given(budget=".nan"),
-    "a budget of infinity": given(budget=".inf"),
-    "an integrator of another program": given(integrator="rk4"),
+    "an unknown key": build_gate_table(maxratio="1"),
+    "a scene that is missing": build_gate_table(scene="none.yaml"),
+    "a scene of a device": build_gate_table(scene="/dev/zero"),
+    "a scene of a pipe": build_gate_table(scene="pipe"),
+    "a scene that is a sweep": build_gate_table(scene="sweep.yaml"),
+    "a scene of code": build_gate_table(scene="'!!python/name:os.system'"),
+    "a solver that is missing": build_gate_table(solver="fastest-of-all"),
+    "a solver of a list": build_gate_table(solver="[sparse]"),
+    "a solver without a name": build_gate_table(solver="{max_iterations: 3}"),
+    "a parameter that is missing": build_gate_table(solver="{name: sparse, speed: 9}"),
+    "code that is missing": build_gate_table(solver="./none.py:Solver"),
+    "code elsewhere": build_gate_table(solver="./../../etc/passwd.py:Solver"),
+    "a limit of zero": build_gate_table(max_ratio="0"),
+    "a limit of NaN": build_gate_table(max_ratio=".nan"),
+    "a limit of 1e999": build_gate_table(max_ratio="1e999"),
+    "an agreement of 2": build_gate_table(agreement_rtol="2"),
+    "an agreement of NaN": build_gate_table(agreement_rtol=".nan"),
+    "a size of 1e9": build_gate_table(size="1e9"),
+    "a size of zero": build_gate_table(size="0"),
+    "no iterations": build_gate_table(max_iterations="0"),
+    "a tolerance below zero": build_gate_table(rtol="-1"),
+    "frames of 1e9": build_gate_table(frames="1e9"),
+    "a clock of another kind": build_gate_table(clock="sun"),
+    "a budget of NaN": build_gate_table(budget=".nan"),
+    "a budget of infinity": build_gate_table(budget=".inf"),
+    "an integrator of another program": build_gate_table(integrator="rk4"),
     "aliases": BOMB + TABLE,
     "brackets": "gates: " + "[" * 100_000,
     "text of another coding": TABLE.encode("utf-16"),
@@ -64,14 +64,14 @@ RECORDS: dict[str, str | bytes | Callable[[Path], object]] = {
     "a device": lambda path: path.symlink_to("/dev/zero"),
     "a folder": Path.mkdir,
     "a link to itself": lambda path: path.symlink_to(path.name),
-    "a machine of lists": json.dumps(stored() | {"machine_info": {"cpu": {"brand_raw": ["a"], "count": {}}}}),
-    "a commit of a number": json.dumps(stored() | {"commit_info": {"id": 3, "time": 7}}),
-    "a date of a list": json.dumps(stored() | {"datetime": []}),
-    "names of markup": json.dumps(stored(fullname="[/bold][link=file:///etc/passwd]\x1b[2J")),
-    "a name of a lone surrogate": json.dumps(stored(fullname="\ud800")),
-    "a name of 1 MB": json.dumps(stored(fullname="x" * 1_000_000)),
-    "a time of 1e308": json.dumps(stored(stats={"min": 1e308})),
-    "a time of 1e-308": json.dumps(stored(stats={"min": 1e-308})),
+    "a machine of lists": json.dumps(build_benchmark_file() | {"machine_info": {"cpu": {"brand_raw": ["a"], "count": {}}}}),
+    "a commit of a number": json.dumps(build_benchmark_file() | {"commit_info": {"id": 3, "time": 7}}),
+    "a date of a list": json.dumps(build_benchmark_file() | {"datetime": []}),
+    "names of markup": json.dumps(build_benchmark_file(fullname="[/bold][link=file:///etc/passwd]\x1b[2J")),
+    "a name of a lone surrogate": json.dumps(build_benchmark_file(fullname="\ud800")),
+    "a name of 1 MB": json.dumps(build_benchmark_file(fullname="x" * 1_000_000)),
+    "a time of 1e308": json.dumps(build_benchmark_file(stats={"min": 1e308})),
+    "a time of 1e-308": json.dumps(build_benchmark_file(stats={"min": 1e-308})),
 }
 
 PLUGIN = """

@@ -46,7 +46,7 @@ SCENES_JSON: dict[str, str | bytes] = {
 }
 
 
-def stored(**changes: Any) -> dict[str, Any]:
+def build_benchmark_file(**changes: Any) -> dict[str, Any]:
     one = {"fullname": "a::b", "stats": {"min": 0.01}, "extra_info": {"ratio": {"median": 1, "low": 0.9, "high": 1.1}}}
     return {"machine_info": {"cpu": {}}, "benchmarks": [one | changes], "version": "5"}
 
@@ -56,23 +56,23 @@ GATES: dict[str, str | bytes] = {
     "a list": "[]",
     "null": "null",
     "no text": bytes(range(128, 256)),
-    "no machine": json.dumps({"benchmarks": stored()["benchmarks"]}),
-    "a machine that is a list": json.dumps(stored() | {"machine_info": []}),
-    "benchmarks that are a mapping": json.dumps(stored() | {"benchmarks": {}}),
-    "a name that is a number": json.dumps(stored(fullname=3)),
-    "a minimum of 1e999": json.dumps(stored()).replace("0.01", "1e999"),
-    "a minimum of NaN": json.dumps(stored(stats={"min": float("nan")})),
-    "a minimum of zero": json.dumps(stored(stats={"min": 0})),
-    "a minimum of words": json.dumps(stored(stats={"min": "fast"})),
-    "stats that are null": json.dumps(stored(stats=None)),
-    "a median of 1e999": json.dumps(stored()).replace('"median": 1', '"median": 1e999'),
-    "an interval of 1e999": json.dumps(stored()).replace("1.1", "1e999"),
-    "an interval upside down": json.dumps(stored()).replace("0.9", "9.9"),
-    "a ratio that is a list": json.dumps(stored(extra_info={"ratio": [1, 1, 1]})),
-    "a ratio of infinity": json.dumps(stored()).replace('"median": 1', '"median": Infinity'),
+    "no machine": json.dumps({"benchmarks": build_benchmark_file()["benchmarks"]}),
+    "a machine that is a list": json.dumps(build_benchmark_file() | {"machine_info": []}),
+    "benchmarks that are a mapping": json.dumps(build_benchmark_file() | {"benchmarks": {}}),
+    "a name that is a number": json.dumps(build_benchmark_file(fullname=3)),
+    "a minimum of 1e999": json.dumps(build_benchmark_file()).replace("0.01", "1e999"),
+    "a minimum of NaN": json.dumps(build_benchmark_file(stats={"min": float("nan")})),
+    "a minimum of zero": json.dumps(build_benchmark_file(stats={"min": 0})),
+    "a minimum of words": json.dumps(build_benchmark_file(stats={"min": "fast"})),
+    "stats that are null": json.dumps(build_benchmark_file(stats=None)),
+    "a median of 1e999": json.dumps(build_benchmark_file()).replace('"median": 1', '"median": 1e999'),
+    "an interval of 1e999": json.dumps(build_benchmark_file()).replace("1.1", "1e999"),
+    "an interval upside down": json.dumps(build_benchmark_file()).replace("0.9", "9.9"),
+    "a ratio that is a list": json.dumps(build_benchmark_file(extra_info={"ratio": [1, 1, 1]})),
+    "a ratio of infinity": json.dumps(build_benchmark_file()).replace('"median": 1', '"median": Infinity'),
     "deep lists": "[" * 100_000,
-    "40 MB": " " * 40_000_000 + json.dumps(stored()),
-    "cut": json.dumps(stored())[:-20],
+    "40 MB": " " * 40_000_000 + json.dumps(build_benchmark_file()),
+    "cut": json.dumps(build_benchmark_file())[:-20],
 }
 
 QUERIES: dict[str, str] = {
@@ -177,7 +177,7 @@ MOVES = "motion: {key_frames: [{time: 0}, {time: 1, offset: [0, 6, 0]}]}"
 RISING = f"{{kind: sphere, center: [0.5, -3, 0.5], radius: 0.1, {MOVES}}}"
 CONTACT = "[{kind: springs, stretch: 100}, {kind: contact, obstacles: [%s]}]"
 KEYS = ", ".join(f"{{time: {i}}}" for i in range(10_001))
-PINNED = "{kind: pins, parts: [corners], motion: {key_frames: [{time: 0}, {time: 1, offset: [0, -4, 0]}]}}"
+MOVING_PINS = "{kind: pins, parts: [corners], motion: {key_frames: [{time: 0}, {time: 1, offset: [0, -4, 0]}]}}"
 PRESS = (
     "{kind: plane, point: [0, -1, 0]}, {kind: plane, point: [0, 1, 0], normal: [0, -1, 0], motion: {key_frames: %s}}"
 )
@@ -203,7 +203,7 @@ SCENES: dict[str, tuple[str, str]] = {
         "leave no room",
     ),
     "pins that go through a ball": (
-        scene(effects=f"[{PINNED}, {{kind: contact, obstacles: [{BALL}]}}]"),
+        scene(effects=f"[{MOVING_PINS}, {{kind: contact, obstacles: [{BALL}]}}]"),
         "pins fix vertex",
     ),
     "a ball that goes through pins": (

@@ -187,7 +187,7 @@ IMPORTING = {
     "changes the environment": Hostile("importing", "os.environ.clear()", "effect", FINE, ""),
     "answers every name": Hostile("importing", "__getattr__ = print\ndel ConfigModel", "effect", MISTAKE, "NameError"),
 }
-PREPARED = {
+PREPARING = {
     "a field without a type": Hostile("fields", "x = 1", "solver", FINE, ""),
     "a field of an unknown type": Hostile("fields", "x: Unknown = 1", "solver", MISTAKE, "NameError"),
     "a field of an array": Hostile(
@@ -417,7 +417,7 @@ OTHERS = {
     "a report elsewhere": Hostile("reporting", "os.chdir('/')", "report", FINE, ""),
 }
 GROUPS = {
-    "importing": IMPORTING, "preparing": PREPARED, "solving": SOLVING,
+    "importing": IMPORTING, "preparing": PREPARING, "solving": SOLVING,
     "an effect": BINDING, "a mesh": MESHES, "": OTHERS,
 }  # fmt: skip
 HOSTILE = {f"{group} {name}".strip(): case for group, cases in GROUPS.items() for name, case in cases.items()}

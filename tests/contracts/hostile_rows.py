@@ -1,6 +1,6 @@
 """Hostile rows of runs: a value for a column each, of files from strangers.
 
-LEFT_OUT must not fit their columns, and their files are named; SHOWN must, and the page bears them.
+LEFT_OUT must not fit their columns, and their files are named; ODD_COLUMNS must, and the page bears them.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ LEFT_OUT: dict[str, tuple[str, Any]] = {
     "a processor of 1 MB": ("cpu", "x" * 1_000_000),
 }
 
-SHOWN: dict[str, tuple[str, Any]] = {
+ODD_COLUMNS: dict[str, tuple[str, Any]] = {
     "a scene of a script": ("scene", "<script>alert(1)<&script>"),
     "a scene that is a link": ("scene", "javascript:alert(1)"),
     "a scene called __proto__": ("scene", "__proto__"),

@@ -230,7 +230,7 @@ PIPES = (
     "study-pipe/x/study.json",
 )
 
-_GRADED = {
+_SUBMISSION_MESSAGES = {
     # name of the file: exit code, words
     "empty.npz": (2, "empty"),
     "text.npz": (2, "no whole .npz"),
@@ -304,7 +304,7 @@ _GRADED = {
     "good.yaml": (2, "suffix '.yaml'"),
     "published-file": (2, "suffix ''"),
 }
-GRADED = {name: CommandCase(f"grade {name} good.yaml --budget 1", *found) for name, found in _GRADED.items()}
+GRADE_CASES = {name: CommandCase(f"grade {name} good.yaml --budget 1", *found) for name, found in _SUBMISSION_MESSAGES.items()}
 
 _FINE = "grade fine.npz good.yaml --budget 1"
 OPTIONS = {
@@ -488,4 +488,4 @@ STUDIES |= {
     ),
 }
 
-CASES = {**GRADED, **OPTIONS, **MATRICES, **STUDIES}
+CASES = {**GRADE_CASES, **OPTIONS, **MATRICES, **STUDIES}

@@ -78,7 +78,7 @@ def _referents(one: object) -> Iterable[object]:
     return gc.get_referents(one)
 
 
-def bound(*effects: SceneEffect) -> tuple[Scene, PreparedSolver]:
+def build_prepared_scene(*effects: SceneEffect) -> tuple[Scene, PreparedSolver]:
     pins = PinsEffect(parts=("top_corners",))
     made = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), GravityEffect(), pins, *effects, size=SIDE)
     made = replace(made, build_coarser=None)  # a recipe, which contains what the effects were described by
@@ -88,7 +88,7 @@ def bound(*effects: SceneEffect) -> tuple[Scene, PreparedSolver]:
 @cache
 def plain() -> tuple[int, int]:
     """The arrays of a scene without the effect, and the most bytes of a step."""
-    made, prepared = bound()
+    made, prepared = build_prepared_scene()
     return arrays(made, prepared), most_in_a_step(made, prepared)
 
 
@@ -110,15 +110,15 @@ def most_in_a_step(made: Scene, prepared: PreparedSolver) -> int:
 
 @pytest.mark.parametrize("effect", IDLE.values(), ids=IDLE)
 def test_an_effect_that_does_nothing_has_no_array(effect: SceneEffect):
-    assert arrays(*bound(effect)) == plain()[0]
+    assert arrays(*build_prepared_scene(effect)) == plain()[0]
 
 
 @pytest.mark.parametrize("effect", PRESENT, ids=lambda effect: effect.kind)
 def test_an_effect_that_does_something_has_arrays(effect: SceneEffect):
-    assert arrays(*bound(effect)) > plain()[0]
+    assert arrays(*build_prepared_scene(effect)) > plain()[0]
 
 
 @pytest.mark.parametrize("effect", IDLE.values(), ids=IDLE)
 def test_a_step_allocates_nothing_for_an_effect_that_does_nothing(effect: SceneEffect):
     # An array of one number at each vertex has 3200 bytes; what Python itself allocates differs by some hundreds.
-    assert abs(most_in_a_step(*bound(effect)) - plain()[1]) < 8 * SIDE**2
+    assert abs(most_in_a_step(*build_prepared_scene(effect)) - plain()[1]) < 8 * SIDE**2

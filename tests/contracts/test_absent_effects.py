@@ -19,8 +19,8 @@ from tests.effect_scenes import AIR_DRAG_EFFECT, BENDING_EFFECT, DASHPOT_EFFECT,
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "configs" / "scenes" / "hanging-cloth.yaml"
-LISTED = {"springs", "gravity", "ether-drag", "pins"}
-ABSENT = sorted(set(EFFECT_CLASSES) - LISTED)
+LISTED_EFFECTS = {"springs", "gravity", "ether-drag", "pins"}
+ABSENT_EFFECTS = sorted(set(EFFECT_CLASSES) - LISTED_EFFECTS)
 
 ENERGIES = {
     "bending": [
@@ -92,9 +92,9 @@ def modules(effects: list[str]) -> list[str]:
     return own + [module for kind in effects for module in ENERGIES.get(kind, [])]
 
 
-def absent() -> list[str]:
+def list_absent_modules() -> list[str]:
     """What no listed effect has."""
-    return sorted(set(modules(ABSENT)) - set(modules(sorted(LISTED))))
+    return sorted(set(modules(ABSENT_EFFECTS)) - set(modules(sorted(LISTED_EFFECTS))))
 
 
 @pytest.fixture(scope="module")
@@ -103,14 +103,14 @@ def plain() -> dict:
 
 
 def test_checking_and_running_a_scene_imports_only_the_effects_that_it_names(plain):
-    assert set(modules(sorted(LISTED))) <= set(plain["modules"])
-    assert not set(absent()) & set(plain["modules"])
+    assert set(modules(sorted(LISTED_EFFECTS))) <= set(plain["modules"])
+    assert not set(list_absent_modules()) & set(plain["modules"])
 
 
 def test_the_motion_has_the_same_bits_with_the_other_effects_hidden_or_loaded(plain):
-    assert probe(hidden=absent())["digests"] == plain["digests"]
+    assert probe(hidden=list_absent_modules())["digests"] == plain["digests"]
     loaded = probe(load=True)
-    assert set(modules(ABSENT)) <= set(loaded["modules"])
+    assert set(modules(ABSENT_EFFECTS)) <= set(loaded["modules"])
     assert loaded["digests"] == plain["digests"]
 
 

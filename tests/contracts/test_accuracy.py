@@ -84,7 +84,7 @@ class Home:
         table = parquet_rows.read_rows(sorted((self.folder / "accuracy").glob("*.parquet")), ACCURACY_SCHEMA)
         return list(map(repr, table.drop_columns(list(TIMES)).to_pylist()))
 
-    def written(self) -> dict[str, int]:
+    def read_write_times(self) -> dict[str, int]:
         return {path.name: path.stat().st_mtime_ns for path in self.units()}
 
     def units(self) -> Iterator[Path]:
@@ -101,7 +101,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Home:
 
 
 @dataclass(frozen=True)
-class Broken:
+class FailingAtOnce:
     """A solver that fails in its first iteration."""
 
     is_minimiser: ClassVar[bool] = True
@@ -122,7 +122,7 @@ class Broken:
 
 
 @dataclass(frozen=True)
-class Crashing(Broken):
+class Crashing(FailingAtOnce):
     """A solver that takes its process along."""
 
     def prepare(self, system: System) -> PreparedSolver:
@@ -201,9 +201,9 @@ def test_methods_that_do_not_minimise_have_work_and_no_curves(home: Home) -> Non
 
 
 def test_completed_measurements_are_not_repeated(home: Home) -> None:
-    before = home.written()
+    before = home.read_write_times()
     assert home.run() == 0
-    assert home.written() == before
+    assert home.read_write_times() == before
 
 
 @pytest.mark.parametrize("after", [1, 4, 7])
@@ -211,32 +211,32 @@ def test_an_interrupted_config_resumes_where_it_was(home: Home, tmp_path: Path, 
     stopped = Home(tmp_path / "home")
     with pytest.raises(KeyboardInterrupt):
         stopped.run(SilentDisplay(stop_after=after))
-    there = stopped.written()
+    there = stopped.read_write_times()
     assert len(there) == after
     assert stopped.run() == UNITS - after
-    assert there.items() <= stopped.written().items()
+    assert there.items() <= stopped.read_write_times().items()
     assert stopped.list_untimed_rows() == home.list_untimed_rows()
 
 
 def test_a_changed_request_replaces_the_earlier_one(tmp_path: Path) -> None:
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[early, peak]", "early"))
     assert made.run() == 2
-    files = set(made.written())
+    files = set(made.read_write_times())
     made.config.write_text(made.config.read_text().replace("rounds: 2", "rounds: 1"))
     assert made.run() == 2
-    assert set(made.written()) == files
+    assert set(made.read_write_times()) == files
     assert {len(row["seconds"]) for row in made.rows("curve")} == {1}
 
 
 def test_results_no_longer_requested_remain_and_are_not_counted(tmp_path: Path) -> None:
     made = Home(tmp_path, CONFIG.partition("work:")[0])
     made.run()
-    before = set(made.written())
+    before = set(made.read_write_times())
     made.config.write_text(made.config.read_text().replace("[early, peak]", "early"))
     files = run_accuracy_study(
         load_accuracy(made.config), made.folder, SilentDisplay(), lambda line: None, isolated=False
     )
-    assert set(made.written()) == before
+    assert set(made.read_write_times()) == before
     moments = parquet_rows.read_rows(files, ACCURACY_SCHEMA)["snapshot"].to_pylist()
     assert set(moments) == {"early"}
     assert "snapshot" in parquet_rows.read_rows(files, ACCURACY_SCHEMA)["kind"].to_pylist()
@@ -271,7 +271,7 @@ def test_a_minimum_that_is_not_certified_is_reported_and_nothing_is_graded_by_it
 def test_a_solver_that_fails_is_a_row_and_the_others_are_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(SOLVERS, "broken", f"{__name__}:Broken")
+    monkeypatch.setitem(SOLVERS, "broken", f"{__name__}:FailingAtOnce")
     made = Home(tmp_path, CONFIG.partition("work:")[0].replace("[sparse,", "[broken, sparse,"))
     made.run()
     for row in made.rows("curve", solver="broken"):
@@ -280,7 +280,9 @@ def test_a_solver_that_fails_is_a_row_and_the_others_are_measured(
     assert {row["status"] for row in made.rows("curve", solver="newton")} == {"ok"}
 
 
-def commanded(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[int, str]:
+def run_command(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: str
+) -> tuple[int, str]:
     monkeypatch.setattr("sys.argv", ["springbench", *arguments])
     with pytest.raises(SystemExit) as ended:
         main()
@@ -299,7 +301,7 @@ def test_the_command_measures_and_draws(
         return [stem.with_suffix(".png")]
 
     monkeypatch.setattr(accuracy_report, "draw_chart_sheets", note_sheets)
-    code, printed = commanded(
+    code, printed = run_command(
         capsys, monkeypatch, "accuracy", str(home.config), "--results", str(home.folder.parent), "--in-process"
     )
     assert code == 0, printed

@@ -45,7 +45,7 @@ default_size: 4
 effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, parts: [ends]}]
 """
 REFINEMENTS = (1, 4)
-WAYS = [
+METHODS = [
     {"solver": ["sparse"], "rtol": 1e-3, "max_iterations": 200, "integrator": ["implicit-euler", "midpoint"]},
     {"solver": ["sparse"], "max_iterations": 5},
 ]
@@ -58,7 +58,7 @@ pytestmark = pytest.mark.usefixtures("without_workers")
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """A grid of six simulations."""
-    monkeypatch.setattr(module, "build_candidate_grid", lambda: WAYS)
+    monkeypatch.setattr(module, "build_candidate_grid", lambda: METHODS)
     monkeypatch.setattr(module, "TIME_STEP_REFINEMENTS", REFINEMENTS)
 
 
@@ -83,16 +83,16 @@ def row_cost(row: dict[str, Any]) -> float:
     return row["cpu_seconds"] / row["t_end"] if row["preempted"] else row["seconds_per_simulated_second"]
 
 
-def measured(scene: Path) -> list[Path]:
+def list_work_files(scene: Path) -> list[Path]:
     return sorted((scene.parent / "results").glob("*/accuracy/*-work-*.parquet"))
 
 
 def test_the_cheapest_method_within_the_error_is_recommended_and_verified(scene: Path) -> None:
     said = list[str]()
     found, count = recommend(scene, 0.1, print_message=said.append)
-    assert count == len(measured(scene)) <= COUNT
+    assert count == len(list_work_files(scene)) <= COUNT
     assert any(line.startswith(f"chain 4: {count} of {COUNT} settings measured") for line in said)
-    table = parquet_rows.read_rows(measured(scene), ACCURACY_SCHEMA).to_pylist()
+    table = parquet_rows.read_rows(list_work_files(scene), ACCURACY_SCHEMA).to_pylist()
     within = [row for row in table if row["error"] <= 0.1]
     assert 0 < len(within) < len(table), "the error separates nothing"
     cheapest = min(within, key=row_cost)
@@ -129,7 +129,7 @@ def test_measurements_of_another_scene_or_machine_are_not_reused(scene: Path) ->
     recommend(scene, 0.1)
     scene.write_text(SCENE.replace("200", "210"))
     assert recommend(scene, 0.1)[1] > 0
-    for path in measured(scene):
+    for path in list_work_files(scene):
         table = pq.read_table(path)
         for column, value in (("machine_id", "0" * 12), ("unit_id", "measured there")):
             k = table.schema.get_field_index(column)
@@ -146,7 +146,7 @@ def test_the_results_of_another_scene_of_this_name_are_left_alone(scene: Path) -
     claim_folder(scene.parent / "results" / f"recommend-{scene.stem}", other)
     with pytest.raises(InputError, match="contains the results of another file of this name"):
         recommend(scene, 0.1)
-    assert not measured(scene)
+    assert not list_work_files(scene)
 
 
 def test_an_error_that_no_method_reaches_is_reported_with_the_nearest(scene: Path) -> None:
@@ -210,7 +210,7 @@ def test_a_scene_without_a_reference_is_refused_before_anything_is_measured(scen
         recommend(scene, 0.1, print_message=said.append)
     assert any(line.startswith("chain: contact has") for line in said)
     assert sum("no certified reference" in line for line in said) == 1
-    assert not measured(scene)
+    assert not list_work_files(scene)
 
 
 def test_compiling_counts_against_no_time_limit(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,7 +261,7 @@ def test_without_a_horizon_it_is_the_longest_at_which_the_error_can_be_measured(
 def test_a_budget_gets_the_least_error_within_it_and_what_half_and_twice_would_buy(scene: Path) -> None:
     """With a budget that nothing exceeds, the most accurate setting wins; the others follow from the same rows."""
     found, count = recommend(scene, 0.0, goal=RecommendationGoal(frame_seconds=1.0))
-    assert count == len(measured(scene))
+    assert count == len(list_work_files(scene))
     least = min(found.measured_methods, key=lambda method: method.error)
     assert found.best_method == least
     assert found.checked_method.error == least.error
@@ -280,14 +280,14 @@ def test_step_sizes_between_powers_of_two_use_up_a_budget(scene: Path) -> None:
     spec = recommend(scene, 0.5)[0].best_method.work_spec
     steps = round(spec.t_end / spec.case.scene.time_step)
 
-    def tuned(cost: float) -> list[int]:
+    def count_frames(cost: float) -> list[int]:
         method = module.MeasuredMethod(spec, 0.1, cost, "integrated", "")
         found = module.list_tuned_specs([method], 1.0, spec.t_end)
         return [round(one.t_end / one.case.scene.time_step) for one in found]
 
-    assert tuned(0.3) == [int(0.95 / 0.3 * steps)]
-    assert tuned(1e-6) == [8 * steps]
-    assert tuned(0.95) == tuned(1.1) == []
+    assert count_frames(0.3) == [int(0.95 / 0.3 * steps)]
+    assert count_frames(1e-6) == [8 * steps]
+    assert count_frames(0.95) == count_frames(1.1) == []
 
 
 def test_the_time_of_a_busy_machine_is_its_processor_time(scene: Path) -> None:

@@ -90,7 +90,7 @@ def assignment(obj: str, scene: dict) -> np.ndarray:
     return np.array(steps)
 
 
-def written(folder: Path, name: str) -> Path:
+def write_scene(folder: Path, name: str) -> Path:
     obj, scene = SCENES[name]
     (folder / f"{name}.obj").write_text(obj)
     path = folder / f"{name}.json"
@@ -101,7 +101,7 @@ def written(folder: Path, name: str) -> Path:
 @pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_moves_as_the_assignment_moves_it(name, backend, tmp_path):
-    spec = load_scene(written(tmp_path, name))
+    spec = load_scene(write_scene(tmp_path, name))
     made = build_scene(spec, 0)
     found = simulate_trajectory(made, backend, FRAMES, initial_guess=spec.initial_guess)
     wanted = assignment(*SCENES[name])
@@ -111,7 +111,7 @@ def test_a_scene_moves_as_the_assignment_moves_it(name, backend, tmp_path):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_a_scene_is_read_as_the_assignment_reads_it(name, tmp_path):
-    spec = load_scene(written(tmp_path, name))
+    spec = load_scene(write_scene(tmp_path, name))
     made = build_scene(spec, 0)
     obj, scene = SCENES[name]
     V, faces = read(obj)

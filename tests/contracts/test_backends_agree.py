@@ -27,8 +27,8 @@ from tests.scene_builders import (
     simulate_trajectory,
 )
 
-FORCED: tuple[LinearSolverName, ...] = ("inverse", "cholespy", "supernodal", "cg")
-WAYS: tuple[Solver, ...] = (*LOCAL_GLOBAL_BACKENDS, *(CompiledLocalGlobal(linear) for linear in FORCED))
+LINEAR_SOLVERS: tuple[LinearSolverName, ...] = ("inverse", "cholespy", "supernodal", "cg")
+BACKENDS: tuple[Solver, ...] = (*LOCAL_GLOBAL_BACKENDS, *(CompiledLocalGlobal(linear) for linear in LINEAR_SOLVERS))
 """The backends, and the compiled one with every linear solver that it could choose."""
 
 AGREEMENT = 1e-10
@@ -48,7 +48,7 @@ pins = pytest.mark.parametrize("weight", WEIGHTS.values(), ids=list(WEIGHTS))
 first_guesses = pytest.mark.parametrize("first_guess", INITIAL_GUESSES)
 
 
-def apart(found: list[Positions]) -> float:
+def compute_spread(found: list[Positions]) -> float:
     """The largest difference of a coordinate between any two."""
     return float(np.ptp(found, axis=0).max())
 
@@ -64,7 +64,7 @@ def after_iterations(backend: Solver, problem, count: int) -> Positions:
 def test_backends_agree_after_many_steps(name, weight, steps):
     made = SCENE_BUILDERS[name](weight)
     assert (
-        apart([simulate_trajectory(made, backend, steps) for backend in WAYS])
+        compute_spread([simulate_trajectory(made, backend, steps) for backend in BACKENDS])
         <= AGREEMENT * made.mesh.bounding_box_diagonal
     )
 
@@ -73,8 +73,8 @@ def test_backends_agree_after_many_steps(name, weight, steps):
 @first_guesses
 def test_backends_agree_from_every_first_guess(weight, first_guess):
     made = SCENE_BUILDERS["cloth"](weight)
-    found = [simulate_trajectory(made, backend, 20, initial_guess=first_guess) for backend in WAYS]
-    assert apart(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
+    found = [simulate_trajectory(made, backend, 20, initial_guess=first_guess) for backend in BACKENDS]
+    assert compute_spread(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
 
 
 @pytest.mark.parametrize("name", LARGE)
@@ -83,7 +83,7 @@ def test_backends_agree_on_a_step_of_a_large_scene(name, weight):
     made = SCENE_BUILDERS[name](weight)
     problem = build_first_problem(made)
     assert (
-        apart([after_iterations(backend, problem, 15) for backend in WAYS])
+        compute_spread([after_iterations(backend, problem, 15) for backend in BACKENDS])
         <= AGREEMENT * made.mesh.bounding_box_diagonal
     )
 
@@ -98,7 +98,7 @@ def test_backends_agree_from_random_positions(name):
     )
     problem = replace(problem, initial_guess=guess)
     assert (
-        apart([after_iterations(backend, problem, 10) for backend in WAYS])
+        compute_spread([after_iterations(backend, problem, 10) for backend in BACKENDS])
         <= AGREEMENT * made.mesh.bounding_box_diagonal
     )
 
@@ -106,23 +106,23 @@ def test_backends_agree_from_random_positions(name):
 @pytest.mark.parametrize("seed", range(8))
 def test_backends_agree_on_random_networks(seed):
     problem = build_random_problem(seed)
-    assert apart([after_iterations(backend, problem, 30) for backend in WAYS]) <= AGREEMENT
+    assert compute_spread([after_iterations(backend, problem, 30) for backend in BACKENDS]) <= AGREEMENT
 
 
 @pytest.mark.skipif(not ASSIGNMENT.is_dir(), reason="the assignment's scenes are not beside the repository")
 @pytest.mark.parametrize("name", ["single-spring-horizontal", "horizontal-chain", "net"])
 def test_backends_agree_on_the_small_scenes_of_the_assignment(name):
     made = assignment_scene(name)
-    found = [simulate_trajectory(made, backend, 100, initial_guess="assignment") for backend in WAYS]
-    assert apart(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
+    found = [simulate_trajectory(made, backend, 100, initial_guess="assignment") for backend in BACKENDS]
+    assert compute_spread(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
 
 
 @pytest.mark.skipif(not ASSIGNMENT.is_dir(), reason="the assignment's scenes are not beside the repository")
 @pytest.mark.long
 def test_all_but_the_dense_backend_agree_on_the_assignments_flag():
     made = assignment_scene("flag")
-    found = [simulate_trajectory(made, backend, 12, initial_guess="assignment") for backend in WAYS[1:]]
-    assert apart(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
+    found = [simulate_trajectory(made, backend, 12, initial_guess="assignment") for backend in BACKENDS[1:]]
+    assert compute_spread(found) <= AGREEMENT * made.mesh.bounding_box_diagonal
 
 
 def assignment_scene(name: str) -> Scene:

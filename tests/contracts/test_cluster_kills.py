@@ -88,7 +88,7 @@ class Sweep(NamedTuple):
     rows: Path
 
     @classmethod
-    def made(cls, folder: Path) -> Sweep:
+    def create(cls, folder: Path) -> Sweep:
         (folder / "scene.yaml").write_text(SCENE_SOURCE)
         (folder / "sweep.yaml").write_text(SWEEP)
         return cls(folder / "sweep.yaml", folder / "r" / "sweep" / "rows")
@@ -99,17 +99,17 @@ class Sweep(NamedTuple):
             [sys.executable, "-m", "springbench", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True
         )
 
-    def done(self) -> dict[str, tuple[int, int]]:
+    def list_done_runs(self) -> dict[str, tuple[int, int]]:
         """The runs that have rows: which file, and when it was written."""
         there = [path for path in self.rows.glob("*.parquet") if not path.name.startswith(".")]
         return {path.name: (path.stat().st_ino, path.stat().st_mtime_ns) for path in there}
 
-    def finished(self, address: str, before: dict[str, tuple[int, int]]) -> str:
+    def finish_runs(self, address: str, before: dict[str, tuple[int, int]]) -> str:
         """Go on to the end, with nothing done again that was there; what was said."""
         said = self.begin(address)
         words, _ = said.communicate(timeout=PATIENCE)
         assert said.returncode == 0, words
-        after = self.done()
+        after = self.list_done_runs()
         assert before.items() <= after.items()
         assert len(after) == RUNS
         assert set(parquet_rows.read_rows(self.rows / name for name in after)["status"].to_pylist()) == {"ok"}
@@ -118,35 +118,35 @@ class Sweep(NamedTuple):
 
 
 def test_a_killed_scheduler_ends_the_command_with_that_reason_and_the_next_command_does_the_rest(tmp_path: Path):
-    sweep = Sweep.made(tmp_path)
+    sweep = Sweep.create(tmp_path)
     with farm(tmp_path / "one") as first:
         client = sweep.begin(first.address)
-        wait_for(sweep.done)
+        wait_for(sweep.list_done_runs)
         first.scheduler.kill()
         said, _ = client.communicate(timeout=PATIENCE)
     assert client.returncode == 1, said
     assert "the scheduler is gone" in " ".join(said.split())
     assert "Traceback" not in said
     with farm(tmp_path / "two") as second:
-        sweep.finished(second.address, sweep.done())
+        sweep.finish_runs(second.address, sweep.list_done_runs())
 
 
 def test_a_client_that_is_killed_leaves_what_was_done_and_the_workers_to_the_next(tmp_path: Path):
-    sweep = Sweep.made(tmp_path)
+    sweep = Sweep.create(tmp_path)
     with farm(tmp_path / "one") as found:
         client = sweep.begin(found.address)
-        wait_for(sweep.done)
+        wait_for(sweep.list_done_runs)
         client.kill()
         client.communicate()
-        before = sweep.done()
-        there = re.search(rf"(\d+) of {RUNS} runs are there already", sweep.finished(found.address, before))
+        before = sweep.list_done_runs()
+        there = re.search(rf"(\d+) of {RUNS} runs are there already", sweep.finish_runs(found.address, before))
     assert there
     assert int(there[1]) >= len(before)  # workers end what they have at hand, and see the folder here
 
 
 def test_a_disk_that_is_full_on_one_worker_sends_its_runs_to_the_other(tmp_path: Path):
-    sweep = Sweep.made(tmp_path)
+    sweep = Sweep.create(tmp_path)
     with farm(tmp_path / "one", (FAR + FULL, FAR)) as found:
-        said = sweep.finished(found.address, {})
+        said = sweep.finish_runs(found.address, {})
     assert "is done elsewhere" in said
     assert "File too large" in said

@@ -26,7 +26,7 @@ from tests.plugin_solvers import SCENE_SOURCE, SOLVER_SOURCE, write_plugin_solve
 from tests.progress_displays import SilentDisplay
 
 
-def done(sweep: Path, results: Path, address: str) -> pa.Table:
+def run_on_cluster(sweep: Path, results: Path, address: str) -> pa.Table:
     found = load_config(sweep)
     results.mkdir(exist_ok=True)
     return run_sweep(found.name, found.list_runs(), results, SilentDisplay(), print, scheduler_address=address).table
@@ -37,7 +37,7 @@ def test_runs_are_done_by_workers_and_a_crash_is_a_row(tmp_path: Path, monkeypat
     quiet: Any = {"dashboard_address": None}
     with LocalCluster(n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", **quiet) as started:
         found: Any = started
-        table = done(made.sweep_path, tmp_path / "r", found.scheduler_address)
+        table = run_on_cluster(made.sweep_path, tmp_path / "r", found.scheduler_address)
         assert len(found.workers) == 1
     first = {row["solver"]: row for row in table.to_pylist()}
     assert first["sparse"]["status"] == "ok", first["sparse"]["reason"]
@@ -47,7 +47,7 @@ def test_runs_are_done_by_workers_and_a_crash_is_a_row(tmp_path: Path, monkeypat
     assert not [*(tmp_path / "r").rglob("*partial*")]
 
 
-def refused(place: tuple[str, int], security: Security | None) -> bool:
+def is_refused(place: tuple[str, int], security: Security | None) -> bool:
     """Whether a server talks neither Dask's protocol, with this certificate if any, nor HTTP, but of pages it lacks."""
     bare = ssl.create_default_context()
     bare.check_hostname, bare.verify_mode = False, ssl.CERT_NONE
@@ -76,7 +76,7 @@ def test_no_client_without_the_certificate_reaches_a_cluster_of_this_machine():
         assert {place for place, _ in places} == {"127.0.0.1"}
         assert int(found.scheduler_address.rpartition(":")[2]) in {port for _, port in places}
         another = Security.temporary()
-        assert all(refused(place, security) for place in places for security in (None, another))
+        assert all(is_refused(place, security) for place in places for security in (None, another))
         mine = found.security.get_connection_args("client")["ssl_context"]
         address = found.scheduler_address.rpartition(":")[2]
         with (
@@ -114,7 +114,7 @@ def test_of_four_workers_of_a_machine_one_is_timed_at_a_time(tmp_path: Path, sha
     with LocalCluster(n_workers=4, threads_per_worker=1, **quiet) as started, Client(started) as client:
         client.run(lock_by, tmp_path, shared=shared)
         found: Any = started
-        rows = done(sweep, tmp_path / "r", found.scheduler_address).to_pylist()
+        rows = run_on_cluster(sweep, tmp_path / "r", found.scheduler_address).to_pylist()
     assert {row["status"] for row in rows} == {"ok"}
     assert {row["timing"] for row in rows} == {"exclusive"}
     lines = [line.split() for line in noted.read_text().splitlines()]
@@ -150,7 +150,7 @@ TIMES = {"started_at", "seconds", "wall_seconds_check", "wall_seconds_sum", "cpu
 SOLVE = 0.03
 """Seconds that a solve takes at least: six of them make a run, so that all last through several kills."""
 
-TELL = (
+RECORD_PROCESS = (
     "import os, time; [open({told!r}, 'a').write(f'{{os.getpid()}} {{stop.iterations}}\\n')]; "
     f"until = time.perf_counter() + {SOLVE}; any(time.perf_counter() > until for _ in iter(int, 1))"
 )
@@ -166,7 +166,7 @@ def all_but_times(table: pa.Table) -> list[str]:
 def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(tmp_path: Path):
     log_path = tmp_path / "told"
     (tmp_path / "counted.py").write_text(
-        SOLVER_SOURCE.replace("pass  # while solving", TELL.format(told=str(log_path)))
+        SOLVER_SOURCE.replace("pass  # while solving", RECORD_PROCESS.format(told=str(log_path)))
     )
     (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     sweep = tmp_path / "sweep.yaml"
@@ -186,11 +186,11 @@ def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(
 
         killer = threading.Thread(target=kill, daemon=True)
         killer.start()
-        disturbed = done(sweep, tmp_path / "r", found.scheduler_address)
+        disturbed = run_on_cluster(sweep, tmp_path / "r", found.scheduler_address)
         over.set()
         killer.join()
         began = set(log_path.read_text().splitlines())
-        whole = done(sweep, tmp_path / "s", found.scheduler_address)
+        whole = run_on_cluster(sweep, tmp_path / "s", found.scheduler_address)
     print(f"{len(killed)} workers were killed, and {len(began) - MANY} of {MANY} runs begun again")
     assert killed
     assert set(disturbed["status"].to_pylist()) == {"ok"}

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 _COMMAND = re.compile(r"^(?:\.venv/bin/)?springbench ")
 
 
-def suggested(page: Path) -> list[str]:
+def find_commands(page: Path) -> list[str]:
     """The commands of a page, in code spans and in fences of shell commands."""
     text = page.read_text()
     spans = re.findall(r"`([^`\n]+)`", text)
@@ -36,7 +36,7 @@ def suggested(page: Path) -> list[str]:
 
 GROUP = cast("TyperGroup", get_command(app))
 
-COMMANDS = [(page, command) for page in PAGES for command in suggested(page) if not command.split()[0].isupper()]
+COMMANDS = [(page, command) for page in PAGES for command in find_commands(page) if not command.split()[0].isupper()]
 
 
 def test_there_are_commands_in_the_pages():

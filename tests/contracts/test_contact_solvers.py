@@ -17,9 +17,9 @@ from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.contact_scenes import OBSTACLE_SPECS, build_contact, build_sheet, collect_steps
 
-SOLVED: dict[str, Solver] = {name: load_target(target)() for name, target in SOLVERS.items()}
-PREFACTORED = ("sparse", "numba", "anderson", "chebyshev", "lbfgs")
-TAKE = (*PREFACTORED, "vbd", "hybrid", "newton", "newton-cg")
+SOLVER_INSTANCES: dict[str, Solver] = {name: load_target(target)() for name, target in SOLVERS.items()}
+PREFACTORED_SOLVERS = ("sparse", "numba", "anderson", "chebyshev", "lbfgs")
+TAKE = (*PREFACTORED_SOLVERS, "vbd", "hybrid", "newton", "newton-cg")
 FLOOR = build_contact(OBSTACLE_SPECS["plane"], friction=0.4)
 FALL = (0.5, -6.0, 0.0)
 
@@ -40,7 +40,7 @@ SCENES = {
 
 
 @cache
-def landed(scene: str) -> tuple[StepProblem, Positions]:
+def find_contact_step(scene: str) -> tuple[StepProblem, Positions]:
     """The step at which most presses and something grips, and its minimum by Newton's method."""
     step = collect_steps(SCENES[scene](), 4, stop=StopRule(100, 1e-12))[-1]
     energy = step.problem.energies[-1]
@@ -53,27 +53,27 @@ def landed(scene: str) -> tuple[StepProblem, Positions]:
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("solver", TAKE)
 def test_solvers_agree_at_convergence(solver, scene):
-    problem, wanted = landed(scene)
-    found = SOLVED[solver].prepare(problem.system).solve(problem, StopRule(1500, 1e-9))
+    problem, wanted = find_contact_step(scene)
+    found = SOLVER_INSTANCES[solver].prepare(problem.system).solve(problem, StopRule(1500, 1e-9))
     # Local-global converges linearly: what is left is some hundred times the last step, 1e-9 of the first.
     np.testing.assert_allclose(found.positions, wanted, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("solver", sorted(set(SOLVED) - {*TAKE, "avbd", "vbd-ogc"}))  # both are vbd here
+@pytest.mark.parametrize("solver", sorted(set(SOLVER_INSTANCES) - {*TAKE, "avbd", "vbd-ogc"}))  # both are vbd here
 def test_others_refuse_contact_by_name(solver):
     with pytest.raises(Unsupported, match="Contact"):
-        SOLVED[solver].prepare(SCENES["friction"]().system)
+        SOLVER_INSTANCES[solver].prepare(SCENES["friction"]().system)
 
 
 @pytest.mark.parametrize("few", [method._MAX_WOODBURY_ROWS, 0], ids=["Woodbury", "conjugate gradients"])
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("solver", [*PREFACTORED, "vbd"])
+@pytest.mark.parametrize("solver", [*PREFACTORED_SOLVERS, "vbd"])
 def test_no_iteration_raises_the_objective(solver, scene, few, monkeypatch):
     monkeypatch.setattr(method, "_MAX_WOODBURY_ROWS", few)
-    problem, wanted = landed(scene)
+    problem, wanted = find_contact_step(scene)
     problem = replace(problem, initial_guess=problem.inertial_target)  # deep inside
     values = [problem.value(problem.initial_guess)]
-    for p in islice(SOLVED[solver].prepare(problem.system).iterates(problem), 30):
+    for p in islice(SOLVER_INSTANCES[solver].prepare(problem.system).iterates(problem), 30):
         values.append(problem.value(p))
         assert values[-1] <= values[-2] + 1e-12 * problem.value_scale(p)  # sums of some hundred terms
     scale = values[0] - problem.value(wanted)
@@ -82,9 +82,9 @@ def test_no_iteration_raises_the_objective(solver, scene, few, monkeypatch):
 
 @pytest.mark.parametrize("scene", ["friction", "held exactly"])
 def test_conjugate_gradients_correct_as_woodburys_formula_does(scene, monkeypatch):
-    problem, _ = landed(scene)
+    problem, _ = find_contact_step(scene)
     rng = np.random.default_rng(0)
-    prepared = method.prepare_with_half_spaces(SOLVED["sparse"], problem.system)
+    prepared = method.prepare_with_half_spaces(SOLVER_INSTANCES["sparse"], problem.system)
     corrections, (energy,) = prepared.corrections, method.begin_active_contacts(problem)
     p = problem.current_positions
     gradient = rng.normal(size=p.shape)
@@ -99,14 +99,14 @@ def test_conjugate_gradients_correct_as_woodburys_formula_does(scene, monkeypatc
     np.testing.assert_allclose(found, exact, rtol=0, atol=1e-6 * np.abs(exact).max())
 
 
-@pytest.mark.parametrize("solver", [*PREFACTORED, "vbd"])
+@pytest.mark.parametrize("solver", [*PREFACTORED_SOLVERS, "vbd"])
 def test_contact_that_is_idle_changes_no_bit(solver):
     far = build_contact({"kind": "plane", "point": (0, -50, 0)}, friction=0.5)
     runs = [
         [
             step.positions
             for step in simulate_scene(
-                made, prepare(made, SOLVED[solver]), StopRule(10), initial_guess="previous", frames=4
+                made, prepare(made, SOLVER_INSTANCES[solver]), StopRule(10), initial_guess="previous", frames=4
             )
         ]
         for made in (build_sheet(), build_sheet(far))
@@ -116,8 +116,8 @@ def test_contact_that_is_idle_changes_no_bit(solver):
 
 @pytest.mark.parametrize("solver", TAKE)
 def test_a_solve_ends_at_exactly_the_iterate_of_its_number(solver):
-    problem, _ = landed("friction")
-    prepared = SOLVED[solver].prepare(problem.system)
+    problem, _ = find_contact_step("friction")
+    prepared = SOLVER_INSTANCES[solver].prepare(problem.system)
     for count in (1, 3):
         wanted = [p.copy() for p in islice(prepared.iterates(problem), count)][-1]
         np.testing.assert_array_equal(prepared.solve(problem, StopRule(count)).positions, wanted)

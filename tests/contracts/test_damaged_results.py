@@ -24,7 +24,7 @@ SWEEP = "{scenes: [good.yaml], sizes: [4], solvers: [sparse, dense], options: {r
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bytes]:
+def finished_files(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bytes]:
     """The files of a sweep that has been run, by their places."""
     home = tmp_path_factory.mktemp("finished")
     (home / "good.yaml").write_text(scene())
@@ -37,9 +37,9 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, bytes]:
 
 
 @pytest.fixture
-def home(finished: dict[Path, bytes], tmp_path: Path) -> Path:
+def home(finished_files: dict[Path, bytes], tmp_path: Path) -> Path:
     """A copy of them."""
-    for place, content in finished.items():
+    for place, content in finished_files.items():
         (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / place).write_bytes(content)
     return tmp_path
@@ -53,7 +53,7 @@ def many(path: Path) -> None:
     pq.write_table(pa.table({"status": pa.array(["ok"] * (parquet_rows.MAX_ROWS + 1)).dictionary_encode()}), path)
 
 
-def replaced(path: Path, make: Callable[[Path], object]) -> None:
+def replace_file(path: Path, make: Callable[[Path], object]) -> None:
     path.unlink()
     make(path)
 
@@ -68,9 +68,9 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
     "text": lambda path: path.write_text("status\nok\n"),
     "noise": lambda path: path.write_bytes(bytes(range(256)) * 16),
     "a head alone": lambda path: path.write_bytes(b"PAR1PAR1"),
-    "a device": lambda path: replaced(path, lambda there: there.symlink_to("/dev/zero")),
-    "a pipe": lambda path: replaced(path, os.mkfifo),
-    "a folder": lambda path: replaced(path, Path.mkdir),
+    "a device": lambda path: replace_file(path, lambda there: there.symlink_to("/dev/zero")),
+    "a pipe": lambda path: replace_file(path, os.mkfifo),
+    "a folder": lambda path: replace_file(path, Path.mkdir),
 }
 
 
@@ -120,7 +120,7 @@ LOCKS: dict[str, Callable[[Path], object]] = {
 def test_a_file_in_place_of_the_lock_is_a_mistake(home: Path, lock: str):
     (home / "victim").write_text("precious")
     path = home / "results" / "sweep" / ".lock"
-    replaced(path, LOCKS[lock])
+    replace_file(path, LOCKS[lock])
     result = attempt(home, ["run", "sweep.yaml"])
     assert (result.code, result.error, result.outside) == (2, "", [])
     assert ".lock" in result.said

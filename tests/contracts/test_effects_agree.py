@@ -17,7 +17,7 @@ from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.effect_scenes import EFFECT_SCENES, build_moving_problem, with_integrator
 
-SOLVED: dict[str, Solver] = {
+MINIMISERS: dict[str, Solver] = {
     name: solver
     for name, solver in ((name, load_target(target)()) for name, target in SOLVERS.items())
     if solver.is_minimiser
@@ -46,21 +46,21 @@ def takes(solver: str, scene: str) -> bool:
 def minimum(scene: str, integrator: str) -> tuple[StepProblem, Positions]:
     """The problem of a scene's step and its minimum, by Newton's method."""
     problem = build_moving_problem(EFFECT_SCENES[scene](), integrator)
-    return problem, SOLVED["newton"].prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
+    return problem, MINIMISERS["newton"].prepare(problem.system).solve(problem, StopRule(100, 1e-12)).positions
 
 
 @pytest.mark.parametrize("scene", EFFECT_SCENES)
-@pytest.mark.parametrize("solver", SOLVED)
+@pytest.mark.parametrize("solver", MINIMISERS)
 def test_solvers_agree_at_convergence_or_refuse_by_name(solver, scene):
     for integrator in INTEGRATORS if "all" in scene and "gas" not in scene else INTEGRATORS[:1]:
         problem, wanted = minimum(scene, integrator)
         if not takes(solver, scene):
             with pytest.raises(Unsupported) as refusal:
-                SOLVED[solver].prepare(problem.system)
+                MINIMISERS[solver].prepare(problem.system)
             known = {type(energy).__name__ for energy in problem.energies} - {"Springs"}
             assert any(name in str(refusal.value) for name in known)
         else:
-            prepared = SOLVED[solver].prepare(problem.system)
+            prepared = MINIMISERS[solver].prepare(problem.system)
             # By other directions than Newton's it may come to another valley, and from far it does.
             near = {"vbd": 1e-3, "avbd": 1e-3, "newton-cg": 1e-4 if scene == "contact" else 0.0}.get(solver, 0.0)
             if solver == "newton-cg" and near:
@@ -105,7 +105,7 @@ def test_local_global_descends_with_every_projective_energy(scene, integrator):
 @pytest.mark.parametrize("scene", EFFECT_SCENES)
 def test_a_scene_runs_for_a_while_and_stays_finite(scene, integrator):
     made = with_integrator(EFFECT_SCENES[scene](), integrator)
-    solver = SOLVED["lbfgs"]
+    solver = MINIMISERS["lbfgs"]
     for step in simulate_scene(made, prepare(made, solver), StopRule(10), initial_guess="previous", frames=15):
         assert np.isfinite(step.positions).all()
         assert np.abs(step.positions).max() < 5.0  # sheets and balloons of a metre, and falls of half a second

@@ -28,12 +28,12 @@ from springbench.solvers.plugins.plugin_discovery import load_target
 
 END, ROUGH_END = 0.15, 0.3
 """Seconds; what begins within steps takes longer to act."""
-MEASURED = ("implicit-euler", "midpoint", "esdirk-4")
+MEASURED_INTEGRATORS = ("implicit-euler", "midpoint", "esdirk-4")
 SPRINGS = {"kind": "springs", "stretch": 20.0}
-HELD = {"kind": "pins", "parts": ["first"], "weight": "exact"}
-HUNG = {"kind": "pins", "parts": ["top"], "weight": "exact"}
+FIRST_PIN = {"kind": "pins", "parts": ["first"], "weight": "exact"}
+TOP_PINS = {"kind": "pins", "parts": ["top"], "weight": "exact"}
 GRAVITY = {"kind": "gravity"}
-SWUNG = HELD | {"motion": {"key_frames": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
+MOVING_PIN = FIRST_PIN | {"motion": {"key_frames": [{"time": 0.0}, {"time": 1.0, "offset": [0.5, 1.0, 0.0]}]}}
 DOWN = (0.5, 1.0, 2.0)
 
 
@@ -52,19 +52,19 @@ class Case:
 
 
 SMOOTH: dict[str, Case] = {
-    "springs": Case((SPRINGS, HELD)),
-    "gravity": Case((SPRINGS, GRAVITY, HELD)),
-    "pins": Case((SPRINGS, GRAVITY, SWUNG)),
-    "constant-force": Case((SPRINGS, {"kind": "constant-force", "force": [0.5, -1.0, 2.0]}, HELD)),
+    "springs": Case((SPRINGS, FIRST_PIN)),
+    "gravity": Case((SPRINGS, GRAVITY, FIRST_PIN)),
+    "pins": Case((SPRINGS, GRAVITY, MOVING_PIN)),
+    "constant-force": Case((SPRINGS, {"kind": "constant-force", "force": [0.5, -1.0, 2.0]}, FIRST_PIN)),
     "attachments": Case((SPRINGS, {"kind": "attachments", "parts": ["first"], "stiffness": 30.0})),
-    "air-drag": Case((SPRINGS, GRAVITY, {"kind": "air-drag", "coefficient": 2.0}, HELD)),
-    "ether-drag": Case((SPRINGS, GRAVITY, {"kind": "ether-drag", "decay_rate": 3.0}, HELD), velocity=(0.0, 0.0, 0.0)),
-    "dashpots": Case((SPRINGS, GRAVITY, {"kind": "dashpots", "stretch": 0.4}, HELD)),
+    "air-drag": Case((SPRINGS, GRAVITY, {"kind": "air-drag", "coefficient": 2.0}, FIRST_PIN)),
+    "ether-drag": Case((SPRINGS, GRAVITY, {"kind": "ether-drag", "decay_rate": 3.0}, FIRST_PIN), velocity=(0.0, 0.0, 0.0)),
+    "dashpots": Case((SPRINGS, GRAVITY, {"kind": "dashpots", "stretch": 0.4}, FIRST_PIN)),
     "rayleigh": Case(
-        (SPRINGS, GRAVITY, {"kind": "rayleigh", "mass_coefficient": 0.5, "stiffness_coefficient": 0.02}, HELD)
+        (SPRINGS, GRAVITY, {"kind": "rayleigh", "mass_coefficient": 0.5, "stiffness_coefficient": 0.02}, FIRST_PIN)
     ),
-    "bending": Case((SPRINGS, {"kind": "bending", "stiffness": 0.05}, HUNG), GridMesh(), 4, steps=32),
-    "wind": Case((SPRINGS, {"kind": "wind", "field": "assignment", "strength": 0.5}, HUNG), GridMesh(), 4, steps=32),
+    "bending": Case((SPRINGS, {"kind": "bending", "stiffness": 0.05}, TOP_PINS), GridMesh(), 4, steps=32),
+    "wind": Case((SPRINGS, {"kind": "wind", "field": "assignment", "strength": 0.5}, TOP_PINS), GridMesh(), 4, steps=32),
     "gas": Case(({"kind": "springs", "stretch": 40.0}, {"kind": "gas", "pressure": 100.0}), BalloonMesh(), 3, steps=48),
 }
 STILL = (0.0, 0.0, 0.0)
@@ -76,7 +76,7 @@ SURFACE = {
     "barrier_stiffness": 5.0,
 }
 SELF = {"kind": "self-contact", "min_distance": 0.05, "dhat": 0.2, "barrier_stiffness": 1.0}
-SEWN = {
+SEWN_ROWS = {
     "kind": "sewing",
     "first_row": {"parts": ["first"]},
     "second_row": {"parts": ["last"]},
@@ -85,11 +85,11 @@ SEWN = {
 }
 SOFT = SPRINGS | {"stretch": 5.0}
 ROUGH: dict[str, Case] = {
-    "contact": Case((SPRINGS, GRAVITY, {"kind": "contact", "obstacles": [PLANE]}, HELD), velocity=STILL),
-    "strain-limits": Case((SOFT, GRAVITY, {"kind": "strain-limits", "max_stretch": 1.05, "stiffness": 40.0}, HELD)),
-    "sewing": Case((SOFT, GRAVITY, SEWN, HELD)),
-    "surface-contact": Case((SPRINGS, GRAVITY, SURFACE | {"kind": "surface-contact"}, HELD), velocity=STILL),
-    "self-contact": Case((SPRINGS, GRAVITY, SELF, HELD), velocity=(-4.0, 0.0, 0.6)),  # a chain thrown back upon itself
+    "contact": Case((SPRINGS, GRAVITY, {"kind": "contact", "obstacles": [PLANE]}, FIRST_PIN), velocity=STILL),
+    "strain-limits": Case((SOFT, GRAVITY, {"kind": "strain-limits", "max_stretch": 1.05, "stiffness": 40.0}, FIRST_PIN)),
+    "sewing": Case((SOFT, GRAVITY, SEWN_ROWS, FIRST_PIN)),
+    "surface-contact": Case((SPRINGS, GRAVITY, SURFACE | {"kind": "surface-contact"}, FIRST_PIN), velocity=STILL),
+    "self-contact": Case((SPRINGS, GRAVITY, SELF, FIRST_PIN), velocity=(-4.0, 0.0, 0.6)),  # a chain thrown onto itself
 }
 """Those of order 1; barriers so soft that steps of a hundredth resolve them."""
 
@@ -101,7 +101,7 @@ def scene(case: Case, integrator: str, time_step: float) -> Scene:
 
 
 @cache
-def truth(effect: str) -> ReferenceTrajectory:
+def integrate_reference(effect: str) -> ReferenceTrajectory:
     return integrate_motion(scene(SMOOTH[effect], "esdirk-4", 0.1), [END])
 
 
@@ -120,12 +120,12 @@ def test_every_effect_states_its_maximum_order() -> None:
 
 @pytest.mark.parametrize(
     "integrator",
-    [pytest.param(i, marks=[pytest.mark.long] * (i not in MEASURED)) for i in INTEGRATORS if i != "substepping"],
+    [pytest.param(i, marks=[pytest.mark.long] * (i not in MEASURED_INTEGRATORS)) for i in INTEGRATORS if i != "substepping"],
 )
 @pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.long] * (e == "gas")) for e in SMOOTH])
 def test_integrators_have_their_order_up_to_that_of_the_effect(effect, integrator):
     order, case = INTEGRATORS[integrator].order, SMOOTH[effect]
-    errors = [truth(effect).measure_error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)]
+    errors = [integrate_reference(effect).measure_error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)]
     stated = min(order, load_target(EFFECT_CLASSES[effect]).max_convergence_order)
     # The next term of the error is smaller by a time step times the fastest frequency; signs may make it larger.
     assert np.log2(errors[0] / errors[1]) > stated - 0.35

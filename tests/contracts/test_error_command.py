@@ -76,7 +76,7 @@ def test_a_run_to_an_error_leaves_its_row_its_recording_and_its_positions(tmp_pa
     assert np.load(tmp_path / "p.npz")["positions"].shape == (6, 5, 3)
 
 
-THROWN = """
+THROWN_CLOTH = """
 mesh: {kind: grid}
 mass: 1
 time_step: 1/30
@@ -95,7 +95,7 @@ effects:
 @pytest.mark.parametrize("error", ["2e-2", "1e-2", "5e-3"])
 def test_errors_in_quadratic_drag_are_reached_though_a_method_loses_its_order(error: str, tmp_path: Path):
     """Midpoint is of order 1 there, and another method has to take over from it."""
-    (tmp_path / "net.yaml").write_text(THROWN)
+    (tmp_path / "net.yaml").write_text(THROWN_CLOTH)
     given = ["run", str(tmp_path / "net.yaml"), "--error", error, "--t-end", "0.5", "--verify"]
     found = CliRunner().invoke(app, [*given, "--results", str(tmp_path)])
     assert found.exit_code == 0, found.output

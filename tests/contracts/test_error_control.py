@@ -52,8 +52,8 @@ from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StopRule
 
 SCENES = Path(__file__).parents[2] / "configs" / "scenes"
-HELD = PinsEffect(parts=("first",), weight="exact")
-MOVED = PinsEffect.model_validate(
+FIRST_PIN = PinsEffect(parts=("first",), weight="exact")
+MOVING_PIN = PinsEffect.model_validate(
     {
         "parts": ["first"],
         "weight": "exact",
@@ -72,13 +72,13 @@ def chain(*effects: Any, size: int = 5) -> SceneSpec:
 
 
 def implicit(spec: SceneSpec, integrator: str, forces: tuple[Any, ...] = ()) -> AdaptiveImplicitStepper:
-    def bound(h: float) -> Scene:
+    def build_scene_at(h: float) -> Scene:
         return replace(build_scene(spec.with_time_step(h), 5, integrator), varying_forces=forces)
 
-    return AdaptiveImplicitStepper(bound, NewtonSolver(), END, FRAMES)
+    return AdaptiveImplicitStepper(build_scene_at, NewtonSolver(), END, FRAMES)
 
 
-SWINGING = chain(SpringsEffect(stretch=40.0), GravityEffect(), HELD)
+SWINGING = chain(SpringsEffect(stretch=40.0), GravityEffect(), FIRST_PIN)
 
 
 @pytest.mark.parametrize("integrator", ["tr-bdf2", "esdirk-3", "esdirk-4", "sdirk-4"])
@@ -115,7 +115,7 @@ def test_frames_are_on_the_motion_though_steps_are_longer_than_they_are():
 def test_steps_grow_again_after_what_made_them_short():
     """Dashpots stop the throw within a thousandth of a second; what is left is slow."""
     path = implicit(
-        chain(SpringsEffect(stretch=40.0), DashpotsEffect(stretch=100.0), GravityEffect(), HELD), "esdirk-4"
+        chain(SpringsEffect(stretch=40.0), DashpotsEffect(stretch=100.0), GravityEffect(), FIRST_PIN), "esdirk-4"
     ).integrate_motion(1e-5)
     assert path.step_size_range[1] >= 16 * path.step_size_range[0]
     assert path.num_accepted_steps < 100
@@ -134,7 +134,7 @@ def test_a_step_below_the_floor_ends_with_the_frame_the_cause_and_what_was_reach
         StepSizeUnderflow,
         match=r"frame 5, after 0\.2\d+ s: even a step of .* not solved; up to there \d+ steps were within",
     ):
-        implicit(chain(SpringsEffect(stretch=40.0), HELD), "esdirk-4", (breaks,)).integrate_motion(1e-3)
+        implicit(chain(SpringsEffect(stretch=40.0), FIRST_PIN), "esdirk-4", (breaks,)).integrate_motion(1e-3)
 
 
 def test_hermites_cubic_is_exact_for_cubics():
@@ -177,7 +177,7 @@ def steps_of(spec: SceneSpec, size: int) -> list[Any]:
     return [*simulate_scene(scene, prepare(scene, VelocityVerlet()), StopRule(1), initial_guess="previous", frames=10)]
 
 
-def perturbed(spec: SceneSpec, size: int, times: list[float]) -> np.ndarray:
+def integrate_perturbation(spec: SceneSpec, size: int, times: list[float]) -> np.ndarray:
     """What 1e-12 of the size at the start becomes, relative to the displacement, by the reference's own method."""
     field = OdeField(build_ode_scene(spec, size))
     begun, half, length = (
@@ -208,12 +208,12 @@ CRUMPLING = SceneSpec(
         (CRUMPLING, 7, 1.0),
         (
             chain(
-                SpringsEffect(stretch=40.0), GravityEffect(), AirDragEffect(drag_law="quadratic", coefficient=0.5), HELD
+                SpringsEffect(stretch=40.0), GravityEffect(), AirDragEffect(drag_law="quadratic", coefficient=0.5), FIRST_PIN
             ),
             5,
             0.5,
         ),
-        (chain(SpringsEffect(stretch=40.0), GravityEffect(), MOVED), 5, 0.3),
+        (chain(SpringsEffect(stretch=40.0), GravityEffect(), MOVING_PIN), 5, 0.3),
     ],
     ids=["crumpling", "drag", "moving pin"],
 )
@@ -221,7 +221,7 @@ def test_the_estimated_growth_is_that_of_perturbed_integrations(spec, size, end)
     found = estimate_growth(spec, size, end)
     times = [float(t) for t in found.times[5::10]]
     np.testing.assert_allclose(
-        found.interpolate_growth(times), perturbed(spec, size, times), rtol=0.5
+        found.interpolate_growth(times), integrate_perturbation(spec, size, times), rtol=0.5
     )  # over some orders of magnitude
 
 
@@ -279,7 +279,7 @@ def test_what_only_round_off_moves_is_at_rest(tmp_path):
 
 def test_the_pattern_of_the_jacobian_contains_all_nonzeros():
     scene = build_scene(
-        chain(SpringsEffect(stretch=40.0), DashpotsEffect(stretch=1.0), GravityEffect(), HELD), 5, "newmark"
+        chain(SpringsEffect(stretch=40.0), DashpotsEffect(stretch=1.0), GravityEffect(), FIRST_PIN), 5, "newmark"
     )
     field = OdeField(scene)
     y, found = (
@@ -301,12 +301,12 @@ def test_candidate_methods_follow_from_the_properties_of_solvers_and_integrators
 @pytest.mark.parametrize(
     ("effect", "what"),
     [
-        (MOVED, "moving pins"),
+        (MOVING_PIN, "moving pins"),
         (AirDragEffect(drag_law="quadratic", coefficient=0.5), "forces of place, speed and time"),
     ],
 )
 def test_methods_that_would_lose_their_order_silently_are_named_with_the_reason(effect, what):
-    fixed = () if effect is MOVED else (HELD,)
+    fixed = () if effect is MOVING_PIN else (FIRST_PIN,)
     messages, error_target = list[str](), ErrorTarget(chain(SpringsEffect(stretch=40.0), effect, *fixed), 5, 0.1, 2)
     found = prepare_candidate_methods(error_target, messages.append)
     assert {way.solver: way.stepper.order for way in found if way.integrator == "substepping"} == dict.fromkeys(
@@ -339,7 +339,7 @@ def test_fixed_steps_are_no_longer_than_is_stable_and_as_short_as_the_error_requ
 
 
 def test_forces_of_the_speed_are_constant_within_parts_of_a_frame_as_short_as_the_error_requires():
-    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(drag_law="quadratic", coefficient=0.5), HELD)
+    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(drag_law="quadratic", coefficient=0.5), FIRST_PIN)
     even = FixedSubstepper(
         build_scene(spec, 5, "substepping"),
         VelocityVerlet(),
@@ -369,7 +369,7 @@ def test_a_rosenbrock_method_meets_a_requested_error():
 
 def test_drag_that_grows_with_the_square_of_the_speed_is_graded_too(tmp_path):
     """As a force: where frames split, it is a filter, which has no equation of motion."""
-    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(drag_law="quadratic", coefficient=0.5), HELD)
+    spec = chain(SpringsEffect(stretch=40.0), AirDragEffect(drag_law="quadratic", coefficient=0.5), FIRST_PIN)
     found = ReferenceStore(tmp_path).load_trajectory(spec, 5, [0.1], error=1e-3)
     error_target = ErrorTarget(spec, 5, 0.1, 2)
     path = AdaptiveImplicitStepper(

@@ -59,7 +59,9 @@ class Tolerant(Formula):
         return super().integrate_motion(max(1.0, setting ** (-1.0 / (self.order + 1.0))))
 
 
-def found(monkeypatch: pytest.MonkeyPatch, error: float, messages: list[str], **followers: Stepper) -> SearchResult:
+def search_followers(
+    monkeypatch: pytest.MonkeyPatch, error: float, messages: list[str], **followers: Stepper
+) -> SearchResult:
     """The result among methods of these names, the last of which measures the errors of all."""
     exact = Tolerant(lambda steps: 5.0 * steps**-4.0, 0.5, 4)
     named = [Method("substepping", name, one) for name, one in {**followers, "exact": exact}.items()]
@@ -74,7 +76,7 @@ def test_the_order_is_measured_and_the_cost_predicted_by_it(monkeypatch):
     """Of order 1 though it states 2, a way costs the ratio of the errors, and not its square root."""
     first = Formula(lambda steps: 2.0 / steps, 1e-3)
     second = Formula(lambda steps: 20.0 / steps**2, 1e-2)
-    answer = found(monkeypatch, 1e-3, [], first=first, second=second)
+    answer = search_followers(monkeypatch, 1e-3, [], first=first, second=second)
     by_name = {one.method.solver: (one, promise) for one, promise in answer.trials}
     assert by_name["first"][0].order == pytest.approx(1.0, abs=0.05)
     assert by_name["second"][0].order == pytest.approx(2.0, abs=0.05)
@@ -86,7 +88,7 @@ def test_the_order_is_measured_and_the_cost_predicted_by_it(monkeypatch):
 def test_candidate_methods_are_sorted_chosen_and_printed_by_one_statistic(monkeypatch):
     messages = list[str]()
     ways = {f"w{k}": Formula(lambda steps: 1.0 / steps**2, 1e-3 * cost) for k, cost in enumerate((3.0, 1.0, 2.0))}
-    answer = found(monkeypatch, 1e-2, messages, **ways)
+    answer = search_followers(monkeypatch, 1e-2, messages, **ways)
     promises = [promise for _, promise in answer.trials]
     assert promises == sorted(promises)
     assert answer.best_trial.method is answer.trials[0][0].method
@@ -98,7 +100,7 @@ def test_candidate_methods_are_sorted_chosen_and_printed_by_one_statistic(monkey
 def test_a_method_that_does_not_improve_is_followed_by_the_next(monkeypatch):
     messages = list[str]()
     stuck = Formula(lambda steps: 0.03 + 1.0 / steps**2, 1e-4)
-    answer = found(monkeypatch, 1e-2, messages, stuck=stuck, slower=Formula(lambda steps: 1.0 / steps, 1e-2))
+    answer = search_followers(monkeypatch, 1e-2, messages, stuck=stuck, slower=Formula(lambda steps: 1.0 / steps, 1e-2))
     assert answer.best_trial.method.solver != "stuck"
     assert answer.best_trial.error_estimated <= 1e-2
     assert any(line.startswith("  stuck: reaches 3.") and "come no nearer" in line for line in messages)
@@ -108,7 +110,7 @@ def test_a_method_that_takes_longer_than_predicted_for_the_next_is_tried_after_i
     """Its error falls as predicted at first, and then by order a half alone."""
     messages = list[str]()
     late = Formula(lambda steps: 20.0 / steps**2 if steps < 40 else 0.0125 * (40 / steps) ** 0.5, 1e-4)
-    answer = found(monkeypatch, 1e-3, messages, late=late, steady=Formula(lambda steps: 1.0 / steps, 3e-4))
+    answer = search_followers(monkeypatch, 1e-3, messages, late=late, steady=Formula(lambda steps: 1.0 / steps, 3e-4))
     assert answer.trials[0][0].method.solver == "late"
     assert answer.best_trial.method.solver == "steady"
     assert any(line.startswith("  late: takes more than") for line in messages)
@@ -124,7 +126,7 @@ def test_an_error_that_no_method_reaches_is_refused_with_the_nearest(monkeypatch
     )
     monkeypatch.setattr(
         "springbench.harness.experiments.error_control.method_search._MethodSearch._find_reference_trial",
-        lambda *_: _truth(),
+        lambda *_: _build_exact_trial(),
     )
     with pytest.raises(RunFailed, match=r"no step size reaches an error of 0.01: b was nearest with 0\.3"):
         search_cheapest_method(
@@ -132,6 +134,6 @@ def test_an_error_that_no_method_reaches_is_refused_with_the_nearest(monkeypatch
         )
 
 
-def _truth() -> Trial:
+def _build_exact_trial() -> Trial:
     follower = Formula(lambda steps: 0.0, 1e-3)
     return Trial(Method("substepping", "truth", follower), 1.0, follower.integrate_motion(1.0), 0.0, 2)

@@ -93,7 +93,9 @@ class _Busy:
 
 
 @pytest.fixture
-def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[list[dict[str, Any]], RunFiles]]:
+def execute_busy_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[], tuple[list[dict[str, Any]], RunFiles]]:
     """Does a run of the busy solver; its rows, and its files."""
     monkeypatch.setitem(SOLVERS, "busy", f"{__name__}:Busy")
     (tmp_path / "scene.yaml").write_text(SCENE)
@@ -103,8 +105,8 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[l
     return lambda: (execute_run(spec, files, lambda phase: None), files)
 
 
-def test_a_run_with_a_correct_report_is_accepted(ran):
-    found, files = ran()
+def test_a_run_with_a_correct_report_is_accepted(execute_busy_run):
+    found, files = execute_busy_run()
     assert {row["status"] for row in found} == {"ok"}
     assert files.recording_path.exists()
     steps = [row for row in found if row["phase"] == "step"]
@@ -120,21 +122,23 @@ CLOCKS = {
 
 
 @pytest.mark.parametrize("clock", CLOCKS.values(), ids=CLOCKS)
-def test_a_run_whose_steps_do_not_add_up_to_the_wall_time_fails(ran, monkeypatch: pytest.MonkeyPatch, clock):
+def test_a_run_whose_steps_do_not_add_up_to_the_wall_time_fails(
+    execute_busy_run, monkeypatch: pytest.MonkeyPatch, clock
+):
     monkeypatch.setattr(clocks, "perf_counter", clock)
-    (row,), files = retry_if_preempted(ran)
+    (row,), files = retry_if_preempted(execute_busy_run)
     assert row["status"] == "failed"
     assert "the times of step add up to" in row["reason"]
     assert not files.recording_path.exists()
 
 
-UNTOUCHED = np.ones((25, 3))
+UNCHANGED_ARRAY = np.ones((25, 3))
 
 
-@pytest.mark.parametrize("whole", [lambda: None, lambda: UNTOUCHED], ids=["nothing", "what was there"])
-def test_a_run_with_a_phase_that_does_nothing_fails(ran, monkeypatch: pytest.MonkeyPatch, whole):
+@pytest.mark.parametrize("whole", [lambda: None, lambda: UNCHANGED_ARRAY], ids=["nothing", "what was there"])
+def test_a_run_with_a_phase_that_does_nothing_fails(execute_busy_run, monkeypatch: pytest.MonkeyPatch, whole):
     monkeypatch.setitem(Busy.lies, "global", whole)
-    (row,), _ = ran()
+    (row,), _ = execute_busy_run()
     assert row["status"] == "failed"
     assert "the phase global does nothing" in row["reason"]
 
@@ -150,7 +154,7 @@ def late(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(RerunRecorder, "record_frame", frame)
 
 
-def recoloured(monkeypatch: pytest.MonkeyPatch) -> None:
+def recolour_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each frame has the colours of the first."""
     strains, first = StrainShading.compute_strains, []
 
@@ -163,20 +167,22 @@ def recoloured(monkeypatch: pytest.MonkeyPatch) -> None:
 
 RECORDINGS = {
     "a frame late": (late, "was recorded with other positions"),
-    "another frame's colours": (recoloured, "was recorded with other colours"),
+    "another frame's colours": (recolour_frames, "was recorded with other colours"),
 }
 
 
 @pytest.mark.parametrize(("lie", "reason"), RECORDINGS.values(), ids=RECORDINGS)
-def test_a_run_whose_recording_does_not_end_as_it_did_fails(ran, monkeypatch: pytest.MonkeyPatch, lie, reason: str):
+def test_a_run_whose_recording_does_not_end_as_it_did_fails(
+    execute_busy_run, monkeypatch: pytest.MonkeyPatch, lie, reason: str
+):
     lie(monkeypatch)
-    (row,), files = ran()
+    (row,), files = execute_busy_run()
     assert row["status"] == "failed"
     assert reason in row["reason"]
     assert not files.recording_path.exists()
 
 
-def test_a_run_whose_second_pass_differs_from_the_timed_one_fails(ran, monkeypatch: pytest.MonkeyPatch):
+def test_a_run_whose_second_pass_differs_from_the_timed_one_fails(execute_busy_run, monkeypatch: pytest.MonkeyPatch):
     steps = count()
     advance = SingleStageIntegrator.complete_step
 
@@ -185,6 +191,6 @@ def test_a_run_whose_second_pass_differs_from_the_timed_one_fails(ran, monkeypat
         return moved._replace(positions=moved.positions + 1e-9 * (next(steps) >= 2 * FRAMES))
 
     monkeypatch.setattr(SingleStageIntegrator, "complete_step", drifting)
-    (row,), _ = ran()
+    (row,), _ = execute_busy_run()
     assert row["status"] == "failed"
     assert row["reason"] == "the recorded pass ended at other positions than the timed pass"

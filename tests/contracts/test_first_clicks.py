@@ -25,7 +25,7 @@ options: {frames: 3, rounds: 2, max_iterations: 20}
 """Both solvers take the same iterates, so that all are equally accurate; only the rows show which is faster."""
 
 
-def did(*words: str) -> str:
+def run_command(*words: str) -> str:
     result = CliRunner().invoke(app, [*words, "--in-process"])
     assert result.exit_code == 0, result.output
     return result.output
@@ -48,7 +48,7 @@ def test_three_clicks_lead_to_the_fastest_solver_its_last_frame_and_the_command_
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenes").symlink_to(SCENES)
     (tmp_path / "study.yaml").write_text(SWEEP)
-    last_line = did("run", "study.yaml").splitlines()[-1]
+    last_line = run_command("run", "study.yaml").splitlines()[-1]
     fastest, row = next(iter(ends(tmp_path / "results" / "study" / "rows").items()))
     with launch_chromium() as browser:
         page, clicks = browser.new_page(viewport={"width": 1280, "height": 800}), 0
@@ -76,6 +76,6 @@ def test_three_clicks_lead_to_the_fastest_solver_its_last_frame_and_the_command_
 
     program, *words = shlex.split(command)
     assert program == "springbench"
-    did(*words)
+    run_command(*words)
     (again,) = ends(tmp_path / "results" / "hanging-cloth" / "rows").values()
     assert (again["solver"], again["positions_digest"]) == (fastest, row["positions_digest"])

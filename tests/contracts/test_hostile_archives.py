@@ -20,7 +20,7 @@ def each(names: object) -> list[object]:
     return [n if n in QUICK else pytest.param(n, marks=pytest.mark.long) for n in names]  # type: ignore[attr-defined]
 
 
-def require_answer(outcome: Outcome, *codes: int) -> None:
+def require_message(outcome: Outcome, *codes: int) -> None:
     assert not outcome.error, outcome.error
     assert "Traceback" not in outcome.said
     assert outcome.code in codes, outcome.said
@@ -35,13 +35,13 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Content:
 @pytest.mark.parametrize("name", each(CHANGES))
 def test_a_hostile_archive_is_not_confirmed(name: str, good: Content, tmp_path: Path):
     archive(name, good, tmp_path / "x.zip")
-    require_answer(attempt(tmp_path, ["verify-archive", "x.zip", "--seed", "1"]), 1, 2, 3)
+    require_message(attempt(tmp_path, ["verify-archive", "x.zip", "--seed", "1"]), 1, 2, 3)
 
 
 @pytest.mark.parametrize("name", each(RAW))
 def test_an_archive_of_another_program_is_refused(name: str, tmp_path: Path):
     (tmp_path / "x.zip").write_bytes(RAW[name]())
-    require_answer(attempt(tmp_path, ["verify-archive", "x.zip"]), 1, 2)
+    require_message(attempt(tmp_path, ["verify-archive", "x.zip"]), 1, 2)
 
 
 @pytest.mark.parametrize(
@@ -51,12 +51,12 @@ def test_a_path_that_is_not_a_file_is_refused(what: str, tmp_path: Path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
     (tmp_path / "loop").symlink_to("loop")
-    require_answer(attempt(tmp_path, ["verify-archive", what]), 2)
+    require_message(attempt(tmp_path, ["verify-archive", what]), 2)
 
 
 @pytest.mark.parametrize("name", each(FOLDERS))
 def test_all_commands_report_hostile_results(name: str, tmp_path: Path):
-    def made(number: int) -> Path:
+    def build_folder(number: int) -> Path:
         folder = tmp_path / str(number)
         folder.mkdir()
         good_results(folder)
@@ -75,7 +75,7 @@ def test_all_commands_report_hostile_results(name: str, tmp_path: Path):
             ["query", "SELECT count(*) FROM rows", "--results", "results"],
         )
     ):
-        outcome = attempt(made(number), arguments)
+        outcome = attempt(build_folder(number), arguments)
         assert not outcome.error, (arguments, outcome.error)
         assert "Traceback" not in outcome.said
         assert outcome.code in (0, 1, 2, 3), (arguments, outcome.said)

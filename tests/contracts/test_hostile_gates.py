@@ -38,7 +38,7 @@ def put(path: Path, content: str | bytes | Callable[[Path], object]) -> None:
         path.write_bytes(content if isinstance(content, bytes) else content.encode(errors="surrogatepass"))
 
 
-def require_answer(outcome: Outcome, *codes: int) -> None:
+def require_message(outcome: Outcome, *codes: int) -> None:
     assert not outcome.error, outcome.error
     assert "Traceback" not in outcome.said
     assert outcome.code in codes, outcome.said
@@ -49,15 +49,15 @@ def require_answer(outcome: Outcome, *codes: int) -> None:
 def test_a_hostile_table_is_refused_by_name(name: str, folder: Path):
     put(folder / "hostile.yaml", TABLES[name])
     outcome = attempt(folder, ["regress", "hostile.yaml", "--budget", "0.1"])
-    require_answer(outcome, 2)
+    require_message(outcome, 2)
     assert "hostile.yaml" in outcome.said
 
 
 @pytest.mark.parametrize("name", each(RECORDS))
 def test_a_hostile_record_ends_with_a_message(name: str, folder: Path):
     put(folder / "hostile.json", RECORDS[name])
-    require_answer(attempt(folder, ["regress", "hostile.json", "--baseline", "hostile.json"]), 0, 2, 3)
-    require_answer(attempt(folder, ["regress", "--history", "hostile.json"]), 2, 3)
+    require_message(attempt(folder, ["regress", "hostile.json", "--baseline", "hostile.json"]), 0, 2, 3)
+    require_message(attempt(folder, ["regress", "--history", "hostile.json"]), 2, 3)
 
 
 @pytest.mark.long

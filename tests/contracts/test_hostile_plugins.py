@@ -54,14 +54,14 @@ def test_a_command_survives_its_plugins(name: str, tmp_path: Path, monkeypatch: 
         require_rows(tmp_path, case)
 
 
-LOOKS = [
+INSPECTIONS = [
     *(("list", name) for name in HOSTILE),
     *(("preview", name) for name, case in HOSTILE.items() if case.part in ("effect", "mesh")),
 ]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("command", "name"), LOOKS)
+@pytest.mark.parametrize(("command", "name"), INSPECTIONS)
 def test_listing_and_showing_survive_plugins(command: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """`list` imports no code of others; `show` binds an effect or a mesh, and says what is wrong with it."""
     case = HOSTILE[name]

@@ -22,10 +22,10 @@ from springbench.harness.results.row_store import FILE_COLUMN
 
 from tests import synthetic_accuracy_rows, synthetic_site_rows
 from tests.contracts.attempts import Outcome, attempt
-from tests.contracts.hostile_rows import LEFT_OUT, SHOWN, rows_with, write_cases
+from tests.contracts.hostile_rows import LEFT_OUT, ODD_COLUMNS, rows_with, write_cases
 
 
-def reported(folder: Path) -> Outcome:
+def run_report(folder: Path) -> Outcome:
     found = attempt(folder, ["report", "results", "--no-viewer"])
     assert not found.error, found.error
     assert "Traceback" not in found.said
@@ -35,7 +35,7 @@ def reported(folder: Path) -> Outcome:
 
 def test_rows_that_do_not_fit_are_named_and_left_out(tmp_path: Path):
     files = write_cases(tmp_path / "results" / "cases", LEFT_OUT)
-    found = reported(tmp_path)
+    found = run_report(tmp_path)
     said = "".join(found.said.split())
     assert found.code == 0
     for file, (name, (column, _)) in zip(files, LEFT_OUT.items(), strict=True):
@@ -44,18 +44,18 @@ def test_rows_that_do_not_fit_are_named_and_left_out(tmp_path: Path):
 
 
 def test_odd_rows_that_fit_are_shown(tmp_path: Path):
-    write_cases(tmp_path / "results" / "cases", SHOWN)
-    found = reported(tmp_path)
+    write_cases(tmp_path / "results" / "cases", ODD_COLUMNS)
+    found = run_report(tmp_path)
     assert found.code == 0
     assert ".parquet" not in found.said
     table = (tmp_path / "results" / "site" / "data" / "cases" / "runs.js").read_text()
-    assert f'"num_rows":{2 * len(SHOWN)},' in table
+    assert f'"num_rows":{2 * len(ODD_COLUMNS)},' in table
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", SHOWN)
+@pytest.mark.parametrize("name", ODD_COLUMNS)
 def test_odd_rows_are_reported_at_the_end_of_a_sweep(tmp_path: Path, name: str):
-    table = read_rows(write_cases(tmp_path / "cases", {name: SHOWN[name]}))
+    table = read_rows(write_cases(tmp_path / "cases", {name: ODD_COLUMNS[name]}))
     Console(file=StringIO()).print(build_summary_table(table))
     summarise_sweep(read_run_times(table))
     draw_timing_plot(table, tmp_path / "timing.png", name)
@@ -89,7 +89,7 @@ def test_a_hostile_file_of_rows_is_named_within_limits(tmp_path: Path, name: str
     folder = tmp_path / "results" / "a" / "rows"
     folder.mkdir(parents=True)
     FILES[name](folder / "hostile.parquet")
-    found = reported(tmp_path)
+    found = run_report(tmp_path)
     assert found.code == 2
     assert "hostile.parquet" in "".join(found.said.split())
 
@@ -102,7 +102,7 @@ def test_a_unit_of_packed_rows_is_no_path(tmp_path: Path, unit: str):
         packed.set_column(packed.column_names.index(FILE_COLUMN), FILE_COLUMN, [[unit] * len(packed)]),
         folder / "rows.parquet",
     )
-    found = reported(tmp_path)
+    found = run_report(tmp_path)
     assert found.code == 2
     assert "rows.parquet" in "".join(found.said.split())
 
@@ -118,7 +118,7 @@ def test_a_recording_is_searched_below_its_folder(tmp_path: Path, recording: str
         if row["kind"] == "curve":
             row["recording_path"] = recording
     synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", given_rows)
-    found = reported(tmp_path)
+    found = run_report(tmp_path)
     assert "recording_path: got" in " ".join(found.said.split())
 
 
@@ -129,7 +129,7 @@ def test_rows_of_accuracy_that_do_not_belong_together_are_refused(tmp_path: Path
     for row in given_rows:
         row["objective_initial"] = row["time_step"] = None
     synthetic_accuracy_rows.write_accuracy_rows(tmp_path / "results" / "study", given_rows)
-    assert reported(tmp_path).code in (0, 2)
+    assert run_report(tmp_path).code in (0, 2)
 
 
 def test_a_strict_read_reports_every_file(tmp_path: Path):

@@ -33,12 +33,12 @@ from springbench.solvers.model.integrators import INTEGRATORS, Motion
 from springbench.solvers.model.step_problem import Positions, Solver, StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
-CONVERGED = StopRule(100, 1e-13)
+CONVERGED_STOP = StopRule(100, 1e-13)
 
 integrators = pytest.mark.parametrize("name", [name for name in INTEGRATORS if name != "substepping"])
 
 
-def made(
+def build_unit_scene(
     name: str,
     mesh: MeshSource,
     *effects: SceneEffect,
@@ -52,7 +52,7 @@ def made(
 
 
 def run(
-    scene: Scene, steps: int, solver: Solver | None = None, stop: StopRule = CONVERGED, state: MotionState | None = None
+    scene: Scene, steps: int, solver: Solver | None = None, stop: StopRule = CONVERGED_STOP, state: MotionState | None = None
 ) -> list[Motion]:
     """The motions at the start and after each step."""
     state, prepared = state or build_initial_state(scene), prepare(scene, solver or NewtonSolver())
@@ -60,8 +60,8 @@ def run(
     return [state.motion, *(step.state.motion for step in path)]
 
 
-HELD = PinsEffect(parts=("first",), weight="exact")
-SWUNG = PinsEffect.model_validate(
+FIRST_PIN = PinsEffect(parts=("first",), weight="exact")
+MOVING_PIN = PinsEffect.model_validate(
     {
         "parts": ["first"],
         "weight": "exact",
@@ -77,19 +77,19 @@ def gusts(p: Positions, v: Positions, t: float) -> Positions:
 
 
 PROBLEMS: dict[str, tuple[tuple[SceneEffect, ...], tuple, tuple[float, float, float]]] = {
-    "swinging": ((SOFT, GravityEffect(), HELD), (), (0.5, 1.0, 2.0)),
-    "under a force of time, place and speed": ((SOFT, HELD), (gusts,), (1.0, 0.0, 0.5)),
-    "slowed by ether drag": ((SOFT, GravityEffect(), EtherDragEffect(decay_rate=3.0), HELD), (), (0.0, 0.0, 0.0)),
+    "swinging": ((SOFT, GravityEffect(), FIRST_PIN), (), (0.5, 1.0, 2.0)),
+    "under a force of time, place and speed": ((SOFT, FIRST_PIN), (gusts,), (1.0, 0.0, 0.5)),
+    "slowed by ether drag": ((SOFT, GravityEffect(), EtherDragEffect(decay_rate=3.0), FIRST_PIN), (), (0.0, 0.0, 0.0)),
     "slowed by quadratic drag": (
-        (SOFT, AirDragEffect(drag_law="quadratic", coefficient=3.0), HELD), (), (1.0, 0.0, 2.0)
+        (SOFT, AirDragEffect(drag_law="quadratic", coefficient=3.0), FIRST_PIN), (), (1.0, 0.0, 2.0)
     ),
-    "slowed by air": ((SOFT, GravityEffect(), AirDragEffect(coefficient=2.0), HELD), (), (1.0, 0.0, 2.0)),
-    "slowed by dashpots": ((SOFT, GravityEffect(), DashpotsEffect(stretch=0.4), HELD), (), (1.0, 0.0, 2.0)),
+    "slowed by air": ((SOFT, GravityEffect(), AirDragEffect(coefficient=2.0), FIRST_PIN), (), (1.0, 0.0, 2.0)),
+    "slowed by dashpots": ((SOFT, GravityEffect(), DashpotsEffect(stretch=0.4), FIRST_PIN), (), (1.0, 0.0, 2.0)),
     "slowed by Rayleigh's damping": (
-        (SOFT, GravityEffect(), RayleighEffect(mass_coefficient=0.5, stiffness_coefficient=0.02), HELD),
+        (SOFT, GravityEffect(), RayleighEffect(mass_coefficient=0.5, stiffness_coefficient=0.02), FIRST_PIN),
         (), (1.0, 0.0, 2.0),
     ),
-    "swung by its pin": ((SOFT, GravityEffect(), SWUNG), (), (0.5, 1.0, 0.0)),
+    "swung by its pin": ((SOFT, GravityEffect(), MOVING_PIN), (), (0.5, 1.0, 0.0)),
 }  # fmt: skip
 
 
@@ -100,10 +100,10 @@ END = 0.15
 
 
 @cache
-def truth(problem: str) -> ReferenceTrajectory:
+def integrate_reference(problem: str) -> ReferenceTrajectory:
     """The motion at the end, which no integrator has a share in; forces take the place of filters."""
     effects, forces, velocity = PROBLEMS[problem]
-    scene = made("esdirk-4", ChainMesh(), *effects, size=4, time_step=0.1, velocity=velocity)
+    scene = build_unit_scene("esdirk-4", ChainMesh(), *effects, size=4, time_step=0.1, velocity=velocity)
     return integrate_motion(replace(scene, varying_forces=(*scene.varying_forces, *forces)), [END])
 
 
@@ -113,9 +113,9 @@ def test_the_error_falls_with_the_methods_order(name, problem):
     effects, forces, velocity = PROBLEMS[problem]
     errors = []
     for steps in (12, 24):
-        scene = made(name, ChainMesh(), *effects, size=4, time_step=END / steps, velocity=velocity)
+        scene = build_unit_scene(name, ChainMesh(), *effects, size=4, time_step=END / steps, velocity=velocity)
         scene = replace(scene, varying_forces=(*scene.varying_forces, *forces))
-        errors.append(truth(problem).measure_error(0, run(scene, steps)[-1].positions))
+        errors.append(integrate_reference(problem).measure_error(0, run(scene, steps)[-1].positions))
     found = np.log2(errors[0] / errors[1])
     # The next term of the error is smaller by a time step times the fastest frequency or rate of decay, at most 0.2.
     assert found == pytest.approx(SPLIT.get((problem, name), INTEGRATORS[name].order), abs=0.2)
@@ -125,7 +125,7 @@ FREE = (GridMesh(), SpringsEffect(stretch=300.0))
 RNG = np.random.default_rng(4)
 
 
-def thrown(scene: Scene, *, spin: float, noise: float = 0.0) -> MotionState:
+def build_spinning_state(scene: Scene, *, spin: float, noise: float = 0.0) -> MotionState:
     """The rest shape, spinning about the vertical [1/s], with random speeds besides [m/s]."""
     arm = scene.mesh.rest_positions - scene.mesh.rest_positions.mean(axis=0)
     velocity = np.cross([0.0, spin, 0.0], arm) + noise * np.random.default_rng(4).normal(size=arm.shape)
@@ -134,8 +134,8 @@ def thrown(scene: Scene, *, spin: float, noise: float = 0.0) -> MotionState:
 
 @integrators
 def test_linear_momentum_is_conserved(name):
-    scene = made(name, *FREE, size=5, time_step=1 / 30)
-    momenta = [scene.system.mass @ v for _, v in run(scene, 15, state=thrown(scene, spin=2.0, noise=1.0))]
+    scene = build_unit_scene(name, *FREE, size=5, time_step=1 / 30)
+    momenta = [scene.system.mass @ v for _, v in run(scene, 15, state=build_spinning_state(scene, spin=2.0, noise=1.0))]
     # Converged forces add up to 1e-13 of some tens of newtons, and round-off of positions over dt to 1e-14.
     np.testing.assert_allclose(momenta, np.tile(momenta[0], (16, 1)), rtol=0, atol=1e-12)
 
@@ -167,15 +167,15 @@ LAWS: dict[str, Callable[[np.ndarray, list[Motion], float], np.ndarray]] = {
 
 @pytest.mark.parametrize("name", LAWS)
 def test_angular_momentum_obeys_the_methods_law(name):
-    scene = made(name, *FREE, size=5, time_step=1 / 30)
-    path = run(scene, 12, state=thrown(scene, spin=4.0, noise=0.5))
+    scene = build_unit_scene(name, *FREE, size=5, time_step=1 / 30)
+    path = run(scene, 12, state=build_spinning_state(scene, spin=4.0, noise=0.5))
     # What is left of forces of some tens of newtons, 1e-12 of them, and round-off of positions over dt.
     np.testing.assert_allclose(LAWS[name](scene.system.mass[:, None], path, 1 / 30), 0.0, rtol=0, atol=2e-11)
 
 
 def quadratic(name: str) -> Scene:
     """A net of springs without rest length, whose energy is quadratic."""
-    scene = made(name, *FREE, size=4, time_step=1 / 10)
+    scene = build_unit_scene(name, *FREE, size=4, time_step=1 / 10)
     springs = replace(scene.all_springs, rest_length=np.zeros(len(scene.all_springs.edges)))
     return replace(scene, system=replace(scene.system, energies=(springs,)))
 
@@ -189,14 +189,14 @@ def energies(scene: Scene, path: list[Motion]) -> np.ndarray:
 
 def test_midpoint_conserves_a_quadratic_energy():
     scene = quadratic("midpoint")
-    found = energies(scene, run(scene, 40, state=thrown(scene, spin=2.0, noise=1.0)))
+    found = energies(scene, run(scene, 40, state=build_spinning_state(scene, spin=2.0, noise=1.0)))
     np.testing.assert_allclose(found, found[0], rtol=1e-12)  # forty steps of some roundings of sums of tens of terms
 
 
 @pytest.mark.parametrize("name", ["implicit-euler", "bdf2"])
 def test_the_others_damp_a_quadratic_energy(name):
     scene = quadratic(name)
-    found = energies(scene, run(scene, 40, state=thrown(scene, spin=2.0, noise=1.0)))
+    found = energies(scene, run(scene, 40, state=build_spinning_state(scene, spin=2.0, noise=1.0)))
     assert found[-1] < 0.9 * found[0]
     if name == "implicit-euler":
         assert all(b <= a * (1.0 + 1e-12) for a, b in pairwise(found))  # as above
@@ -206,12 +206,12 @@ def test_the_others_damp_a_quadratic_energy(name):
 @pytest.mark.parametrize("name", ["midpoint", "newmark"])
 def test_the_energy_stays_near_over_a_hundred_thousand_steps(name):
     """Midpoint is symplectic; the trapezoidal rule, Newmark's mean acceleration, is conjugate to it."""
-    scene = made(
+    scene = build_unit_scene(
         name, ChainMesh(), SpringsEffect(scaling_rule="fixed", stretch=25.0), size=3, time_step=0.02
     )  # omega h = .3
     begun = MotionState(Motion(1.1 * scene.mesh.rest_positions, np.random.default_rng(0).normal(size=(3, 3))), None, 0)
     path = simulate_scene(
-        scene, prepare(scene, NewtonSolver()), CONVERGED, initial_guess="inertial", frames=100_000, initial_state=begun
+        scene, prepare(scene, NewtonSolver()), CONVERGED_STOP, initial_guess="inertial", frames=100_000, initial_state=begun
     )
     found = energies(scene, [begun.motion, *(step.state.motion for step in path if step.index % 500 == 0)])
     # It swings by (omega h)^2 at most, and does not drift.
@@ -225,7 +225,7 @@ MINIMISERS = [name for name, target in SOLVERS.items() if load_target(target).is
 @pytest.mark.parametrize("name", ["implicit-euler", "bdf2", "midpoint", "generalised-alpha", "sdirk-3"])
 @pytest.mark.parametrize("solver", MINIMISERS)
 def test_every_minimiser_takes_the_steps_of_every_integrator(name, solver):
-    scene = made(
+    scene = build_unit_scene(
         name,
         GridMesh(),
         SpringsEffect(stretch=30.0),

@@ -47,46 +47,46 @@ print("\\n" + json.dumps(answers))
 RECORD, PICTURES = 'pip install "springbench[record]"', 'pip install "springbench[pictures]"'
 
 
-class Answer(NamedTuple):
+class CommandResult(NamedTuple):
     code: int
     text: str
 
 
-COMMANDS: dict[str, Answer] = {
-    "run net --size 4 --frames 2 --solver sparse --in-process": Answer(0, RECORD),
-    "list net": Answer(0, "missing"),
-    "report": Answer(0, "index.html"),
-    "figure timing results/net": Answer(0, "timing.pdf"),
-    "figure run results/net": Answer(2, PICTURES),
-    "preview net --size 4": Answer(2, PICTURES),
-    "gallery net": Answer(2, PICTURES),
-    "inspect mine.rrd": Answer(2, RECORD),
-    "view mine.rrd": Answer(2, RECORD),
-    "run recorded.yaml": Answer(2, f"recorded.yaml:4: options.record: recordings need Rerun, which this installation "
+COMMANDS: dict[str, CommandResult] = {
+    "run net --size 4 --frames 2 --solver sparse --in-process": CommandResult(0, RECORD),
+    "list net": CommandResult(0, "missing"),
+    "report": CommandResult(0, "index.html"),
+    "figure timing results/net": CommandResult(0, "timing.pdf"),
+    "figure run results/net": CommandResult(2, PICTURES),
+    "preview net --size 4": CommandResult(2, PICTURES),
+    "gallery net": CommandResult(2, PICTURES),
+    "inspect mine.rrd": CommandResult(2, RECORD),
+    "view mine.rrd": CommandResult(2, RECORD),
+    "run recorded.yaml": CommandResult(2, f"recorded.yaml:4: options.record: recordings need Rerun, which this installation "
                                    f"lacks; to have it: {RECORD}; or set `record: false`"),
 }  # fmt: skip
-RECORDED = "scenes: [net]\nsolvers: [sparse]\noptions:\n  record: true\n"
+RECORDED_SWEEP = "scenes: [net]\nsolvers: [sparse]\noptions:\n  record: true\n"
 
 
 @pytest.fixture(scope="module")
-def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Answer]:
+def command_results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, CommandResult]:
     folder = tmp_path_factory.mktemp("light")
     blocked = [name for part in OPTIONAL_PARTS for name in part.modules]
     (folder / "site").mkdir()
     (folder / "site" / "sitecustomize.py").write_text(f"BLOCKED = {blocked}\n{BLOCK}")
-    (folder / "recorded.yaml").write_text(RECORDED)
+    (folder / "recorded.yaml").write_text(RECORDED_SWEEP)
     environment = os.environ | {"PYTHONPATH": str(folder / "site"), "COLUMNS": "1000"}
     command = [sys.executable, "-c", SCRIPT, json.dumps(list(COMMANDS))]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
-    return {name: Answer(*answer) for name, answer in zip(COMMANDS, found, strict=True)}
+    return {name: CommandResult(*answer) for name, answer in zip(COMMANDS, found, strict=True)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_command_works_or_names_what_to_install(answers: dict[str, Answer], command: str):
-    expected, found = COMMANDS[command], answers[command]
+def test_a_command_works_or_names_what_to_install(command_results: dict[str, CommandResult], command: str):
+    expected, found = COMMANDS[command], command_results[command]
     assert found.code == expected.code, found.text
     assert expected.text in found.text
 

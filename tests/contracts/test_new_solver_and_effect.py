@@ -85,7 +85,7 @@ class Hum(ConfigModel):
 
 
 @pytest.fixture(autouse=True)
-def added(monkeypatch: pytest.MonkeyPatch) -> None:
+def registered_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(SOLVERS, "mine", f"{__name__}:Mine")
     monkeypatch.setitem(EFFECT_CLASSES, "hum", f"{__name__}:Hum")
 

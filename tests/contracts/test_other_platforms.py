@@ -15,7 +15,7 @@ from springbench.harness.execution.sandbox import CallLimits, SandboxError, call
 from springbench.solvers import platform_calls
 from springbench.solvers.jit import kernel_cache
 
-ABSENT = """
+ABSENT_CALLS = """
 import multiprocessing.popen_fork, os, psutil, signal, subprocess, sys, tempfile  # what uses these calls itself
 for name in ("fcntl", "resource"):
     sys.modules[name] = None
@@ -68,7 +68,7 @@ def test_a_sweep_runs_and_gives_the_same_positions(tmp_path: Path):
     for name, text in (("scene.yaml", SCENE), ("sweep.yaml", SWEEP), ("square.obj", SQUARE), ("drag.py", DRAG)):
         (tmp_path / name).write_text(text)
     (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(ABSENT)
+    (tmp_path / "site" / "sitecustomize.py").write_text(ABSENT_CALLS)
     found = dict[str, object]()
     for results, path in (("here", ""), ("elsewhere", str(tmp_path / "site"))):
         environment = {**os.environ, "PYTHONPATH": path}
@@ -143,7 +143,7 @@ UNIX_CALLS = re.compile(
     r"pthread_sigmask|setitimer)\b|\bselect\.poll\b|[\"']/proc/"
 )
 """What Windows lacks."""
-GUARDED = {
+GUARDED_CALLS = {
     "harness/execution/interrupts.py": "sys.platform",
     "harness/experiments/archive/compaction.py": 'hasattr(os, "O_DIRECTORY")',
     "harness/execution/process_memory.py": "OSError",
@@ -167,5 +167,5 @@ def test_one_module_has_what_only_unix_has():
     importing = {name for name, text in sources.items() if UNIX_MODULES.search(text)}
     assert importing == {"solvers/platform_calls.py"}
     calling = {name for name, text in sources.items() if UNIX_CALLS.search(text)} - importing
-    assert calling == set(GUARDED)
-    assert all(guard in sources[name] for name, guard in GUARDED.items())
+    assert calling == set(GUARDED_CALLS)
+    assert all(guard in sources[name] for name, guard in GUARDED_CALLS.items())

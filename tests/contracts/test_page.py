@@ -90,23 +90,23 @@ class Tab:
     def open(self, page: str, view: str = "") -> Any:
         self.page.goto("about:blank")
         self.page.goto(f"{page}#{view}")
-        return self.settled()
+        return self.wait_until_ready()
 
     def go(self, view: str) -> Any:
         """To another view of the page that is open."""
         self.page.evaluate("view => { location.hash = view; }", view)
-        return self.settled()
+        return self.wait_until_ready()
 
-    def settled(self) -> Any:
+    def wait_until_ready(self) -> Any:
         """The page, once it shows what its URL says: a browser reports a new one later."""
         self.page.wait_for_function("document.documentElement.dataset.ready === (location.hash || '#')")
         return self.page
 
     def view(self) -> str:
-        return self.settled().evaluate("location.hash")
+        return self.wait_until_ready().evaluate("location.hash")
 
     def rows(self) -> int:
-        return int(self.settled().get_by_role("grid").get_attribute("aria-rowcount")) - 1
+        return int(self.wait_until_ready().get_by_role("grid").get_attribute("aria-rowcount")) - 1
 
     def close(self) -> None:
         """Ends it; no message, and no request but to files."""

@@ -24,11 +24,11 @@ from typer.testing import CliRunner
 from tests.architecture.test_vocabulary import DIALECT
 
 ROOT = Path(__file__).resolve().parents[2]
-GENERATED = ROOT / "configs" / "reference"
+GENERATED_FOLDER = ROOT / "configs" / "reference"
 GUIDES = [ROOT / "configs" / folder for folder in ("howto", "explanation", "tutorials")]
-HIDDEN = {".venv", ".pytest_cache", "node_modules", ".ipynb_checkpoints"}
-PAGES = sorted(page for page in ROOT.glob("**/*.md") if not HIDDEN & set(page.relative_to(ROOT).parts))
-WRITTEN = [page for page in PAGES if page.parent != GENERATED]
+HIDDEN_FOLDERS = {".venv", ".pytest_cache", "node_modules", ".ipynb_checkpoints"}
+PAGES = sorted(page for page in ROOT.glob("**/*.md") if not HIDDEN_FOLDERS & set(page.relative_to(ROOT).parts))
+WRITTEN_PAGES = [page for page in PAGES if page.parent != GENERATED_FOLDER]
 """Pages that people write."""
 MAX_PAGE_WORDS = 1500
 MAX_FIRST_PAGE_WORDS = 700
@@ -36,7 +36,7 @@ MAX_TOTAL_WORDS = 15_000
 """Words of prose on all pages: what a newcomer can read; code, tables and generated reference are extra."""
 MAX_MEAN_WORDS = 22
 MAX_SENTENCE_WORDS = 40
-BANNED = (DIALECT - {"oracle", "goals", "blame"}) | {"asked", "wanted", "reckoned", "nothing whatever"}
+BANNED_WORDS = (DIALECT - {"oracle", "goals", "blame"}) | {"asked", "wanted", "reckoned", "nothing whatever"}
 """Words of the dialect, as in `tests.architecture.test_vocabulary`; pages may name the folder `tests/oracles`."""
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 
@@ -71,7 +71,7 @@ def count_words(text: str) -> int:
     return len(re.findall(r"[^\W_][\w'’./-]*", text))
 
 
-@pytest.mark.parametrize("page", WRITTEN, ids=name_page)
+@pytest.mark.parametrize("page", WRITTEN_PAGES, ids=name_page)
 def test_sentences_of_a_page_are_short(page: Path) -> None:
     sentences = split_sentences(page.read_text(encoding="utf-8"))
     lengths = [count_words(one) for one in sentences]
@@ -79,24 +79,24 @@ def test_sentences_of_a_page_are_short(page: Path) -> None:
     assert sum(lengths) < MAX_MEAN_WORDS * max(len(lengths), 1)
 
 
-@pytest.mark.parametrize("page", WRITTEN, ids=name_page)
+@pytest.mark.parametrize("page", WRITTEN_PAGES, ids=name_page)
 def test_a_page_uses_the_terms_of_the_field(page: Path) -> None:
     words = {word.lower() for word in re.findall(r"[^\W\d_]+", remove_code(page.read_text(encoding="utf-8")))}
-    assert words & BANNED == set()
+    assert words & BANNED_WORDS == set()
 
 
-@pytest.mark.parametrize("page", WRITTEN, ids=name_page)
+@pytest.mark.parametrize("page", WRITTEN_PAGES, ids=name_page)
 def test_a_page_is_short(page: Path) -> None:
     limit = MAX_FIRST_PAGE_WORDS if page.parent == ROOT else MAX_PAGE_WORDS
     assert len(page.read_text(encoding="utf-8").split()) <= limit
 
 
 def test_all_pages_together_are_short() -> None:
-    texts = (page.read_text(encoding="utf-8") for page in WRITTEN)
+    texts = (page.read_text(encoding="utf-8") for page in WRITTEN_PAGES)
     assert sum(count_words(sentence) for text in texts for sentence in split_sentences(text)) <= MAX_TOTAL_WORDS
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.parent in (GENERATED, *GUIDES)], ids=name_page)
+@pytest.mark.parametrize("page", [page for page in PAGES if page.parent in (GENERATED_FOLDER, *GUIDES)], ids=name_page)
 def test_the_first_line_states_the_readers_of_the_page(page: Path) -> None:
     text = re.sub(r"\A<!-- Made by .*-->\n", "", page.read_text(encoding="utf-8"))
     title, first = text.split("\n\n")[:2]
@@ -157,7 +157,7 @@ def find_commands(page: Path) -> Iterator[PageCommand]:
                     yield PageCommand(page, tuple(words[1:]))
 
 
-COMMANDS = [one for page in WRITTEN for one in find_commands(page)]
+COMMANDS = [one for page in WRITTEN_PAGES for one in find_commands(page)]
 
 
 @cache
@@ -179,7 +179,7 @@ def test_a_command_of_a_page_exists_with_its_options(command: PageCommand) -> No
     parser.parse_args([word for word in arguments if not word.startswith("[")])
 
 
-@pytest.mark.parametrize("page", WRITTEN, ids=name_page)
+@pytest.mark.parametrize("page", WRITTEN_PAGES, ids=name_page)
 def test_a_command_in_a_sentence_exists_with_its_options(page: Path) -> None:
     for span in re.findall(r"`springbench ([a-z-]+)([^`]*)`", page.read_text(encoding="utf-8")):
         found = find_command(span[0])
@@ -223,7 +223,7 @@ def test_a_quick_command_of_a_page_runs(command: PageCommand, folder: Path) -> N
     assert outcome.exit_code == 0, outcome.output
 
 
-@pytest.mark.parametrize("page", WRITTEN, ids=name_page)
+@pytest.mark.parametrize("page", WRITTEN_PAGES, ids=name_page)
 def test_python_in_a_page_compiles(page: Path) -> None:
     for block in re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
         compile(block, name_page(page), "exec")

@@ -23,7 +23,7 @@ from tests.scene_builders import LOCAL_GLOBAL_BACKENDS, build_test_scene, comput
 
 G = 9.81
 DT = 1 / 30
-CONVERGED = StopRule(20_000, 1e-13)
+CONVERGED_STOP = StopRule(20_000, 1e-13)
 
 backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 
@@ -32,7 +32,7 @@ FREE = build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), size=6)
 
 
 def moving(
-    made: Scene, velocity: Positions, steps: int, stop: StopRule = CONVERGED
+    made: Scene, velocity: Positions, steps: int, stop: StopRule = CONVERGED_STOP
 ) -> list[tuple[Positions, Positions]]:
     """Positions and velocities at the start and after each step."""
     prepared, state = (

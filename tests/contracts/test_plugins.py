@@ -85,12 +85,12 @@ WHEEL = {
 }
 """The content of a wheel: pip installs it without a build backend, and without a network."""
 NAMES = {"mesh": "Cord", "effect": "Hum", "solver": "Mine", "integrator": "EULER", "report": "tell"}
-INSTALLED = {"mesh": "cord", "effect": "hum", "solver": "mine", "integrator": "euler", "report": "tell"}
-WAYS = {
+ENTRY_POINTS = {"mesh": "cord", "effect": "hum", "solver": "mine", "integrator": "euler", "report": "tell"}
+NAMING_FORMS = {
     "beside": {part: f"./mine.py:{name}" for part, name in NAMES.items()},
     "below": {part: f"./own/mine.py:{name}" for part, name in NAMES.items()},
     "module": {part: f"somebodys:{name}" for part, name in NAMES.items()},
-    "entry-point": INSTALLED,
+    "entry-point": ENTRY_POINTS,
 }
 
 
@@ -119,7 +119,7 @@ def springbench(folder: Path, *arguments: str, code: int = 0) -> str:
     return completed.stdout + completed.stderr
 
 
-def packed(folder: Path) -> Path:
+def build_wheel(folder: Path) -> Path:
     """The package `somebodys`, ready to be installed."""
     wheel = folder / "somebodys-4.2-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
@@ -130,9 +130,9 @@ def packed(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed_packages(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of packages in which the package `somebodys` was installed."""
-    wheel, target = packed(tmp_path_factory.mktemp("source")), tmp_path_factory.mktemp("installed")
+    wheel, target = build_wheel(tmp_path_factory.mktemp("source")), tmp_path_factory.mktemp("installed")
     options = ["--quiet", "--no-deps", "--no-index", "--no-compile", "--target", str(target)]
     subprocess.run([sys.executable, "-m", "pip", "install", *options, str(wheel)], check=True)
     return target
@@ -147,35 +147,35 @@ def plugin_folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("way", mark_rare_cases(WAYS, ["beside", "entry-point"]))
-def test_a_sweep_runs_user_code_and_names_its_origin(way: str, plugin_folder: Path, installed: Path):
-    (plugin_folder / "installed").symlink_to(installed)
-    for mark in [*plugin_folder.rglob("*.was-run"), *installed.rglob("*.was-run")]:
+@pytest.mark.parametrize("way", mark_rare_cases(NAMING_FORMS, ["beside", "entry-point"]))
+def test_a_sweep_runs_user_code_and_names_its_origin(way: str, plugin_folder: Path, installed_packages: Path):
+    (plugin_folder / "installed").symlink_to(installed_packages)
+    for mark in [*plugin_folder.rglob("*.was-run"), *installed_packages.rglob("*.was-run")]:
         mark.unlink()
-    configs(plugin_folder, WAYS[way])
+    configs(plugin_folder, NAMING_FORMS[way])
 
-    def ran() -> bool:
-        return any(next(folder.rglob("*.was-run"), None) for folder in (plugin_folder, installed))
+    def has_run() -> bool:
+        return any(next(folder.rglob("*.was-run"), None) for folder in (plugin_folder, installed_packages))
 
     assert "missing" in springbench(plugin_folder, "list", "sweep.yaml")
-    assert not ran(), "to list a config runs nothing that it names"
+    assert not has_run(), "to list a config runs nothing that it names"
     springbench(plugin_folder, "run", "sweep.yaml")
-    assert ran()
+    assert has_run()
     (rows,) = (plugin_folder / "results" / "sweep" / "rows").glob("*.parquet")
     row = pq.read_table(rows).to_pylist()[0]
     assert row["status"] == "ok", row["reason"]
-    assert (row["solver"], row["integrator"]) == (WAYS[way]["solver"], WAYS[way]["integrator"])
+    assert (row["solver"], row["integrator"]) == (NAMING_FORMS[way]["solver"], NAMING_FORMS[way]["integrator"])
     own = {name: (module, version) for name, module, version in json.loads(row["plugins"])}
-    assert set(own) == {name for part, name in WAYS[way].items() if part != "report"}
+    assert set(own) == {name for part, name in NAMING_FORMS[way].items() if part != "report"}
     for module, version in own.values():
         if way in ("beside", "below"):
-            assert module == WAYS[way]["solver"].partition(":")[0]
+            assert module == NAMING_FORMS[way]["solver"].partition(":")[0]
             assert len(version) == 12
         else:
             assert module == "somebodys"
             assert version.startswith("4.2+")
     assert (plugin_folder / "results" / "sweep" / "told.txt").read_text().endswith("rows")
-    for mark in [*plugin_folder.rglob("*.was-run"), *installed.rglob("*.was-run")]:
+    for mark in [*plugin_folder.rglob("*.was-run"), *installed_packages.rglob("*.was-run")]:
         mark.unlink()
     assert "done" in springbench(plugin_folder, "list", "sweep.yaml"), "the run has the same name, opened or not"
     if way in ("below", "module"):
@@ -183,7 +183,7 @@ def test_a_sweep_runs_user_code_and_names_its_origin(way: str, plugin_folder: Pa
     springbench(plugin_folder, "schema")
     springbench(plugin_folder, "query", "select plugins from rows")
     springbench(plugin_folder, "report", "results/sweep")
-    assert not ran(), "rows are read without the code that they are of"
+    assert not has_run(), "rows are read without the code that they are of"
 
 
 @pytest.mark.long
@@ -191,9 +191,9 @@ def test_a_fresh_environment_takes_both_packages_and_sweeps_with_them(tmp_path: 
     """This project and a user's, with all that they need, from the package index."""
     venv.create(tmp_path / "fresh", with_pip=True)
     bin, env = tmp_path / "fresh" / "bin", {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    wanted = [str(ROOT), str(packed(tmp_path))]
+    wanted = [str(ROOT), str(build_wheel(tmp_path))]
     subprocess.run([bin / "python", "-m", "pip", "install", "--quiet", *wanted], check=True, env=env)
-    configs(tmp_path, WAYS["entry-point"])
+    configs(tmp_path, NAMING_FORMS["entry-point"])
     subprocess.run([bin / "springbench", "run", "sweep.yaml"], cwd=tmp_path, check=True, env=env)
     (rows,) = (tmp_path / "results" / "sweep" / "rows").glob("*.parquet")
     row = pq.read_table(rows).to_pylist()[0]
@@ -203,14 +203,14 @@ def test_a_fresh_environment_takes_both_packages_and_sweeps_with_them(tmp_path: 
 
 
 def test_a_changed_file_is_another_run(plugin_folder: Path):
-    sweep = configs(plugin_folder, WAYS["beside"])
+    sweep = configs(plugin_folder, NAMING_FORMS["beside"])
     springbench(plugin_folder, "run", "sweep.yaml")
     (plugin_folder / "mine.py").write_text(CODE.replace("patience: int = 3", "patience: int = 4"))
     assert "missing" in springbench(plugin_folder, "list", sweep.name)
 
 
 def test_a_run_has_one_name_and_one_code_with_and_without_imported_plugins(plugin_folder: Path):
-    sweep = configs(plugin_folder, WAYS["beside"])
+    sweep = configs(plugin_folder, NAMING_FORMS["beside"])
     closed, opened = (load_config(sweep, imports_code=opens).list_runs()[0] for opens in (False, True))
     assert closed.build_identity() == opened.build_identity()
     assert compute_source_fingerprint(collect_source_parts(closed)) == compute_source_fingerprint(
@@ -221,7 +221,7 @@ def test_a_run_has_one_name_and_one_code_with_and_without_imported_plugins(plugi
 
 
 def test_two_of_one_solver_are_distinguished_by_what_only_one_of_them_states(plugin_folder: Path):
-    sweep = configs(plugin_folder, WAYS["beside"])
+    sweep = configs(plugin_folder, NAMING_FORMS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5}", "patience: 5}, './mine.py:Mine'"))
     (group,) = group_by_scene(
         [PictureJob(run, plugin_folder, plugin_folder) for run in load_config(sweep).list_runs()], plugin_folder
@@ -232,7 +232,7 @@ def test_two_of_one_solver_are_distinguished_by_what_only_one_of_them_states(plu
 def test_a_file_next_to_the_config_travels_between_processes(plugin_folder: Path):
     import pickle
 
-    run = load_config(configs(plugin_folder, WAYS["beside"])).list_runs()[0]
+    run = load_config(configs(plugin_folder, NAMING_FORMS["beside"])).list_runs()[0]
     (plugin_folder / "run.pickle").write_bytes(pickle.dumps(run))
     program = "import pickle; run = pickle.load(open('run.pickle', 'rb')); "
     program += "print(run.scene.load_plugins().effects[1], run.build_identity())"
@@ -254,10 +254,10 @@ RAISES = {
 def test_a_method_that_raises_is_named_with_its_line(method: str, plugin_folder: Path):
     (plugin_folder / "mine.py").write_text(CODE.replace(*RAISES[method]))
     with pytest.raises(InputError, match=rf"scene\.yaml:.*`{method}` raised KeyError: 3 \(mine\.py:\d+\)"):
-        load_config(configs(plugin_folder, WAYS["beside"]))
+        load_config(configs(plugin_folder, NAMING_FORMS["beside"]))
 
 
-WEIGHTED = """
+WEIGHTED_SOLVER = """
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -272,15 +272,15 @@ class Weighted(SparseLocalGlobal):
 
 @pytest.mark.slow
 def test_a_file_with_a_blank_in_its_name_and_a_field_that_is_an_array_are_verified(plugin_folder: Path):
-    (plugin_folder / "my solver.py").write_text(WEIGHTED)
-    sweep = configs(plugin_folder, WAYS["beside"] | {"solver": "./my solver.py:Weighted"})
+    (plugin_folder / "my solver.py").write_text(WEIGHTED_SOLVER)
+    sweep = configs(plugin_folder, NAMING_FORMS["beside"] | {"solver": "./my solver.py:Weighted"})
     sweep.write_text(sweep.read_text().replace(", patience: 5", "").replace("rounds: 1", "rounds: 1, verify: true"))
     springbench(plugin_folder, "run", "sweep.yaml")
     rows = [row for path in (plugin_folder / "results").rglob("*.parquet") for row in pq.read_table(path).to_pylist()]
     assert {(row["solver"], row["status"]) for row in rows} == {("./my solver.py:Weighted", "ok")}
 
 
-REFUSED = {
+REFUSED_NAMES = {
     "../mine.py:Mine": "expected",
     "/mine.py:Mine": "expected",
     "mine.py:Mine": "named from the config's folder on: ./file.py:Mine",
@@ -295,7 +295,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", REFUSED_NAMES)
 def test_code_elsewhere_is_refused(name: str, plugin_folder: Path):
     inside = plugin_folder / "inside"
     (inside / "own").mkdir(parents=True)
@@ -304,7 +304,7 @@ def test_code_elsewhere_is_refused(name: str, plugin_folder: Path):
     (inside / "linked").symlink_to(plugin_folder / "own")
     with pytest.raises(InvalidPluginName, match=r".") as caught:
         SOLVER_TABLE.resolve_name(name, inside)
-    assert REFUSED[name] in str(caught.value) or "from the config's folder on" in str(caught.value)
+    assert REFUSED_NAMES[name] in str(caught.value) or "from the config's folder on" in str(caught.value)
 
 
 WRONG = {
@@ -319,7 +319,7 @@ WRONG = {
 
 @pytest.mark.parametrize(("part", "name"), WRONG)
 def test_the_target_of_a_name_is_checked_when_it_is_run(part: str, name: str, plugin_folder: Path):
-    sweep = configs(plugin_folder, WAYS["beside"] | {part: name})
+    sweep = configs(plugin_folder, NAMING_FORMS["beside"] | {part: name})
     assert load_config(sweep, imports_code=False).list_runs()
     with pytest.raises(InputError) as caught:
         load_config(sweep)
@@ -327,7 +327,7 @@ def test_the_target_of_a_name_is_checked_when_it_is_run(part: str, name: str, pl
 
 
 def test_wrong_parameters_of_own_code_are_reported_with_their_line(plugin_folder: Path):
-    sweep = configs(plugin_folder, WAYS["beside"])
+    sweep = configs(plugin_folder, NAMING_FORMS["beside"])
     sweep.write_text(sweep.read_text().replace("patience: 5", "patience: soon"))
     with pytest.raises(InputError, match=r"sweep\.yaml:2: solvers\[0\]\.patience: got \"soon\"; should be"):
         load_config(sweep)

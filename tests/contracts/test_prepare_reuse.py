@@ -17,7 +17,7 @@ from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, make_read_only
 
-FORCED = {
+SOLVER_VARIANTS = {
     f"numba, {solver.linear_solver} in {solver.precision}": solver
     for solver in (
         CompiledLocalGlobal("supernodal", "float16"),
@@ -25,7 +25,7 @@ FORCED = {
         CompiledLocalGlobal("cg", "float64"),
     )
 }
-CHOICES = {name: load_target(target)() for name, target in SOLVERS.items()} | FORCED
+CHOICES = {name: load_target(target)() for name, target in SOLVERS.items()} | SOLVER_VARIANTS
 LARGE = "cloth large enough for threads, exact pins"
 PROBLEMS = {
     "cloth": lambda: build_first_problem(build_cloth(9)),
@@ -55,27 +55,27 @@ def elsewhere(problem: StepProblem) -> StepProblem:
     )
 
 
-def pushed(problem: StepProblem) -> StepProblem:
+def change_force(problem: StepProblem) -> StepProblem:
     return replace(problem, external_force=-2.0 * problem.external_force + noise(problem, 4))
 
 
-def pulled(problem: StepProblem) -> StepProblem:
+def change_targets(problem: StepProblem) -> StepProblem:
     targets = problem.pin_targets + noise(problem, 5)[: len(problem.pin_targets)]
     current = problem.current_positions.copy()
     current[problem.system.pins.vertices] = targets
     return replace(problem, pin_targets=targets, current_positions=current)
 
 
-def guessed(problem: StepProblem) -> StepProblem:
+def change_guess(problem: StepProblem) -> StepProblem:
     return replace(problem, initial_guess=problem.initial_guess + noise(problem, 6))
 
 
 STEPS: tuple[Callable[[StepProblem], StepProblem], ...] = (
     elsewhere,
-    pushed,
-    pulled,
-    guessed,
-    lambda problem: guessed(pulled(pushed(elsewhere(problem)))),
+    change_force,
+    change_targets,
+    change_guess,
+    lambda problem: change_guess(change_targets(change_force(elsewhere(problem)))),
 )
 
 

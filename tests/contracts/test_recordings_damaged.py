@@ -31,7 +31,7 @@ try:
 finally:
     recorder.abandon_recording()
 """
-KILLED = RECORD.format(before="", after="os.kill(os.getpid(), signal.SIGKILL)")
+KILLED_PROGRAM = RECORD.format(before="", after="os.kill(os.getpid(), signal.SIGKILL)")
 FULL = RECORD.format(
     before="signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16))",
     after="recorder.finish_recording({})",
@@ -69,7 +69,7 @@ def test_many_recordings_leave_no_threads_behind(tmp_path: Path):
 
 
 def test_a_killed_run_leaves_all_frames_up_to_the_last_flush(tmp_path: Path):
-    result = run(KILLED, tmp_path / "a.rrd")
+    result = run(KILLED_PROGRAM, tmp_path / "a.rrd")
     assert result.returncode == -signal.SIGKILL, result.stderr
     (left,) = tmp_path.iterdir()
     assert left.name != "a.rrd"

@@ -81,8 +81,8 @@ def test_a_docstring_becomes_text_lists_and_code() -> None:
 
 PUBLIC = [name for name in springbench.__all__ if isinstance(getattr(springbench, name), type | FunctionType)]
 """Classes and functions; the other names are types of arrays and of names."""
-SIMULATED = ["load_scene", "make_scene", "Simulation", "Solution", "Solver"]
-RECORDED = ["run_config", "load_rows", "open_recording", "RunRecording", "draw_picture", "view_recording"]
+SIMULATING_EXAMPLES = ["load_scene", "make_scene", "Simulation", "Solution", "Solver"]
+READING_EXAMPLES = ["run_config", "load_rows", "open_recording", "RunRecording", "draw_picture", "view_recording"]
 """Names whose examples simulate, and those whose examples read the results of the first one."""
 
 
@@ -108,17 +108,17 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 def test_the_examples_of_scenes_and_simulations_run() -> None:
-    for name in SIMULATED:
+    for name in SIMULATING_EXAMPLES:
         run_examples([name])
 
 
 @pytest.mark.long
 @pytest.mark.usefixtures("folder")
 def test_all_examples_of_the_api_run() -> None:
-    run_examples(SIMULATED + RECORDED)
+    run_examples(SIMULATING_EXAMPLES + READING_EXAMPLES)
 
 
-@pytest.mark.parametrize("name", sorted({*PUBLIC} - {*SIMULATED, *RECORDED}))
+@pytest.mark.parametrize("name", sorted({*PUBLIC} - {*SIMULATING_EXAMPLES, *READING_EXAMPLES}))
 @pytest.mark.usefixtures("folder")
 def test_the_example_of_a_public_name_runs(name: str) -> None:
     run_examples([name])

@@ -55,10 +55,10 @@ os._exit(0)
 
 
 def count_threads_left(code: str, path: Path) -> int:
-    return said(f"{STREAM}\nprint({code})", path)
+    return run_program(f"{STREAM}\nprint({code})", path)
 
 
-def said(program: str, path: Path) -> int:
+def run_program(program: str, path: Path) -> int:
     command = [sys.executable, "-c", program, path]
     return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
@@ -79,7 +79,7 @@ def test_the_public_call_for_layouts_leaves_threads_that_nothing_ends(tmp_path: 
 
 def test_no_public_call_releases_a_stream_whose_writer_has_died(tmp_path: Path):
     # Way round: `PartialFile` retains such a stream, by `Py_IncRef`, and takes back its clean-up at exit.
-    assert said(DEAD, tmp_path / "a.rrd"), (
+    assert run_program(DEAD, tmp_path / "a.rrd"), (
         "disconnect does not wait for a dead writer any more: call it, and keep nothing"
     )
 

@@ -38,7 +38,7 @@ TOUCH: dict[str, int | None] = {
     "twisted-cloth": 12,
 }
 """Mesh sizes so small that an ablation takes seconds. What effects and time steps change shrinks with them alike."""
-CALLED = ("this scene calls for it", "without it this is another scene", "the scene is impossible without it")
+NEEDED_VERDICTS = ("this scene calls for it", "without it this is another scene", "the scene is impossible without it")
 
 
 @pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.long) for name in LONG | TOUCH)])
@@ -56,7 +56,7 @@ def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: s
         run_ablation(sweep, tmp_path, SilentDisplay(), lambda line: None, with_pairs=False, isolated=False)
     )
     values = {row["name"]: describe_effect(row, rows) for row in select_kind(rows, "ablated")}
-    assert {name: words for name, words in values.items() if not any(called in words for called in CALLED)} == {}
+    assert {name: words for name, words in values.items() if not any(called in words for called in NEEDED_VERDICTS)} == {}
     # Scenes that all solvers take leave out contact of a mesh with itself, which few solvers know.
     assert {
         row["name"]: row["reason"] for row in select_kind(rows, "suggestion") if row["name"] != "self-contact"

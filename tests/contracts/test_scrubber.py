@@ -15,7 +15,7 @@ from tests.headless_browser import launch_chromium
 from tests.synthetic_recordings import build_recording_info, write_recording
 
 AMPLITUDES = {"newton": 0.05, "lbfgs": 0.1}
-COLOURED = """canvas => {
+COLOURED_SHARE = """canvas => {
   const { width, height } = canvas, shown = canvas.getContext("2d").getImageData(0, 0, width, height).data;
   let found = 0;
   for (let k = 0; k < shown.length; k += 4) {
@@ -74,8 +74,8 @@ def test_each_iterate_is_shown_with_its_distance_to_the_reference(tmp_path: Path
             assert f"iteration {files[solver].frames[frame]}:" in words
             assert float(words.split(" is ")[1].split(" m ")[0].replace("−", "-")) == pytest.approx(far, rel=0.01)
         slider.press("Home")
-        assert left.evaluate(COLOURED) > 0.1
-        assert right.evaluate(COLOURED) == 0.0, "the reference has no distance from itself"
+        assert left.evaluate(COLOURED_SHARE) > 0.1
+        assert right.evaluate(COLOURED_SHARE) == 0.0, "the reference has no distance from itself"
         slider.press("ArrowRight")
         left.press("ArrowRight")
         tab.wait_for_function("/at=.*turn=/.test(location.hash)")

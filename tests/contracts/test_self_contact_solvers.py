@@ -48,7 +48,7 @@ TAKE = (*SOON, "vbd-ogc", "chebyshev", "sparse", "numba")
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 is_idle_at = _Certificate.is_idle_at
 THICKNESS = 0.01
-APART = SelfContactEffect(min_distance=THICKNESS)
+SELF_CONTACT = SelfContactEffect(min_distance=THICKNESS)
 
 
 def upside_down(*effects: SceneEffect) -> Scene:
@@ -65,7 +65,7 @@ def solver(name: str):
 
 @pytest.mark.parametrize("name", TAKE)
 def test_a_sheet_that_falls_onto_itself_passes_through_nowhere(name):
-    made, touched = upside_down(APART), 0
+    made, touched = upside_down(SELF_CONTACT), 0
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     rule = StopRule(60, 1e-3)
     for step in simulate_scene(made, prepare(made, solver(name)), rule, initial_guess="extrapolated", frames=14):
@@ -76,7 +76,7 @@ def test_a_sheet_that_falls_onto_itself_passes_through_nowhere(name):
 
 
 def test_without_the_effect_it_does_pass_through():
-    made, (apart,) = upside_down(), upside_down(APART).intersection_checks
+    made, (apart,) = upside_down(), upside_down(SELF_CONTACT).intersection_checks
     steps = simulate_scene(
         made, prepare(made, NewtonSolver()), StopRule(60, 1e-3), initial_guess="extrapolated", frames=14
     )
@@ -85,9 +85,9 @@ def test_without_the_effect_it_does_pass_through():
 
 
 @functools.cache
-def begun() -> tuple[Scene, MotionState]:
+def build_touching_start() -> tuple[Scene, MotionState]:
     """A step in which it touches."""
-    made = upside_down(APART)
+    made = upside_down(SELF_CONTACT)
     rule = StopRule(60, 1e-3)
     *_, last = simulate_scene(made, prepare(made, NewtonSolver()), rule, initial_guess="extrapolated", frames=9)
     return made, last.state
@@ -95,7 +95,7 @@ def begun() -> tuple[Scene, MotionState]:
 
 @pytest.mark.parametrize("name", TAKE)
 def test_every_iterate_and_the_path_to_it_are_intersection_free(name):
-    made, state = begun()
+    made, state = build_touching_start()
     stated = build_problem(made, state, "inertial")
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     p = stated.initial_guess
@@ -109,7 +109,7 @@ def test_every_iterate_and_the_path_to_it_are_intersection_free(name):
 
 
 def test_all_methods_find_the_same_minimum_from_near_it():
-    made, state = begun()
+    made, state = build_touching_start()
     stated = build_problem(made, state, "inertial")
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     lowest = prepare(made, NewtonSolver()).solve(stated, StopRule(300, 1e-9)).positions
@@ -125,7 +125,7 @@ def test_all_methods_find_the_same_minimum_from_near_it():
 @pytest.mark.parametrize("name", sorted(set(SOLVERS) - {*TAKE, "avbd"}))  # which is vbd where no length is exact
 def test_all_other_solvers_refuse_it_by_name(name):
     with pytest.raises(Unsupported, match="SelfContact"):
-        solver(name).prepare(upside_down(APART).system)
+        solver(name).prepare(upside_down(SELF_CONTACT).system)
 
 
 @pytest.mark.parametrize("name", ["newton", "hybrid"])
@@ -158,7 +158,7 @@ def test_where_nothing_is_near_the_motion_is_that_without(name, monkeypatch):
 @functools.cache
 def first_touch() -> tuple[Scene, StepProblem]:
     """The first step that begins without and ends with active pairs."""
-    made = upside_down(APART)
+    made = upside_down(SELF_CONTACT)
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     for step in simulate_scene(
         made, prepare(made, NewtonSolver()), StopRule(60, 1e-3), initial_guess="previous", frames=14
@@ -195,7 +195,7 @@ def test_an_iterate_without_contact_counts_only_where_its_path_is_free():
 
 
 def test_two_free_sheets_that_collide_conserve_momentum():
-    made = build_test_scene(StackMesh(layer_spacing=0.05), SpringsEffect(stretch=100.0, shear=20.0), APART, size=5)
+    made = build_test_scene(StackMesh(layer_spacing=0.05), SpringsEffect(stretch=100.0, shear=20.0), SELF_CONTACT, size=5)
     p, v = made.mesh.rest_positions, np.zeros_like(made.mesh.rest_positions)
     v[len(p) // 2 :] = (0.1, -2.0, 0.0)
     state, mass = MotionState(integrators.Motion(p, v), None, 0), made.system.mass
@@ -222,8 +222,8 @@ STARTS = {
 @pytest.mark.parametrize("name", STARTS)
 def test_an_intersecting_start_is_refused_with_the_pairs(name):
     begin, words = STARTS[name]
-    made = build_test_scene(StackMesh(layer_spacing=0.2), SpringsEffect(stretch=100.0), APART, size=3)
-    (check,) = APART.build_contribution(made.mesh, made.system.mass, 1 / 30).scene_checks
+    made = build_test_scene(StackMesh(layer_spacing=0.2), SpringsEffect(stretch=100.0), SELF_CONTACT, size=3)
+    (check,) = SELF_CONTACT.build_contribution(made.mesh, made.system.mass, 1 / 30).scene_checks
     with pytest.raises(InputError, match=words):
         check(begin.compute_positions(made.mesh.rest_positions), ())
     check(build_initial_state(made).motion.positions, ())
@@ -231,20 +231,20 @@ def test_an_intersecting_start_is_refused_with_the_pairs(name):
 
 def test_a_mesh_through_itself_at_rest_is_refused():
     with pytest.raises(InputError, match=r"passes through itself at rest.*edge \d+-\d+ through triangle"):
-        build_test_scene(StackMesh(layer_spacing=0.0), SpringsEffect(stretch=100.0), APART, size=3)
+        build_test_scene(StackMesh(layer_spacing=0.0), SpringsEffect(stretch=100.0), SELF_CONTACT, size=3)
 
 
 def test_exact_pins_that_move_are_refused():
     moves = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.1, 0.0, 0.0))))
     pins = PinsEffect(parts=("left",), motion=moves, weight="exact")
     with pytest.raises(InputError, match="exact pins that move"):
-        build_test_scene(GridMesh(), SpringsEffect(stretch=100.0), pins, APART, size=4)
+        build_test_scene(GridMesh(), SpringsEffect(stretch=100.0), pins, SELF_CONTACT, size=4)
 
 
 @pytest.mark.parametrize("name", ["midpoint", "sdirk-2", "generalised-alpha"])
 def test_integrators_whose_stages_are_at_other_times_are_refused(name):
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 0.02, "frames": 1, "path": "scene.yaml"}
-    spec = SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=1.0), APART)})
+    spec = SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=1.0), SELF_CONTACT)})
     with pytest.raises(InputError, match=f"end of a step, and {name} has other unknowns"):
         build_scene(spec, 4, name)
     assert build_scene(spec, 4, "bdf2").intersection_checks

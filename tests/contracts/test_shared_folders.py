@@ -30,22 +30,22 @@ def sweep(folder: Path) -> Path:
     return folder / "sweep.yaml"
 
 
-def begun(config: Path, workers: int = 1) -> subprocess.Popen[str]:
+def start_command(config: Path, workers: int = 1) -> subprocess.Popen[str]:
     command = ["run", str(config), "--results", str(config.parent / "r"), "--workers", str(workers)]
     return subprocess.Popen([sys.executable, "-m", "springbench", *command], cwd=ROOT, stdout=-1, stderr=-2, text=True)
 
 
-def done(said: str) -> Counter[str]:
+def count_done_runs(said: str) -> Counter[str]:
     """How often each run was done, by what a command printed."""
     return Counter(re.findall(r"scene (\d+) sparse: [\d.]+ ms a step", " ".join(said.split())))
 
 
 def test_each_run_is_done_by_one_of_two_commands(tmp_path: Path):
     config = sweep(tmp_path)
-    both = [begun(config), begun(config)]
+    both = [start_command(config), start_command(config)]
     said = [command.communicate()[0] for command in both]
     assert [command.returncode for command in both] == [0, 0], said
-    counts = [done(one) for one in said]
+    counts = [count_done_runs(one) for one in said]
     assert sum(counts, Counter()) == Counter(map(str, range(3, 3 + RUNS))), said
     assert len(list((tmp_path / "r" / "sweep" / "rows").glob("*.parquet"))) == RUNS
 
@@ -53,10 +53,10 @@ def test_each_run_is_done_by_one_of_two_commands(tmp_path: Path):
 @pytest.mark.long
 def test_what_a_killed_command_had_claimed_is_done_by_the_other(tmp_path: Path):
     config, saved = sweep(tmp_path), tmp_path / "r" / "sweep" / "rows"
-    first = begun(config)
+    first = start_command(config)
     while not list(saved.glob("*.parquet")) and first.poll() is None:
         sleep(0.01)
-    second = begun(config)
+    second = start_command(config)
     sleep(0.5)
     first.kill()
     first.communicate()

@@ -24,7 +24,7 @@ from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, make_read_only
 
-FORCED = {
+SOLVER_VARIANTS = {
     "numba, inverse in float32": CompiledLocalGlobal("inverse", "float32"),
     "numba, cholespy": CompiledLocalGlobal("cholespy"),
     "numba, supernodal": CompiledLocalGlobal("supernodal"),
@@ -35,7 +35,7 @@ FORCED = {
     "newton, trust-region": NewtonSolver("trust-region"),
     "newton, progressive": NewtonSolver("progressive"),
 }
-CHOICES = {name: load_target(target)() for name, target in SOLVERS.items()} | FORCED
+CHOICES = {name: load_target(target)() for name, target in SOLVERS.items()} | SOLVER_VARIANTS
 LOCAL_GLOBAL = {
     name: solver
     for name, solver in CHOICES.items()

@@ -52,7 +52,7 @@ CASES = {
 }
 
 
-def limited(made: PluginSweep, limit: str) -> int:
+def limit_run_time(made: PluginSweep, limit: str) -> int:
     """Limit the solver's run, and leave the other out, which a busy machine might keep as long; how many remain."""
     if limit:
         config_text = (
@@ -64,7 +64,7 @@ def limited(made: PluginSweep, limit: str) -> int:
     return 1 if limit else 2
 
 
-def ran(made: PluginSweep, *more: str) -> Result:
+def run_sweep_command(made: PluginSweep, *more: str) -> Result:
     return CliRunner().invoke(app, ["run", str(made.sweep_path), "--results", str(made.sweep_path.parent / "r"), *more])
 
 
@@ -82,8 +82,8 @@ def first_rows(made: PluginSweep) -> dict[str, dict[str, Any]]:
 def test_a_sweep_survives_its_solvers(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     case = CASES[name]
     made = write_plugin_solver(tmp_path, monkeypatch, solve_code=case.does)
-    runs = limited(made, case.limit)
-    result = ran(made)
+    runs = limit_run_time(made, case.limit)
+    result = run_sweep_command(made)
     assert result.exit_code == 1, result.output
     assert "Traceback" not in result.output
     found = first_rows(made)
@@ -93,7 +93,7 @@ def test_a_sweep_survives_its_solvers(name: str, tmp_path: Path, monkeypatch: py
     assert mine["status"] == case.status, mine["reason"]
     assert case.said.format(line=made.source_line(case.does)) in mine["reason"]
     assert mine["solver"] == "mine"
-    again = ran(made)
+    again = run_sweep_command(made)
     assert again.exit_code == 1
     assert f"{runs} of {runs} runs are there already" in re.sub(r"\s+", " ", again.output)
     assert first_rows(made) == found
@@ -104,12 +104,12 @@ def test_a_run_that_took_too_long_is_done_again_with_another_limit(tmp_path: Pat
     flag = tmp_path / "quick"
     hangs = f"import pathlib\n        while not pathlib.Path({str(flag)!r}).exists(): hang = 1"
     made = write_plugin_solver(tmp_path, monkeypatch, solve_code=hangs)
-    limited(made, "time_limit: 8")
-    assert ran(made).exit_code == 1
+    limit_run_time(made, "time_limit: 8")
+    assert run_sweep_command(made).exit_code == 1
     flag.touch()
-    assert "1 of 1 runs are there already" in re.sub(r"\s+", " ", ran(made).output)
+    assert "1 of 1 runs are there already" in re.sub(r"\s+", " ", run_sweep_command(made).output)
     made.sweep_path.write_text(made.sweep_path.read_text().replace("time_limit: 8", "time_limit: 800"))
-    assert (result := ran(made)).exit_code == 0, result.output
+    assert (result := run_sweep_command(made)).exit_code == 0, result.output
     assert {row["status"] for row in first_rows(made).values()} == {"ok"}
 
 
@@ -159,7 +159,7 @@ def test_a_worker_stays_from_run_to_run(tmp_path: Path, monkeypatch: pytest.Monk
     made = write_plugin_solver(
         tmp_path, monkeypatch, solve_code=does, options=SWEEP_OPTIONS + ", rtol: [1e-2, 1e-3, 1e-4]"
     )
-    assert (result := ran(made, "--workers", "1")).exit_code == 0, result.output
+    assert (result := run_sweep_command(made, "--workers", "1")).exit_code == 0, result.output
     workers = set(note.read_text().split())
     assert len(workers) == 1
     assert str(os.getpid()) not in workers
@@ -175,7 +175,7 @@ def test_a_lost_drawing_process_fails_the_command_and_preserves_the_measurements
         sweep_pictures, "draw_sweep_pictures", leave
     )  # where it draws: that process is a fork of this one
     made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, max_iterations: 5")
-    result = ran(made)
+    result = run_sweep_command(made)
     assert result.exit_code == 1
     assert "the process that draws ended its process with exit code 3" in " ".join(result.output.split())
     assert len([*(tmp_path / "r").rglob("*.parquet")]) == 2
@@ -191,10 +191,10 @@ def leave(*_: Any, **__: Any) -> None:
 
 def test_a_debugger_can_have_the_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made = write_plugin_solver(tmp_path, monkeypatch, solve_code="import os; globals()['seen'] = os.getpid()")
-    assert (result := ran(made)).exit_code == 0, result.output
+    assert (result := run_sweep_command(made)).exit_code == 0, result.output
     module = made.solver_path.stem
     assert not hasattr(sys.modules.get(module), "seen")
-    assert ran(made, "--rerun", "--in-process").exit_code == 0
+    assert run_sweep_command(made, "--rerun", "--in-process").exit_code == 0
     assert sys.modules[module].seen == os.getpid()
 
 
@@ -206,5 +206,5 @@ def test_the_plot_of_times_has_the_name_of_its_sweep(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(timing_plot, "draw_timing_plot", write_title)
     made = write_plugin_solver(tmp_path, monkeypatch, options="frames: 1, rounds: 1, max_iterations: 5, record: false")
-    assert (result := ran(made, "--in-process")).exit_code == 0, result.output
+    assert (result := run_sweep_command(made, "--in-process")).exit_code == 0, result.output
     assert (tmp_path / "title.txt").read_text() == "sweep"

@@ -16,7 +16,7 @@ from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.scene_builders import build_cloth
 
-TURNS, OTHERS, NOISE = 12, 100, 1.08
+NUM_BLOCKS, OTHERS, NOISE = 12, 100, 1.08
 """The least time of identical runs moves by 4 %: twice that, in the median of some turns."""
 
 
@@ -40,7 +40,7 @@ def test_a_run_takes_as_long_after_a_hundred_others_as_first():
         used.run_task(
             partial(least, 4 + number % 13, ("sparse", "numba", "vbd", "lbfgs")[number % 4], 1), quiet, TaskLimits()
         )
-    for _ in range(TURNS):
+    for _ in range(NUM_BLOCKS):
         new = IsolatedWorker()
         new.run_task(partial(least, 4, "numba", 1), quiet, TaskLimits())  # loads the kernels, as the other has
         first, after = new.run_task(run, quiet, TaskLimits()), used.run_task(run, quiet, TaskLimits())
@@ -52,7 +52,7 @@ def test_a_run_takes_as_long_after_a_hundred_others_as_first():
     assert 1.0 / NOISE < median(ratios) < NOISE, ratios
 
 
-def answer(tick: ProgressCallback) -> bytes:
+def return_bytes(tick: ProgressCallback) -> bytes:
     tick("answering")
     return bytes(2**16)
 
@@ -62,7 +62,7 @@ def test_the_memory_of_the_parent_process_stays_constant():
     """64 KiB an answer: if stored, the second thousand would be 64 MiB."""
     sizes = list[int]()
     for _ in range(2):
-        for _ in run_tasks(2, int, [None] * 1000, lambda number: PoolTask(answer, quiet, TaskLimits())):
+        for _ in run_tasks(2, int, [None] * 1000, lambda number: PoolTask(return_bytes, quiet, TaskLimits())):
             pass
         sizes.append(psutil.Process().memory_info().rss)
     assert sizes[1] - sizes[0] < 16 * 2**20

@@ -2,7 +2,7 @@
 
     python -m tests.cuda.ahead LAUNCHES       of a pickle {kernel: {pickled arguments, ...}}, without the simulator
 
-prints {kernel: [what became of it with each, ...]} as JSON; see `Compiled`.
+prints {kernel: [what became of it with each, ...]} as JSON; see `CompiledKernel`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from springbench.solvers.methods import newton, position_based, vertex_block
 CAPABILITY = 9, 0
 
 
-class Compiled(NamedTuple):
+class CompiledKernel(NamedTuple):
     """wrong: why it does not compile, or ""; registers of a thread; bytes of shared memory of a block; bytes spilled by
     a thread; doubles: instructions of arithmetic in float64."""
 
@@ -80,7 +80,7 @@ def example(argument: Any) -> Any:
     return type(argument)()
 
 
-def compiled(kernel: Any, arguments: tuple[Any, ...]) -> Compiled:
+def compile_kernel(kernel: Any, arguments: tuple[Any, ...]) -> CompiledKernel:
     """What becomes of a kernel with such arguments, up to the machine's code."""
     core, types = import_module("cuda.core"), tuple(map(kernel.typeof_pyval, arguments))
     options = core.LinkerOptions(arch="sm_{}{}".format(*CAPABILITY), verbose=True, ptxas_options=["-v"])
@@ -89,12 +89,12 @@ def compiled(kernel: Any, arguments: tuple[Any, ...]) -> Compiled:
         linker = core.Linker(core.ObjectCode.from_ptx(code.encode()), options=options)
         linker.link("cubin")
     except Exception as error:  # Numba's, libNVVM's and the linker's have nothing in common
-        return Compiled(f"{type(error).__name__}: {error}")
+        return CompiledKernel(f"{type(error).__name__}: {error}")
     log = linker.get_info_log()
     units = r"used (\d+) registers", r"(\d+) bytes smem", r"(\d+) bytes spill stores"
     registers, shared, spilled = (int(re.findall(unit, log, re.IGNORECASE)[0]) for unit in units)
     doubles = re.findall(r"\b(?:add|sub|mul|fma|div|sqrt|rcp)\.[\w.]*f64\b", code)
-    return Compiled("", registers, shared, spilled, len(doubles))
+    return CompiledKernel("", registers, shared, spilled, len(doubles))
 
 
 if __name__ == "__main__":
@@ -102,5 +102,5 @@ if __name__ == "__main__":
     dispatcher: Any = import_module("numba.cuda.dispatcher")
     dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=CAPABILITY)
     there, launches = kernels(), pickle.loads(Path(sys.argv[1]).read_bytes())
-    done = {name: [compiled(there[name], pickle.loads(one)) for one in launches[name]] for name in sorted(launches)}
+    done = {name: [compile_kernel(there[name], pickle.loads(one)) for one in launches[name]] for name in sorted(launches)}
     sys.stdout.write(json.dumps(done))

@@ -12,7 +12,7 @@ from springbench.solvers.cuda import cuda_device
 from springbench.solvers.model.step_problem import Unsupported
 
 
-def _there() -> bool:
+def _is_device_present() -> bool:
     try:
         cuda_device.require_device("tests")
     except Unsupported:
@@ -20,13 +20,13 @@ def _there() -> bool:
     return True
 
 
-collect_ignore_glob = [] if _there() else ["test_*.py"]
+collect_ignore_glob = [] if _is_device_present() else ["test_*.py"]
 
 
 @pytest.fixture(autouse=True)
 def fast(monkeypatch: pytest.MonkeyPatch) -> None:
     """The simulator is, where it stands for a device."""
     if cuda_device.is_simulated():
-        from tests.cuda.simulator import hasten  # what it loads takes a second, which others need not wait for
+        from tests.cuda.simulator import install_simulator  # takes a second to load
 
-        hasten(monkeypatch)
+        install_simulator(monkeypatch)

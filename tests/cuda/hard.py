@@ -61,10 +61,10 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
     """What becomes of a scene."""
     solver = METHODS[method]
     try:
-        found = ran(made, solver(device="cuda", precision=precision))
+        found = simulate_steps(made, solver(device="cuda", precision=precision))
     except Unsupported as error:
-        return Outcome(*_refused(str(error), made, solver))
-    wanted, begun = ran(made, solver()), build_initial_state(made).motion.positions
+        return Outcome(*_classify_refusal(str(error), made, solver))
+    wanted, begun = simulate_steps(made, solver()), build_initial_state(made).motion.positions
     if not np.isfinite(found).all():
         return Outcome("wrong" if np.isfinite(wanted).all() else "right", "not finite")
     length = float(made.all_springs.rest_length.mean()) if len(made.all_springs.rest_length) else 1.0
@@ -76,7 +76,7 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
         if away <= may:
             break
         changes = rounded * np.random.default_rng(seed).uniform(-1.0, 1.0, (2, *begun.shape))
-        may = max(may, TIMES * np.abs(ran(made, solver(), changes) - wanted).max())
+        may = max(may, TIMES * np.abs(simulate_steps(made, solver(), changes) - wanted).max())
     why = f"{away:.1e} m from the processor"
     if away > may and precision == "float32" and solver().is_minimiser:
         part = _fall(made, found[0]) / _fall(made, wanted[0])
@@ -84,7 +84,7 @@ def outcome(made: Scene, method: str, precision: Precision) -> Outcome:
     return Outcome("right" if away <= may else "wrong", why, float(away / may))
 
 
-def ran(made: Scene, solver: Any, changes: Frames | tuple[float, float] = (0.0, 0.0)) -> Frames:
+def simulate_steps(made: Scene, solver: Any, changes: Frames | tuple[float, float] = (0.0, 0.0)) -> Frames:
     """Where the first steps end, (frames, n, 3) [m]. changes (2, n, 3) [m]: of the start's positions, and of what its
     velocities move in a step."""
     prepared = prepare(made, solver)
@@ -101,7 +101,7 @@ def _fall(made: Scene, p: Positions) -> float:
     return -StepObjective(FixedObjective(made.system), stated).objective_change(p, stated.initial_guess)[0]
 
 
-def _refused(why: str, made: Scene, solver: Any) -> tuple[Literal["refused", "wrong"], str]:
+def _classify_refusal(why: str, made: Scene, solver: Any) -> tuple[Literal["refused", "wrong"], str]:
     """Because of what a device does not take, or as the processor does."""
     if "device" in why:
         return "refused", why

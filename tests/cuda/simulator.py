@@ -31,14 +31,14 @@ forwards: Iterator[bool] = cycle((True, False))
 """Whether a block's first thread begins, of those to come."""
 
 
-def hasten(monkeypatch: pytest.MonkeyPatch) -> None:
+def install_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
     """From now on."""
     monkeypatch.setattr(sys.modules[__name__], "forwards", cycle((True, False)))
     monkeypatch.setattr(kernel.BlockManager, "run", run)
     monkeypatch.setattr(Kernel, "__call__", call)
     monkeypatch.setattr(Array, "__getattr__", attribute)
     monkeypatch.setattr(Array, "__getitem__", entry)
-    monkeypatch.setattr(api.FakeCUDAShared, "array", shared)
+    monkeypatch.setattr(api.FakeCUDAShared, "array", allocate_shared)
 
 
 def run(self: Any, grid_point: Any, *arguments: Any) -> None:
@@ -48,7 +48,7 @@ def run(self: Any, grid_point: Any, *arguments: Any) -> None:
         together([Thread(partial(self._f, *arguments), self, grid_point, at, self._debug) for at in points])
         return
     here: Any = current_thread()
-    here.blockIdx, here.syncthreads = api.Dim3(*grid_point), unforeseen if len(points) > 1 else alone
+    here.blockIdx, here.syncthreads = api.Dim3(*grid_point), fail_unexpected_wait if len(points) > 1 else alone
     for at in points:
         here.threadIdx = api.Dim3(*at)
         self._f(*arguments)
@@ -66,7 +66,7 @@ def alone() -> None:
     """The only thread of its block waits for no other."""
 
 
-def unforeseen() -> None:
+def fail_unexpected_wait() -> None:
     raise AssertionError("threads wait for each other in a function that the kernel calls by no name of its own")
 
 
@@ -86,7 +86,7 @@ class Thread(kernel.BlockThread):
         self.ended = True
         self.paused.release()
 
-    def turn(self) -> None:
+    def run_until_wait(self) -> None:
         """Up to where it waits for the others, or to its end."""
         self.go.release()
         self.paused.acquire()
@@ -103,7 +103,7 @@ def together(threads: list[Thread]) -> None:
     threads = threads if next(forwards) else threads[::-1]
     while threads:
         for thread in threads:
-            thread.turn()
+            thread.run_until_wait()
         threads = [thread for thread in reversed(threads) if not thread.ended]
 
 
@@ -138,7 +138,7 @@ def attribute(self: Any, name: str) -> Any:
     return getattr(self._item._ary, name)
 
 
-def shared(self: Any, shape: Any, dtype: Any) -> Any:
+def allocate_shared(self: Any, shape: Any, dtype: Any) -> Any:
     """A block's array, identified by the line that allocates it."""
     caller = sys._getframe(1)
     line = caller.f_code.co_filename, caller.f_lineno

@@ -45,7 +45,7 @@ METHODS: tuple[Callable[..., Any], ...] = (
     XpbdSmallSteps,
 )
 
-SHARED, REGISTERS = 48 * 1024, 65_536
+SHARED_BYTES, NUM_REGISTERS = 48 * 1024, 65_536
 """Bytes of shared memory that a block has without asking for more, and registers that it has (CUDA C++ Programming
 Guide, "Technical Specifications per Compute Capability")."""
 
@@ -72,7 +72,7 @@ def missing() -> str:
     return ""
 
 
-def recorded(monkeypatch: pytest.MonkeyPatch) -> dict[str, set[bytes]]:
+def record_launches(monkeypatch: pytest.MonkeyPatch) -> dict[str, set[bytes]]:
     """Examples of arguments, pickled, of each kernel that is launched from now on."""
     names = {id(kernel): name for name, kernel in ahead.kernels().items()}
     found = dict[str, set[bytes]]()
@@ -109,7 +109,7 @@ def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: py
     with monkeypatch.context() as patch:
         patch.setattr(additive_schwarz, "SUBDOMAIN_SIZE", 3)  # small scenes have levels, and the reference changes soon
         patch.setattr(device_vbd, "REBASE_INTERVAL", 3)
-        launches = recorded(patch)
+        launches = record_launches(patch)
         launch_all()
         assert set(launches) == set(ahead.kernels())
     file = tmp_path / "launches.pickle"
@@ -118,14 +118,14 @@ def test_every_kernel_compiles_as_it_is_launched(tmp_path: Path, monkeypatch: py
     command = [sys.executable, "-m", "tests.cuda.ahead", str(file)]
     completed = subprocess.run(command, cwd=ROOT, env=without, capture_output=True, text=True, check=False)
     assert completed.returncode == 0, completed.stderr
-    found = {name: [ahead.Compiled(*one) for one in each] for name, each in json.loads(completed.stdout).items()}
+    found = {name: [ahead.CompiledKernel(*one) for one in each] for name, each in json.loads(completed.stdout).items()}
     assert set(found) == set(launches)
     assert {name: one.wrong for name, each in found.items() for one in each if one.wrong} == {}
     for name, each in found.items():
         for one in each:
             print(f"{name}: {one}")
             assert one.spilled == 0, name
-            assert one.shared <= SHARED, name
-            assert one.registers * MOST_THREADS <= REGISTERS, name
+            assert one.shared <= SHARED_BYTES, name
+            assert one.registers * MOST_THREADS <= NUM_REGISTERS, name
     for name in WITHOUT_DOUBLES:
         assert [one.doubles for one in found[f"{name}, float32"]] == [0], name

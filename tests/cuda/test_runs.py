@@ -26,7 +26,7 @@ options: {max_iterations: 40, rtol: 1.0e-2, rounds: 1, frames: 2, threads: 1, pi
 """
 
 
-def ran(folder: Path) -> tuple[Result, list[list[dict[str, Any]]]]:
+def run_cloth_command(folder: Path) -> tuple[Result, list[list[dict[str, Any]]]]:
     """What the command says, and the rows of each run; in this process."""
     (folder / "cloth.yaml").write_text(CLOTH_SCENE_YAML)
     sweep = folder / "sweep.yaml"
@@ -45,19 +45,19 @@ def test_rows_name_the_device_and_timed_steps_request_no_residual(
     requests, timed = list[float](), list[tuple[int, int]]()
     residual, replay = device_solver.DeviceSolverState.residual, device_solver.DeviceSolver.replay_iterations
 
-    def counted(self: Any) -> float:
+    def count_request(self: Any) -> float:
         requests.append(residual(self))
         return requests[-1]
 
-    def seen(self: Any, problem: StepProblem, iterations: int) -> Any:
+    def record_replay(self: Any, problem: StepProblem, iterations: int) -> Any:
         before = len(requests)
         found = replay(self, problem, iterations)
         timed.append((iterations, len(requests) - before))
         return found
 
-    monkeypatch.setattr(device_solver.DeviceSolverState, "residual", counted)
-    monkeypatch.setattr(device_solver.DeviceSolver, "replay_iterations", seen)
-    result, (here, there) = ran(tmp_path)
+    monkeypatch.setattr(device_solver.DeviceSolverState, "residual", count_request)
+    monkeypatch.setattr(device_solver.DeviceSolver, "replay_iterations", record_replay)
+    result, (here, there) = run_cloth_command(tmp_path)
     assert result.exit_code == 0, result.output
     assert {row["device"] for row in here} == {cuda_device.describe_device()["device"]}
     assert {row["device"] for row in there} == {None}
@@ -76,11 +76,11 @@ class OutOfMemory(Exception):
     """As the driver raises it."""
 
 
-class Lost(Exception):
+class DeviceLost(Exception):
     """As the driver raises it."""
 
 
-for kind in (OutOfMemory, Lost):
+for kind in (OutOfMemory, DeviceLost):
     kind.__module__ = "numba.cuda.cudadrv.driver"
 
 
@@ -88,7 +88,7 @@ for kind in (OutOfMemory, Lost):
     ("error", "said", "lost"),
     [
         (OutOfMemory("CUDA_ERROR_OUT_OF_MEMORY"), "the device has no memory left: CUDA_ERROR_OUT_OF_MEMORY", False),
-        (Lost("CUDA_ERROR_ILLEGAL_ADDRESS"), "the device failed: CUDA_ERROR_ILLEGAL_ADDRESS", True),
+        (DeviceLost("CUDA_ERROR_ILLEGAL_ADDRESS"), "the device failed: CUDA_ERROR_ILLEGAL_ADDRESS", True),
     ],
     ids=["memory", "lost"],
 )
@@ -101,7 +101,7 @@ def test_a_device_failure_is_a_row_and_the_sweep_continues(
         raise error
 
     monkeypatch.setattr(cuda_target.DeviceStream, "download_array", fails)
-    result, (here, there) = ran(tmp_path)
+    result, (here, there) = run_cloth_command(tmp_path)
     assert result.exit_code == 1
     assert [row["status"] for row in here] == ["failed"]
     assert said in here[0]["reason"]

@@ -53,7 +53,7 @@ def main() -> int:
     def is_known(mutation: Mutation) -> bool:
         known = stored.get(mutation.name + suffix)
         digests = (mutation.digest, runner.digest_sources(mutation, whole=whole))
-        return bool(known and known.decided and (known.entry, known.sources) == digests and not options.again)
+        return bool(known and known.is_decided and (known.entry, known.sources) == digests and not options.again)
 
     def last_seconds(mutation: Mutation) -> float:
         known = stored.get(mutation.name + suffix)
@@ -87,10 +87,10 @@ def main() -> int:
 
 def summarise_outcomes(outcomes: list[Outcome]) -> int:
     """Print how many are caught, and which are not. Returns the exit code."""
-    undecided = [outcome.name for outcome in outcomes if not outcome.decided]
-    missed = [outcome.name for outcome in outcomes if outcome.decided and not outcome.caught]
+    undecided = [outcome.name for outcome in outcomes if not outcome.is_decided]
+    missed = [outcome.name for outcome in outcomes if outcome.is_decided and not outcome.is_caught]
     print(
-        f"{sum(outcome.caught for outcome in outcomes)} of {len(outcomes)} caught"
+        f"{sum(outcome.is_caught for outcome in outcomes)} of {len(outcomes)} caught"
         + (f"; not caught: {', '.join(missed)}" if missed else "")
         + (f"; undecided, run again: {', '.join(undecided)}" if undecided else "")
     )

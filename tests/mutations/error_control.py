@@ -8,8 +8,8 @@ _SEARCH, _GROWTH = "harness/experiments/error_control/method_search.py", "harnes
 _CONTROLLER = "solvers/model/integrators/step_size_controller.py"
 _CONTROLLERS = "tests/unit/test_step_size_controller.py"
 _FORMULAS = "tests/contracts/test_error_search.py"
-_ASKED = "tests/contracts/test_error_control.py"
-_GROWS = f"{_ASKED}::test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_predictable"
+_ERROR_CONTROL = "tests/contracts/test_error_control.py"
+_GROWS = f"{_ERROR_CONTROL}::test_growth_does_not_depend_on_the_time_step_and_ends_where_nothing_is_predictable"
 
 _TABLE = (
     (
@@ -17,7 +17,7 @@ _TABLE = (
         "harness/simulation/adaptive_stepping.py",
         "setting * ratio ** ((order + 1.0) / order)",
         "setting * ratio ** (order / (order + 1.0))",
-        f"{_ASKED}::test_a_tolerance_is_changed_by_the_order_of_a_step",
+        f"{_ERROR_CONTROL}::test_a_tolerance_is_changed_by_the_order_of_a_step",
     ),
     ("control-history", _CONTROLLER, "** (-control.beta_2 / power)", "** (control.beta_2 / power)", _CONTROLLERS),
     ("control-limits", _CONTROLLER, "min(control.max_factor, max(control.min_factor, change))", "change", _CONTROLLERS),
@@ -55,14 +55,14 @@ _TABLE = (
         _GROWTH,
         "self.times[self.growth_factor <= _HORIZON_SAFETY * REFERENCE_MARGIN * error]",
         "self.times[self.growth_factor <= error]",
-        f"{_ASKED}::test_a_refusal_names_the_longest_horizon_that_works",
+        f"{_ERROR_CONTROL}::test_a_refusal_names_the_longest_horizon_that_works",
     ),
     (
         "growth-at-rest",
         _GROWTH,
         "moved.max() > unit * max(1, half) ** 0.5",
         "moved.max() > 0.0",
-        f"{_ASKED}::test_what_only_round_off_moves_is_at_rest",
+        f"{_ERROR_CONTROL}::test_what_only_round_off_moves_is_at_rest",
     ),
     (
         "error-doubt",

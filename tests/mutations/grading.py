@@ -7,8 +7,8 @@ from tests.mutations.base import Mutation
 _FOLDER = "harness/experiments/grading"
 _GRADE, _MATRICES = "tests/unit/test_grade.py", "tests/unit/test_matrices_command.py"
 _MOMENTUM = f"{_GRADE}::test_momentum_of_a_scene_without_pins_is_balanced_and_a_lost_impulse_is_measured"
-_NAMED = f"{_GRADE}::test_a_correct_program_is_correct_and_a_mistake_is_named"
-_COMPARED = f"{_MATRICES}::test_a_matrix_of_another_program_is_compared_and_stored_zeros_are_counted"
+_MISTAKE_TEST = f"{_GRADE}::test_a_correct_program_is_correct_and_a_mistake_is_named"
+_MATRIX_TEST = f"{_MATRICES}::test_a_matrix_of_another_program_is_compared_and_stored_zeros_are_counted"
 
 _TABLE = (
     (
@@ -65,7 +65,7 @@ _TABLE = (
         f"{_FOLDER}/fingerprints.py",
         "max(0.0, 1.0 - deviation / of_correct)",
         "max(0.0, deviation / of_correct)",
-        _NAMED,
+        _MISTAKE_TEST,
     ),
     (
         "grade-iterations-from-0",
@@ -86,14 +86,14 @@ _TABLE = (
         f"{_FOLDER}/matrix_comparison.py",
         "zeros = int((received.data == 0).sum())",
         "zeros = int((received.data != 0).sum())",
-        _COMPARED,
+        _MATRIX_TEST,
     ),
     (
         "matrix-of-any-sign",
         f"{_FOLDER}/matrix_comparison.py",
         "np.abs(_square(received) - _square(expected)).max()",
         "np.abs(np.abs(_square(received)) - np.abs(_square(expected))).max()",
-        _COMPARED,
+        _MATRIX_TEST,
     ),
     (
         "matrix-without-pins",

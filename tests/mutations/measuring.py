@@ -8,7 +8,7 @@ from __future__ import annotations
 from tests.mutations.base import Mutation
 
 _RERUN, _RENDER = "harness/recording/rerun_recorder.py", "harness/report/mesh_rendering.py"
-_LIES, _RECORDINGS = "tests/contracts/test_false_reports.py", "tests/contracts/test_recordings.py"
+_FALSE_REPORTS, _RECORDINGS = "tests/contracts/test_false_reports.py", "tests/contracts/test_recordings.py"
 _UNIT_STEP, _UNIT_MEASURE, _UNIT_CLOCK = (f"tests/unit/test_{name}.py" for name in ("simulate", "phase_times", "clock"))
 _PICTURES, _PHASES = (
     "tests/unit/test_report_pictures.py",
@@ -135,7 +135,7 @@ MEASURING = (
         "harness/simulation/instrumentation_pass.py",
         "scene.compute_time(step.index), step.positions, *drawn",
         "scene.compute_time(step.index), step.problem.step_start.positions, *drawn",
-        (_LIES,),
+        (_FALSE_REPORTS,),
         ("sparse", "other positions"),
     ),
     Mutation(
@@ -170,7 +170,7 @@ MEASURING = (
         'if measured.final_positions is not None and found[run.frames]["positions_digest"] != '
         "hash_positions(\n            measured.final_positions\n        ):",
         "if False:",
-        (_LIES,),
+        (_FALSE_REPORTS,),
     ),
     Mutation(
         "picture-of-other-colours",

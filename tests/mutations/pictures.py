@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tests.mutations.base import Mutation
 
-_RECORDINGS, _READ_BACK, _DRAWN, _LAYOUT = (
+_RECORDINGS, _READ_BACK, _REPORT_PICTURES, _LAYOUT = (
     "tests/contracts/test_recordings.py",
     "tests/unit/test_record_verify.py",
     "tests/unit/test_report_pictures.py",
@@ -68,28 +68,28 @@ PICTURES = (
         "harness/recording/camera_framing.py",
         "gaps = gaps[gaps >= least]",
         "gaps = gaps[gaps < least]",
-        (_DRAWN,),
+        (_REPORT_PICTURES,),
     ),
     Mutation(
         "outside-miscounted",
         "harness/recording/camera_framing.py",
         "count = int((~framed).sum())",
         "count = int(framed.sum())",
-        (_DRAWN,),
+        (_REPORT_PICTURES,),
     ),
     Mutation(
         "obstacles-not-moved-to-the-origin",
         "harness/report/obstacle_meshes.py",
         "made.points = points - origin",
         "made.points = points",
-        (_DRAWN,),
+        (_REPORT_PICTURES,),
     ),
     Mutation(
         "intersections-unsaid",
         "harness/report/self_intersection_notes.py",
         "for k in frames)",
         "for k in ())",
-        (_DRAWN,),
+        (_REPORT_PICTURES,),
     ),
     Mutation(
         "replay-opens-at-its-end",

@@ -15,10 +15,10 @@ from tests.mutations.measuring import MEASURING
 from tests.mutations.mesh_files import MESH_FILES
 from tests.mutations.page import PAGE
 from tests.mutations.pictures import PICTURES
-from tests.mutations.published import PUBLISHED
+from tests.mutations.published import PUBLISHED_STUDIES
 from tests.mutations.settings import SETTINGS
 from tests.mutations.solving import SOLVING
 from tests.mutations.steps import STEPS
 
 TABLE = ENERGIES + CONTACT + STEPS + MEASURING + PICTURES + DEVICE + ARCHIVE + GATES + EXACT_LENGTHS + ENERGY_BALANCE
-TABLE += ERROR_CONTROL + PAGE + GRADING + SETTINGS + MESH_FILES + PUBLISHED + SOLVING
+TABLE += ERROR_CONTROL + PAGE + GRADING + SETTINGS + MESH_FILES + PUBLISHED_STUDIES + SOLVING

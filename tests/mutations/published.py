@@ -69,4 +69,4 @@ _TABLE = (
     ),
 )
 
-PUBLISHED = tuple(Mutation(name, file, old, new, (test,)) for name, file, old, new, test in _TABLE)
+PUBLISHED_STUDIES = tuple(Mutation(name, file, old, new, (test,)) for name, file, old, new, test in _TABLE)

@@ -55,12 +55,12 @@ class Outcome:
     failed: str = ""
 
     @property
-    def caught(self) -> bool:
+    def is_caught(self) -> bool:
         """Whether a test failed, and the product detected it if it must."""
         return self.tests == CAUGHT and self.product in ("", CAUGHT)
 
     @property
-    def decided(self) -> bool:
+    def is_decided(self) -> bool:
         """Whether nothing timed out, and the tests were not all skipped, as without a browser."""
         return self.tests != SKIPPED and TIMED_OUT not in (self.tests, self.product)
 
@@ -119,7 +119,7 @@ class SourceCopy:
                 shutil.copy2(source, self._root / name)
 
     @contextmanager
-    def planted(self, mutation: Mutation) -> Iterator[None]:
+    def plant_mutation(self, mutation: Mutation) -> Iterator[None]:
         """Plant an error; afterwards its file is as before, its times included. Raises StaleMutation.
 
         Each planting has a time of modification of its own [whole seconds]: Python takes bytecode for up to date by the
@@ -167,7 +167,7 @@ def _run_tests(
     copy: SourceCopy, mutation: Mutation, tests: Iterable[str], limit: float, max_failures: int = 1
 ) -> tuple[int, list[str]]:
     """Run tests with an error planted; returns the exit code and the tests that failed, or the last line of output."""
-    with copy.planted(mutation):
+    with copy.plant_mutation(mutation):
         code, output = copy.run_command(mutation, [*PYTEST, f"--maxfail={max_failures}", *tests], limit)
     lines = output.splitlines()
     failures = [line.removeprefix("FAILED ").split(" - ")[0] for line in lines if line.startswith("FAILED ")]
@@ -230,7 +230,7 @@ def _examine_product(copy: SourceCopy, mutation: Mutation) -> str:
     if not mutation.product:
         return ""
     solver, reason = mutation.product
-    with copy.planted(mutation):
+    with copy.plant_mutation(mutation):
         code, output = copy.run_command(mutation, ["-m", "tests.mutations.product", solver], TEST_SECONDS)
     if code == _TIME_OUT_CODE:
         return TIMED_OUT

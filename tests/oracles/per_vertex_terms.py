@@ -72,12 +72,12 @@ def build_air_drag_terms(effect: Any, declared: SceneDeclaration) -> EffectTerms
     if declared.has_stages:
         return EffectTerms(evaluate_force=force)
 
-    def slowed(v: Array) -> Array:
+    def scale_velocity(v: Array) -> Array:
         speed = np.sqrt((v**2).sum(axis=1))
         drag = dt * c * speed
         return np.array([u * m / (m + d) if d > 0 else u for u, m, d in zip(v, mass, drag, strict=True)])
 
-    return EffectTerms(filter_velocity=slowed)
+    return EffectTerms(filter_velocity=scale_velocity)
 
 
 def _build_drag(c: Array) -> BeginFunction:
@@ -132,10 +132,10 @@ def build_pin(weight: float, motion: Any, q: ExtendedArray) -> PinnedVertex:
       q: declared point (3,) [m].
     """
 
-    def there(time: float) -> ExtendedArray:
+    def place_target(time: float) -> ExtendedArray:
         return place_at(motion, time).transform(q[None])[0]
 
     def moving(time: float) -> ExtendedArray:
         return velocity_at(motion, q, time)
 
-    return PinnedVertex(weight, there, moving)
+    return PinnedVertex(weight, place_target, moving)

@@ -27,7 +27,7 @@ from tests.oracles.complex_step import ExtendedArray, to_extended
 from tests.oracles.scene_declaration import Array, EffectTerms, SceneDeclaration, StepMoment
 from tests.oracles.step_terms import MotionArrays, ReferenceStep, filter_motion, sum_forces
 
-AnswerFunction = Callable[[float], Array]
+SolutionFunction = Callable[[float], Array]
 """Maps the time [s] of a stage to the solution (n, 3) [m] that the solver returns."""
 
 _HALF = np.sqrt(to_extended(0.5))
@@ -97,7 +97,7 @@ STAGED_INTEGRATORS = (*_TABLEAUX, *_ALPHA_PARAMETERS)
 
 
 @dataclass(frozen=True, eq=False)
-class StageAnswers:
+class StageSolutions:
     """Reference stages of a step, their solutions (n, 3) [m], and its end."""
 
     reference_steps: list[ReferenceStep]
@@ -116,7 +116,7 @@ class _StageRecorder:
         effect_terms: Sequence[EffectTerms],
         now: MotionArrays,
         time: float,
-        answer: AnswerFunction,
+        answer: SolutionFunction,
     ) -> None:
         self.declared, self.effect_terms, self.answer, self.time = declared, effect_terms, answer, time
         self.dt = to_extended(declared.time_step)
@@ -175,9 +175,9 @@ class _StageRecorder:
         a[[i for i, _ in self.exact]] = 0
         return a
 
-    def finish_step(self, end: MotionArrays, a: ExtendedArray) -> StageAnswers:
+    def finish_step(self, end: MotionArrays, a: ExtendedArray) -> StageSolutions:
         """Return the completed step."""
-        return StageAnswers(
+        return StageSolutions(
             self.reference_steps, self.answers, self.apply_exact_pins(end, self.time + self.declared.time_step), a
         )
 
@@ -189,8 +189,8 @@ def solve_stages(
     now: MotionArrays,
     acceleration: Array,
     time: float,
-    answer: AnswerFunction,
-) -> StageAnswers:
+    answer: SolutionFunction,
+) -> StageSolutions:
     """Take the step of an integrator from a motion and its acceleration.
 
     Args:
@@ -207,7 +207,7 @@ def solve_stages(
     return run(name, step, to_extended(acceleration))
 
 
-def _runge_kutta(name: str, step: _StageRecorder, a0: ExtendedArray) -> StageAnswers:
+def _runge_kutta(name: str, step: _StageRecorder, a0: ExtendedArray) -> StageSolutions:
     rows, dt, (p, v) = _TABLEAUX[name], step.dt, step.now
     known, V, A = [(to_extended(0), a0)], list[ExtendedArray](), list[ExtendedArray]()
     if rows[0] == [0]:
@@ -228,7 +228,7 @@ def _runge_kutta(name: str, step: _StageRecorder, a0: ExtendedArray) -> StageAns
     return step.finish_step([x, V[-1]], A[-1])
 
 
-def _generalised_alpha(name: str, step: _StageRecorder, a: ExtendedArray) -> StageAnswers:
+def _generalised_alpha(name: str, step: _StageRecorder, a: ExtendedArray) -> StageSolutions:
     (am, af), dt, (d, v) = _ALPHA_PARAMETERS[name], step.dt, step.now
     gamma, beta = to_extended(0.5) - am + af, (1 - am + af) ** 2 / 4
 

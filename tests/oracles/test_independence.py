@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-FORBIDDEN = (
+FORBIDDEN_MODULES = (
     *(f"springbench.solvers.{name}" for name in ("contact", "iteration", "kernels", "linalg", "methods", "simd")),
     *(f"springbench.solvers.model.{name}" for name in ("energies", "integrators", "system_matrix_assembly")),
     *(
@@ -19,7 +19,7 @@ PLANTS_ERRORS = ("test_", "planted_errors.py")
 
 
 def find_forbidden_imports(source: str) -> set[str]:
-    """Return the modules of FORBIDDEN that a source imports, or that it imports from."""
+    """Return the modules of FORBIDDEN_MODULES that a source imports, or that it imports from."""
     imported = set[str]()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
@@ -27,7 +27,7 @@ def find_forbidden_imports(source: str) -> set[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative imports are not read here"
             imported |= {f"{node.module}.{one.name}" for one in node.names}
-    return {module for module in FORBIDDEN for name in imported if f"{name}.".startswith(f"{module}.")}
+    return {module for module in FORBIDDEN_MODULES for name in imported if f"{name}.".startswith(f"{module}.")}
 
 
 def test_no_module_imports_a_formula_of_the_solvers():

@@ -21,17 +21,17 @@ from springbench.solvers.contact.contact_potential import ObstacleContact
 
 from tests.oracles.verify_scene import verify_terms
 
-TURNS = KeyFrameMotion(
+ROTATION = KeyFrameMotion(
     key_frames=(KeyFrame(time=0.0), KeyFrame(time=0.1, offset=(0.01, 0.02, 0.0), angle=20.0)), axis=(0.1, 1.0, 0.2)
 )
 BALL = MeshObstacle(mesh=BalloonMesh(radius=0.3), size=2, offset=(0.1, -0.5, 0.0))
 OBSTACLES: dict[str, tuple[Any, ...]] = {
     "mesh": (BALL,),
-    "mesh that turns": (BALL.model_copy(update={"motion": TURNS}),),
+    "mesh that turns": (BALL.model_copy(update={"motion": ROTATION}),),
     "plane and box": (PlaneObstacle(point=(0, -1, 0)), BoxObstacle(low=(0.0, 0.5, 0.0), high=(0.4, 0.7, 0.3))),
     "sphere and capsule": (
         SphereObstacle(center=(0, -1, 0), radius=0.5),
-        CapsuleObstacle(end_points=((0, 1, 0), (0.5, 1, 0)), radius=0.2, motion=TURNS),
+        CapsuleObstacle(end_points=((0, 1, 0), (0.5, 1, 0)), radius=0.2, motion=ROTATION),
     ),
 }
 

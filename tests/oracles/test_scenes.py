@@ -55,13 +55,13 @@ def find_scenes(*folders: str) -> dict[str, Path]:
 
 
 SCENES = find_scenes("scenes")
-VERIFIED = find_scenes("hard", "hard-long", "exact")
+VERIFIED_SCENES = find_scenes("hard", "hard-long", "exact")
 """Scenes of the published sweeps with `verify: true`."""
 TOUCHING = {"unseen/cloth-over-ball", "unseen/sheets-pressed"}
 """Scenes with contact in folders of scenes without."""
-UNSEEN = find_scenes("unseen")
-OTHERS = find_scenes("hessians", "winners") | {name: path for name, path in UNSEEN.items() if name not in TOUCHING}
-CONTACT = find_scenes("contact-accuracy", "growth", "hard-touch", "touch") | {name: UNSEEN[name] for name in TOUCHING}
+UNSEEN_SCENES = find_scenes("unseen")
+OTHERS = find_scenes("hessians", "winners") | {name: path for name, path in UNSEEN_SCENES.items() if name not in TOUCHING}
+CONTACT = find_scenes("contact-accuracy", "growth", "hard-touch", "touch") | {name: UNSEEN_SCENES[name] for name in TOUCHING}
 
 
 def coarse_size(spec: SceneSpec) -> int:
@@ -76,9 +76,9 @@ def test_both_implementations_agree_on_a_coarse_scene(name: str):
     assert run_reference_check(spec, coarse_size(spec), integrator) == "agrees"
 
 
-@pytest.mark.parametrize("name", VERIFIED)
+@pytest.mark.parametrize("name", VERIFIED_SCENES)
 def test_both_implementations_agree_on_a_verified_scene(name: str):
-    spec = load_scene(VERIFIED[name])
+    spec = load_scene(VERIFIED_SCENES[name])
     assert run_reference_check(spec, spec.default_size or 0) == "agrees"
 
 
@@ -91,14 +91,14 @@ def test_both_implementations_agree_on_a_coarse_scene_with_contact(name: str):
 
 @pytest.mark.long
 @pytest.mark.parametrize("integrator", INTEGRATOR_NAMES)
-@pytest.mark.parametrize("name", SCENES | VERIFIED | OTHERS)
+@pytest.mark.parametrize("name", SCENES | VERIFIED_SCENES | OTHERS)
 def test_both_implementations_agree_with_every_integrator_at_full_size(name: str, integrator: str):
-    spec = load_scene((SCENES | VERIFIED | OTHERS)[name])
+    spec = load_scene((SCENES | VERIFIED_SCENES | OTHERS)[name])
     assert run_reference_check(spec, spec.default_size or 0, integrator) == "agrees"
 
 
 def test_every_scene_of_the_configs_is_compared():
-    compared = {path for paths in (SCENES, VERIFIED, OTHERS, CONTACT) for path in paths.values()}
+    compared = {path for paths in (SCENES, VERIFIED_SCENES, OTHERS, CONTACT) for path in paths.values()}
     assert compared == set(CONFIGS.glob("*/*.yaml"))
 
 
@@ -155,10 +155,10 @@ class Magnet(ConfigModel):
         )
 
 
-STAGED = [name for name in INTEGRATORS if name not in INTEGRATOR_NAMES]
+MULTISTAGE_INTEGRATORS = [name for name in INTEGRATORS if name not in INTEGRATOR_NAMES]
 
 
-@pytest.mark.parametrize("integrator", STAGED)
+@pytest.mark.parametrize("integrator", MULTISTAGE_INTEGRATORS)
 def test_both_implementations_agree_with_integrators_of_several_stages(integrator: str):
     assert (
         run_reference_check(build_scene_spec(SPRINGS_SPEC, PINS_SPEC, GUSTS_SPEC, *DRAG_SPECS), 3, integrator)
@@ -166,7 +166,7 @@ def test_both_implementations_agree_with_integrators_of_several_stages(integrato
     )
 
 
-@pytest.mark.parametrize("integrator", [name for name in STAGED if hasattr(INTEGRATORS[name], "a")])
+@pytest.mark.parametrize("integrator", [name for name in MULTISTAGE_INTEGRATORS if hasattr(INTEGRATORS[name], "a")])
 def test_a_weight_that_is_wrong_by_a_millionth_is_found(integrator: str, monkeypatch: pytest.MonkeyPatch):
     method: Any = INTEGRATORS[integrator]
     rows = [list(row) for row in method.a]

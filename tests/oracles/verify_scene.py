@@ -62,7 +62,7 @@ def verify_terms(spec: SceneSpec, scene: Scene, integrator: str) -> str:
     return f"{NO_REFERENCE}: {external}" if external else MATCH
 
 
-class _FixedAnswer:
+class _FixedSolution:
     """Substitute for a prepared solver, with a given solution.
 
     Its solution is x (n, 3) [m] as a function of the time [s]. It returns the velocity at the step's end if
@@ -93,7 +93,7 @@ def _compare_single_stage(
     reference_step = build_reference_step(integrator, own.declaration, own.effect_terms, now, before, time)
     m = reference_step.step_moment
     x = np.asarray(m.p + m.stage_fraction * m.time_step * m.v, float) + point.shift
-    answer: Any = _FixedAnswer(lambda until: x, with_velocity=integrator == "substepping")
+    answer: Any = _FixedSolution(lambda until: x, with_velocity=integrator == "substepping")
     run = simulate_scene(
         scene, answer, StopRule(), initial_guess="previous", frames=index + 1, initial_state=point.state
     )
@@ -128,7 +128,7 @@ def _compare_stages(
     a = point.state.acceleration
     assert a is not None
     expected = solve_stages(integrator, own.declaration, own.effect_terms, now, a, time, x)
-    answer: Any = _FixedAnswer(x)
+    answer: Any = _FixedSolution(x)
     index = point.state.index
     done = next(
         simulate_scene(scene, answer, StopRule(), initial_guess="previous", frames=index + 1, initial_state=point.state)

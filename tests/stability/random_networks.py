@@ -42,7 +42,7 @@ class Case:
 
     def problem(self) -> StepProblem:
         """A step of the network, which moves and is pushed."""
-        rng, rest, system = self._drawn()
+        rng, rest, system = self._draw_network()
         n, q = self.n, self.pinned
         p, v = rest + 0.3 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))
         current = p.copy()
@@ -62,9 +62,9 @@ class Case:
             problem, system=system, inertial_target=on, external_force=np.zeros_like(p), step_start=start
         ), on
 
-    def thrown(self, integrator: str) -> tuple[Scene, MotionState]:
+    def build_free_scene(self, integrator: str) -> tuple[Scene, MotionState]:
         """The network without pins and forces, as a scene to be stepped, and a start that moves and is stretched."""
-        rng, rest, system = replace(self, pinned=0)._drawn()
+        rng, rest, system = replace(self, pinned=0)._draw_network()
         mesh = NetworkMesh(positions=tuple(map(tuple, rest.tolist()))).build_mesh()
         by = INTEGRATORS[integrator]
         none = np.empty((0, 3))
@@ -73,7 +73,7 @@ class Case:
         p, v = rest + 0.3 * rng.normal(size=rest.shape), rng.normal(size=rest.shape)
         return scene, MotionState(Motion(p, v), None, 0)
 
-    def _drawn(self) -> tuple[np.random.Generator, Positions, System]:
+    def _draw_network(self) -> tuple[np.random.Generator, Positions, System]:
         """The generator, the rest shape (n, 3) [m], and the system: springs and pins."""
         rng, n = np.random.default_rng(self.seed), self.n
         rest, first = rng.normal(size=(n, 3)), rng.integers(0, n, self.m)
@@ -88,7 +88,7 @@ class Case:
 Map = Callable[[Positions], Positions]
 
 
-def turned(problem: StepProblem, seed: int, mirror: bool) -> tuple[StepProblem, Map]:
+def rotate_problem(problem: StepProblem, seed: int, mirror: bool) -> tuple[StepProblem, Map]:
     """The problem turned at random, mirrored and shifted, and what that does to positions."""
     rng = np.random.default_rng(seed)
     R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -96,11 +96,11 @@ def turned(problem: StepProblem, seed: int, mirror: bool) -> tuple[StepProblem, 
     shift, springs = rng.normal(size=3), springs_of(problem)
     system = replace(problem.system, energies=(replace(springs, rest_direction=springs.rest_direction @ R.T),))
     return replace(
-        changed(problem, lambda p: p @ R.T + shift, lambda v: v @ R.T), system=system
+        transform_problem(problem, lambda p: p @ R.T + shift, lambda v: v @ R.T), system=system
     ), lambda p: p @ R.T + shift
 
 
-def renumbered(problem: StepProblem, seed: int) -> tuple[StepProblem, Map]:
+def renumber_problem(problem: StepProblem, seed: int) -> tuple[StepProblem, Map]:
     """The problem with its vertices and springs in another order, some springs' ends exchanged, and what that does to
     positions."""
     rng, springs, pins = np.random.default_rng(seed), springs_of(problem), problem.system.pins
@@ -113,11 +113,11 @@ def renumbered(problem: StepProblem, seed: int) -> tuple[StepProblem, Map]:
     where = np.argsort(place[pins.vertices])
     moved = DirichletPins(place[pins.vertices][where], pins.weight[where])
     system = System(problem.system.mass[back], problem.system.time_step, (renamed,), moved)
-    other = changed(replace(problem, pin_targets=problem.inertial_target), lambda p: p[back], lambda v: v[back])
+    other = transform_problem(replace(problem, pin_targets=problem.inertial_target), lambda p: p[back], lambda v: v[back])
     return replace(other, system=system, pin_targets=problem.pin_targets[where]), lambda p: p[back]
 
 
-def changed(problem: StepProblem, places: Map, vectors: Map) -> StepProblem:
+def transform_problem(problem: StepProblem, places: Map, vectors: Map) -> StepProblem:
     """The problem with `places` applied to its positions [m] and `vectors` to its forces and velocities."""
     start = problem.step_start
     begun = replace(

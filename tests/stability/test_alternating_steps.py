@@ -28,13 +28,13 @@ LENGTHS = (1 / 3, 1 / 300)
 FRAMES, STOP = 6, StopRule(30, 1e-6)
 
 
-def made(integrator: str = "implicit-euler") -> Scene:
+def build_alternating_scene(integrator: str = "implicit-euler") -> Scene:
     return build_scene(load_scene(FILE), 6, integrator)
 
 
 @pytest.mark.parametrize("name", SOLVERS)
 def test_each_step_is_one_of_its_length_from_where_the_last_one_ended(name: str):
-    scene, solver = made(), load_target(SOLVERS[name])()
+    scene, solver = build_alternating_scene(), load_target(SOLVERS[name])()
     assert scene.alternate_scene is not None
     alone = [solver.prepare(part.system) for part in (scene, scene.alternate_scene)]
     state, time = build_initial_state(scene), 0.0  # added up here, multiplied there: some eps apart
@@ -60,11 +60,11 @@ def test_midpoint_falls_exactly_as_a_stone_does_whatever_the_steps():
 
 def test_an_integrator_of_two_steps_of_one_length_is_refused():
     with pytest.raises(Unsupported, match="steps of one length"):
-        prepare(made("bdf2"), NewtonSolver())
+        prepare(build_alternating_scene("bdf2"), NewtonSolver())
 
 
 def test_each_step_is_verified_with_the_matrix_of_its_length():
-    scene = made("midpoint")
+    scene = build_alternating_scene("midpoint")
     judge = StepVerifier(scene, None, is_minimiser=True)
     for step in simulate_scene(
         scene, prepare(scene, NewtonSolver()), StopRule(100), initial_guess="previous", frames=FRAMES
@@ -122,7 +122,7 @@ def test_what_measures_at_one_time_step_refuses_two_by_the_key(command: str, tmp
 
 
 def test_symplectic_euler_takes_the_substeps_that_each_length_requires():
-    scene = made()
+    scene = build_alternating_scene()
     assert scene.alternate_scene is not None
     prepared = [SymplecticEuler().prepare(part.system) for part in (scene, scene.alternate_scene)]
     counts = [one.num_substeps for one in prepared if isinstance(one, PreparedSymplecticEuler)]

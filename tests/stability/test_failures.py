@@ -22,7 +22,7 @@ from springbench.solvers.model.step_problem import Positions, PreparedSolver, So
 from springbench.solvers.registry import SOLVERS
 from typer.testing import CliRunner
 
-FRAMES, BROKEN = 20, 4
+FRAMES, FAILING_FRAME = 20, 4
 """Frames of the run, and the one in which what is made to break does."""
 
 SCENE = f"""
@@ -59,7 +59,7 @@ class _Breaking:
         return self.sound.iterates(problem)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
-        if round(problem.step_start.time / problem.system.time_step) == BROKEN - 1:
+        if round(problem.step_start.time / problem.system.time_step) == FAILING_FRAME - 1:
             self.happens()
         return self.sound.solve(problem, stop)
 
@@ -124,13 +124,13 @@ def test_a_failure_in_a_frame_is_reported_and_recorded_up_to_there(
     (broken,) = [row for row in rows if row["solver"] == "broken"]
     assert (broken["phase"], broken["status"]) == ("run", status)
     assert reason in broken["reason"]
-    assert broken["frame"] == BROKEN or (status == "diverged" and 1 < broken["frame"] < BROKEN)
+    assert broken["frame"] == FAILING_FRAME or (status == "diverged" and 1 < broken["frame"] < FAILING_FRAME)
     others = [row for row in rows if row["solver"] == "sparse"]
     assert {row["status"] for row in others} == {"ok"}
     assert {row["frame"] for row in others if row["phase"] == "step"} == set(range(1, FRAMES + 1))
     (recording,) = (results / "sweep" / "recordings").glob("*-broken-*.rrd")
     replay = read_replay(recording)
     assert replay.frames.tolist() == list(range(broken["frame"]))
-    assert np.isfinite(replay.positions[:BROKEN]).all()
+    assert np.isfinite(replay.positions[:FAILING_FRAME]).all()
     assert (replay.properties["status"], replay.properties["failed_frame"]) == (status, broken["frame"])
     assert reason in str(replay.properties["reason"])

@@ -16,7 +16,7 @@ from tests.stability.test_hard_scenes import METHODS, cases, scene, spacing
 MINIMISERS = {name: solver for name, solver in METHODS.items() if solver.is_minimiser}
 TOLERANCE = 1e-6
 STOP = StopRule(100, TOLERANCE)
-SAID = ("converged", "roundoff")
+CLAIMED_REASONS = ("converged", "roundoff")
 """What a solver calls an end; "stalled" and "max-iter" claim nothing."""
 SLACK = 2.0
 """Two factorisations of one Q differ by round-off, and some methods stop by the residual one iteration earlier."""
@@ -36,7 +36,7 @@ UNIQUE = (
 """Cases whose objective is convex: inertia, or springs without length, outweigh what compressed springs take."""
 
 
-def answers(case: str, stop: StopRule) -> tuple[StepProblem, dict[str, Solution]]:
+def solve_first_step(case: str, stop: StopRule) -> tuple[StepProblem, dict[str, Solution]]:
     """The first step of a case, and the answers of the minimisers that take it."""
     made, found = scene(case), {}
     stated = build_problem(made, build_initial_state(made), "previous")
@@ -50,17 +50,17 @@ def answers(case: str, stop: StopRule) -> tuple[StepProblem, dict[str, Solution]
 
 @cases
 def test_a_solution_is_as_stationary_as_reported(case: str):
-    stated, found = answers(case, STOP)
+    stated, found = solve_first_step(case, STOP)
     oracle = ReferenceEvaluator(stated.system)
     for name, solution in found.items():
-        reading, said = oracle.measure_stationarity(stated, solution.positions), solution.termination_reason in SAID
+        reading, said = oracle.measure_stationarity(stated, solution.positions), solution.termination_reason in CLAIMED_REASONS
         assert not said or reading.above_roundoff <= SLACK * TOLERANCE, (name, solution.termination_reason, reading)
         assert solution.termination_reason != "max-iter" or solution.num_iterations == STOP.max_iterations, name
 
 
 @pytest.mark.parametrize("case", UNIQUE)
 def test_all_minimisers_agree_where_there_is_one_minimum(case: str):
-    _, found = answers(case, StopRule(1000, 1e-9))
+    _, found = solve_first_step(case, StopRule(1000, 1e-9))
     assert {name for name, solution in found.items() if solution.termination_reason != "max-iter"} == set(MINIMISERS)
     # The tolerance of what the step moves, at most some metres, a hundredfold for what is softer than Q.
     atol = 1e-7 * spacing(scene(case))

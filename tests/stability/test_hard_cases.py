@@ -48,19 +48,19 @@ def at_rest(rest: Positions) -> Positions:
     return rest
 
 
-def changed(**system) -> Scene:
+def build_changed_cloth(**system) -> Scene:
     made = build_cloth(8)
     return replace(made, system=replace(made.system, **system))
 
 
 def heavy_and_light() -> Scene:
     mass = build_cloth(8).system.mass
-    return changed(mass=mass * np.where(np.arange(len(mass)) % 2, 1e4, 1e-4))
+    return build_changed_cloth(mass=mass * np.where(np.arange(len(mass)) % 2, 1e4, 1e-4))
 
 
 def mostly_massless() -> Scene:
     mass = build_cloth(8).system.mass
-    return changed(mass=np.where(np.arange(len(mass)) % 3, 0.0, mass))
+    return build_changed_cloth(mass=np.where(np.arange(len(mass)) % 3, 0.0, mass))
 
 
 def weights(w: float) -> Scene:
@@ -75,14 +75,14 @@ def far_away(distance: float) -> Scene:
     return replace(made, mesh=replace(made.mesh, rest_positions=rest), pin_targets=made.pin_targets + distance)
 
 
-def tangled(rest: Positions) -> Positions:
+def tangle_positions(rest: Positions) -> Positions:
     return np.random.default_rng(0).normal(size=rest.shape)
 
 
 # A cloth of 1 m by 1 m that hangs from two corners reaches 1 m below them, and half as far again as it stretches.
 CASES = {
-    "a time step of a hundred seconds": Case(lambda: changed(time_step=100.0), at_rest, 1.5),
-    "a time step of a microsecond": Case(lambda: changed(time_step=1e-6), at_rest, 0.51),
+    "a time step of a hundred seconds": Case(lambda: build_changed_cloth(time_step=100.0), at_rest, 1.5),
+    "a time step of a microsecond": Case(lambda: build_changed_cloth(time_step=1e-6), at_rest, 0.51),
     "springs of 1e9 N/m": Case(lambda: build_cloth(8, stretch=1e9), at_rest, 1.1),
     "springs of 1e-6 N/m fall freely": Case(lambda: build_cloth(8, stretch=1e-6), at_rest, 2.3),
     "masses eight orders apart": Case(heavy_and_light, at_rest, 1.5),
@@ -93,9 +93,9 @@ CASES = {
     "collapsed into a point": Case(lambda: build_cloth(8), np.zeros_like, 1.5),
     "flattened to a line": Case(lambda: build_cloth(8), lambda rest: rest * [1.0, 0.0, 0.0], 1.5),
     "turned inside out": Case(lambda: build_cloth(8), np.negative, 2.0),
-    "tangled": Case(lambda: build_cloth(8), tangled, 4.0),
-    "tangled, exact pins": Case(lambda: build_cloth(8, "exact"), tangled, 4.0),
-    "a tangle of a stiff block": Case(lambda: SCENE_BUILDERS["block"](1e10), tangled, 4.0),
+    "tangled": Case(lambda: build_cloth(8), tangle_positions, 4.0),
+    "tangled, exact pins": Case(lambda: build_cloth(8, "exact"), tangle_positions, 4.0),
+    "a tangle of a stiff block": Case(lambda: SCENE_BUILDERS["block"](1e10), tangle_positions, 4.0),
     "stretched a thousandfold": Case(lambda: build_cloth(8), lambda rest: 1e3 * rest, 500.0),
     "a stiff tower of 3 m": Case(lambda: SCENE_BUILDERS["tower"](1e10), at_rest, 3.1),
 }

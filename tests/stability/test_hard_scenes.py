@@ -43,19 +43,19 @@ METHODS: dict[str, Solver] = {
 }
 TAKE_ALL = {"lbfgs", "hybrid", "newton"}
 """The methods for any energies; others may refuse contact and effects that they do not know, by name."""
-REFUSED = {
+REFUSED_SOLVERS = {
     (case, method): "mass"
     for case in ("numbers-massless-vertices", "numbers-mostly-massless")
     for method in SOLVERS
     if method in ("xpbd", "mgpbd") or load_target(SOLVERS[method]).solver_info.is_substepping
 }
-REFUSED |= {(case, "velocity-verlet"): "substeps" for case in ("effects-air-drag-1e9", "effects-bending-1e12")}
+REFUSED_SOLVERS |= {(case, "velocity-verlet"): "substeps" for case in ("effects-air-drag-1e9", "effects-bending-1e12")}
 """Methods that move each vertex by its own mass cannot move one that has none; explicit ones would take all day."""
 
 FRAMES, ITERATIONS = 2, 8
 VALUE = 1e-12
 """Round-off of the objective relative to the sum of its terms' sizes: sums of a thousand terms, each off by 1e-16."""
-ROUNDED = 2e-13
+POSITION_ROUNDOFF = 2e-13
 """Of the largest coordinate: what positions from a triangular solve are off by, a thousand eps. At a minimum an error e
 costs |e|_Q^2 / 2, which is all that an iterate may rise by there."""
 
@@ -75,7 +75,7 @@ def spacing(made: Scene) -> float:
     return float(np.median(lengths[lengths > 0.0])) if lengths.any() else 1.0
 
 
-def rounded(stated: StepProblem, p: Positions) -> Positions:
+def bound_gradient_error(stated: StepProblem, p: Positions) -> Positions:
     """What a gradient may be off by (n, 3) [N], vertex by vertex: along an error d a step Q^-1 (g + d) rises by at most
     |Q^-1 d|_Q^2 / 2, because Q majorises."""
     return np.repeat(gradient_roundoff(stated, p)[:, None] / 3**0.5, 3, axis=1)
@@ -92,22 +92,22 @@ def prepared_or_refused(made: Scene, solver: Solver) -> PreparedSolver | None:
 
 
 @lru_cache(maxsize=1)
-def oracle(case: str) -> ReferenceEvaluator:
+def build_evaluator(case: str) -> ReferenceEvaluator:
     return ReferenceEvaluator(scene(case).system)
 
 
 def slack(case: str, stated: StepProblem, iterates: list[Positions]) -> float:
     """What round-off may raise the objective by [J]."""
-    of_values = VALUE * max(map(stated.value_scale, iterates)) + 0.5 * (ROUNDED * rounding_scale(stated)) ** 2
-    return of_values + 0.5 * max(oracle(case).compute_energy_norm(rounded(stated, p)) for p in iterates) ** 2
+    of_values = VALUE * max(map(stated.value_scale, iterates)) + 0.5 * (POSITION_ROUNDOFF * rounding_scale(stated)) ** 2
+    return of_values + 0.5 * max(build_evaluator(case).compute_energy_norm(bound_gradient_error(stated, p)) for p in iterates) ** 2
 
 
 @methods  # which vary faster than the cases, so that each scene is built once
 @cases
 def test_a_hard_scene_is_refused_by_name_or_stays_finite_descends_and_repeats_itself(case: str, method: str):
     made, solver = scene(case), METHODS[method]
-    if (case, method) in REFUSED:
-        with pytest.raises(Unsupported, match=REFUSED[case, method]):
+    if (case, method) in REFUSED_SOLVERS:
+        with pytest.raises(Unsupported, match=REFUSED_SOLVERS[case, method]):
             prepare(made, solver)
         return
     may_refuse = case.startswith(("contact", "effects", "network")) and method not in TAKE_ALL
@@ -165,7 +165,7 @@ def test_any_number_of_threads_gives_the_same_bits(case: str, size: int | None, 
     np.testing.assert_array_equal(*found)
 
 
-COMPILED = [case for case in CASES if not case.startswith("effects-gas")]
+COMPILED_CASES = [case for case in CASES if not case.startswith("effects-gas")]
 """What the compiled local-global takes, and solves as well by a factor in single precision."""
 
 
@@ -174,7 +174,7 @@ LOOSE = {"scales-cubes-1e6-m-apart": 1e-3}
 step, as processors add up."""
 
 
-@pytest.mark.parametrize("case", COMPILED)
+@pytest.mark.parametrize("case", COMPILED_CASES)
 def test_a_factor_in_single_precision_leaves_the_motion_where_it_was(case: str):
     """Within 1e-4 of the spacing, also 1e6 m away: the gradient is float64, so that rounding the factor to 6e-8 changes
     an iterate by that part of its last step, not of the positions."""

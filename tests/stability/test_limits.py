@@ -40,7 +40,7 @@ Shape = Callable[[np.ndarray], np.ndarray]
 """(H, V0) [N] -> where the vertices are, (n, 2) [m]."""
 
 
-def hung(shape: Shape, support: tuple[float, float]) -> np.ndarray:
+def solve_hanging_shape(shape: Shape, support: tuple[float, float]) -> np.ndarray:
     """The shape whose last vertex is at the support."""
     found = root(lambda ends: shape(ends)[-1] - support, [0.3 * WEIGHT, -0.5 * WEIGHT], tol=1e-14)
     assert np.abs(shape(found.x)[-1] - support).max() <= 1e-13 * LENGTH, found.message
@@ -109,7 +109,7 @@ def orders(sizes: list[float], errors: list[float]) -> list[float]:
 def test_a_hanging_elastic_chain_tends_to_the_elastic_catenary_with_order_two(solver, support, EA):
     """From an extension of a half of the cable's length to one of 1e-5 of it."""
     counts = [17, 33, 65, 129]
-    errors = [np.abs(equilibrium(n, EA, support, solver) - hung(cable(n, EA), support)).max() for n in counts]
+    errors = [np.abs(equilibrium(n, EA, support, solver) - solve_hanging_shape(cable(n, EA), support)).max() for n in counts]
     assert errors[-1] <= 1e-3 * LENGTH
     # The next term of the midpoint rule is smaller by a link's share of the bow's radius, squared: at most 1/10.
     np.testing.assert_allclose(orders([1.0 / (n - 1) for n in counts], errors), 2.0, rtol=0, atol=0.1)
@@ -120,7 +120,7 @@ def test_a_hanging_elastic_chain_tends_to_the_elastic_catenary_with_order_two(so
 def test_a_stiffer_and_stiffer_chain_tends_to_inextensible_links_with_order_one(solver, support):
     """Links stretch by T / EA: 1e-2 to 1e-8 of their length."""
     stiffness = [WEIGHT * 10.0**k for k in range(2, 9)]
-    wanted = hung(links(13), support)
+    wanted = solve_hanging_shape(links(13), support)
     errors = [np.abs(equilibrium(13, EA, support, solver) - wanted).max() for EA in stiffness]
     # The next term is smaller by the strain, 1e-2 to begin with; round-off of the last, 1e-8, is 1e-15 of the length
     # over the stiffness of the bow next to that of the links.
@@ -130,7 +130,7 @@ def test_a_stiffer_and_stiffer_chain_tends_to_inextensible_links_with_order_one(
 @supports
 def test_inextensible_links_tend_to_the_catenary_with_order_two(support):
     counts = [17, 33, 65, 129]
-    errors = [np.abs(hung(links(n), support) - hung(cable(n, np.inf), support)).max() for n in counts]
+    errors = [np.abs(solve_hanging_shape(links(n), support) - solve_hanging_shape(cable(n, np.inf), support)).max() for n in counts]
     np.testing.assert_allclose(orders([1.0 / (n - 1) for n in counts], errors), 2.0, rtol=0, atol=0.1)  # as above
 
 
@@ -139,4 +139,4 @@ def test_inextensible_links_tend_to_the_catenary_with_order_two(support):
 def test_a_chain_that_hardly_stretches_hangs_as_the_inextensible_catenary(solver, support):
     found = equilibrium(65, 1e8 * WEIGHT, support, solver)
     # Of 64 links each is short of its arc by a part of (w r / H)^2 / 24, 1e-4 to 1e-5; the strain is 1e-8.
-    np.testing.assert_allclose(found, hung(cable(65, np.inf), support), rtol=0, atol=2e-4 * LENGTH)
+    np.testing.assert_allclose(found, solve_hanging_shape(cable(65, np.inf), support), rtol=0, atol=2e-4 * LENGTH)

@@ -31,7 +31,7 @@ def hangs(made: Scene, now: Motion) -> None:
     assert np.abs(now.velocity).max() <= 1e-8 * made.mesh.bounding_box_diagonal / made.system.time_step
 
 
-def keeps_its_momentum(made: Scene, now: Motion) -> None:
+def conserves_momentum(made: Scene, now: Motion) -> None:
     mass = made.system.mass[:, None]
     centre = (mass * now.positions).sum(axis=0) / mass.sum()
     begun = (mass * build_initial_state(made).motion.positions).sum(axis=0) / mass.sum()
@@ -46,7 +46,7 @@ def stays_near_its_hand(made: Scene, now: Motion) -> None:
 
 CHECKS: dict[str, Callable[[Scene, Motion], None]] = {
     "long-hanging-cloth": hangs,
-    "long-spinning-net": keeps_its_momentum,
+    "long-spinning-net": conserves_momentum,
     "long-driven-chain": stays_near_its_hand,
 }
 

@@ -21,12 +21,12 @@ from tests.stability.random_networks import (
     EPS,
     MINIMISERS,
     Case,
-    changed,
+    transform_problem,
     examples,
     networks,
-    renumbered,
+    renumber_problem,
     springs_of,
-    turned,
+    rotate_problem,
 )
 
 GLOBAL = ("dense", "sparse", "numba", "anderson", "chebyshev", "newton")
@@ -37,7 +37,7 @@ STEADY = ("dense", "sparse", "numba", "chebyshev", "newton")
 be the difference. The others are tested likewise where they have converged, in `test_properties_converged`."""
 ITERATIONS = 4
 
-VALUE, ROUNDED = 1e-12, 2e-13
+VALUE, POSITION_ROUNDOFF = 1e-12, 2e-13
 """As in `tests.stability.test_hard_scenes`."""
 
 EXAMPLES = examples(12)
@@ -66,7 +66,7 @@ def test_iterates_are_finite_and_descend(name: str, case: Case):
     found = [problem.initial_guess, *(p.copy() for p in islice(iterates, 8))]
     assert np.isfinite(found).all()
     floor = rounding_scale(problem)
-    slack = VALUE * max(map(problem.value_scale, found)) + 0.5 * (ROUNDED * floor) ** 2
+    slack = VALUE * max(map(problem.value_scale, found)) + 0.5 * (POSITION_ROUNDOFF * floor) ** 2
     assert all(problem.value(q) <= problem.value(p) + slack for p, q in pairwise(found))
 
 
@@ -75,7 +75,7 @@ def test_iterates_are_finite_and_descend(name: str, case: Case):
 @given(case=networks(), turn=st.integers(0, 2**16), mirror=st.booleans())
 def test_rotated_shifted_and_mirrored_scenes_have_the_same_motion(name: str, case: Case, turn: int, mirror: bool):
     problem = case.problem()
-    other, moved = turned(problem, turn, mirror)
+    other, moved = rotate_problem(problem, turn, mirror)
     np.testing.assert_allclose(ends(name, other), moved(ends(name, problem)), rtol=0, atol=tolerance(case))
 
 
@@ -86,7 +86,7 @@ def test_the_motion_does_not_depend_on_the_numbering_or_direction_of_vertices_an
     name: str, case: Case, order: int
 ):
     problem = case.problem()
-    other, moved = renumbered(problem, order)
+    other, moved = renumber_problem(problem, order)
     np.testing.assert_allclose(ends(name, other), moved(ends(name, problem)), rtol=0, atol=tolerance(case))
 
 
@@ -101,7 +101,7 @@ def test_the_motion_does_not_depend_on_the_units_of_length_time_and_mass(name: s
     scaled = replace(springs, stiffness=springs.stiffness * k, rest_length=springs.rest_length * length)
     pins = replace(problem.system.pins, weight=problem.system.pins.weight * k)
     system = System(problem.system.mass * mass, problem.system.time_step * time, (scaled,), pins)
-    other = changed(problem, lambda p: p * length, lambda v: v * length / time)
+    other = transform_problem(problem, lambda p: p * length, lambda v: v * length / time)
     other = replace(other, system=system, external_force=problem.external_force * (k * length))
     other = replace(
         other,

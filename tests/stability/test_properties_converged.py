@@ -30,8 +30,8 @@ from tests.stability.random_networks import (
     Map,
     examples,
     networks,
-    renumbered,
-    turned,
+    renumber_problem,
+    rotate_problem,
 )
 
 ENOUGH = StopRule(3000)
@@ -51,13 +51,13 @@ converging = pytest.mark.parametrize("name", [name for name in MINIMISERS if nam
 EXAMPLES = examples(10)
 
 
-FEW_SOFT_WAYS, ONE_SOFT_WAY = Case(6, 12, 0, 5.0, 0.0, 0), Case(4, 12, 558, 5.0, 0.0, 0)
+FEW_SOFT_MODES, ONE_SOFT_MODE = Case(6, 12, 0, 5.0, 0.0, 0), Case(4, 12, 558, 5.0, 0.0, 0)
 """Found by a search: Anderson's method and L-BFGS end 140 and 120 eps k/lambda from the minimum, lambda the smallest
 eigenvalue. A sum of ten forces is known to ten eps, not to one."""
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class NearMinimum:
     """A problem that starts near a minimum; where that is; how well it can be known [m]."""
 
     problem: StepProblem
@@ -65,7 +65,7 @@ class Settled:
     known: float
 
 
-def settled(case: Case, problem: StepProblem) -> Settled:
+def start_near_minimum(case: Case, problem: StepProblem) -> NearMinimum:
     """The problem near the minimum that Newton's method finds; a flat one is left out."""
     p = NewtonSolver().prepare(problem.system).solve(problem, ENOUGH).positions
     least = float(np.linalg.eigvalsh(build_free_hessian(problem, p).toarray()).min(initial=np.inf))
@@ -73,10 +73,10 @@ def settled(case: Case, problem: StepProblem) -> Settled:
     assume(least >= CLEAR * inertia)
     guess = p + NEAR * np.random.default_rng(case.seed).normal(size=p.shape)
     known = 1000.0 * EPS * case.worst * max(1.0, inertia / least)
-    return Settled(replace(problem, initial_guess=guess), p, known)
+    return NearMinimum(replace(problem, initial_guess=guess), p, known)
 
 
-def converged(name: str, problem: StepProblem) -> Positions:
+def solve_converged(name: str, problem: StepProblem) -> Positions:
     return MINIMISERS[name].prepare(problem.system).solve(problem, ENOUGH).positions
 
 
@@ -88,18 +88,18 @@ def for_method(name: str, case: Case) -> Case:
 @converging
 @EXAMPLES
 @given(case=networks())
-@example(case=FEW_SOFT_WAYS)
-@example(case=ONE_SOFT_WAY)
+@example(case=FEW_SOFT_MODES)
+@example(case=ONE_SOFT_MODE)
 def test_all_methods_end_at_the_minimum_that_they_start_near(name: str, case: Case):
     case = for_method(name, case)
-    given = settled(case, case.problem())
-    np.testing.assert_allclose(converged(name, given.problem), given.minimum, rtol=0, atol=given.known)
+    given = start_near_minimum(case, case.problem())
+    np.testing.assert_allclose(solve_converged(name, given.problem), given.minimum, rtol=0, atol=given.known)
 
 
 CHANGES: dict[str, Callable[[StepProblem, int], tuple[StepProblem, Map]]] = {
-    "turned and shifted": lambda problem, seed: turned(problem, seed, mirror=False),
-    "mirrored": lambda problem, seed: turned(problem, seed, mirror=True),
-    "renumbered, springs flipped": renumbered,
+    "turned and shifted": lambda problem, seed: rotate_problem(problem, seed, mirror=False),
+    "mirrored": lambda problem, seed: rotate_problem(problem, seed, mirror=True),
+    "renumbered, springs flipped": renumber_problem,
 }
 
 
@@ -109,9 +109,9 @@ CHANGES: dict[str, Callable[[StepProblem, int], tuple[StepProblem, Map]]] = {
 @given(case=networks(), seed=st.integers(0, 2**16))
 def test_equivalent_descriptions_end_at_the_same_minimum(name: str, change: str, case: Case, seed: int):
     case = for_method(name, case)
-    given = settled(case, case.problem())
+    given = start_near_minimum(case, case.problem())
     other, moved = CHANGES[change](given.problem, seed)
-    here, there = converged(name, given.problem), converged(name, other)
+    here, there = solve_converged(name, given.problem), solve_converged(name, other)
     np.testing.assert_allclose(there, moved(here), rtol=0, atol=2.0 * given.known)
 
 
@@ -123,7 +123,7 @@ def test_a_free_body_conserves_momentum(name: str, case: Case):
     free = case.problem()
     free = replace(free, external_force=np.zeros_like(free.external_force))
     mass, begun = free.system.mass[:, None], free.step_start
-    moved = (mass * (converged(name, settled(case, free).problem) - begun.positions)).sum(axis=0) / DT
+    moved = (mass * (solve_converged(name, start_near_minimum(case, free).problem) - begun.positions)).sum(axis=0) / DT
     scale = (mass * np.abs(begun.positions)).sum() / DT  # what the differences above are taken of
     wanted = (mass * begun.velocity).sum(axis=0)
     np.testing.assert_allclose(moved, wanted, rtol=0, atol=100 * EPS * case.worst * scale)
@@ -136,7 +136,7 @@ def test_a_free_body_at_rest_length_moves_uniformly(name: str, case: Case):
     case = for_method(name, case)
     free, wanted = case.flying()
     atol = 100 * EPS * case.worst * np.abs(wanted).max()
-    np.testing.assert_allclose(converged(name, free), wanted, rtol=0, atol=atol)
+    np.testing.assert_allclose(solve_converged(name, free), wanted, rtol=0, atol=atol)
 
 
 STEPS = 4
@@ -144,7 +144,7 @@ integrators = pytest.mark.parametrize("integrator", LAWS)
 LAWFUL = examples(20)
 
 
-def stepped(scene: Scene, state: MotionState) -> list[Motion]:
+def simulate_motions(scene: Scene, state: MotionState) -> list[Motion]:
     """The motions at the start and after each step."""
     run = simulate_scene(
         scene, prepare(scene, NewtonSolver()), ENOUGH, initial_guess="inertial", frames=STEPS, initial_state=state
@@ -156,8 +156,8 @@ def stepped(scene: Scene, state: MotionState) -> list[Motion]:
 @LAWFUL
 @given(case=networks())
 def test_angular_momentum_obeys_the_integrators_law(integrator: str, case: Case):
-    scene, state = case.thrown(integrator)
-    path = stepped(scene, state)
+    scene, state = case.build_free_scene(integrator)
+    path = simulate_motions(scene, state)
     mass = scene.system.mass[:, None]
     reach = max(np.abs(p).max() for p, _ in path)
     # A force that is left, k times the coordinates times eps at each of some ten springs, times an arm and dt.
@@ -171,10 +171,10 @@ def test_angular_momentum_obeys_the_integrators_law(integrator: str, case: Case)
 def test_a_convex_energy_decays_or_stays(integrator: str, case: Case):
     """Springs without rest length have a quadratic energy: midpoint conserves it, implicit Euler loses some each step,
     BDF2 has lost some in the end."""
-    scene, state = case.thrown(integrator)
+    scene, state = case.build_free_scene(integrator)
     springs = replace(scene.all_springs, rest_length=np.zeros(case.m))
     scene = replace(scene, system=replace(scene.system, energies=(springs,)))
-    path = stepped(scene, state)
+    path = simulate_motions(scene, state)
     found = energies(scene, path)
     slack = 100.0 * EPS * case.worst * found[0]  # positions are off by eps times that, and energies by as much
     if integrator == "midpoint":

@@ -37,7 +37,7 @@ STEPS, STOP = 100, StopRule(200, 1e-6)
 MINIMISERS = [name for name, target in SOLVERS.items() if load_target(target).is_minimiser]
 
 
-def held_block() -> Scene:
+def pinned_block() -> Scene:
     """Its left side does not move; nothing pulls."""
     return build_test_scene(
         BlockMesh(),
@@ -84,10 +84,10 @@ def comes_to_a_minimum(made: Scene, p: Positions) -> None:
 LINE, PLANE = FlattenedStart(axes=("y", "z")), FlattenedStart(axes=("y",))
 Check = Callable[[Scene, Positions], None]
 CASES: dict[str, tuple[Callable[[], Scene], AnyStart, Check]] = {
-    "a held block in one point": (held_block, CollapsedStart(), returns_to_its_rest_shape),
-    "a held block in a line": (held_block, LINE, returns_to_its_rest_shape),
-    "a held block in a plane": (held_block, PLANE, returns_to_its_rest_shape),
-    "a held block at random": (held_block, RandomStart(side_length=1.0), comes_to_a_minimum),
+    "a held block in one point": (pinned_block, CollapsedStart(), returns_to_its_rest_shape),
+    "a held block in a line": (pinned_block, LINE, returns_to_its_rest_shape),
+    "a held block in a plane": (pinned_block, PLANE, returns_to_its_rest_shape),
+    "a held block at random": (pinned_block, RandomStart(side_length=1.0), comes_to_a_minimum),
     "a free block in one point": (free_block, CollapsedStart(), returns_to_its_lengths),
     "a free block in a line": (free_block, LINE, returns_to_its_lengths),
     "a free block in a plane": (free_block, PLANE, returns_to_its_lengths),

@@ -38,7 +38,7 @@ solvers = pytest.mark.parametrize("solver", [NewtonSolver(), HybridNewton()], id
 STOP = StopRule(300, 1e-6)
 
 
-def squeezed(mesh, size: int, pins: str, factors: tuple[float, float, float]) -> tuple[Scene, Positions]:
+def squeeze_scene(mesh, size: int, pins: str, factors: tuple[float, float, float]) -> tuple[Scene, Positions]:
     """A scene whose time step leaves the springs to themselves, and its shape squeezed evenly about its mean."""
     made = build_test_scene(
         mesh,
@@ -52,9 +52,9 @@ def squeezed(mesh, size: int, pins: str, factors: tuple[float, float, float]) ->
 
 
 SADDLES = {
-    "a chain pressed along its line": lambda: squeezed(ChainMesh(), 9, "ends", (0.5, 1, 1)),
-    "a sheet pressed evenly in its plane": lambda: squeezed(GridMesh(), 5, "corners", (0.5, 1, 0.5)),
-    "a tower pressed to half its height": lambda: squeezed(TowerMesh(), 4, "base", (1, 0.5, 1)),
+    "a chain pressed along its line": lambda: squeeze_scene(ChainMesh(), 9, "ends", (0.5, 1, 1)),
+    "a sheet pressed evenly in its plane": lambda: squeeze_scene(GridMesh(), 5, "corners", (0.5, 1, 0.5)),
+    "a tower pressed to half its height": lambda: squeeze_scene(TowerMesh(), 4, "base", (1, 0.5, 1)),
 }
 saddles = pytest.mark.parametrize("saddle", SADDLES)
 
@@ -155,7 +155,7 @@ def test_only_a_close_tolerance_requires_a_minimum():
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "hard"
 CASES = {path.stem: path for path in sorted(CONFIGS.glob("*.yaml"))}
-TELLING = [case for case in CASES if case.startswith("saddle")] + [
+SADDLE_CASES = [case for case in CASES if case.startswith("saddle")] + [
     "contact-pressed-sphere",
     "motion-burst",
     "motion-pushed-together",
@@ -186,7 +186,7 @@ def ends(case: str, solver: Solver, frames: int) -> list[str]:
     return wrong
 
 
-@pytest.mark.parametrize("case", TELLING)
+@pytest.mark.parametrize("case", SADDLE_CASES)
 @solvers
 def test_a_step_that_a_residual_would_end_too_early_ends_at_a_certified_minimum(case: str, solver: Solver):
     wrong = ends(case, solver, 3)
@@ -202,7 +202,7 @@ def test_all_steps_of_a_hard_scene_end_at_certified_minima(case: str, solver: So
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", TELLING)
+@pytest.mark.parametrize("case", SADDLE_CASES)
 def test_no_step_of_lbfgs_passes_for_solved_at_a_saddle(case: str):
     spec = load_scene(CASES[case])
     made = build_scene(spec, spec.default_size or 0)

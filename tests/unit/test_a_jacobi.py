@@ -18,7 +18,7 @@ from tests.scene_builders import build_cloth, build_first_problem
 HANGING = build_first_problem(build_cloth(8, "exact", stretch=100.0))
 
 
-def made(sweeps: int):
+def build_matrices(sweeps: int):
     """Q over the free vertices, dense, and the matrix that stands for so many sweeps."""
     found = []
     prepare_local_global(
@@ -31,7 +31,7 @@ def made(sweeps: int):
 
 @pytest.mark.parametrize("sweeps", [2, 4])
 def test_its_matrix_applies_the_given_number_of_jacobi_sweeps(sweeps):
-    Q, S = made(sweeps)
+    Q, S = build_matrices(sweeps)
     b = np.random.default_rng(0).normal(size=len(Q))
     x = np.zeros_like(b)
     for _ in range(sweeps):
@@ -41,7 +41,7 @@ def test_its_matrix_applies_the_given_number_of_jacobi_sweeps(sweeps):
 
 @pytest.mark.parametrize("sweeps", [1, 2, 3, 4])
 def test_its_inverse_majorises_the_hessian_as_q_does(sweeps):
-    Q, S = made(sweeps)
+    Q, S = build_matrices(sweeps)
     products = np.linalg.eigvals(S @ Q)
     assert np.abs(products.imag).max() <= 1e-12
     assert products.real.min() > 0.0

@@ -46,7 +46,7 @@ frames: 8
 default_size: 5
 effects: [{kind: springs, stretch: 300, shear: 60}, {kind: gravity}, {kind: pins, parts: [top_corners]}]
 """
-HELD = """
+PINNED_CHAIN = """
 mesh: {kind: network, positions: [[0, 0, 0], [1, 0, 0], [2, 0, 0]], springs: [[0, 1], [1, 2]], mass: [0, 0, 1]}
 time_step: 1/30
 frames: 3
@@ -132,7 +132,7 @@ def test_pairs_are_reported_under_both_names(ablation_rows):
 
 
 def test_a_scene_that_requires_an_effect_states_it(tmp_path: Path):
-    ablation_rows = rows_of(HELD, tmp_path, max_iterations=5)
+    ablation_rows = rows_of(PINNED_CHAIN, tmp_path, max_iterations=5)
     assert by_name(ablation_rows)["springs"]["status"] == "unsolvable"
     assert "impossible without it (" in describe_effect(by_name(ablation_rows)["springs"], ablation_rows)
     assert by_name(ablation_rows)["gravity"]["status"] == "ok"

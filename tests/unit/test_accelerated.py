@@ -115,13 +115,13 @@ def test_fewer_iterations_reach_an_accuracy_than_of_local_global(method):
     lowest = problem.value(iterates(Lbfgs(), problem, 1500)[-1])
     begun = problem.value(problem.current_positions)
 
-    def needed(solver: Solver) -> int:
+    def count_iterations(solver: Solver) -> int:
         for count, p in enumerate(solver.prepare(problem.system).iterates(problem), 1):
             if problem.value(p) - lowest <= 1e-4 * (begun - lowest):
                 return count
         raise AssertionError("iterates end")
 
-    assert 3 * needed(method()) < needed(CompiledLocalGlobal())  # measured: 6 to 10 times fewer
+    assert 3 * count_iterations(method()) < count_iterations(CompiledLocalGlobal())  # measured: 6 to 10 times fewer
 
 
 @methods

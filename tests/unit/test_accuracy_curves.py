@@ -69,7 +69,7 @@ def test_distances_leave_out_what_is_pinned() -> None:
     assert (largest, rms) == pytest.approx((0.3, 0.3 / len(free) ** 0.5), rel=1e-12)  # round-off of a difference
 
 
-class Scripted:
+class ScriptedSolver:
     """Prepared: a given sequence of iterates."""
 
     def __init__(self, iterate: Callable[[int], Positions], pause: float = 0.0) -> None:
@@ -106,7 +106,7 @@ ENDS = {
 
 @pytest.mark.parametrize(("iterate", "status", "reason"), ENDS.values(), ids=ENDS)
 def test_a_curve_states_its_termination_reason(iterate: Callable[[int], Positions], status: str, reason: str) -> None:
-    found = curve(Scripted(iterate))
+    found = curve(ScriptedSolver(iterate))
     assert found.status == status
     assert reason in found.reason
     assert found.iterate_indices[0] == 0
@@ -120,7 +120,7 @@ def test_a_curve_states_its_termination_reason(iterate: Callable[[int], Position
 
 
 def test_a_curve_ends_at_its_time_limit_without_the_iterates_that_compile() -> None:
-    found = curve(Scripted(towards(lambda n: 1 / (1 + n)), pause=0.02), time_limit=0.05, num_rounds=1)
+    found = curve(ScriptedSolver(towards(lambda n: 1 / (1 + n)), pause=0.02), time_limit=0.05, num_rounds=1)
     assert found.status == "time-limit"
     # Sleeping takes at least the requested time: three iterates after the warm-up are over the limit, perhaps fewer.
     assert (
@@ -161,18 +161,18 @@ def test_passes_that_differ_in_the_last_bit_are_a_failure() -> None:
         return p
 
     with pytest.raises(RunFailed, match="other positions"):
-        curve(Scripted(iterate))
+        curve(ScriptedSolver(iterate))
 
 
 def at_a_saddle(iterate: Callable[[int], Positions]) -> ScoredCurve:
     above = refine_minimum(FLAT, FLAT.current_positions, NewtonSolver())
     limits: dict[str, Any] = {"max_iterations": 40, "time_limit": 60.0, "num_rounds": 1}
     return measure_convergence(
-        cast("Any", Scripted(iterate)), STARTED, ReferenceEvaluator(FLAT.system), above.objective, **limits
+        cast("Any", ScriptedSolver(iterate)), STARTED_NEAR_SADDLE, ReferenceEvaluator(FLAT.system), above.objective, **limits
     )
 
 
-STARTED = replace(FLAT, current_positions=FLAT.current_positions + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]]))
+STARTED_NEAR_SADDLE = replace(FLAT, current_positions=FLAT.current_positions + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]]))
 """A step whose current positions are near the saddle at which FLAT's are."""
 
 
@@ -192,4 +192,4 @@ def test_a_solver_that_leaves_a_saddle_continues_to_its_minimum() -> None:
 def test_a_stationarity_that_is_no_number_is_a_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
     reading = StationarityReading(np.inf, 0.0, np.inf)
     monkeypatch.setattr(ReferenceEvaluator, "measure_stationarity", lambda self, problem, p: reading)
-    assert curve(Scripted(towards(lambda n: 0.5**n))).status == "diverged"
+    assert curve(ScriptedSolver(towards(lambda n: 0.5**n))).status == "diverged"

@@ -16,7 +16,7 @@ from springbench.harness.scenes.scene_spec import InitialGuess
 from springbench.harness.simulation.time_loop import COARSE_TO_FINE, INITIAL_GUESSES
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SHIPPED = [path for path in sorted(CONFIGS.glob("*.yaml")) if {"curves:", "work:"} & {*path.read_text().splitlines()}]
+SHIPPED_CONFIGS = [path for path in sorted(CONFIGS.glob("*.yaml")) if {"curves:", "work:"} & {*path.read_text().splitlines()}]
 
 CLOTH = """
 mesh: {kind: grid}
@@ -42,13 +42,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def loaded(folder: Path, text: str) -> AccuracyPlan:
+def load_text(folder: Path, text: str) -> AccuracyPlan:
     (folder / "config.yaml").write_text(text)
     return load_accuracy(folder / "config.yaml")
 
 
 def test_a_study_of_curves_has_each_snapshot_and_solver_that_minimises(folder: Path) -> None:
-    units = loaded(folder, CONFIG).curves
+    units = load_text(folder, CONFIG).curves
     assert [(u.snapshot, u.solver.name) for u in units] == [
         ("early", "numba"),
         ("early", "newton"),
@@ -64,12 +64,12 @@ def test_studies_take_every_first_guess_that_is_no_solve_and_reports_have_words_
     *guesses, coarse = get_args(InitialGuess)
     assert coarse == COARSE_TO_FINE
     requested = CONFIG.replace("rounds: 7", f"rounds: 7, initial_guess: [{', '.join(guesses)}]")
-    assert {unit.initial_guesses for unit in loaded(folder, requested).curves} == {tuple(guesses)}
+    assert {unit.initial_guesses for unit in load_text(folder, requested).curves} == {tuple(guesses)}
     assert set(INITIAL_GUESS_LABELS) == set(INITIAL_GUESSES) == set(guesses)
 
 
 def test_a_study_of_work_has_all_combinations(folder: Path) -> None:
-    units = loaded(folder, CONFIG).work
+    units = load_text(folder, CONFIG).work
     found = {(u.case.scene_name, u.case.size, u.case.scene.time_step, u.options["rtol"], u.solver.name) for u in units}
     assert found == {
         ("other", size, dt, tolerance, "xpbd")
@@ -82,14 +82,14 @@ def test_a_study_of_work_has_all_combinations(folder: Path) -> None:
 
 def test_a_unit_of_two_studies_is_measured_with_the_settings_of_the_first(folder: Path) -> None:
     twice = CONFIG.replace("work:", "  - {scene: cloth, size: 4, snapshot: early, solver: newton, rounds: 2}\nwork:")
-    once, both = loaded(folder, CONFIG), loaded(folder, twice)
+    once, both = load_text(folder, CONFIG), load_text(folder, twice)
     assert [(u.build_file_stem(), u.measurement) for u in both.curves] == [
         (u.build_file_stem(), u.measurement) for u in once.curves
     ]
 
 
 def test_a_unit_with_other_settings_has_the_same_file_and_another_id(folder: Path) -> None:
-    accuracy = loaded(folder, CONFIG)
+    accuracy = load_text(folder, CONFIG)
     for unit in (accuracy.curves[0], accuracy.work[0]):
         other = replace(unit, measurement=replace(unit.measurement, rounds=9))
         assert other.build_file_stem() == unit.build_file_stem()
@@ -97,9 +97,9 @@ def test_a_unit_with_other_settings_has_the_same_file_and_another_id(folder: Pat
 
 
 def test_a_changed_scene_is_another_point(folder: Path) -> None:
-    before = {unit.build_file_stem() for unit in loaded(folder, CONFIG).curves}
+    before = {unit.build_file_stem() for unit in load_text(folder, CONFIG).curves}
     (folder / "cloth.yaml").write_text(CLOTH.replace("stretch: 100", "stretch: 101"))
-    assert not before & {unit.build_file_stem() for unit in loaded(folder, CONFIG).curves}
+    assert not before & {unit.build_file_stem() for unit in load_text(folder, CONFIG).curves}
 
 
 MISTAKES = [
@@ -122,7 +122,7 @@ MISTAKES = [
 @pytest.mark.parametrize(("before", "after", "line", "said"), MISTAKES, ids=[after for _, after, *_ in MISTAKES])
 def test_a_mistake_is_reported_with_its_line(folder: Path, before: str, after: str, line: int, said: str) -> None:
     with pytest.raises(InputError) as refused:
-        loaded(folder, CONFIG.replace(before, after))
+        load_text(folder, CONFIG.replace(before, after))
     assert any(m.line == line and said in m.problem for m in refused.value.mistakes), refused.value
 
 
@@ -130,12 +130,12 @@ def test_a_sweep_and_an_accuracy_config_are_not_taken_for_each_other(folder: Pat
     (folder / "sweep.yaml").write_text("scenes: [cloth.yaml]\nsizes: [4]\nsolvers: [numba]\n")
     with pytest.raises(InputError, match="expected an accuracy config"):
         load_accuracy(folder / "sweep.yaml")
-    loaded(folder, CONFIG)
+    load_text(folder, CONFIG)
     with pytest.raises(InputError, match="springbench accuracy"):
         load_config(folder / "config.yaml")
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", SHIPPED_CONFIGS, ids=lambda path: path.stem)
 def test_every_shipped_config_has_curves_and_names_its_schema(path: Path) -> None:
     requested = load_accuracy(path)
     assert requested.curves or requested.work

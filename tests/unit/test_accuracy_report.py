@@ -153,15 +153,15 @@ def test_crossings_name_both_solvers_and_both_times(tmp_path: Path) -> None:
 
 
 def test_a_lead_changes_only_beyond_what_rounds_differ(tmp_path: Path) -> None:
-    def race(folder: Path, factor: float) -> list[str]:
+    def describe_lead(folder: Path, factor: float) -> list[str]:
         a: list[dict[str, Any]] = list(made.build_curve_rows("net", 10, "early", "lbfgs"))
         b: list[dict[str, Any]] = [row | {"solver": "vbd"} for row in a]
         for row in b[1:]:  # slower at first, then faster by the factor
             row["seconds"] = [s * (2.0 if row["iteration"] < 20 else factor) for s in row["seconds"]]
         return describe_crossings(table(folder, [*made.build_snapshot_rows("net", 10, "early"), *a, *b]).curves)
 
-    assert len(race(tmp_path / "noise", 0.97)) == 1, "3 % lie within quartiles of 0.985 and 1.05"
-    changed = race(tmp_path / "sure", 0.5)
+    assert len(describe_lead(tmp_path / "noise", 0.97)) == 1, "3 % lie within quartiles of 0.985 and 1.05"
+    changed = describe_lead(tmp_path / "sure", 0.5)
     assert len(changed) == 2
     assert "vbd is faster than lbfgs" in changed[1]
 

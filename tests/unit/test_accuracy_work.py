@@ -95,13 +95,13 @@ def test_seconds_that_another_clock_contradicts_are_a_failure(
     assert "the times of step add up to" in found["reason"]
 
 
-LOST = [
+FAILURES = [
     ({"measurement": replace(UNIT.measurement, time_limit=1e-9)}, "time-limit", "was reached in frame"),
     ({"solver": SolverSpec("symplectic-euler", {}), "case": replace(UNIT.case, integrator="bdf2")}, "unsupported", ""),
 ]
 
 
-@pytest.mark.parametrize(("change", "status", "reason"), LOST, ids=[status for _, status, _ in LOST])
+@pytest.mark.parametrize(("change", "status", "reason"), FAILURES, ids=[status for _, status, _ in FAILURES])
 def test_a_failure_is_a_status_with_a_reason(
     trajectory: ReferenceTrajectory, change: dict[str, Any], status: str, reason: str
 ) -> None:

@@ -36,16 +36,16 @@ def run(integrator: str, steps: int, stop: StopCriterion) -> list[SimulationStep
 
 
 @pytest.fixture(scope="module")
-def truth() -> ReferenceTrajectory:
+def reference_motion() -> ReferenceTrajectory:
     return integrate_motion(scene("esdirk-4", 4), [END])
 
 
 @pytest.mark.parametrize("steps", [24, 96])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "midpoint", "newmark", "sdirk-3", "esdirk-4"])
-def test_solves_add_little_to_the_error_of_the_step_with_few_iterations(integrator, steps, truth):
+def test_solves_add_little_to_the_error_of_the_step_with_few_iterations(integrator, steps, reference_motion):
     auto, converged = run(integrator, steps, AutoTolerance(200)), run(integrator, steps, StopRule(200, 1e-12))
-    own = truth.measure_error(0, converged[-1].positions)
-    away = np.linalg.norm(auto[-1].positions - converged[-1].positions) / truth.displacement[0]
+    own = reference_motion.measure_error(0, converged[-1].positions)
+    away = np.linalg.norm(auto[-1].positions - converged[-1].positions) / reference_motion.displacement[0]
     assert away <= 0.5 * own  # a tenth a step, whose signs may agree where those of the steps' own errors do not
     past = slice(6, None)
     most = 0.8 if INTEGRATORS[integrator].order < 4 else 1.0  # an error of 7e-9 requires all but the last digits

@@ -14,7 +14,7 @@ from tests.synthetic_recordings import build_recording_info, generate_waves, wri
 
 
 @pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[object]:
+def drawing_arguments(monkeypatch: pytest.MonkeyPatch) -> list[object]:
     """What the functions that draw are given; they write a few bytes instead of a picture."""
     given: list[object] = []
 
@@ -44,12 +44,12 @@ def test_an_opened_recording_has_every_frame(tmp_path: Path):
         springbench.open_recording(tmp_path / "nowhere.rrd")
 
 
-def test_a_recording_is_drawn_alone_and_several_side_by_side(tmp_path: Path, drawn: list[object]):
+def test_a_recording_is_drawn_alone_and_several_side_by_side(tmp_path: Path, drawing_arguments: list[object]):
     path = write_recording(tmp_path / "a.rrd", build_recording_info("chain"), frame_count=2)
     replay = springbench.open_recording(path)
     picture = springbench.draw_picture(replay)
     springbench.draw_picture({"one": path, "other": replay})
-    alone, other = drawn
+    alone, other = drawing_arguments
     assert alone is replay
     assert isinstance(other, dict)
     assert list(other) == ["one", "other"]

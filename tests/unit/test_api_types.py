@@ -26,7 +26,7 @@ from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MISTAKEN = """
+MISTAKEN_CODE = """
 import springbench
 
 scene = springbench.make_scene(mesh={"kind": "grid"}, time_step=0.01, frames=3, mass=1.0)
@@ -55,7 +55,7 @@ def test_types_have_the_keys_of_the_models():
 
 @pytest.mark.long
 def test_a_type_checker_finds_names_and_keys_that_do_not_exist(tmp_path: Path):
-    (tmp_path / "mistaken.py").write_text(MISTAKEN)
+    (tmp_path / "mistaken.py").write_text(MISTAKEN_CODE)
     (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(ROOT)], "typeCheckingMode": "strict"}))
     command = [
         Path(sys.executable).with_name("pyright"),
@@ -67,7 +67,7 @@ def test_a_type_checker_finds_names_and_keys_that_do_not_exist(tmp_path: Path):
     ]
     completed = json.loads(subprocess.run(command, capture_output=True, text=True, cwd=tmp_path).stdout)
     found = {problem["range"]["start"]["line"] + 1 for problem in completed["generalDiagnostics"]}
-    assert found == {i for i, line in enumerate(MISTAKEN.splitlines(), 1) if "  # " in line}, completed
+    assert found == {i for i, line in enumerate(MISTAKEN_CODE.splitlines(), 1) if "  # " in line}, completed
 
 
 class Mine:

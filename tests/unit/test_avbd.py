@@ -54,7 +54,7 @@ def heavier(stated: StepProblem, times: float) -> StepProblem:
     return replace(stated, system=replace(stated.system, mass=mass), external_force=force)
 
 
-def solved(stated: StepProblem, iterations: int = 20_000, tolerance: float = 1e-11, **settings: Any):
+def solve_step(stated: StepProblem, iterations: int = 20_000, tolerance: float = 1e-11, **settings: Any):
     prepared = Avbd(**settings).prepare(stated.system)
     return prepared.solve(stated, StopRule(iterations, tolerance))
 
@@ -65,7 +65,7 @@ def test_a_pendulum_ends_where_its_sphere_is_nearest_to_free_fall():
     m, dt = stated.system.mass[1], stated.system.time_step
     y = stated.inertial_target[1] + stated.external_force[1] * dt**2 / m - stated.current_positions[0]
     r = float(concatenate_constraints(stated.system.length_constraints).max_length[0])
-    found = solved(stated)
+    found = solve_step(stated)
     assert found.termination_reason == "converged"
     np.testing.assert_allclose(
         found.positions[1] - stated.current_positions[0], r * y / np.linalg.norm(y), atol=ROUND_OFF
@@ -82,7 +82,7 @@ def test_a_chain_at_rest_carries_what_hangs_below(heavy):
     np.testing.assert_allclose(
         ExactLengths(stated.system).compute_tensions(stated, stated.current_positions), weight, rtol=1e-6
     )
-    found = solved(stated)
+    found = solve_step(stated)
     np.testing.assert_allclose(found.positions, stated.current_positions, atol=1e-6)
     assert found.warm_start is not None
     np.testing.assert_allclose(found.warm_start[:, 0], weight, rtol=1e-3)
@@ -104,7 +104,7 @@ def test_a_swinging_chain_is_the_limit_of_stiff_ones():
     assert away[1] < 0.2 * away[0]  # a tenth, if both are converged
 
 
-def limited() -> Scene:
+def build_limited_net() -> Scene:
     """A net that hangs by its corners, so soft that most of what would be its sag is beyond its limits."""
     corners = PinsEffect.model_validate({"parts": ["corners"], "weight": "exact"})
     limits = StrainLimitsEffect.model_validate({"stiffness": "exact", "max_stretch": 1.05})
@@ -114,7 +114,7 @@ def limited() -> Scene:
 
 
 def test_exact_limits_are_satisfied_and_pull_only_where_they_are_reached():
-    bound = limited()
+    bound = build_limited_net()
     lengths, slack = concatenate_constraints(bound.system.length_constraints), np.empty(0)
     for step in simulate_scene(
         bound, prepare(bound, Avbd()), StopRule(20_000, 1e-9), initial_guess="previous", frames=8
@@ -129,10 +129,10 @@ def test_exact_limits_are_satisfied_and_pull_only_where_they_are_reached():
     assert not slack.all()
 
 
-@pytest.mark.parametrize("bound", [chain(9, mass=1.0), limited()], ids=["chain", "limits"])
+@pytest.mark.parametrize("bound", [chain(9, mass=1.0), build_limited_net()], ids=["chain", "limits"])
 def test_the_verifier_finds_a_minimum_at_the_solution_and_nowhere_else(bound):
     stated = build_first_problem(bound)
-    judge, p = StepVerifier(bound, None, is_minimiser=True), solved(stated).positions
+    judge, p = StepVerifier(bound, None, is_minimiser=True), solve_step(stated).positions
     assert judge.measure_stationarity(stated, p).above_roundoff < 1e-7
     assert judge.measure_curvature(stated, p).is_convex
     moved = p.copy()
@@ -142,7 +142,7 @@ def test_the_verifier_finds_a_minimum_at_the_solution_and_nowhere_else(bound):
 
 def test_the_farthest_point_of_a_sphere_is_stationary_and_no_minimum():
     stated = build_first_problem(chain(2, mass=1.0))
-    p = solved(stated).positions
+    p = solve_step(stated).positions
     p[1] = 2.0 * p[0] - p[1]
     judge = StepVerifier(chain(2, mass=1.0), None, is_minimiser=True)
     assert judge.measure_stationarity(stated, p).above_roundoff < 1e-7
@@ -168,13 +168,13 @@ def test_softened_springs_end_at_the_minimum():
     ratio = replace(found, stiffness=np.where(np.arange(8) % 2, 100.0, 1.0) * found.stiffness)
     stated = replace(stated, system=replace(stated.system, energies=(ratio,)))
     end = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200)).positions
-    assert np.abs(end - solved(stated, ramp_spring_stiffness=True, stiffness_ramp=1e6).positions).max() < 1e-6
+    assert np.abs(end - solve_step(stated, ramp_spring_stiffness=True, stiffness_ramp=1e6).positions).max() < 1e-6
 
 
 CLAIMS = {
     "three links": lambda: chain(4, mass=1.0),
     "nine links": lambda: chain(10, mass=1.0),
-    "limits": limited,
+    "limits": build_limited_net,
 }
 
 
@@ -199,7 +199,7 @@ def test_a_residual_without_a_tolerance_is_that_of_the_step_too():
     stated = build_first_problem(bound)
     found = Avbd().prepare(stated.system).solve(stated, StopRule(40))
     judge = StepVerifier(bound, None, is_minimiser=True)
-    reading, scale = judge.measure_stationarity(stated, found.positions), solved(stated).initial_residual
+    reading, scale = judge.measure_stationarity(stated, found.positions), solve_step(stated).initial_residual
     np.testing.assert_allclose(found.residual, reading.stationarity * scale, rtol=1e-6)
 
 
@@ -297,7 +297,7 @@ def _at(stated: StepProblem, part: float) -> StepProblem:
 @pytest.mark.parametrize("case", HARD)
 def test_hard_cases_preserve_exact_lengths(case):
     stated = HARD[case]()
-    found = solved(stated, 50_000, 1e-9)
+    found = solve_step(stated, 50_000, 1e-9)
     lengths = concatenate_constraints(stated.system.length_constraints)
     assert np.abs(length_errors(lengths, found.positions) / lengths.max_length).max() < 1e-6
 
@@ -310,7 +310,7 @@ def test_lengths_that_cannot_all_be_satisfied_are_reported():
     far = stated.pin_targets.copy()
     far[1] = far[0] + 2.0 * (far[1] - far[0])
     stated = replace(stated, pin_targets=far)
-    found = solved(stated, 5000)
+    found = solve_step(stated, 5000)
     assert found.termination_reason == "max-iter"
     away = length_errors(concatenate_constraints(stated.system.length_constraints), found.positions)
     assert (away > 0.0).all()

@@ -50,7 +50,7 @@ def key(spec: WorkSpec) -> tuple[Any, ...]:
     return spec.solver.name, spec.case.scene.time_step, spec.options["rtol"]
 
 
-class Measured:
+class MeasuredTable:
     """Rows of a table, cut off at the time limits of the specifications."""
 
     def __init__(self, rows: dict[Any, dict[str, Any]]) -> None:
@@ -76,7 +76,7 @@ def test_the_choice_is_that_of_a_full_search():
     measured = none = 0
     for seed in range(200):
         rows = table(seed)
-        measure = Measured(rows)
+        measure = MeasuredTable(rows)
         omitted = search_grid(specs(), 1e-2, inf, measure, 60.0)
         assert measure.best(1e-2) == cheapest(rows, 1e-2), seed
         assert omitted.is_complete
@@ -89,7 +89,7 @@ def test_the_choice_is_that_of_a_full_search():
 
 def test_a_method_stored_as_cheap_excludes_slower_methods_at_once():
     rows = {key(one): {"status": "ok", "error": 1.0, "seconds_per_simulated_second": 10.0} for one in specs()}
-    measure = Measured(rows)
+    measure = MeasuredTable(rows)
     omitted = search_grid(specs(), 1e-2, 1.0, measure, 60.0)
     assert set(measure.found) == {(solver, 0.4, 0.1) for solver in SOLVERS}
     assert all(row["status"] == "time-limit" for row in measure.found.values())
@@ -99,7 +99,7 @@ def test_a_method_stored_as_cheap_excludes_slower_methods_at_once():
 def test_an_error_too_small_to_measure_meets_the_target_and_limits_the_others():
     exact = {"status": "uncertified", "error": None, "seconds_per_simulated_second": 1.0}
     slow = {"status": "ok", "error": 1.0, "seconds_per_simulated_second": 10.0}
-    measure = Measured({key(one): exact if one.solver.name == "a" else slow for one in specs()})
+    measure = MeasuredTable({key(one): exact if one.solver.name == "a" else slow for one in specs()})
     search_grid(specs(), 1e-2, inf, measure, 60.0)
     assert {at[2] for at in measure.found if at[0] == "a"} == {0.1}, "smaller tolerances are left out"
     assert {at for at in measure.found if at[0] != "a"} == {(solver, 0.4, 0.1) for solver in SOLVERS[1:]}
@@ -119,7 +119,7 @@ def test_a_simulation_may_take_little_more_than_the_best(best: float, limit: flo
 
 
 def test_after_its_search_time_nothing_begins():
-    omitted = search_grid(specs(), 1e-2, inf, Measured(table(0)), -1.0)
+    omitted = search_grid(specs(), 1e-2, inf, MeasuredTable(table(0)), -1.0)
     assert (omitted.num_trials, omitted.is_complete) == (0, False)
     assert omitted.reasons == {OUT_OF_TIME: len(specs())}
 
@@ -137,7 +137,7 @@ def test_within_a_cost_the_choice_is_near_the_least_error_in_hindsight():
             within = (row for row in found.values() if row.get("seconds_per_simulated_second", inf) <= limit)
             return min((row["error"] for row in within), default=inf)
 
-        measure = Measured(rows)
+        measure = MeasuredTable(rows)
         search_grid(specs(), 0.0, 2.0 * limit / SLOWER, measure, 60.0)
         ratios.append(find_least(measure.found) / find_least(rows))
     assert max(ratios) <= 1.3

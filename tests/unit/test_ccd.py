@@ -21,12 +21,12 @@ from springbench.solvers.contact.contact_potential import SelfContact
 from springbench.solvers.contact.potentials.barrier import compute_distances
 
 THICKNESS = 1 / 64
-LEFT = Fraction(1, 20)
+REMAINING_FRACTION = Fraction(1, 20)
 """Of a gap: what a step leaves at least (`springbench.solvers.contact.ccd`)."""
 
 TRIANGLE = ((0, 0, 0), (8, 0, 0), (0, 8, 0))
-CROSSED = ((-4, 0, 0), (4, 0, 0))
-OVER = ((0, -4, 1), (0, 4, 1))
+FIRST_EDGE = ((-4, 0, 0), (4, 0, 0))
+EDGE_ABOVE = ((0, -4, 1), (0, 4, 1))
 
 
 class Closing(NamedTuple):
@@ -48,8 +48,8 @@ CLOSING = {
     "both by half": Closing([(1, 1, 1), *TRIANGLE], _up(-0.75, 0.25, 0.25, 0.25), False),
     "a corner that rises": Closing([(0, 0, 1), *TRIANGLE], _up(0, 1, 0, 0), False),
     "a corner that rises to a point that falls": Closing([(0, 0, 1), *TRIANGLE], _up(-0.5, 0.5, 0, 0), False),
-    "edges": Closing([*CROSSED, *OVER], _up(0, 0, -1, -1), True),
-    "edges, both by half": Closing([*CROSSED, *OVER], _up(0.5, 0.5, -0.5, -0.5), True),
+    "edges": Closing([*FIRST_EDGE, *EDGE_ABOVE], _up(0, 0, -1, -1), True),
+    "edges, both by half": Closing([*FIRST_EDGE, *EDGE_ABOVE], _up(0.5, 0.5, -0.5, -0.5), True),
     "ends of edges": Closing([(0, 0, 0), (8, 0, 0), (0, 0, 1), (0, 8, 1)], _up(0.5, -0.5, -0.5, 0.5), True),
     "one end of an edge": Closing([(0, 0, 0), (8, 0, 0), (0, 0, 1), (0, 8, 1)], _up(1, 0, 0, 0), True),
 }
@@ -79,7 +79,7 @@ def test_no_pair_that_closes_at_its_bound_loses_more_than_nineteen_twentieths_of
                     pairs_of(closing.edges), pad_positions(p), pad_positions(d), 1.0, *ccd.allocate_ccd_scratch()
                 )
             )
-            assert step * Fraction(speed) <= (1 - LEFT) * gap  # exactly: the distance is linear in the step
+            assert step * Fraction(speed) <= (1 - REMAINING_FRACTION) * gap  # exact: linear in the step
             # And it is of use: of a step that has to end, it ends in the last tenth of the gap.
             assert step == 1 or step * Fraction(speed) >= Fraction(89, 100) * gap
 
@@ -103,7 +103,7 @@ def _to_edge(p: Exact, a: Exact, b: Exact) -> Fraction:
     return _dot(z, z)
 
 
-def squared(x: Sequence[Exact], edges: bool) -> Fraction:
+def squared_distance(x: Sequence[Exact], edges: bool) -> Fraction:
     """The squared distance of a point and a triangle, or of two edges: the least of the border's and the inside's."""
     a, b, c, d = x
     if edges:
@@ -144,7 +144,7 @@ def test_no_random_pair_comes_nearer_than_allowed_on_its_path(edges):
                 tuple(Fraction(a) + t * Fraction(b) for a, b in zip(x, y, strict=True))
                 for x, y in zip(p, d, strict=True)
             ]
-            assert squared(at, edges) >= least
+            assert squared_distance(at, edges) >= least
     assert ended >= 4
 
 
@@ -163,7 +163,7 @@ def test_candidates_stored_between_steps_bound_them_as_well():
             contact.value(rest)
             contact.collision_free_step_size(rest, saved * d)
             step = Fraction(contact.collision_free_step_size(rest, d))
-            assert step * Fraction(speed) <= (1 - LEFT) * gap
+            assert step * Fraction(speed) <= (1 - REMAINING_FRACTION) * gap
 
 
 @pytest.mark.parametrize("way", [0.5, 1.9])

@@ -81,7 +81,7 @@ FLAT = snap_through(weight=0.0, height=0.0)
 """Between its pins and without weight the mass is in balance, and about to snap."""
 
 
-def frozen(problem: StepProblem) -> StepSnapshot:
+def build_snapshot(problem: StepProblem) -> StepSnapshot:
     return StepSnapshot(1, problem, Motion(problem.current_positions, problem.step_start.velocity), "0123456789ab")
 
 
@@ -156,7 +156,7 @@ def test_the_search_for_a_minimum_leaves_a_saddle():
 
 
 def test_a_point_that_is_no_minimum_is_never_a_reference(tmp_path):
-    reference = ReferenceStore(tmp_path, Stays()).find_minima(frozen(FLAT))
+    reference = ReferenceStore(tmp_path, Stays()).find_minima(build_snapshot(FLAT))
     assert reference.minima == ()
     with pytest.raises(UncertifiedError, match="it is a saddle"):
         _ = reference.lowest_minimum
@@ -165,7 +165,7 @@ def test_a_point_that_is_no_minimum_is_never_a_reference(tmp_path):
 
 def test_a_lower_minimum_replaces_the_reference(tmp_path):
     problem, store = snap_through(), ReferenceStore(tmp_path)
-    one = frozen(problem)
+    one = build_snapshot(problem)
     above = store.find_minima(one).lowest_minimum
     assert above.positions[4, 1] > 0.1
     below = store.classify_minimum(one, lower(above.positions))
@@ -179,7 +179,7 @@ def test_a_lower_minimum_replaces_the_reference(tmp_path):
 
 def test_a_point_belongs_to_the_minimum_that_newtons_method_finds_from_it(tmp_path):
     problem, store = snap_through(), ReferenceStore(tmp_path)
-    one = frozen(problem)
+    one = build_snapshot(problem)
     above = store.find_minima(one).lowest_minimum
     rng, names = np.random.default_rng(0), {}
     for side, start in (("above", above.positions), ("below", lower(above.positions))):
@@ -191,14 +191,14 @@ def test_a_point_belongs_to_the_minimum_that_newtons_method_finds_from_it(tmp_pa
 
 
 def test_a_point_that_leads_to_no_minimum_has_no_branch(tmp_path):
-    known = ReferenceStore(tmp_path).find_minima(frozen(FLAT))
-    found = ReferenceStore(tmp_path, Stays()).classify_minimum(frozen(FLAT), FLAT.current_positions)
+    known = ReferenceStore(tmp_path).find_minima(build_snapshot(FLAT))
+    found = ReferenceStore(tmp_path, Stays()).classify_minimum(build_snapshot(FLAT), FLAT.current_positions)
     assert not found.is_certified
-    assert len(ReferenceStore(tmp_path).find_minima(frozen(FLAT)).minima) == len(known.minima)
+    assert len(ReferenceStore(tmp_path).find_minima(build_snapshot(FLAT)).minima) == len(known.minima)
 
 
 def test_minima_are_found_once(tmp_path):
-    one = frozen(PROBLEMS["cloth"]())
+    one = build_snapshot(PROBLEMS["cloth"]())
     found = ReferenceStore(tmp_path).find_minima(one).lowest_minimum
     again = ReferenceStore(tmp_path, Stays()).find_minima(one).lowest_minimum
     np.testing.assert_array_equal(found.positions, again.positions)
@@ -228,7 +228,7 @@ def standing(folder: Path) -> tuple[ReferenceStore, StepSnapshot]:
     return store, store.load_frames(load_scene(STANDING), 9, [1])[1]
 
 
-def turned(problem: StepProblem, p: Positions, angle: float) -> Positions:
+def rotate_about_pin(problem: StepProblem, p: Positions, angle: float) -> Positions:
     """p turned about the vertical line through the pinned vertex."""
     c, s, foot = np.cos(angle), np.sin(angle), p[problem.system.pins.vertices[0]]
     return foot + (p - foot) @ np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
@@ -239,7 +239,7 @@ def test_a_valley_of_minima_is_found_as_such_and_is_no_reference(tmp_path):
     found = refine_minimum(one.problem, one.problem.current_positions, NewtonSolver())
     assert found.kind == VALLEY
     assert abs(found.min_eigenvalue) <= found.eigenvalue_uncertainty < 1e-9
-    other = turned(one.problem, found.positions, 1.0)
+    other = rotate_about_pin(one.problem, found.positions, 1.0)
     assert np.linalg.norm(other - found.positions, axis=1).max() > 1e-3
     assert one.problem.value(other) == pytest.approx(found.objective, rel=1e-13)  # a dozen terms
     with pytest.raises(UncertifiedError, match="valley"):
@@ -284,7 +284,7 @@ def test_a_certificate_is_of_the_very_point_that_is_stored(name: str):
 
 
 def test_minima_that_were_stored_with_less_than_a_certificate_are_found_again(tmp_path):
-    one = frozen(PROBLEMS["cloth"]())
+    one = build_snapshot(PROBLEMS["cloth"]())
     found = ReferenceStore(tmp_path).find_minima(one).lowest_minimum
     path = tmp_path / f"minima-{one.digest}.npz"
     arrays = dict(np.load(path))

@@ -36,7 +36,7 @@ HALF_LOST = PhaseWatch(wall_seconds=1.0, num_entries=100, process_seconds=0.5, t
 MOSTLY_LOST = PhaseWatch(wall_seconds=1.0, num_entries=100, process_seconds=0.05, thread_seconds=0.05)
 """A second in which others had the core 19 times as long."""
 
-LIES = {
+FALSE_TIMES = {
     "the solve is left out": (SECOND, 0.05),
     "times are scaled": (SECOND, 1e-3),
     "times are scaled up": (SECOND, 1.5),
@@ -48,7 +48,7 @@ LIES = {
 }
 
 
-@pytest.mark.parametrize(("watch", "reported"), LIES.values(), ids=LIES)
+@pytest.mark.parametrize(("watch", "reported"), FALSE_TIMES.values(), ids=FALSE_TIMES)
 def test_times_that_another_clock_does_not_confirm_are_refused(watch: PhaseWatch, reported: float) -> None:
     with pytest.raises(RunFailed, match="the times of step add up to"):
         watch.build_columns("step", [reported / 4] * 4)
@@ -70,7 +70,7 @@ def test_a_false_report_is_measured_again_and_a_second_one_is_a_failure(lies: in
     assert len(list(times)) == 3 - (lies < 2)
 
 
-HONEST = {
+TRUE_TIMES = {
     "to the last bit": (SECOND, 1.0),
     "within three hundredths": (SECOND, 1.0 - 0.9 * CLOCK_RTOL),
     "within a millisecond": (
@@ -94,7 +94,7 @@ HONEST = {
 }
 
 
-@pytest.mark.parametrize(("watch", "reported"), HONEST.values(), ids=HONEST)
+@pytest.mark.parametrize(("watch", "reported"), TRUE_TIMES.values(), ids=TRUE_TIMES)
 def test_times_that_another_clock_confirms_are_accepted_and_both_are_reported(
     watch: PhaseWatch, reported: float
 ) -> None:
@@ -134,7 +134,7 @@ def test_a_watch_adds_up_what_is_done_within_it_and_nothing_in_between() -> None
     assert watch.preempted_seconds in [max(0.0, watch.wall_seconds - seconds) for seconds in busy]
 
 
-STOPPED = """
+STOPPED_PROGRAM = """
 import os, signal
 from springbench.harness.simulation.stopwatch import PhaseWatch
 watch = PhaseWatch()
@@ -145,7 +145,7 @@ print(watch.build_columns("step", [watch.wall_seconds])["preempted"], watch.pree
 
 
 def test_a_process_that_was_stopped_is_reported() -> None:
-    child = subprocess.Popen([sys.executable, "-c", STOPPED], stdout=subprocess.PIPE, text=True)
+    child = subprocess.Popen([sys.executable, "-c", STOPPED_PROGRAM], stdout=subprocess.PIPE, text=True)
     _, status = os.waitpid(child.pid, os.WUNTRACED)
     assert os.WIFSTOPPED(status)
     sleep(0.1)
@@ -159,33 +159,33 @@ def test_a_process_that_was_stopped_is_reported() -> None:
 PROBLEM = build_first_problem(
     build_test_scene(ChainMesh(), GravityEffect(), PinsEffect(parts=("first",), weight=1e4), size=4)
 )
-KEPT, UNTOUCHED = np.ones((2, 4, 3))
+FILLED_ARRAY, UNCHANGED_ARRAY = np.ones((2, 4, 3))
 
 
-def filled() -> np.ndarray:
-    KEPT[:] = 1.0
-    return KEPT
+def fill_array() -> np.ndarray:
+    FILLED_ARRAY[:] = 1.0
+    return FILLED_ARRAY
 
 
-DOES = {
-    "it writes to its array": filled,
+WORKING_PHASES = {
+    "it writes to its array": fill_array,
     "it returns a new array": lambda: np.ones(3),
     "it tells whether it succeeded": lambda: False,
     "it writes what is not a number": lambda: np.full(3, np.nan),
 }
-DOES_NOT = {"it returns nothing": lambda: None, "it returns its array as it is": lambda: UNTOUCHED}
+IDLE_PHASES = {"it returns nothing": lambda: None, "it returns its array as it is": lambda: UNCHANGED_ARRAY}
 
 
-def prepared(call: Any) -> Any:
-    return SimpleNamespace(iteration_phases=lambda problem: {"local": filled, "global": call})
+def prepare_phases(call: Any) -> Any:
+    return SimpleNamespace(iteration_phases=lambda problem: {"local": fill_array, "global": call})
 
 
-@pytest.mark.parametrize("call", DOES.values(), ids=DOES)
+@pytest.mark.parametrize("call", WORKING_PHASES.values(), ids=WORKING_PHASES)
 def test_a_phase_that_computes_is_timed(call: Any) -> None:
-    assert check_phases(prepared(call), PROBLEM) == {"local": filled, "global": call}
+    assert check_phases(prepare_phases(call), PROBLEM) == {"local": fill_array, "global": call}
 
 
-@pytest.mark.parametrize("call", DOES_NOT.values(), ids=DOES_NOT)
+@pytest.mark.parametrize("call", IDLE_PHASES.values(), ids=IDLE_PHASES)
 def test_a_phase_that_computes_nothing_is_detected(call: Any) -> None:
     with pytest.raises(RunFailed, match="the phase global does nothing"):
-        check_phases(prepared(call), PROBLEM)
+        check_phases(prepare_phases(call), PROBLEM)

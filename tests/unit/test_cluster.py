@@ -27,7 +27,7 @@ class Workers:
         return {name: function(*arguments) if what is None else what for name, what in self._said.items()}
 
 
-class Own(NamedTuple):
+class UserCodeRun(NamedTuple):
     """A run with user code."""
 
     plugins: tuple[PluginName, ...]
@@ -37,7 +37,7 @@ class Own(NamedTuple):
 
 
 def machines(client: Workers, *plugins: PluginName, say: Callable[[str], None] = print) -> list[str]:
-    runs: Any = [Own(plugins)]
+    runs: Any = [UserCodeRun(plugins)]
     requested: Any = client
     return dask_cluster.check_workers(requested, list[RunSpec](runs), say)
 

@@ -42,12 +42,12 @@ ROUND_OFF = 1e-14
 """Of a sum of some dozen terms, relative to their magnitude."""
 
 
-def named(solver: CompiledLocalGlobal) -> str:
+def format_label(solver: CompiledLocalGlobal) -> str:
     return f"{solver.linear_solver}, {solver.precision}"
 
 
-direct = pytest.mark.parametrize("solver", DIRECT, ids=named)
-less = pytest.mark.parametrize("solver", LESS, ids=named)
+direct = pytest.mark.parametrize("solver", DIRECT, ids=format_label)
+less = pytest.mark.parametrize("solver", LESS, ids=format_label)
 
 
 def iterates(prepared, problem: StepProblem, count: int) -> list[Positions]:
@@ -163,7 +163,7 @@ def test_the_energy_never_rises_with_a_rounded_factor(solver, name, start):
     assert problem.value(iterated[-1]) < problem.value(iterated[0])
 
 
-@pytest.mark.parametrize("solver", [s for s in DIRECT if s.precision == "float64"], ids=named)
+@pytest.mark.parametrize("solver", [s for s in DIRECT if s.precision == "float64"], ids=format_label)
 @problems
 def test_collapsed_positions_come_apart_as_in_the_sparse_backend(solver, name):
     problem = PROBLEMS[name]()
@@ -173,7 +173,7 @@ def test_collapsed_positions_come_apart_as_in_the_sparse_backend(solver, name):
     assert np.abs(found - wanted).max() <= 1e-10 * np.abs(wanted).max()  # a solve, by the condition of Q
 
 
-@pytest.mark.parametrize("solver", DIRECT[3:], ids=named)
+@pytest.mark.parametrize("solver", DIRECT[3:], ids=format_label)
 @pytest.mark.parametrize("size", [3000, 30_000], ids="blocks of {} bytes".format)
 def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
     """A sheet large enough for groups, in one block each and in many, with one thread and two."""
@@ -198,7 +198,7 @@ def test_blocks_change_nothing_but_the_order_of_work(solver, size, monkeypatch):
 
 
 @pytest.mark.skipif(THREAD_COUNT < 2, reason="Numba was started with one thread")
-@pytest.mark.parametrize("solver", DIRECT[3:], ids=named)
+@pytest.mark.parametrize("solver", DIRECT[3:], ids=format_label)
 @pytest.mark.parametrize("stop", [StopRule(10), StopRule(200, 0.3)], ids=["count", "tolerance"])
 def test_the_bits_do_not_depend_on_the_number_of_threads(solver, stop):
     problem = build_first_problem(build_cloth(60))

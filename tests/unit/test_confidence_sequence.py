@@ -15,7 +15,7 @@ from springbench.harness.results.regression_verdict import RegressionVerdict
 
 from tests.bench.replay_study import find_first_verdict
 
-TURNS, SAMPLES = 400, 1000
+NUM_BLOCKS, SAMPLES = 400, 1000
 
 
 def machine(rng: np.random.Generator, calls: int, noise: float, bursts: bool) -> NDArray[np.float64]:
@@ -35,9 +35,9 @@ def machine(rng: np.random.Generator, calls: int, noise: float, bursts: bool) ->
 def sample(seed: int, slower: float = 1.0, noise: float = 0.02, *, bursts: bool = False) -> NDArray[np.float64]:
     """The log ratios of turns of a program and one that takes `slower` as long."""
     rng = np.random.default_rng(seed)
-    times = machine(rng, 4 * TURNS, noise, bursts).reshape(TURNS, 4)
+    times = machine(rng, 4 * NUM_BLOCKS, noise, bursts).reshape(NUM_BLOCKS, 4)
     outer, inner = times[:, [0, 3]].sum(axis=1), times[:, 1:3].sum(axis=1)
-    abba = rng.random(TURNS) < 0.5
+    abba = rng.random(NUM_BLOCKS) < 0.5
     return np.log(slower * np.where(abba, outer, inner) / np.where(abba, inner, outer))
 
 
@@ -103,12 +103,12 @@ def test_the_first_verdict_is_that_of_a_test_after_each_block():
         looked = next(
             (
                 (a, n)
-                for n in range(1, TURNS + 1)
+                for n in range(1, NUM_BLOCKS + 1)
                 if (a := rule.decide_verdict(x[:n])) is not RegressionVerdict.INCONCLUSIVE
             ),
             None,
         )
-        assert find_first_verdict(rule, x) == (looked or (RegressionVerdict.INCONCLUSIVE, TURNS))
+        assert find_first_verdict(rule, x) == (looked or (RegressionVerdict.INCONCLUSIVE, NUM_BLOCKS))
 
 
 def test_a_verdict_follows_from_the_interval():

@@ -16,14 +16,14 @@ from springbench.solvers.model.step_problem import NotPositiveDefinite, Unsuppor
 from tests.network_matrices import backward_error, grid_matrix, grid_springs, network_matrix, random_right_hand_sides
 
 
-def solved(Q, b):
+def solve_system(Q, b):
     out = np.full_like(b, np.nan)
     factor = ConjugateGradients(Q)
     factor.solve(b, out)
     return out, factor
 
 
-def shuffled(n):
+def build_shuffled_grid(n):
     springs = np.random.default_rng(0).permutation(n * n)[grid_springs(n, n)]
     return network_matrix(springs, 1.0, np.full(n * n, 1e-3))
 
@@ -48,7 +48,7 @@ CASES = {
     "one vertex": network_matrix([], 1.0, [2.0]),
     "a sheet below the coarsest size": grid_matrix(10, 10),
     "a sheet": grid_matrix(70, 70),
-    "a sheet numbered at random": shuffled(60),
+    "a sheet numbered at random": build_shuffled_grid(60),
     "a solid": grid_matrix(15, 15, 15),
     "a chain": network_matrix([(i, i + 1) for i in range(3999)], 1.0, np.full(4000, 0.01)),
     "a star": network_matrix([(0, i) for i in range(1, 4000)], 1.0, np.ones(4000)),
@@ -65,7 +65,7 @@ CASES = {
 def test_solves_networks_of_every_shape_in_few_iterations(name):
     Q = CASES[name]
     b = random_right_hand_sides(len(Q.indptr) - 1)
-    out, factor = solved(Q, b)
+    out, factor = solve_system(Q, b)
     expected = splu(Q.tocsc()).solve(b)
     # z underestimates the error by the cycle's rate, 0.1 to 0.3; conditions of 1e4 to 1e6 times eps are the rest.
     assert np.abs(out - expected).max() <= 1e-10 * np.abs(expected).max()
@@ -84,13 +84,13 @@ def test_solves_random_networks_as_superlu_does(seed, n, degree):
     b = random_right_hand_sides(n)
     expected = splu(Q.tocsc()).solve(b)
     # entries over four decades: the condition is at most 1e5, and z is within ten times the error
-    assert np.abs(solved(Q, b)[0] - expected).max() <= 1e-11 * np.abs(expected).max()
+    assert np.abs(solve_system(Q, b)[0] - expected).max() <= 1e-11 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("shapes", [[(60, 60), (240, 240)], [(13, 13, 13), (30, 30, 30)]], ids=["sheets", "solids"])
 def test_iterations_do_not_grow_with_the_mesh(shapes):
     counts = [
-        solved(grid_matrix(*shape), random_right_hand_sides(int(np.prod(shape))))[1].num_iterations for shape in shapes
+        solve_system(grid_matrix(*shape), random_right_hand_sides(int(np.prod(shape))))[1].num_iterations for shape in shapes
     ]
     # 16 times the vertices; without a coarse level they take four times the iterations
     assert counts[1] <= counts[0] + 3
@@ -99,8 +99,8 @@ def test_iterations_do_not_grow_with_the_mesh(shapes):
 def test_a_tolerance_in_positions_sees_through_the_units_of_rows():
     Q = grid_matrix(60, 60)
     b = random_right_hand_sides(3600)
-    out, factor = solved(Q, b)
-    scaled, again = solved(csr_array(Q * 2.0**-40), b * 2.0**-40)
+    out, factor = solve_system(Q, b)
+    scaled, again = solve_system(csr_array(Q * 2.0**-40), b * 2.0**-40)
     np.testing.assert_array_equal(scaled, out)  # powers of two change no digit
     assert again.num_iterations == factor.num_iterations
     # The rows of the pins are 1e5 times the others, and weigh no more.
@@ -108,7 +108,7 @@ def test_a_tolerance_in_positions_sees_through_the_units_of_rows():
 
 
 def test_the_last_corrections_explain_the_termination():
-    _, factor = solved(grid_matrix(60, 60), random_right_hand_sides(3600))
+    _, factor = solve_system(grid_matrix(60, 60), random_right_hand_sides(3600))
     assert len(factor.correction_ratios) == factor.num_iterations + 1
     assert factor.correction_ratios[-1].max() <= CG_RTOL < factor.correction_ratios[-2].max()
 
@@ -118,17 +118,17 @@ def test_right_hand_sides_that_are_zero_or_far_apart_do_not_disturb_each_other()
     b = random_right_hand_sides(3600)
     b[:, 1] = 0.0
     b[:, 2] *= 1e3
-    out, _ = solved(Q, b)
+    out, _ = solve_system(Q, b)
     expected = np.empty_like(b)
     SupernodalCholesky(Q).solve(b, expected)
     assert (out[:, 1] == 0.0).all()
     # the tolerance is that of the largest entry of all
     assert np.abs(out - expected).max() <= 1e-11 * np.abs(expected).max()
-    assert (solved(Q, np.zeros((3600, 3)))[0] == 0.0).all()
+    assert (solve_system(Q, np.zeros((3600, 3)))[0] == 0.0).all()
 
 
 def test_solves_no_equations_at_all():
-    assert solved(csr_array((0, 0)), np.empty((0, 3)))[0].shape == (0, 3)
+    assert solve_system(csr_array((0, 0)), np.empty((0, 3)))[0].shape == (0, 3)
 
 
 def test_a_solve_depends_on_its_right_hand_sides_alone():
@@ -149,7 +149,7 @@ def test_gives_the_same_bits_whatever_the_number_of_threads():
     try:
         for count in range(1, before + 1):
             numba.set_num_threads(count)
-            results.append(solved(Q, b)[0])
+            results.append(solve_system(Q, b)[0])
     finally:
         numba.set_num_threads(before)
     for out in results[1:]:
@@ -172,7 +172,7 @@ def test_names_a_vertex_of_negative_mass():
 def test_refuses_an_unconstrained_sheet():
     Q = network_matrix(grid_springs(60, 60), 1.0, np.zeros(3600))
     with pytest.raises(NotPositiveDefinite, match="not positive definite"):
-        solved(Q, random_right_hand_sides(3600))
+        solve_system(Q, random_right_hand_sides(3600))
 
 
 def test_names_a_vertex_near_springs_that_push():
@@ -182,11 +182,11 @@ def test_names_a_vertex_near_springs_that_push():
     diagonal = np.full(3600, 1e-3)
     diagonal[1830] = 10.0
     with pytest.raises(NotPositiveDefinite):
-        solved(network_matrix(springs, k, diagonal), random_right_hand_sides(3600))
+        solve_system(network_matrix(springs, k, diagonal), random_right_hand_sides(3600))
 
 
 def test_reports_stiffnesses_that_are_too_far_apart():
     springs, rng = grid_springs(100, 100), np.random.default_rng(0)
     Q = network_matrix(springs, 10.0 ** rng.uniform(0, 14, len(springs)), np.full(10000, 1e-3))
     with pytest.raises((Unsupported, NotPositiveDefinite), match="too far apart"):
-        solved(Q, random_right_hand_sides(10000))
+        solve_system(Q, random_right_hand_sides(10000))

@@ -13,20 +13,20 @@ from springbench.solvers.model.step_problem import Positions, StepStart
 
 from tests.contact_scenes import CONTACT_THICKNESS, OBSTACLE_SPECS, build_contact
 
-REACH = 1e-6
+CONTACT_RTOL = 1e-6
 """Relative: so near Newton's method comes to the first contact."""
 
 
-def bound(effect: ContactEffect, n: int, stiffness: float = 100.0) -> Energy:
+def build_energy(effect: ContactEffect, n: int, stiffness: float = 100.0) -> Energy:
     obstacles = tuple(one.build_obstacle() for one in effect.obstacles)
     return Energy(obstacles, CONTACT_THICKNESS, effect.friction, np.full(n, stiffness), 1e-6, 0.1, 1.0)
 
 
-def begun(energy: Energy, p: Positions, v: Positions, time: float = 0.0) -> Energy:
+def begin_step(energy: Energy, p: Positions, v: Positions, time: float = 0.0) -> Energy:
     return energy.begin_step(StepStart(p, v, time, p, 1.0, time + 1.0))
 
 
-def ways(obstacle: ConvexObstacle, count: int = 400) -> tuple[Positions, Positions]:
+def sample_displacements(obstacle: ConvexObstacle, count: int = 400) -> tuple[Positions, Positions]:
     """Starts outside of an obstacle and velocities towards it and past it."""
     rng = np.random.default_rng(0)
     p = rng.uniform(-1.2, 1.2, (4 * count, 3))
@@ -35,17 +35,17 @@ def ways(obstacle: ConvexObstacle, count: int = 400) -> tuple[Positions, Positio
     return p, rng.uniform(0.3, 2.0, (len(p), 1)) * (aim - p)
 
 
-def nearest_on_way(obstacle: ConvexObstacle, p: Positions, v: Positions) -> np.ndarray:
+def sample_least_distance(obstacle: ConvexObstacle, p: Positions, v: Positions) -> np.ndarray:
     """The least distance on the way, by many points."""
     return np.min([obstacle.signed_distance(p + s * v, 0.0) for s in np.linspace(0.0, 1.0, 2001)], axis=0)
 
 
 @pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_a_half_space_has_the_start_on_its_outer_side_and_the_obstacle_on_the_other(name):
-    energy = bound(build_contact(OBSTACLE_SPECS[name]), 400)
+    energy = build_energy(build_contact(OBSTACLE_SPECS[name]), 400)
     (obstacle,) = energy.obstacles
-    p, v = ways(obstacle)
-    planes = begun(energy, p, v).active_planes
+    p, v = sample_displacements(obstacle)
+    planes = begin_step(energy, p, v).active_planes
     assert len(planes.vertices) > 50
     outside = np.einsum("ij,ij->i", planes.normal, p[planes.vertices]) - planes.offset
     assert outside.min() >= -1e-12
@@ -58,13 +58,13 @@ def test_a_half_space_has_the_start_on_its_outer_side_and_the_obstacle_on_the_ot
 
 @pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_vertices_that_miss_an_obstacle_are_free_and_those_that_hit_it_are_stopped(name):
-    energy = bound(build_contact(OBSTACLE_SPECS[name]), 400)
+    energy = build_energy(build_contact(OBSTACLE_SPECS[name]), 400)
     (obstacle,) = energy.obstacles
-    p, v = ways(obstacle)
-    planes = begun(energy, p, v).active_planes
+    p, v = sample_displacements(obstacle)
+    planes = begin_step(energy, p, v).active_planes
     gap = np.full(len(p), np.inf)
     gap[planes.vertices] = np.einsum("ij,ij->i", planes.normal, (p + v)[planes.vertices]) - planes.offset
-    least = nearest_on_way(obstacle, p, v)
+    least = sample_least_distance(obstacle, p, v)
     misses, hits = least > CONTACT_THICKNESS * (1 + 1e-3), least < CONTACT_THICKNESS * (1 - 1e-2)
     assert misses.sum() > 20
     assert hits.sum() > 20
@@ -74,40 +74,40 @@ def test_vertices_that_miss_an_obstacle_are_free_and_those_that_hit_it_are_stopp
 
 @pytest.mark.parametrize("name", ["plane", "sphere", "capsule", "plate"])
 def test_a_half_space_touches_the_first_contact_of_a_path(name):
-    energy = bound(build_contact(OBSTACLE_SPECS[name]), 400)
+    energy = build_energy(build_contact(OBSTACLE_SPECS[name]), 400)
     (obstacle,) = energy.obstacles
-    p, v = ways(obstacle)
-    planes = begun(energy, p, v).active_planes
+    p, v = sample_displacements(obstacle)
+    planes = begin_step(energy, p, v).active_planes
     a, d = p[planes.vertices], v[planes.vertices]
     rate = np.einsum("ij,ij->i", planes.normal, d)
     hit = rate < -1e-3
     s = ((planes.offset - np.einsum("ij,ij->i", planes.normal, a)) / np.where(hit, rate, 1.0))[hit]
-    crossed = (s <= 1.0) & (nearest_on_way(obstacle, a[hit], d[hit]) < 0.99 * CONTACT_THICKNESS)
+    crossed = (s <= 1.0) & (sample_least_distance(obstacle, a[hit], d[hit]) < 0.99 * CONTACT_THICKNESS)
     there = obstacle.signed_distance((a[hit] + s[:, None] * d[hit])[crossed], 0.0)
     assert crossed.sum() > 20
-    # The stop's REACH is relative to the radius with the thickness, 0.31 m at most.
-    np.testing.assert_allclose(there, CONTACT_THICKNESS, rtol=0, atol=2 * REACH * 0.31)
+    # The stop's CONTACT_RTOL is relative to the radius with the thickness, 0.31 m at most.
+    np.testing.assert_allclose(there, CONTACT_THICKNESS, rtol=0, atol=2 * CONTACT_RTOL * 0.31)
 
 
 def test_nothing_near_is_idle_and_costs_no_half_space():
-    energy = bound(build_contact(OBSTACLE_SPECS["sphere"], OBSTACLE_SPECS["capsule"]), 3)
+    energy = build_energy(build_contact(OBSTACLE_SPECS["sphere"], OBSTACLE_SPECS["capsule"]), 3)
     p = np.array([[5.0, 5.0, 5.0], [5.1, 5.0, 5.0], [5.0, 5.3, 5.0]])
-    step = begun(energy, p, np.zeros_like(p))
+    step = begin_step(energy, p, np.zeros_like(p))
     out = np.zeros_like(p)
     step.add_gradient(p, out)
     assert step.has_no_active_collisions()
     assert (step.value(p), float(np.abs(out).max()), step.hessian(p).nnz) == (0.0, 0.0, 0)
-    assert not begun(energy, p, np.full_like(p, -5.0)).has_no_active_collisions()
+    assert not begin_step(energy, p, np.full_like(p, -5.0)).has_no_active_collisions()
 
 
 @pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_gradient_and_hessian_are_differences_of_the_value(name):
     """At points that press, slip and stick; the energy is smooth but where one of them begins."""
-    energy = bound(build_contact(OBSTACLE_SPECS[name], friction=0.5), 200)
+    energy = build_energy(build_contact(OBSTACLE_SPECS[name], friction=0.5), 200)
     (obstacle,) = energy.obstacles
-    p, _ = ways(obstacle, 200)
+    p, _ = sample_displacements(obstacle, 200)
     rng = np.random.default_rng(2)
-    step = begun(energy, p, rng.normal(size=p.shape))
+    step = begin_step(energy, p, rng.normal(size=p.shape))
     grip = np.where(np.arange(len(step.active_planes.vertices)) % 2, 3.0, 0.0)
     step = replace(step, active_planes=step.active_planes._replace(friction_limit=grip), smoothing_length=0.3)
     x, u, h = p + 0.5 * rng.normal(size=p.shape), rng.normal(size=p.shape), 1e-7
@@ -125,11 +125,11 @@ def test_gradient_and_hessian_are_differences_of_the_value(name):
 
 @pytest.mark.parametrize("name", OBSTACLE_SPECS)
 def test_cautious_rows_majorise_the_energy(name):
-    energy = bound(build_contact(OBSTACLE_SPECS[name], friction=0.5), 200)
+    energy = build_energy(build_contact(OBSTACLE_SPECS[name], friction=0.5), 200)
     (obstacle,) = energy.obstacles
-    p, _ = ways(obstacle, 200)
+    p, _ = sample_displacements(obstacle, 200)
     rng = np.random.default_rng(3)
-    step = begun(energy, p, rng.normal(size=p.shape))
+    step = begin_step(energy, p, rng.normal(size=p.shape))
     step = replace(
         step,
         active_planes=step.active_planes._replace(friction_limit=np.full(len(step.active_planes.vertices), 3.0)),

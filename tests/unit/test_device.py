@@ -107,7 +107,7 @@ def test_events_distinguish_kernels_and_transfers() -> None:
     assert compute_event_seconds(None) == {}, "of a device without a clock nothing is told"
 
 
-class Refused(Exception):
+class NvmlRefusal(Exception):
     """As NVIDIA's management library refuses."""
 
 
@@ -116,7 +116,7 @@ def nvml(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """A management library that reports a clock and no power."""
 
     def refuses(*_: Any) -> float:
-        raise Refused
+        raise NvmlRefusal
 
     made = SimpleNamespace(
         NVML_CLOCK_SM=1,

@@ -19,11 +19,11 @@ from springbench.solvers.iteration.device_interface import SIMULATOR_NAME
 from typer.testing import CliRunner
 
 from tests.bench.device import compare_sides
-from tests.synthetic_device_rows import MEASURED, build_device_rows, write_device_results
+from tests.synthetic_device_rows import DEVICE_ROWS, build_device_rows, write_device_results
 from tests.unit.test_machine_comparison import table_of
 
 
-def refused(number: int, reason: str) -> dict[str, Any]:
+def build_refused_row(number: int, reason: str) -> dict[str, Any]:
     row = build_device_rows(number, "vbd", 0, 0.0, on=True)[0]
     gone = ("vertices", "seconds", "termination_reason", "frame", "device", "kernel_seconds")
     return row | dict.fromkeys(gone) | {"phase": "run", "status": "unsupported", "reason": reason}
@@ -34,7 +34,7 @@ def describe_report(some: list[dict[str, Any]], config: str = "configs/gpu.yaml"
 
 
 def test_a_device_pays_from_where_it_is_faster_on_all_larger_meshes() -> None:
-    said = describe_report(MEASURED)
+    said = describe_report(DEVICE_ROWS)
     assert "cloth, to 0.001 of the residual at a step's start: a device pays from 100,000 vertices on" in said
     assert "vbd there is 4 times as fast as hybrid on the processor" in said
     assert "vbd there is 30 times as fast as numba on the processor at 1,000,000" in said
@@ -60,7 +60,7 @@ def test_a_mesh_in_between_that_is_slower_moves_the_size(ratios: list[float], fi
 
 
 def test_without_a_device_nothing_is_claimed_and_the_command_is_named() -> None:
-    said = describe_report([*build_device_rows(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")])
+    said = describe_report([*build_device_rows(0, "hybrid", 10_000, 0.1), build_refused_row(1, "vbd: there is no CUDA device")])
     assert "nothing is said of what one saves (vbd: there is no CUDA device)" in said
     assert "`.venv/bin/springbench run configs/gpu.yaml` fills this in" in said
     assert "times as fast" not in said
@@ -78,7 +78,7 @@ def test_times_of_the_simulator_are_no_devices() -> None:
 
 
 def test_what_has_no_time_is_reported() -> None:
-    some = [*build_device_rows(0, "vbd", 100, 0.1, on=True), refused(1, "the device has no memory left")]
+    some = [*build_device_rows(0, "vbd", 100, 0.1, on=True), build_refused_row(1, "the device has no memory left")]
     said = describe_report(some)
     assert "1 of 2 runs on a device have no time: the device has no memory left." in said
     assert "at no size did both sides get there (the device alone), so nothing is compared" in said
@@ -86,8 +86,8 @@ def test_what_has_no_time_is_reported() -> None:
 
 @pytest.mark.parametrize("there", [True, False], ids=["measured", "no device"])
 def test_the_report_draws_the_ratio_and_the_page_states_it(there: bool, tmp_path: Path) -> None:
-    failed = [*build_device_rows(0, "hybrid", 10_000, 0.1), refused(1, "vbd: there is no CUDA device")]
-    saved = MEASURED if there else failed
+    failed = [*build_device_rows(0, "hybrid", 10_000, 0.1), build_refused_row(1, "vbd: there is no CUDA device")]
+    saved = DEVICE_ROWS if there else failed
     write_device_results(tmp_path / "r" / "gpu", saved)
     done = CliRunner().invoke(app, ["report", str(tmp_path / "r"), "--no-viewer"])
     assert done.exit_code == 0, done.output

@@ -44,22 +44,22 @@ from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.scene_builders import build_test_scene
 
-DT, CONVERGED = 0.05, StopRule(100, 1e-12)
+DT, CONVERGED_STOP = 0.05, StopRule(100, 1e-12)
 ROUND_OFF = 1e-12
 """Of a balance, relative to the energies in it: a few hundred sums of float64, each within 2e-16."""
 SPRINGS = SpringsEffect(stretch=50.0, scaling_rule="fixed")
-PINNED = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
+FIRST_PIN = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
 SCENES = Path("configs/scenes")
 CONSERVATIVE = ("curtain", "single-spring", "stiff-cloth-sway")
 """Scenes without damping, friction and sources."""
-DRIVEN = ("hanging-cloth", "flag-in-gusts", "heavy-bob", "rope-bridge", "spinning-skirt", "tower")
+DRIVEN_SCENES = ("hanging-cloth", "flag-in-gusts", "heavy-bob", "rope-bridge", "spinning-skirt", "tower")
 
 
 def pendulum(*effects: Any, integrator: str = "implicit-euler", **settings: Any) -> Scene:
     """A mass of 1 kg on a spring of 1 m, pinned at its other end, that falls from the horizontal."""
     scene = build_test_scene(
         ChainMesh(length=1.0),
-        *(effects or (SPRINGS, PINNED, GravityEffect())),
+        *(effects or (SPRINGS, FIRST_PIN, GravityEffect())),
         size=2,
         mass=2.0,
         time_step=DT,
@@ -71,14 +71,14 @@ def pendulum(*effects: Any, integrator: str = "implicit-euler", **settings: Any)
 
 
 def observe(
-    scene: Scene, frames: int, solver: str = "newton", stop: StopRule = CONVERGED
+    scene: Scene, frames: int, solver: str = "newton", stop: StopRule = CONVERGED_STOP
 ) -> list[tuple[SimulationStep, StepDissipation]]:
     budget, prepared = DissipationBudget(scene), prepare(scene, load_target(SOLVERS[solver])())
     run = simulate_scene(scene, prepared, stop, initial_guess="previous", frames=frames)
     return [(step, budget.add_step(step)) for step in run]
 
 
-def shipped(name: str, integrator: str = "implicit-euler") -> Scene:
+def build_shipped_scene(name: str, integrator: str = "implicit-euler") -> Scene:
     spec = load_scene(SCENES / f"{name}.yaml")
     return build_scene(spec, min(spec.default_size or 8, 8), integrator)
 
@@ -109,7 +109,7 @@ def test_implicit_euler_dissipates_as_its_formula_states():
 
 def test_midpoint_dissipates_nothing_of_a_linear_motion():
     """A free fall, and a spring that swings along itself, of which implicit Euler takes a third and more."""
-    for effects, speed in (((GravityEffect(),), 1.0), ((SPRINGS, PINNED), 0.1)):
+    for effects, speed in (((GravityEffect(),), 1.0), ((SPRINGS, FIRST_PIN), 0.1)):
         by = {
             name: observe(pendulum(*effects, integrator=name, velocity=(speed, 0.0, 0.0)), 20)
             for name in ("midpoint", "implicit-euler")
@@ -123,7 +123,7 @@ def test_midpoint_dissipates_nothing_of_a_linear_motion():
 def test_damping_dissipates_as_its_formula_states():
     """Dashpots c |n.v|^2 dt; drag of all vertices c m v^2 dt; a filter takes kinetic energy before the step."""
     (step, found), *_ = observe(
-        pendulum(SPRINGS, PINNED, DashpotsEffect(stretch=2.0, scaling_rule="fixed"), velocity=(1, 0, 0)), 1
+        pendulum(SPRINGS, FIRST_PIN, DashpotsEffect(stretch=2.0, scaling_rule="fixed"), velocity=(1, 0, 0)), 1
     )
     assert found.dissipation_damping == pytest.approx(2.0 * step.state.motion.velocity[1, 0] ** 2 * DT, rel=1e-9)
     (_, found), *_ = observe(pendulum(EtherDragEffect(decay_rate=2.0), velocity=(1.0, 0.0, 0.0)), 1)
@@ -132,16 +132,16 @@ def test_damping_dissipates_as_its_formula_states():
     assert found.dissipation_damping == pytest.approx(0.5 * step.state.motion.velocity[0, 0] ** 2 * DT, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", [*DRIVEN, *CONSERVATIVE])
+@pytest.mark.parametrize("name", [*DRIVEN_SCENES, *CONSERVATIVE])
 def test_the_balance_closes_to_round_off_in_every_frame(name: str):
-    found = [now for _, now in observe(shipped(name), 5, stop=StopRule(20, 1e-6))]
+    found = [now for _, now in observe(build_shipped_scene(name), 5, stop=StopRule(20, 1e-6))]
     assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
     assert all(now.balance_error is not None for now in found)
 
 
 @pytest.mark.parametrize("integrator", ["midpoint", "bdf2", "sdirk-4", "esdirk-4", "tr-bdf2", "newmark", "hht"])
 def test_the_balance_closes_by_every_integrator(integrator: str):
-    found = [now for _, now in observe(shipped("hanging-cloth", integrator), 3, stop=StopRule(20, 1e-6))]
+    found = [now for _, now in observe(build_shipped_scene("hanging-cloth", integrator), 3, stop=StopRule(20, 1e-6))]
     assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
 
 
@@ -178,7 +178,7 @@ def test_pins_that_the_start_has_displaced_are_projected_before_the_motion(integ
 def test_a_perturbed_start_is_dissipated_alike_with_exact_and_penalty_pins(integrator: str):
     """Energy that a method of order 4 takes is a hundredth; accelerations of penalties were 10^4 times all energy."""
     lost = list[float]()
-    for scene in (shipped("spinning-skirt", integrator), make_pins_exact(shipped("spinning-skirt", integrator))):
+    for scene in (build_shipped_scene("spinning-skirt", integrator), make_pins_exact(build_shipped_scene("spinning-skirt", integrator))):
         found = [now for _, now in observe(scene, 3)]
         assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
         lost.append(sum(now.dissipation_integrator or 0.0 for now in found) / (found[-1].provided_energy or 1.0))
@@ -188,7 +188,7 @@ def test_a_perturbed_start_is_dissipated_alike_with_exact_and_penalty_pins(integ
 
 def test_energies_of_the_last_frame_are_those_of_the_start_plus_all_terms():
     """The sum over frames, with energies of the ends from positions and velocities alone."""
-    scene = shipped("curtain")
+    scene = build_shipped_scene("curtain")
     found = observe(scene, 8, "sparse", StopRule(3))
     last, start = found[-1][1], scene.mesh.rest_positions
     dissipated = sum(now.dissipated_energy for _, now in found)
@@ -204,7 +204,7 @@ def test_energies_of_the_last_frame_are_those_of_the_start_plus_all_terms():
 
 def test_an_unconverged_solve_takes_more_than_a_converged_one():
     lost = [
-        sum(abs(now.dissipation_solve or 0.0) for _, now in observe(shipped("hanging-cloth"), 5, "sparse", StopRule(n)))
+        sum(abs(now.dissipation_solve or 0.0) for _, now in observe(build_shipped_scene("hanging-cloth"), 5, "sparse", StopRule(n)))
         for n in (2, 20, 200)
     ]
     assert lost[0] > 3.0 * lost[1] > 9.0 * lost[2]
@@ -213,7 +213,7 @@ def test_an_unconverged_solve_takes_more_than_a_converged_one():
 @pytest.mark.slow
 def test_contact_is_separated_from_friction():
     """A block on a slope: what friction takes is its force times the way, and obstacles at rest do no work."""
-    found = [now for _, now in observe(shipped("block-slide"), 25)]
+    found = [now for _, now in observe(build_shipped_scene("block-slide"), 25)]
     assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
     assert sum(now.dissipation_friction or 0.0 for now in found) > 0.1 * (found[-1].provided_energy or 0.0)
     assert max(abs(now.source_work or 0.0) for now in found) == 0.0
@@ -221,13 +221,13 @@ def test_contact_is_separated_from_friction():
 
 @pytest.mark.slow
 def test_obstacles_that_move_are_sources():
-    found = [now for _, now in observe(shipped("net-catches-ball"), 40)]
+    found = [now for _, now in observe(build_shipped_scene("net-catches-ball"), 40)]
     assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
     assert sum(now.source_work or 0.0 for now in found) > 0.0
 
 
 def test_tensions_of_exact_lengths_do_no_work_as_a_residual():
-    scene = pendulum(SpringsEffect(stretch="exact"), PINNED, GravityEffect())
+    scene = pendulum(SpringsEffect(stretch="exact"), FIRST_PIN, GravityEffect())
     found = [now for _, now in observe(scene, 10, "avbd", StopRule(400, 1e-12))]
     assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
     assert max(abs(now.dissipation_solve or 0.0) for now in found) < 1e-6
@@ -237,7 +237,7 @@ def test_tensions_of_exact_lengths_do_no_work_as_a_residual():
 @pytest.mark.parametrize("name", ["curtain", "hanging-cloth", "flag-in-gusts", "spinning-skirt"])
 def test_an_accurate_integrator_of_frames_takes_no_more_than_the_error_of_its_quadrature(name: str):
     """Dormand and Prince's method is exact to 1e-6 here: what it seems to take is the error of the other terms."""
-    for step, now in observe(shipped(name, "substepping"), 5, "dormand-prince-8"):
+    for step, now in observe(build_shipped_scene(name, "substepping"), 5, "dormand-prince-8"):
         assert abs(now.dissipation_integrator or 0.0) <= 4.0 * (now.balance_error or 0.0) + 1e-6 * size_of(now)
         assert (now.balance_error or 0.0) <= 1e-3 * size_of(now)
         assert now.dissipation_solve is now.dissipation_engine is None
@@ -247,7 +247,7 @@ def test_an_accurate_integrator_of_frames_takes_no_more_than_the_error_of_its_qu
 
 def test_damping_within_frames_is_that_of_small_steps():
     """The drag of a pendulum in three frames, against implicit Euler with steps a twentieth as long."""
-    effects = SPRINGS, PINNED, GravityEffect(), AirDragEffect(coefficient=0.5)
+    effects = SPRINGS, FIRST_PIN, GravityEffect(), AirDragEffect(coefficient=0.5)
     frames = [now for _, now in observe(pendulum(*effects, integrator="substepping"), 3, "dormand-prince-8")]
     scene = pendulum(*effects)
     scene = replace(scene, system=replace(scene.system, time_step=DT / 20))

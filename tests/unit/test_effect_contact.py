@@ -138,7 +138,7 @@ def net(**pins: Any) -> PinsEffect:
     return PinsEffect.model_validate({"parts": ["corners"]} | pins)
 
 
-REFUSED = {
+CONFLICTS = {
     "thickness": ([build_contact(OBSTACLE_SPECS["plane"], min_distance=0.3)], ["contact", "min_distance", "springs"]),
     "pin": (
         [build_contact({"kind": "sphere", "center": (0.5, 0, 0.5), "radius": 0.1}), net()],
@@ -158,9 +158,9 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@pytest.mark.parametrize("case", CONFLICTS)
 def test_conflicts_are_refused_with_both_names(case):
-    effects, named = REFUSED[case]
+    effects, named = CONFLICTS[case]
     with pytest.raises(InputError) as refusal:
         build_test_scene(GridMesh(), SpringsEffect(stretch=300.0), *effects, size=6)
     assert all(name in str(refusal.value) for name in named)

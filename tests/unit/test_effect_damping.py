@@ -117,7 +117,7 @@ def oscillator(*damping: SceneEffect) -> Scene:
     return with_integrator(made, "midpoint")
 
 
-DAMPED = {
+OSCILLATORS = {
     "dashpots": (DashpotsEffect(stretch=1.5), 1.5),
     "Rayleigh, stiffness": (RayleighEffect(stiffness_coefficient=0.015), 1.5),
     "Rayleigh, masses": (RayleighEffect(mass_coefficient=3.0), 1.5),
@@ -125,10 +125,10 @@ DAMPED = {
 }
 
 
-@pytest.mark.parametrize("case", DAMPED)
+@pytest.mark.parametrize("case", OSCILLATORS)
 def test_an_oscillator_decays_at_its_rate(case):
     """x'' + 2 s x' + w^2 x = 0 with s = c, a/2, b w^2/2; w^2 = 200, so all of these make 1.5 in all."""
-    effect, rate = DAMPED[case]
+    effect, rate = OSCILLATORS[case]
     w = (200.0 - rate**2) ** 0.5
     steps = round(4 * np.pi / w / 0.002)  # two periods
     path = moving(oscillator(effect), np.zeros((2, 3)), steps, np.array([[-0.005, 0, 0], [1.005, 0, 0]]))

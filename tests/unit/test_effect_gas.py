@@ -36,7 +36,7 @@ RADIUS = 0.5
 MESH = BalloonMesh(radius=RADIUS).build_mesh(3)
 
 
-def bound(mesh=MESH, pressure=100.0) -> gas_energy.Gas:
+def build_gas(mesh=MESH, pressure=100.0) -> gas_energy.Gas:
     (energy,) = GasEffect(pressure=pressure).build_contribution(mesh, np.ones(len(mesh.rest_positions)), 0.1).energies
     assert isinstance(energy, gas_energy.Gas)
     return energy
@@ -57,7 +57,7 @@ def test_a_balloon_swells_to_the_radius_of_a_membrane(pressure):
 
 
 def test_pressure_times_volume_stays_what_it_is_at_rest():
-    energy = bound()
+    energy = build_gas()
     for scale in (0.5, 1.0, 3.0):
         g = np.zeros_like(MESH.rest_positions)
         energy.add_gradient(scale * MESH.rest_positions, g)
@@ -75,7 +75,7 @@ def test_the_volume_is_that_of_the_polyhedron_wherever_it_is():
 
 
 def test_gas_inside_out_has_no_finite_energy_and_is_pushed_outwards():
-    energy = bound()
+    energy = build_gas()
     out = np.zeros_like(MESH.rest_positions)
     flipped = -MESH.rest_positions
     assert energy.value(flipped) == np.inf
@@ -87,12 +87,12 @@ def test_gas_inside_out_has_no_finite_energy_and_is_pushed_outwards():
 
 def test_a_mesh_turned_inside_out_is_turned_back():
     turned = replace(MESH, triangles=MESH.triangles[:, ::-1].copy())
-    assert bound(turned).rest_volume == pytest.approx(bound().rest_volume, rel=1e-14)
-    assert bound(turned).value(2.0 * MESH.rest_positions) < 0.0
+    assert build_gas(turned).rest_volume == pytest.approx(build_gas().rest_volume, rel=1e-14)
+    assert build_gas(turned).value(2.0 * MESH.rest_positions) < 0.0
 
 
 def test_the_hessian_is_sparse_but_for_one_column():
-    energy, p = bound(), 1.1 * MESH.rest_positions
+    energy, p = build_gas(), 1.1 * MESH.rest_positions
     column = energy.low_rank_columns(p).ravel()
     sparse = energy.sparse_hessian(p)
     assert sparse.nnz <= 9 * (len(p) + 2 * len(MESH.springs))
@@ -125,7 +125,7 @@ def without(k: int):
     return replace(MESH, triangles=np.delete(MESH.triangles, k, axis=0))
 
 
-def flipped(k: int):
+def flip_triangle(k: int):
     triangles = MESH.triangles.copy()
     triangles[k] = triangles[k, ::-1]
     return replace(MESH, triangles=triangles)
@@ -136,7 +136,7 @@ BAD = {
     "a chain": (ChainMesh().build_mesh(4), "no triangles"),
     "a sheet": (GridMesh().build_mesh(3), "8 edges belong to one triangle only"),
     "a hole": (without(5), "3 edges belong to one triangle only"),
-    "a triangle that faces inwards": (flipped(5), "two triangles traverse the edge in the same direction,"),
+    "a triangle that faces inwards": (flip_triangle(5), "two triangles traverse the edge in the same direction,"),
     "no volume": (FLAT, "encloses no volume"),
 }
 
@@ -145,10 +145,10 @@ BAD = {
 def test_a_mesh_that_is_not_closed_is_refused(case):
     mesh, message = BAD[case]
     with pytest.raises(InputError, match=message):
-        bound(mesh)
+        build_gas(mesh)
 
 
-def swollen(size: int, pressure: float) -> StepProblem:
+def build_balloon_step(size: int, pressure: float) -> StepProblem:
     """A step of a balloon. At 200 Pa it swells to more than twice its radius: there the springs soften as it grows, and
     the gas preserves its volume, whose stiffness is the dense part of the Hessian."""
     made = build_test_scene(
@@ -165,7 +165,7 @@ def swollen(size: int, pressure: float) -> StepProblem:
     "solver", [NewtonSolver(), HybridNewton(), NewtonCG(), Lbfgs()], ids=lambda solver: type(solver).__name__
 )
 def test_gas_is_minimised_where_its_sparse_part_alone_has_saddles(solver):
-    given = swollen(4, 200.0)
+    given = build_balloon_step(4, 200.0)
     found = solver.prepare(given.system).solve(given, StopRule(2000, 1e-9))
     wanted = NewtonSolver().prepare(given.system).solve(given, StopRule(100, 1e-12)).positions
     np.testing.assert_allclose(found.positions, wanted, atol=1e-7)  # 1e-9 of the first step's length, over what is soft
@@ -180,7 +180,7 @@ def test_gas_is_minimised_where_its_sparse_part_alone_has_saddles(solver):
 @pytest.mark.parametrize("pressure", [2.0, 200.0])
 def test_a_factor_of_gas_is_that_of_its_whole_hessian(pressure, at_rest):
     """Where the sparse part is definite, and where it is not; multiplied, solved, and distinguished from a saddle."""
-    given = swollen(3, pressure)
+    given = build_balloon_step(3, pressure)
     rest = NewtonSolver().prepare(given.system).solve(given, StopRule(100, 1e-12)).positions
     step, p = StepObjective(FixedObjective(given.system), given), rest if at_rest else given.current_positions
     hessian, free = step.hessian(p), given.system.free_vertices
@@ -197,7 +197,7 @@ def test_a_factor_of_gas_is_that_of_its_whole_hessian(pressure, at_rest):
 
 def test_a_balloon_of_a_thousand_vertices_ends_at_a_certified_minimum():
     """1,212 vertices: a dense Hessian would have 13 million entries."""
-    given = swollen(11, 200.0)
+    given = build_balloon_step(11, 200.0)
     assert given.system.num_vertices > 1000
     found = NewtonSolver().prepare(given.system).solve(given, StopRule(100, 1e-9))
     assert found.termination_reason == "converged"

@@ -25,7 +25,7 @@ from springbench.solvers.registry import SOLVERS, load_target
 from tests.oracles.verify_scene import verify_terms
 
 ROWS = tuple(VertexSelection(indices=tuple(range(first, first + 5))) for first in (0, 25))
-SEWN = SewingEffect(
+SEWING = SewingEffect(
     first_row=ROWS[0], second_row=ROWS[1], stiffness=2e4, start_time=0.02, end_time=0.2, final_length=0.05
 )
 
@@ -41,7 +41,7 @@ def gaps(p: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("solver", ["newton", "numba", "admm"])
 def test_a_seam_closes_when_it_should_and_stays_closed(solver):
-    made = build_scene(spec(SEWN), 5)
+    made = build_scene(spec(SEWING), 5)
     steps = simulate_scene(
         made,
         prepare(made, load_target(SOLVERS[solver])()),
@@ -58,7 +58,7 @@ def test_a_seam_closes_when_it_should_and_stays_closed(solver):
 
 
 def test_with_self_contact_the_panels_meet_and_pass_nowhere():
-    made = build_scene(spec(SEWN, SelfContactEffect(min_distance=0.01)), 5)
+    made = build_scene(spec(SEWING, SelfContactEffect(min_distance=0.01)), 5)
     last = made.mesh.rest_positions
     for step in simulate_scene(
         made,
@@ -73,17 +73,17 @@ def test_with_self_contact_the_panels_meet_and_pass_nowhere():
 
 
 def test_each_vertex_is_sewn_to_what_is_nearest():
-    made = build_scene(spec(SEWN.model_copy(update={"second_row": VertexSelection(indices=(25, 29))})), 5)
+    made = build_scene(spec(SEWING.model_copy(update={"second_row": VertexSelection(indices=(25, 29))})), 5)
     (energy,) = (e for e in made.system.energies if isinstance(e, Energy))
     assert energy.edges.tolist() == [[0, 25], [1, 25], [2, 25], [3, 29], [4, 29]]
 
 
 def test_the_reference_terms_agree():
-    assert verify_terms(spec(SEWN), build_scene(spec(SEWN), 5), "implicit-euler") == "agrees"
+    assert verify_terms(spec(SEWING), build_scene(spec(SEWING), 5), "implicit-euler") == "agrees"
 
 
 def test_rows_that_share_a_vertex_and_ends_before_the_beginning_are_refused():
     with pytest.raises(InputError, match="sewing: vertex 0 is in both rows"):
-        build_scene(spec(SEWN.model_copy(update={"second_row": VertexSelection(indices=(0,))})), 3)
+        build_scene(spec(SEWING.model_copy(update={"second_row": VertexSelection(indices=(0,))})), 3)
     with pytest.raises(ValidationError, match="end at 0 s, before they begin at 1 s"):
         SewingEffect(first_row=ROWS[0], second_row=ROWS[1], stiffness=1.0, start_time=1.0, end_time=0.0)

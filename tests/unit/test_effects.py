@@ -34,7 +34,7 @@ DT = 0.1
 RNG = np.random.default_rng(0)
 P, V, T = RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3)), 1.7
 
-ABSENT = [
+EFFECTS_OF_NOTHING = [
     GravityEffect(acceleration=(0.0, 0.0, 0.0)),
     ConstantForceEffect(force=(0.0, 0.0, 0.0)),
     WindEffect(strength=0.0),
@@ -46,23 +46,23 @@ ABSENT = [
 
 
 def force_of(effect) -> np.ndarray:
-    (force,) = bound(effect).forces
+    (force,) = build_contribution(effect).forces
     return force(P, V, T)
 
 
-def bound(effect) -> EffectContribution:
+def build_contribution(effect) -> EffectContribution:
     return effect.build_contribution(MESH, MASS, DT)
 
 
-def chosen(**selectors) -> list[int]:
-    (pin,) = bound(PinsEffect(**selectors)).pins
+def select_vertices(**selectors) -> list[int]:
+    (pin,) = build_contribution(PinsEffect(**selectors)).pins
     np.testing.assert_array_equal(pin.targets, MESH.rest_positions[pin.vertices])
     return pin.vertices.tolist()
 
 
-@pytest.mark.parametrize("effect", ABSENT, ids=repr)
+@pytest.mark.parametrize("effect", EFFECTS_OF_NOTHING, ids=repr)
 def test_an_effect_of_nothing_leaves_nothing(effect):
-    contribution = bound(effect)
+    contribution = build_contribution(effect)
     assert all(getattr(contribution, field.name) == () for field in fields(contribution))
 
 
@@ -135,11 +135,11 @@ def test_the_assignments_wind_per_share_is_the_mean_over_the_mass():
 
 
 def test_ether_drag_scales_the_velocity_once_a_step():
-    (decay,) = bound(EtherDragEffect(decay_rate=3.0)).velocity_filters
+    (decay,) = build_contribution(EtherDragEffect(decay_rate=3.0)).velocity_filters
     np.testing.assert_allclose(decay(V), np.exp(-3.0 * DT) * V, rtol=1e-15)
 
 
-SELECTED = {
+SELECTIONS = {
     "a part": ({"parts": ("top",)}, MESH.parts["top"]),
     "two parts that overlap": (
         {"parts": ("top", "left")},
@@ -159,25 +159,25 @@ SELECTED = {
 }
 
 
-@pytest.mark.parametrize("case", SELECTED)
+@pytest.mark.parametrize("case", SELECTIONS)
 def test_pins_fix_the_vertices_that_their_selectors_name(case):
-    selectors, wanted = SELECTED[case]
-    assert chosen(**selectors) == list(wanted)
+    selectors, wanted = SELECTIONS[case]
+    assert select_vertices(**selectors) == list(wanted)
 
 
 @pytest.mark.parametrize(("weight", "wanted"), [(5.0, 5.0), ("exact", np.inf)])
 def test_pins_have_their_weight(weight, wanted):
-    (pin,) = bound(PinsEffect(parts=("top",), weight=weight)).pins
+    (pin,) = build_contribution(PinsEffect(parts=("top",), weight=weight)).pins
     assert pin.weight == wanted
 
 
 def test_pins_weigh_what_the_assignments_do_by_default():
-    (pin,) = bound(PinsEffect(parts=("top",))).pins
+    (pin,) = build_contribution(PinsEffect(parts=("top",))).pins
     assert pin.weight == 1e10
 
 
 SHEET = GridMesh().build_mesh(5)
-HOLED = replace(
+SHEET_WITH_HOLE = replace(
     SHEET,
     triangles=SHEET.triangles[~(SHEET.triangles == 12).any(axis=1)],
     attributes={"weight": np.arange(25) / 25},
@@ -198,9 +198,9 @@ HOLED = replace(
 def test_holes_and_numbers_of_a_file_select_the_vertices_of_the_reference(selectors, wanted):
     pins = PinsEffect.model_validate(selectors)
     assert (
-        pins.select_vertices(HOLED, "pins").tolist()
+        pins.select_vertices(SHEET_WITH_HOLE, "pins").tolist()
         == wanted
-        == reference_selection(SceneDeclaration(HOLED, np.ones(25), DT, ()), pins)
+        == reference_selection(SceneDeclaration(SHEET_WITH_HOLE, np.ones(25), DT, ()), pins)
     )
 
 
@@ -212,7 +212,7 @@ def test_a_holeless_sheet_and_unknown_numbers_are_refused():
         ({"sphere": {"center": (9.0, 0.0, 0.0), "radius": 0.1}}, "no vertex of the mesh lies in the sphere"),
     ):
         with pytest.raises(InputError, match=message):
-            bound(PinsEffect.model_validate(selectors))
+            build_contribution(PinsEffect.model_validate(selectors))
 
 
 def test_selectors_that_are_not_used_are_not_written_down():
@@ -227,18 +227,18 @@ def test_selectors_that_are_not_used_are_not_written_down():
     }
 
 
-REFUSED = {
+REFUSED_SELECTORS = {
     "an unknown part": ({"parts": ("topp",)}, "did you mean 'top'"),
     "a vertex beyond the last": ({"indices": (0, N)}, f"got {N}; the mesh has the vertices 0 to {N - 1}"),
     "an empty box": ({"box": {"low": (5.0, 5.0, 5.0), "high": (6.0, 6.0, 6.0)}}, "no vertex of the mesh lies in"),
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@pytest.mark.parametrize("case", REFUSED_SELECTORS)
 def test_pins_that_do_not_fit_the_mesh_are_refused(case):
-    selectors, message = REFUSED[case]
+    selectors, message = REFUSED_SELECTORS[case]
     with pytest.raises(InputError, match=message):
-        bound(PinsEffect(**selectors))
+        build_contribution(PinsEffect(**selectors))
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_invalid_pins_are_refused(data):
 
 
 def test_springs_take_the_stiffness_of_their_rule():
-    (energy,) = bound(SpringsEffect(stretch=100.0, shear=20.0, bend=0.01)).energies
+    (energy,) = build_contribution(SpringsEffect(stretch=100.0, shear=20.0, bend=0.01)).energies
     assert isinstance(energy, SpringsEnergy)
     wanted = compute_spring_stiffness(MESH, scaling_rule="continuum", stretch=100.0, shear=20.0, bend=0.01)
     np.testing.assert_array_equal(energy.stiffness, wanted)
@@ -261,18 +261,18 @@ def test_springs_take_the_stiffness_of_their_rule():
 
 
 def test_springs_shear_as_they_stretch_by_default():
-    (energy,) = bound(SpringsEffect(stretch=100.0, scaling_rule="fixed")).energies
+    (energy,) = build_contribution(SpringsEffect(stretch=100.0, scaling_rule="fixed")).energies
     assert isinstance(energy, SpringsEnergy)
     assert set(energy.stiffness) == {100.0}
 
 
 def test_springs_of_no_stiffness_are_left_out():
-    (energy,) = bound(SpringsEffect(stretch=100.0, shear=0.0)).energies
+    (energy,) = build_contribution(SpringsEffect(stretch=100.0, shear=0.0)).energies
     assert isinstance(energy, SpringsEnergy)
     np.testing.assert_array_equal(energy.edges, MESH.springs[MESH.spring_families["stretch"]])
 
 
 def test_the_reference_size_sets_the_stiffness_of_liu2013():
-    (energy,) = bound(SpringsEffect(stretch=100.0, scaling_rule="liu2013", reference_size=9)).energies
+    (energy,) = build_contribution(SpringsEffect(stretch=100.0, scaling_rule="liu2013", reference_size=9)).energies
     assert isinstance(energy, SpringsEnergy)
     assert energy.stiffness[0] == 100.0 * (5 - 1) / (9 - 1)

@@ -30,7 +30,7 @@ SUMS = 1e-13
 
 
 @pytest.fixture(params=ENERGIES)
-def begun(request):
+def begun_energy(request):
     """An energy of a step that has begun, and two points that it acts at."""
     effect, name = ENERGIES[request.param]
     problem = build_moving_problem(build_effect_cloth(effect))
@@ -55,33 +55,33 @@ def hessian(energy, p) -> np.ndarray:
     return blocks.reshape(n, n, 3, 3).transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
 
 
-def test_the_value_is_that_of_the_energy(begun):
-    energy, p, _ = begun
+def test_the_value_is_that_of_the_energy(begun_energy):
+    energy, p, _ = begun_energy
     assert energy.element_law.value(energy.elements, p) == pytest.approx(energy.value(p), rel=SUMS)
 
 
-def test_the_gradient_is_that_of_the_energy(begun):
-    energy, p, _ = begun
+def test_the_gradient_is_that_of_the_energy(begun_energy):
+    energy, p, _ = begun_energy
     found, wanted = np.zeros_like(p), np.zeros_like(p)
     energy.element_law.add_gradient(energy.elements, p, found)
     energy.add_gradient(p, wanted)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
 
 
-def test_the_hessian_is_that_of_the_energy(begun):
-    energy, p, _ = begun
+def test_the_hessian_is_that_of_the_energy(begun_energy):
+    energy, p, _ = begun_energy
     wanted = csr_array(energy.hessian(p)).toarray()
     np.testing.assert_allclose(hessian(energy, p), wanted, rtol=0, atol=SUMS * np.abs(wanted).max())
 
 
-def test_the_objective_change_is_the_difference_of_the_values(begun):
-    energy, p, q = begun
+def test_the_objective_change_is_the_difference_of_the_values(begun_energy):
+    energy, p, q = begun_energy
     wanted, size = energy.value(q) - energy.value(p), energy.value(q) + energy.value(p)
     assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(wanted, rel=0, abs=SUMS * size)
 
 
-def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_digits(begun):
-    energy, p, q = begun
+def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_digits(begun_energy):
+    energy, p, q = begun_energy
     slope = np.zeros_like(p)
     energy.add_gradient(p, slope)
     q = p + 1e-13 * (q - p)
@@ -90,8 +90,8 @@ def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_
     assert energy.element_law.energy_change(energy.elements, p, q) == pytest.approx(wanted, rel=1e-5)
 
 
-def test_elements_have_constant_second_derivatives_exactly_where_declared(begun):
-    energy, p, q = begun
+def test_elements_have_constant_second_derivatives_exactly_where_declared(begun_energy):
+    energy, p, q = begun_energy
     assert np.array_equal(hessian(energy, p), hessian(energy, q)) == energy.element_law.has_constant_hessian
 
 

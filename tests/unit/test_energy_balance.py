@@ -55,7 +55,7 @@ def build_pins(weight: str | float = "exact", **settings: Any) -> PinsEffect:
     return PinsEffect.model_validate({"parts": ["first"], "weight": weight, **settings})
 
 
-def taken(bound: Scene, frames: int) -> list[SimulationStep]:
+def simulate_steps(bound: Scene, frames: int) -> list[SimulationStep]:
     run = simulate_scene(
         bound, prepare(bound, NewtonSolver()), StopRule(100, 1e-12), initial_guess="previous", frames=frames
     )
@@ -64,7 +64,7 @@ def taken(bound: Scene, frames: int) -> list[SimulationStep]:
 
 def balances(bound: Scene, frames: int) -> list[EnergyGain]:
     balance = EnergyBalance(bound)
-    return [balance.add_step(step) for step in taken(bound, frames)]
+    return [balance.add_step(step) for step in simulate_steps(bound, frames)]
 
 
 def by_midpoint(bound: Scene) -> Scene:
@@ -76,7 +76,7 @@ def by_midpoint(bound: Scene) -> Scene:
     )
 
 
-def led(step: SimulationStep, positions: Positions, velocity: Positions) -> SimulationStep:
+def replace_end(step: SimulationStep, positions: Positions, velocity: Positions) -> SimulationStep:
     """The same step with another end."""
     now = integrators.Motion(positions, velocity)
     return replace(step, solution=replace(step.solution, positions=positions), state=replace(step.state, motion=now))
@@ -94,7 +94,7 @@ def test_a_vibration_by_midpoint_has_the_energy_that_it_began_with():
         chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"), build_pins(), velocity=(0.5, 0.0, 0.0))
     )
     before = 1.0
-    for step, found in zip(taken(bound, 6), balances(bound, 6), strict=True):
+    for step, found in zip(simulate_steps(bound, 6), balances(bound, 6), strict=True):
         now = step.positions[1, 0]
         left, mean = 0.5 * 0.5**2 - 0.5 * 50.0 * (now - 1.0) ** 2, 0.5 * ((now - before) / DT) ** 2
         assert found.gain == pytest.approx(max(left, mean) - 0.5 * 0.5**2, abs=CLOSE)
@@ -148,29 +148,29 @@ def test_a_filter_that_speeds_up_is_a_source():
 def test_stored_energy_counts_where_a_spring_is_longer_than_twice_its_length():
     """A stiff spring that a solve leaves too long stores much, and moves nothing: 10 s are for a slow way there."""
     bound = chain(SpringsEffect(stretch=1e9, scaling_rule="fixed"), GravityEffect(), build_pins(), time_step=10.0)
-    (step,) = taken(bound, 1)
+    (step,) = simulate_steps(bound, 1)
     for length, grows in ((1.5, False), (2.5, True)):
         p = np.array([[0.0, 0.0, 0.0], [length, 0.0, 0.0]])
-        found = EnergyBalance(bound).add_step(led(step, p, np.zeros_like(p)))
+        found = EnergyBalance(bound).add_step(replace_end(step, p, np.zeros_like(p)))
         assert found.is_above(GROWTH_LIMIT) == grows
     assert found.gain == pytest.approx(0.5 * 1e9 * 1.5**2, rel=1e-6)
 
 
 def test_a_motion_counts_whatever_velocity_a_solver_claims():
     bound = chain(GravityEffect())
-    (step,) = taken(bound, 1)
+    (step,) = simulate_steps(bound, 1)
     moved = step.problem.current_positions + np.array([1e5, 0.0, 0.0])
-    assert EnergyBalance(bound).add_step(led(step, moved, np.zeros_like(moved))).is_above(BLOW_UP_FACTOR)
+    assert EnergyBalance(bound).add_step(replace_end(step, moved, np.zeros_like(moved))).is_above(BLOW_UP_FACTOR)
 
 
 def test_round_off_is_no_gain():
     bound = chain(SpringsEffect(stretch=50.0, scaling_rule="fixed"))
-    (step,) = taken(bound, 1)
+    (step,) = simulate_steps(bound, 1)
     p = step.problem.current_positions * (1.0 + 4.0 * np.finfo(float).eps)
     v = (p - step.problem.current_positions) / DT
     assert v.any()
-    assert not EnergyBalance(bound).add_step(led(step, p, v)).is_above(GROWTH_LIMIT)
-    assert EnergyBalance(bound).add_step(led(step, p, 1e6 * v)).is_above(GROWTH_LIMIT)
+    assert not EnergyBalance(bound).add_step(replace_end(step, p, v)).is_above(GROWTH_LIMIT)
+    assert EnergyBalance(bound).add_step(replace_end(step, p, 1e6 * v)).is_above(GROWTH_LIMIT)
 
 
 def test_growth_names_its_first_frame_and_its_largest_ratio():
@@ -246,7 +246,9 @@ class Prepared:
 '''
 
 
-def done(folder: Path, solver: str, record: str, timing: str, integrator: str) -> tuple[list[dict[str, Any]], RunFiles]:
+def execute_run_with_limit(
+    folder: Path, solver: str, record: str, timing: str, integrator: str
+) -> tuple[list[dict[str, Any]], RunFiles]:
     (folder / "limit.yaml").write_text(LIMIT)
     (folder / "wrong.py").write_text(WRONG)
     options = OPTIONS % (record, timing, integrator)
@@ -261,7 +263,7 @@ def done(folder: Path, solver: str, record: str, timing: str, integrator: str) -
     ("record", "timing"), [pytest.param("true", "exclusive", marks=pytest.mark.slow), ("false", "none")]
 )
 def test_a_run_whose_energy_grows_is_reported_in_all_rows(tmp_path: Path, record: str, timing: str):
-    found, files = done(tmp_path, "newton", record, timing, "midpoint")
+    found, files = execute_run_with_limit(tmp_path, "newton", record, timing, "midpoint")
     assert {row["status"] for row in found} == {"energy-growth"}
     assert len(list_failed_runs(parquet_rows.read_rows([files.rows_path]))) == 1
     assert "without a source, from frame " in found[0]["reason"]
@@ -291,13 +293,13 @@ def test_the_reason_of_growth_is_the_step_or_its_iterations(integrator: str, sol
 
 
 def test_the_same_steps_by_implicit_euler_are_ok(tmp_path: Path):
-    found, _ = done(tmp_path, "newton", "false", "none", "implicit-euler")
+    found, _ = execute_run_with_limit(tmp_path, "newton", "false", "none", "implicit-euler")
     assert {row["status"] for row in found} == {"ok"}
     assert all(row["energy_gain"] <= 0.0 < row["energy_available"] for row in found if row["phase"] == "step")
 
 
 def test_a_blow_up_ends_a_run_at_its_first_frame(tmp_path: Path):
-    (row,), files = done(tmp_path, "./wrong.py:Wrong", "false", "none", "implicit-euler")
+    (row,), files = execute_run_with_limit(tmp_path, "./wrong.py:Wrong", "false", "none", "implicit-euler")
     assert (row["status"], row["phase"]) == ("diverged", "run")
     assert f"from frame {row['frame']} on the motion has " in row["reason"]
     assert 1 < row["frame"] < 20

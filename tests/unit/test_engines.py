@@ -54,7 +54,9 @@ effects: [{kind: springs, stretch: 300}, {kind: gravity}, {kind: pins, parts: [c
 """
 
 
-def made(*effects: Any, mesh: Any = None, size: int = 4, integrator: str = "substepping", **given: Any) -> Scene:
+def build_engine_scene(
+    *effects: Any, mesh: Any = None, size: int = 4, integrator: str = "substepping", **given: Any
+) -> Scene:
     path = Path("scene.yaml")
     spec = SceneSpec(mesh=mesh or GridMesh(), mass=1.0, time_step=1 / 30, frames=1, effects=effects, path=path, **given)
     return build_scene(spec, size, integrator)
@@ -97,7 +99,7 @@ def test_an_engine_that_is_not_installed_gives_the_command_to_install_it_as_reas
     engine = load_target(OPTIONAL_SOLVERS[name])()
     wanted = rf"^{name}: .*pip install -e '\.\[{engine.engine_package.extra_name}\]'` in the checkout"
     with pytest.raises(Unsupported, match=wanted):
-        engine.prepare(made(*HANGING).system)
+        engine.prepare(build_engine_scene(*HANGING).system)
 
 
 @engines
@@ -105,14 +107,14 @@ def test_an_engine_refuses_unsupported_effects_by_name(name: str):
     engine = load_target(OPTIONAL_SOLVERS[name])()
     assert not is_minimiser(engine)
     with pytest.raises(Unsupported, match=rf"^{name}: expresses springs.* the scene has \w*Bending\w* as well"):
-        engine.prepare(made(*HANGING, BendingEffect(stiffness=1e-3)).system)
+        engine.prepare(build_engine_scene(*HANGING, BendingEffect(stiffness=1e-3)).system)
     with pytest.raises(Unsupported, match=f"{name}: divides the step itself"):
-        engine.prepare(made(*HANGING, integrator="bdf2").system)
+        engine.prepare(build_engine_scene(*HANGING, integrator="bdf2").system)
 
 
 def test_drag_that_an_engine_does_not_have_is_refused():
     with pytest.raises(Unsupported, match="pypbd: expresses springs; the scene has EtherDrag as well"):
-        load_target(OPTIONAL_SOLVERS["pypbd"])().prepare(made(*HANGING, EtherDragEffect(decay_rate=1.0)).system)
+        load_target(OPTIONAL_SOLVERS["pypbd"])().prepare(build_engine_scene(*HANGING, EtherDragEffect(decay_rate=1.0)).system)
 
 
 def semi_implicit(scene: Scene, stated: StepProblem, substeps: int, damping: float) -> tuple[Positions, Positions]:
@@ -144,7 +146,7 @@ def test_mujoco_steps_a_network_as_documented(integrator: str, damping: float):
         GravityEffect(),
         HANGING[2],
     )
-    scene = made(*parts, size=3, velocity=(0.3, 0.0, -0.2))
+    scene = build_engine_scene(*parts, size=3, velocity=(0.3, 0.0, -0.2))
     stated = build_problem(scene, build_initial_state(scene), "previous")
     wind = replace(
         stated, external_force=stated.external_force + np.random.default_rng(0).normal(size=stated.external_force.shape)
@@ -161,7 +163,7 @@ def test_mujoco_steps_a_network_as_documented(integrator: str, damping: float):
 
 
 def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
-    scene = made(GravityEffect(), EtherDragEffect(decay_rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
+    scene = build_engine_scene(GravityEffect(), EtherDragEffect(decay_rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
     found = ready("mujoco", scene.system).solve(
         build_problem(scene, build_initial_state(scene), "previous"), StopRule(400)
     )
@@ -174,7 +176,7 @@ def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
 @pytest.mark.parametrize("substeps", [1, 7])
 def test_pypbd_moves_one_spring_as_xpbd_in_small_steps_does(substeps: int):
     pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
-    scene = made(SpringsEffect(stretch=500.0), GravityEffect(), pins, mesh=ChainMesh(), size=2)
+    scene = build_engine_scene(SpringsEffect(stretch=500.0), GravityEffect(), pins, mesh=ChainMesh(), size=2)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("pypbd", scene.system).solve(stated, StopRule(substeps))
     wanted = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps))
@@ -196,7 +198,7 @@ def test_newton_physics_steps_springs_by_the_formulas_of_its_methods(
     pins = PinsEffect.model_validate({"parts": ["first"], "weight": "exact"})
     size, velocity = (2 if wanted == "xpbd" else 4), (0.3, 0.1, -0.2)  # its XPBD moves along all springs at once
     effects = SpringsEffect(stretch=500.0), GravityEffect(), pins
-    scene = made(*effects, mesh=ChainMesh(), size=size, velocity=velocity)
+    scene = build_engine_scene(*effects, mesh=ChainMesh(), size=size, velocity=velocity)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("newton-physics", scene.system, **parameters).solve(stated, StopRule(substeps)).positions
     if wanted == "semi-implicit":
@@ -204,7 +206,7 @@ def test_newton_physics_steps_springs_by_the_formulas_of_its_methods(
     elif wanted == "xpbd":
         should = XpbdSmallSteps().prepare(scene.system).solve(stated, StopRule(substeps)).positions
     else:
-        same = made(*effects, mesh=ChainMesh(), size=size, velocity=velocity, integrator="implicit-euler")
+        same = build_engine_scene(*effects, mesh=ChainMesh(), size=size, velocity=velocity, integrator="implicit-euler")
         step = build_problem(same, build_initial_state(same), "previous")
         should = load_target(SOLVERS["newton"])().prepare(same.system).solve(step, StopRule(100, 1e-12)).positions
     assert np.abs(found - stated.current_positions).max() > 100 * 2e-6
@@ -213,10 +215,10 @@ def test_newton_physics_steps_springs_by_the_formulas_of_its_methods(
 
 def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linearised_step():
     effects = HANGING[:2], PinsEffect.model_validate({"parts": ["top_corners"], "weight": "exact"})
-    scene = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2))
+    scene = build_engine_scene(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2))
     stated = build_problem(scene, build_initial_state(scene), "previous")
     found = ready("taichi", scene.system, iterations_per_substep=30, cg_rtol=1e-9).solve(stated, StopRule(1)).positions
-    same = made(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2), integrator="implicit-euler")
+    same = build_engine_scene(*effects[0], effects[1], velocity=(0.3, 0.1, -0.2), integrator="implicit-euler")
     should = (
         load_target(SOLVERS["newton"])()
         .prepare(same.system)
@@ -230,9 +232,9 @@ def test_the_program_in_taichi_minimises_the_step_and_one_iteration_is_the_linea
 
 
 def test_all_of_a_net_is_one_colour_to_newton_physics_which_sees_no_springs():
-    ready("newton-physics", made(*HANGING).system)
+    ready("newton-physics", build_engine_scene(*HANGING).system)
     for colours, message in (("newton", "1 colours"), ("springs", "4 colours")):
-        prepared = ready("newton-physics", made(*HANGING).system, colouring_source=colours)
+        prepared = ready("newton-physics", build_engine_scene(*HANGING).system, colouring_source=colours)
         assert message in prepared.description
 
 
@@ -240,14 +242,14 @@ def test_newton_physics_reports_a_missing_device():
     warp = pytest.importorskip("warp", reason="the extra `newton` is not installed")
     if not warp.is_cuda_available():
         with pytest.raises(Unsupported, match="Warp finds no CUDA device"):
-            ready("newton-physics", made(*HANGING).system, device="cuda")
+            ready("newton-physics", build_engine_scene(*HANGING).system, device="cuda")
 
 
 @engines
 @pytest.mark.parametrize("weight", [1e10, "exact"])
 def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_number(name: str, weight: float | str):
     pins = PinsEffect.model_validate({"parts": ["top_corners"], "weight": weight})
-    scene = made(*HANGING[:2], pins)
+    scene = build_engine_scene(*HANGING[:2], pins)
     stated = build_problem(scene, build_initial_state(scene), "previous")
     prepared = ready(name, scene.system)
     original = stated.step_start.positions.copy()
@@ -269,7 +271,7 @@ def test_a_solve_depends_on_the_problem_alone_and_ends_at_the_iterate_of_its_num
 
 @engines
 def test_rows_state_the_version_of_the_engine(name: str):
-    prepared = ready(name, made(*HANGING).system)
+    prepared = ready(name, build_engine_scene(*HANGING).system)
     package = load_target(OPTIONAL_SOLVERS[name]).solver_info.package_name
     version = json.loads(build_provenance_columns(SolverSpec(name, {}))["versions"])[package]
     assert f"{package} {version}," in prepared.description
@@ -280,7 +282,7 @@ def test_rows_state_the_version_of_the_engine(name: str):
 def test_the_script_that_is_printed_ends_where_the_run_did(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    ready(name, made(*HANGING).system)
+    ready(name, build_engine_scene(*HANGING).system)
     (tmp_path / "net.yaml").write_text(NET)
     config = tmp_path / "config.yaml"
     config.write_text(CONFIG.format(engine=name))
@@ -302,7 +304,7 @@ def test_the_script_that_is_printed_ends_where_the_run_did(
 def test_the_folder_of_a_script_is_made_and_a_file_in_its_place_refused(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    scene, engine = made(*HANGING), load_target(OPTIONAL_SOLVERS[name])()
+    scene, engine = build_engine_scene(*HANGING), load_target(OPTIONAL_SOLVERS[name])()
     end = scene.mesh.rest_positions
     texts = write_engine_script("hangs", scene, engine, 20, 2, tmp_path / "new" / "folder", end=end)
     assert {path.name for path in (tmp_path / "new" / "folder").iterdir()} == {*texts, "hangs.npz"}
@@ -324,7 +326,7 @@ def test_a_script_moves_pins_and_slows_velocities_as_the_run_does(
 ):
     motion = {"key_frames": [{"time": 0.0}, {"time": 0.1, "offset": [0.1, 0.1, 0.0]}]}
     pulled = PinsEffect.model_validate({"parts": ["top_corners"], "weight": "exact", "motion": motion})
-    scene = made(*HANGING[:2], pulled, EtherDragEffect(decay_rate=2.0), integrator="implicit-euler")
+    scene = build_engine_scene(*HANGING[:2], pulled, EtherDragEffect(decay_rate=2.0), integrator="implicit-euler")
     ready(name, scene.system)
     engine = load_target(OPTIONAL_SOLVERS[name])()
     script = write_engine_script("pulled", scene, engine, substeps=20, frames=4, folder=tmp_path)["pulled.py"]

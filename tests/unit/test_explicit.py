@@ -38,7 +38,7 @@ from springbench.solvers.model.step_problem import StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
 END, ONCE = 0.3, StopRule(1)
-HELD, SOFT = PinsEffect(parts=("first",), weight="exact"), SpringsEffect(stretch=20.0)
+FIRST_PIN, SOFT = PinsEffect(parts=("first",), weight="exact"), SpringsEffect(stretch=20.0)
 METHODS = {
     "velocity-verlet": (2, 16),
     "blanes-moan-4": (4, 8),
@@ -56,19 +56,19 @@ EFFECTS: dict[str, tuple[Any, ...]] = {
 }
 
 
-def made(*effects: Any, time_step: float = END, mesh: Any = None, size: int = 4) -> Scene:
+def build_unit_scene(*effects: Any, time_step: float = END, mesh: Any = None, size: int = 4) -> Scene:
     """A scene of 1 kg, which solvers integrate by themselves."""
     given = {"mesh": mesh or ChainMesh(), "effects": effects, "velocity": (0.5, 1.0, 2.0), "time_step": time_step}
     return build_scene(SceneSpec(mass=1.0, frames=1, path=Path("scene.yaml"), **given), size, "substepping")
 
 
-def prepared(name: str, scene: Scene, **parameters: Any) -> PreparedExplicit:
+def prepare_explicit(name: str, scene: Scene, **parameters: Any) -> PreparedExplicit:
     return load_target(SOLVERS[name])(**parameters).prepare(scene.system)
 
 
-def fixed(name: str, scene: Scene, substeps: int) -> PreparedExplicit:
+def fix_substeps(name: str, scene: Scene, substeps: int) -> PreparedExplicit:
     """With substeps of one length."""
-    one: Any = prepared(name, scene)
+    one: Any = prepare_explicit(name, scene)
     taken = replace(one.substep_choice, num_substeps=substeps, tolerance=0.0)
     method = (
         replace(one.method, error_exponent=0.0)
@@ -87,16 +87,16 @@ def run(scene: Scene, ready: Any, frames: int = 1, state: MotionState | None = N
 
 
 @cache
-def truth(effects: str) -> ReferenceTrajectory:
-    return integrate_motion(made(SOFT, GravityEffect(), HELD, *EFFECTS[effects]), [END])
+def integrate_reference(effects: str) -> ReferenceTrajectory:
+    return integrate_motion(build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, *EFFECTS[effects]), [END])
 
 
 @pytest.mark.parametrize("effects", EFFECTS)
 @pytest.mark.parametrize("name", METHODS)
 def test_the_error_falls_with_the_methods_order(name, effects):
-    scene, (order, first) = made(SOFT, GravityEffect(), HELD, *EFFECTS[effects]), METHODS[name]
-    paths = (run(scene, fixed(name, scene, k * first)) for k in (1, 2))
-    coarse, fine = (truth(effects).measure_error(0, path[-1].positions) for path in paths)
+    scene, (order, first) = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, *EFFECTS[effects]), METHODS[name]
+    paths = (run(scene, fix_substeps(name, scene, k * first)) for k in (1, 2))
+    coarse, fine = (integrate_reference(effects).measure_error(0, path[-1].positions) for path in paths)
     # The next terms of the error are smaller by a substep times the fastest frequency, up to a half, of the highest
     # orders; they have the sign that makes it fall faster.
     assert order - 0.25 < np.log2(coarse / fine) < order + 1.3
@@ -104,9 +104,9 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 
 @pytest.mark.parametrize("name", ["tsitouras-5", "dormand-prince-8"])
 def test_the_requested_error_controls_the_measured_one(name):
-    scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, time_step=END / 3)
     errors = [
-        truth("none").measure_error(0, run(scene, prepared(name, scene, error_tolerance=requested), 3)[-1].positions)
+        integrate_reference("none").measure_error(0, run(scene, prepare_explicit(name, scene, error_tolerance=requested), 3)[-1].positions)
         for requested in (1e-4, 1e-6, 1e-8, 1e-10)
     ]
     assert errors[0] < 1e-3
@@ -118,22 +118,22 @@ def test_it_agrees_with_an_implicit_integrator():
     """Bending is a force as well; SDIRK of order 4 has it as an energy."""
     pins = PinsEffect(parts=("top_corners",), weight="exact")
     effects = (SpringsEffect(stretch=5.0), BendingEffect(stiffness=1e-3), GravityEffect(), pins)
-    scene = made(*effects, mesh=GridMesh(), time_step=0.02)
+    scene = build_unit_scene(*effects, mesh=GridMesh(), time_step=0.02)
     other = build_scene(SceneSpec(mesh=GridMesh(), mass=1.0, frames=1, path=Path("scene.yaml"), effects=effects,
                             velocity=(0.5, 1.0, 2.0), time_step=0.02), 4, "sdirk-4")  # fmt: skip
     path = simulate_scene(
         other, prepare(other, NewtonSolver()), StopRule(100, 1e-12), initial_guess="extrapolated", frames=5
     )
     wanted = [step.positions for step in path][-1]
-    found = run(scene, prepared("dormand-prince-8", scene, error_tolerance=1e-9), 5)[-1].positions
+    found = run(scene, prepare_explicit("dormand-prince-8", scene, error_tolerance=1e-9), 5)[-1].positions
     moved = np.abs(wanted - scene.mesh.rest_positions).max()
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-4 * moved)  # the error of order 4 at these steps
 
 
 @pytest.mark.parametrize("name", ["velocity-verlet", "blanes-moan-4", "blanes-moan-6"])
 def test_the_energy_of_symplectic_methods_stays_near_over_a_hundred_thousand_steps(name):
-    scene = made(SpringsEffect(scaling_rule="fixed", stretch=25.0), size=3, time_step=1.0)
-    ready, substeps = prepared(name, scene), 2000
+    scene = build_unit_scene(SpringsEffect(scaling_rule="fixed", stretch=25.0), size=3, time_step=1.0)
+    ready, substeps = prepare_explicit(name, scene), 2000
     h = 0.25 / ready.substep_choice.num_substeps  # of the longest that is stable
     system = replace(scene.system, time_step=substeps * h)
     taken = replace(ready.substep_choice, num_substeps=substeps)
@@ -148,9 +148,9 @@ def test_the_energy_of_symplectic_methods_stays_near_over_a_hundred_thousand_ste
 
 @pytest.mark.parametrize("name", METHODS)
 def test_momentum_is_conserved(name):
-    scene = made(SpringsEffect(stretch=30.0), mesh=GridMesh(), time_step=0.1)
+    scene = build_unit_scene(SpringsEffect(stretch=30.0), mesh=GridMesh(), time_step=0.1)
     v = np.random.default_rng(1).normal(size=scene.mesh.rest_positions.shape)
-    path = run(scene, prepared(name, scene), 10, MotionState(Motion(scene.mesh.rest_positions, v), None, 0))
+    path = run(scene, prepare_explicit(name, scene), 10, MotionState(Motion(scene.mesh.rest_positions, v), None, 0))
     m = scene.system.mass
     np.testing.assert_allclose([m @ w for _, w in path], np.tile(m @ v, (10, 1)), rtol=0, atol=1e-12)  # round-off
     if name in ("velocity-verlet", "blanes-moan-4", "blanes-moan-6"):
@@ -160,13 +160,13 @@ def test_momentum_is_conserved(name):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_the_same_steps_give_the_same_bits(name):
-    scene = made(SOFT, GravityEffect(), HELD)
-    one, two = (run(scene, prepared(name, scene), 4) for _ in "ab")
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN)
+    one, two = (run(scene, prepare_explicit(name, scene), 4) for _ in "ab")
     np.testing.assert_array_equal(np.array(one), np.array(two))
 
 
 def test_the_largest_frequency_is_bounded_closely():
-    scene = made(SpringsEffect(stretch=300.0, shear=100.0), GravityEffect(), mesh=GridMesh(), size=9)
+    scene = build_unit_scene(SpringsEffect(stretch=300.0, shear=100.0), GravityEffect(), mesh=GridMesh(), size=9)
     K = scene.all_springs.stiffness_matrix(81).toarray()
     most = np.sqrt(np.linalg.eigvals(K / scene.system.mass[:, None]).real.max())
     assert most <= estimate_max_frequency(scene.system) <= 1.05 * most
@@ -180,22 +180,22 @@ def test_limits_of_stability_are_those_of_textbooks():
 
 
 def test_unsupported_effects_are_refused_by_name():
-    scene = made(SOFT, DashpotsEffect(stretch=0.4), HELD)
+    scene = build_unit_scene(SOFT, DashpotsEffect(stretch=0.4), FIRST_PIN)
     with pytest.raises(Unsupported, match=r"dormand-prince-8.*Dashpots"):
-        prepared("dormand-prince-8", scene)
+        prepare_explicit("dormand-prince-8", scene)
     with pytest.raises(Unsupported, match="1e-14 to 1"):
-        prepared("tsitouras-5", made(SOFT), error_tolerance=0.0)
+        prepare_explicit("tsitouras-5", build_unit_scene(SOFT), error_tolerance=0.0)
 
 
 def test_an_error_that_no_step_meets_ends_with_the_fraction_of_the_frame_that_was_reached():
-    scene = made(SOFT, GravityEffect(), HELD)
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN)
     broken = replace(scene, constant_force=np.full_like(scene.constant_force, np.nan))
-    ready = prepared("tsitouras-5", broken)
+    ready = prepare_explicit("tsitouras-5", broken)
     with pytest.raises(RuntimeError, match="was not reached within"):
         run(broken, ready)
 
 
 def test_a_minimiser_has_nothing_to_do_where_the_solver_should_integrate():
-    scene = made(SOFT, GravityEffect(), HELD)
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN)
     with pytest.raises(Unsupported, match="substepping"):
         run(scene, prepare(scene, NewtonSolver()))

@@ -62,11 +62,11 @@ def test_panels_are_named_by_parts() -> None:
         [plot(a, b, c) for a in ("net", "block") for b in ("gap", "largest") for c in ("time", "iterations")]
     )
 
-    def picked(*selectors: str) -> list[str]:
+    def select_names(*selectors: str) -> list[str]:
         return [
             ":".join(one.name_parts) for one in select_entries(entries, [tuple(one.split(":")) for one in selectors])
         ]
 
-    assert picked("gap:time") == ["net:gap:time"], "of the first, where it is not said of what"
-    assert picked("block:gap:time", "net:time") == ["block:gap:time", "net:gap:time", "net:largest:time"]
-    assert picked("net:gap", "gap:net") == ["net:gap:time", "net:gap:iterations"]
+    assert select_names("gap:time") == ["net:gap:time"], "of the first, where it is not said of what"
+    assert select_names("block:gap:time", "net:time") == ["block:gap:time", "net:gap:time", "net:largest:time"]
+    assert select_names("net:gap", "gap:net") == ["net:gap:time", "net:gap:iterations"]

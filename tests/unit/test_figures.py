@@ -43,7 +43,7 @@ from tests.figure_images import (
     tile_figures,
 )
 
-LOOKS = EXPECTED_FOLDER / "figures.png"
+EXPECTED_SHEET = EXPECTED_FOLDER / "figures.png"
 
 
 @pytest.fixture(scope="module")
@@ -69,8 +69,8 @@ def test_all_kinds_are_on_a_sheet() -> None:
 def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tmp_path: Path) -> None:
     now = tile_figures(list(figures.values()), (2460, 1080))
     now.save(tmp_path / "figures.png")
-    then = Image.open(LOOKS)
-    hint = f"look at {tmp_path / 'figures.png'} beside {LOOKS}, and where it is better, put it there"
+    then = Image.open(EXPECTED_SHEET)
+    hint = f"look at {tmp_path / 'figures.png'} beside {EXPECTED_SHEET}, and where it is better, put it there"
     assert now.size == then.size, hint
     assert least_similarity(now, then) > MIN_SIMILARITY, hint
 

@@ -20,7 +20,7 @@ PRICES = {"bending": (1.7, 1.6, 1.9), "wind": (1.05, 0.98, 1.1), "gas": (2.4, 2.
 """Of each effect, with the interval."""
 
 
-def priced(folder: Path, solvers: list[str], refused: str, codes: dict[str, str]) -> Path:
+def write_overheads(folder: Path, solvers: list[str], refused: str, codes: dict[str, str]) -> Path:
     """Each effect's price by each solver; one refuses bending; codes: of solvers of other code."""
     rows: list[dict[str, Any]] = []
     for solver in solvers:
@@ -49,7 +49,7 @@ def test_the_most_expensive_effect_is_first_all_last_and_a_ratio_within_round_of
     tmp_path: Path
 ) -> None:
     figure, (grid,) = compose_kind(
-        "prices", priced(tmp_path, ["numba", "dense"], "dense", {"dense": "before"}), FigureOptions()
+        "prices", write_overheads(tmp_path, ["numba", "dense"], "dense", {"dense": "before"}), FigureOptions()
     )
     values = {(cell.row, cell.column): (cell.outcome, cell.value_text, cell.is_stale) for cell in grid.cells}
     assert list(dict.fromkeys(cell.row for cell in grid.cells)) == ["gas", "bending", "wind", "all"]
@@ -63,7 +63,7 @@ def test_the_most_expensive_effect_is_first_all_last_and_a_ratio_within_round_of
 
 def test_results_of_other_code_alone_are_reported_in_words_without_dots(tmp_path: Path) -> None:
     codes: dict[str, str] = {"numba": "before", "dense": "before"}
-    figure, _ = compose_kind("prices", priced(tmp_path, list(codes), "", codes), FigureOptions())
+    figure, _ = compose_kind("prices", write_overheads(tmp_path, list(codes), "", codes), FigureOptions())
     said = " ".join(text.get_text() for text in visible_texts(figure))
     assert "Dot" not in said
     assert "Measured by other code than today's." in said
@@ -73,7 +73,7 @@ def test_results_of_other_code_alone_are_reported_in_words_without_dots(tmp_path
 @pytest.mark.parametrize("width", [85.0, 220.0])
 def test_all_solvers_fit_a_page(tmp_path: Path, width: float) -> None:
     figure, (grid,) = compose_kind(
-        "prices", priced(tmp_path, list(SOLVERS), "dense", {}), FigureOptions(width_mm=width)
+        "prices", write_overheads(tmp_path, list(SOLVERS), "dense", {}), FigureOptions(width_mm=width)
     )
     across, up = figure.get_size_inches() * MILLIMETRES_PER_INCH
     assert up < 1.2 * across
@@ -83,7 +83,7 @@ def test_all_solvers_fit_a_page(tmp_path: Path, width: float) -> None:
 
 
 def test_a_solver_of_two_settings_has_a_column_for_each(tmp_path: Path) -> None:
-    folder = priced(tmp_path, ["newton", "numba"], "", {})
+    folder = write_overheads(tmp_path, ["newton", "numba"], "", {})
     table = read_ablation(folder / "ablation" / "cloth.parquet")
     graded = [
         row | {"parameters": '{"indefinite_strategy": "shift-schedule"}', "overhead_ratio": 9.0} for row in table[:4]

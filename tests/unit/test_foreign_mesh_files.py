@@ -261,7 +261,7 @@ FACES = np.array([[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]])
 LEGACY_POLYDATA = b"# vtk DataFile Version 3.0\nx\nBINARY\nDATASET POLYDATA\nPOINTS 3 float\n" + b"".join(
     (struct.pack(">9f", 0, 0, 0, 1, 0, 0, 0, 1, 0), b"\nPOLYGONS 1 4\n", struct.pack(">4i", 3, 0, 1, 2))
 )
-WRITTEN = {
+WRITER_OPTIONS = {
     "text.stl": {"binary": False},
     "binary.stl": {"binary": True},
     "text.vtk": {"binary": False, "file_format": "vtk"},
@@ -287,12 +287,12 @@ def cut_copies(path: Path) -> Iterator[Path]:
         yield short
 
 
-@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.parametrize("name", WRITER_OPTIONS)
 @pytest.mark.filterwarnings("ignore")
 def test_a_cut_file_is_reported_as_cut(tmp_path, name):
     path = tmp_path / name
     mesh = meshio.Mesh(PLANE, [("triangle", FACES.astype(np.int32))])
-    meshio.write(path, mesh, **WRITTEN[name])
+    meshio.write(path, mesh, **WRITER_OPTIONS[name])
     assert len(FileMesh(path=path).build_mesh().triangles) == 4
     for short in cut_copies(path):
         with pytest.raises(InputError, match=r"was (the file )?cut"):

@@ -82,7 +82,7 @@ def patch(
 
 
 @cache
-def pressed() -> MotionState:
+def build_pressed_state() -> MotionState:
     """The sheet at rest where the slope carries it."""
     made = patch(0.0, down=GravityEffect(acceleration=(0.0, -G * COS, 0.0)))
     last = steps(made, 60)[-1].state.motion
@@ -103,7 +103,7 @@ def motion(made: Scene, run: list[SimulationStep]) -> np.ndarray:
     return np.array([weight @ step.state.motion.velocity for step in run])
 
 
-def slid(run: list[SimulationStep]) -> float:
+def measure_slip(run: list[SimulationStep]) -> float:
     """How far the first vertex went down the slope [m]."""
     return float(run[-1].positions[0, 0] - run[0].problem.step_start.positions[0, 0])
 
@@ -116,8 +116,8 @@ def of_name(solver: str) -> Solver:
 @pytest.mark.parametrize("solver", TAKE)
 def test_a_vertex_sticks_and_slides_from_the_first_step_on(solver):
     """By implicit Euler n steps lead n (n + 1)/2 dt^2 g (sin - mu cos) down the slope."""
-    assert 0.0 < slid(steps(pebble(STICKS), 12, of_name(solver))) < 12 / 60 * 1e-5
-    found = slid(steps(pebble(SLIPS), 12, of_name(solver)))
+    assert 0.0 < measure_slip(steps(pebble(STICKS), 12, of_name(solver))) < 12 / 60 * 1e-5
+    found = measure_slip(steps(pebble(SLIPS), 12, of_name(solver)))
     # In the first step the normal force is less by what still moves into the slope, 1e-3 of it.
     assert found == pytest.approx(78 / 60**2 * G * (SIN - SLIPS * COS), rel=1e-3)
 
@@ -133,24 +133,24 @@ def test_surfaces_exert_coulombs_force_of_the_steps_own_pressure(solver):
 @pytest.mark.parametrize("surface", SURFACES)
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_surfaces_stick_below_the_angle_of_friction_and_slip_above(surface, integrator):
-    run = steps(patch(STICKS, SURFACES[surface], integrator=integrator), 12, state=pressed())
-    assert 0.0 < slid(run) < 12 / 60 * 1e-3
+    run = steps(patch(STICKS, SURFACES[surface], integrator=integrator), 12, state=build_pressed_state())
+    assert 0.0 < measure_slip(run) < 12 / 60 * 1e-3
     made = patch(SLIPS, SURFACES[surface], integrator=integrator)
-    v = motion(made, steps(made, 12, state=pressed()))[-1, 0]
+    v = motion(made, steps(made, 12, state=build_pressed_state()))[-1, 0]
     assert v == pytest.approx(G * (SIN - SLIPS * COS) * 12 / 60, rel=1e-2 if surface == "mesh" else 0.1)
 
 
 @pytest.mark.parametrize("integrator", ["bdf2", "midpoint"])
 def test_other_integrators_take_the_pressure_of_their_unknown(integrator):
     """Both are exact for a constant force, but for the first step of bdf2, which is of implicit Euler."""
-    assert 0.0 < slid(steps(pebble(STICKS, integrator=integrator), 12)) < 1.2 * 12 / 60 * 1e-5
-    found, wanted = slid(steps(pebble(SLIPS, integrator=integrator), 30)), 0.5 * G * (SIN - SLIPS * COS) / 4
+    assert 0.0 < measure_slip(steps(pebble(STICKS, integrator=integrator), 12)) < 1.2 * 12 / 60 * 1e-5
+    found, wanted = measure_slip(steps(pebble(SLIPS, integrator=integrator), 30)), 0.5 * G * (SIN - SLIPS * COS) / 4
     assert found == pytest.approx(wanted, rel=2e-3 if integrator == "bdf2" else 1e-4)
 
 
 def test_a_slide_converges_with_order_1_by_implicit_euler():
     wanted = 0.5 * G * (SIN - SLIPS * COS) / 4
-    coarse, fine = (abs(slid(steps(pebble(SLIPS, dt), round(0.5 / dt))) - wanted) for dt in (1 / 30, 1 / 60))
+    coarse, fine = (abs(measure_slip(steps(pebble(SLIPS, dt), round(0.5 / dt))) - wanted) for dt in (1 / 30, 1 / 60))
     assert coarse / fine == pytest.approx(2.0, rel=0.02)
 
 
@@ -192,7 +192,7 @@ def test_a_floor_that_slides_and_rises_takes_a_sheet_along_from_the_first_step_o
     np.testing.assert_allclose(v[:, 0], 0.2 * (9.81 * t + v[:, 1]), rtol=1e-3)
 
 
-class Counted:
+class CountingSolver:
     """A prepared solver that counts its solves."""
 
     def __init__(self, prepared: PreparedSolver) -> None:
@@ -204,7 +204,7 @@ class Counted:
 
 
 def solves(made: Scene, frames: int) -> tuple[list[StepProblem], list[SimulationStep]]:
-    counted: Any = Counted(prepare(made, NewtonSolver()))
+    counted: Any = CountingSolver(prepare(made, NewtonSolver()))
     return counted.problems, list(simulate_scene(made, counted, EXACTLY, initial_guess="previous", frames=frames))
 
 
@@ -245,7 +245,7 @@ def test_rows_state_the_friction_rounds_and_their_remaining_change():
     assert row["friction_relative_change"] is None
 
 
-class Recited:
+class ScriptedSolver:
     """A prepared solver that returns given positions of a pebble, round by round, again and again."""
 
     def __init__(self, *positions: tuple[float, float]) -> None:
@@ -257,16 +257,16 @@ class Recited:
         return Solution(np.array([[x, y, 0.0]]), 1, 0.0, 1.0, "converged")
 
 
-SLID, STUCK, BETWEEN = (2e-3, -2e-3), (1e-7, 1e-4), (1e-3, -1e-3)
+SLIDING, STICKING, LESS_PRESSED = (2e-3, -2e-3), (1e-7, 1e-4), (1e-3, -1e-3)
 """Of a pebble in a round: pressed, out of range of contact, pressed less."""
 
 
 @pytest.mark.parametrize(
-    ("cycle", "rounds", "end", "change"), [((SLID, STUCK), 4, STUCK, 1.0), ((SLID, BETWEEN, STUCK), 5, BETWEEN, 0.5)]
+    ("cycle", "rounds", "end", "change"), [((SLIDING, STICKING), 4, STICKING, 1.0), ((SLIDING, LESS_PRESSED, STICKING), 5, LESS_PRESSED, 0.5)]
 )
 def test_rounds_that_repeat_end_where_most_friction_acts_and_report_what_is_left(cycle, rounds, end, change):
     made = pebble(1e3)
-    recited: Any = Recited(*cycle)
+    recited: Any = ScriptedSolver(*cycle)
     solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "previous"), EXACTLY)
     assert recited.solves == len(solved.iteration_counts) == rounds
     assert tuple(solved.solution.positions[0, :2]) == end
@@ -278,7 +278,7 @@ def test_rounds_that_repeat_end_where_most_friction_acts_and_report_what_is_left
 @pytest.mark.parametrize("factor", [-0.5, 0.5, -0.9])
 def test_rounds_that_converge_however_slowly_are_not_cut_short(factor):
     made = pebble(SLIPS, friction_iterations=20)
-    recited: Any = Recited(*((2e-3, -2e-3 * (1.0 + 0.5 * factor**k)) for k in range(20)))
+    recited: Any = ScriptedSolver(*((2e-3, -2e-3 * (1.0 + 0.5 * factor**k)) for k in range(20)))
     solved = solve_with_friction(recited, build_problem(made, build_initial_state(made), "previous"), EXACTLY)
     assert solved.convergence is not None
     assert solved.convergence.num_iterations == 20 or solved.convergence.relative_change <= 1e-4

@@ -26,7 +26,7 @@ from tests.unit.test_report_pictures import cloth
 needs_opengl = pytest.mark.skipif(
     opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or ""
 )
-SEEN = np.random.default_rng(0).normal(size=(20, 3))
+SAMPLE_POINTS = np.random.default_rng(0).normal(size=(20, 3))
 
 MILLIMETRES, POINTS = 85.0, 5.5
 """Width of a column of print, and the smallest type that is read there."""
@@ -53,7 +53,7 @@ effects:
     ids=lambda one: one.kind,
 )
 def test_what_is_drawn_of_an_obstacle_is_its_surface(obstacle):
-    made = build_obstacle_mesh(obstacle, 0.0, SEEN)
+    made = build_obstacle_mesh(obstacle, 0.0, SAMPLE_POINTS)
     assert made is not None
     points = np.asarray(made.points, np.float64)
     distance = obstacle.build_obstacle().signed_distance(points, 0.0)
@@ -64,13 +64,13 @@ def test_what_is_drawn_of_an_obstacle_is_its_surface(obstacle):
 
 def test_an_obstacle_is_drawn_where_it_has_moved_to():
     moves = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=2.0, offset=(0.0, 4.0, 0.0))))
-    made = build_obstacle_mesh(SphereObstacle(radius=1.0, motion=moves), 1.0, SEEN)
+    made = build_obstacle_mesh(SphereObstacle(radius=1.0, motion=moves), 1.0, SAMPLE_POINTS)
     assert made is not None
     assert np.asarray(made.points).mean(axis=0) == pytest.approx([0.0, 2.0, 0.0], abs=1e-5)  # single precision
 
 
 def test_the_level_ground_is_not_drawn():
-    assert build_obstacle_mesh(PlaneObstacle(), 0.0, SEEN) is None
+    assert build_obstacle_mesh(PlaneObstacle(), 0.0, SAMPLE_POINTS) is None
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from springbench.harness.errors import InputError
 from springbench.harness.scenes.mesh.file_mesh import FileMesh
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
-TURN = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # a quarter turn about z
+QUARTER_TURN = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # a quarter turn about z
 
 
 def gltf(
@@ -82,7 +82,7 @@ def test_lines_are_springs(tmp_path, mode, count):
 
 def test_nodes_place_and_mirror_their_meshes(tmp_path):
     document, binary = gltf(
-        [0, 1, 2], node={"rotation": TURN, "scale": [2, 1, 1], "translation": [5, 0, 0], "name": "a"}
+        [0, 1, 2], node={"rotation": QUARTER_TURN, "scale": [2, 1, 1], "translation": [5, 0, 0], "name": "a"}
     )
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
     document["nodes"] += [{"children": [2], "matrix": mirror.T.ravel().tolist()}, {"mesh": 0, "translation": [0, 0, 1]}]

@@ -35,7 +35,7 @@ from typer.testing import CliRunner
 from tests import mistaken_simulations
 from tests.mistaken_simulations import read_scene, simulate, write_scene
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "scenes"
+SHARED_SCENES = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 FREE_CHAIN = """
 mesh: {kind: chain}
 mass: 0.6
@@ -47,7 +47,7 @@ effects: [{kind: springs, stretch: 40}, {kind: gravity}]
 """
 
 
-PRESSED = """
+COMPRESSED_CHAIN = """
 mesh: {kind: chain, length: 1}
 mass: 0.6
 time_step: 1/20
@@ -79,7 +79,7 @@ def grade_array(grader: SceneGrader, p: np.ndarray) -> PositionGrade:
     )
 
 
-def judge(path: Path, p: np.ndarray, seconds: float, size: int = 0) -> list[StepVerdict]:
+def grade_steps(path: Path, p: np.ndarray, seconds: float, size: int = 0) -> list[StepVerdict]:
     """The verdicts on the steps alone, without fingerprints."""
     scene = build_scene(load_scene(path), size)
     return StepJudge(scene).judge_steps(align_submission(scene, PositionSequence(path, p), 1), seconds)
@@ -282,7 +282,7 @@ def test_positions_collapsed_to_a_point_are_no_minimum(seconds, tmp_path):
     path, scene = load_case(tmp_path)
     V = scene["V"]
     for p in (np.zeros((4, *V.shape)), np.tile(V.mean(axis=0), (4, len(V), 1))):
-        steps = judge(path, np.concatenate([simulate(scene, 3), p]), seconds)
+        steps = grade_steps(path, np.concatenate([simulate(scene, 3), p]), seconds)
         assert [one.is_minimum for one in steps] == [True] * 3 + [False] * 4
         assert all(one.gap > 1.0 for one in steps[3:] if one.gap is not None)
 
@@ -292,20 +292,20 @@ def test_minima_in_few_digits_are_minima_by_their_gap_too(digits, tmp_path):
     path, scene = load_case(tmp_path)
     p = simulate(scene, 8, iterations=400)
     stored = p.astype(digits).astype(float) if digits is np.float32 else np.round(p, digits)
-    steps = judge(path, stored, 20.0)
+    steps = grade_steps(path, stored, 20.0)
     assert all(one.is_minimum and one.gap is not None and one.gap_floor > 0.0 for one in steps)
 
 
 def test_a_saddle_is_no_minimum(tmp_path):
     """Two springs are pressed along their line: where their middle is in equilibrium there, it buckles."""
-    (tmp_path / "rod.yaml").write_text(PRESSED)
+    (tmp_path / "rod.yaml").write_text(COMPRESSED_CHAIN)
     scene = build_scene(load_scene(tmp_path / "rod.yaml"), 3)
     p, inertia = (
         scene.mesh.rest_positions + np.array([[0, 0, 0], [0, 0, 0], [-0.3, 0, 0]]),
         20**2 * scene.system.mass[1],
     )
     p[1, 0] = (4000 * (p[0, 0] + p[2, 0]) + inertia * p[1, 0]) / (8000 + inertia)
-    (step,) = judge(tmp_path / "rod.yaml", p[None], 5.0, size=3)
+    (step,) = grade_steps(tmp_path / "rod.yaml", p[None], 5.0, size=3)
     assert step.residual < 1e-9
     assert step.gap is not None
     assert step.gap > 0.01
@@ -481,7 +481,7 @@ def test_programs_with_each_mistake_name_it(name, tmp_path):
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["single-spring-horizontal", "horizontal-chain", "net"])
 def test_mistakes_on_the_published_scenes_are_named_or_reported_as_invisible(name, tmp_path):
-    path = SHARED / f"{name}.json"
+    path = SHARED_SCENES / f"{name}.json"
     if not path.exists():
         pytest.skip("the assignment's scenes are not part of this repository")
     scene, grader, wrong = read_scene(path), make_grader(path), dict[str, str]()

@@ -46,7 +46,7 @@ def test_stiff_springs_take_less_than_half_of_newtons_factorisations(ratio, monk
     prepared = {solver: solver.prepare(given.system) for solver in (NewtonSolver(), HybridNewton())}
     ends = [p.solve(given, StopRule(3000)).positions for p in prepared.values()]
     best, start = min(map(given.value, ends)), given.value(given.current_positions)
-    done = counted(monkeypatch)
+    done = count_factorisations(monkeypatch)
 
     def count(solver) -> int:
         before = len(done)
@@ -57,7 +57,7 @@ def test_stiff_springs_take_less_than_half_of_newtons_factorisations(ratio, monk
     assert count(HybridNewton()) < 0.5 * count(NewtonSolver())
 
 
-def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def count_factorisations(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A list that grows with every factorisation of a Hessian from now on."""
     done = list[str]()
     for name in ("factorise", "factorise_and_solve"):

@@ -38,7 +38,7 @@ FIRST, SECOND = 0.4, 0.1
 """Lengths of two springs of length 1 at rest."""
 
 
-def compressed() -> StepProblem:
+def build_compressed_step() -> StepProblem:
     """Two springs of 1 N/m along x, each from a vertex that is pinned to one that is free, k dt^2/m = 1/10."""
     given = build_first_problem(build_cloth(2, "exact"))
     edges = np.array([[0, 1], [2, 3]])
@@ -62,7 +62,7 @@ def lateral(length: float) -> float:
     return 1.0 - 1.0 / length
 
 
-def begun(given: StepProblem) -> tuple[StepObjective, DescentPoint, np.ndarray]:
+def begin_descent(given: StepProblem) -> tuple[StepObjective, DescentPoint, np.ndarray]:
     step = StepObjective(FixedObjective(given.system), given)
     p = step.apply_exact_pins(given.initial_guess)
     return step, DescentPoint(p, step.gradient(p)), np.repeat(ResidualMetric(given.system).free_diagonal, 3)
@@ -77,7 +77,7 @@ def curvatures(hessian) -> list[float]:
 
 @filters
 def test_a_spring_retains_its_stiffness_and_its_lateral_part_is_filtered(name):
-    step, at, diagonal = begun(compressed())
+    step, at, diagonal = begin_descent(build_compressed_step())
     hessian = step.hessian(at.positions)
     assert REGULARISATION_RULES[name]().factorise_hessian(hessian, at, diagonal) == 1
     wanted = [10.0 + FILTERS[name](lateral(length)) for length in (FIRST, SECOND)]
@@ -114,8 +114,8 @@ def test_pairs_of_surfaces_are_filtered_too(name):
 
 def test_the_trust_region_takes_absolute_values_until_the_model_is_right():
     """Absolute values first; clamped after a step that the quadratic model foretold within 1 %, and only then."""
-    given = compressed()
-    step, at, _ = begun(given)
+    given = build_compressed_step()
+    step, at, _ = begin_descent(given)
     hessian, rule = step.hessian(at.positions), TrustRegionRule()
     assert rule.use_absolute
     for by, absolute in ((1e-6, False), (0.5, True), (1e-6, False)):
@@ -129,7 +129,7 @@ def test_the_trust_region_takes_absolute_values_until_the_model_is_right():
 
 
 def test_progressive_projection_leaves_a_definite_hessian_as_it_is():
-    step, at, diagonal = begun(compressed())
+    step, at, diagonal = begin_descent(build_compressed_step())
     rule = ProgressiveRule()
     hessian = step.hessian(at.positions)
     assert rule.factorise_hessian(hessian, at, diagonal) == 0
@@ -140,9 +140,9 @@ def test_progressive_projection_leaves_a_definite_hessian_as_it_is():
 def test_progressive_projection_takes_the_elements_where_the_gradient_is_largest():
     """Without the inertia that stabilises it, the shorter spring makes the Hessian indefinite; its force is the larger
     one, so that the other one retains its negative lateral part."""
-    given = compressed()
+    given = build_compressed_step()
     system = replace(given.system, mass=np.full(4, 2.0))
-    step, at, diagonal = begun(replace(given, system=system))
+    step, at, diagonal = begin_descent(replace(given, system=system))
     hessian, rule = step.hessian(at.positions), ProgressiveRule()
     force = at.gradient.copy()
     force[1] *= 0.1
@@ -168,7 +168,7 @@ def test_all_rules_descend_to_the_same_certified_minimum(rule, name):
     assert found.termination_reason in ("converged", "roundoff", "stalled")
     size = np.ptp(wanted.positions, axis=0).max()
     np.testing.assert_allclose(found.positions, wanted.positions, atol=1e-9 * size)
-    _, at, _ = begun(replace(given, initial_guess=found.positions))
+    _, at, _ = begin_descent(replace(given, initial_guess=found.positions))
     assert isinstance(prepared, PreparedDescent)
     assert prepared.method.can_terminate(StepObjective(FixedObjective(given.system), given), at)
 
@@ -176,9 +176,9 @@ def test_all_rules_descend_to_the_same_certified_minimum(rule, name):
 @others
 def test_all_rules_leave_a_saddle(rule):
     """Both springs pressed along their lines, in balance, and unstable across them."""
-    given = compressed()
+    given = build_compressed_step()
     system = replace(given.system, mass=np.full(4, 0.1))
-    _, at, _ = begun(replace(given, system=system))
+    _, at, _ = begin_descent(replace(given, system=system))
     given = replace(given, system=system, external_force=at.gradient)
     start = StepObjective(FixedObjective(system), given)
     assert not start.gradient(at.positions).any()
@@ -202,7 +202,7 @@ def test_energies_without_elements_are_refused_by_name(rule):
 
 
 def test_the_hessian_of_touching_pairs_becomes_exact_progressively():
-    step, at, diagonal = begun(compressed())
+    step, at, diagonal = begin_descent(build_compressed_step())
     rule, levels = ContactScheduleRule(), list[int | None]()
     for length in (0.05, 0.06, *[FIRST] * 4):
         p = at.positions.copy()

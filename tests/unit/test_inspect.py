@@ -34,7 +34,7 @@ def chain(tmp_path: Path) -> Path:
     return write_recording(tmp_path / "chain.rrd", build_recording_info("chain"))
 
 
-def printed(*paths: Path, **options: Any) -> str:
+def print_inspection(*paths: Path, **options: Any) -> str:
     """What an inspection prints, white space made one blank."""
     out = io.StringIO()
     settings = {"frame": None, "export": None, "csv": None, **options}
@@ -43,7 +43,7 @@ def printed(*paths: Path, **options: Any) -> str:
 
 
 def test_an_inspection_states_the_contents_of_a_recording(cloth: Path):
-    text = printed(cloth)
+    text = print_inspection(cloth)
     for words in (
         "cloth - test",
         "cpu a, b [c]",
@@ -62,13 +62,13 @@ def test_an_inspection_states_the_contents_of_a_recording(cloth: Path):
 
 def test_an_inspection_reports_that_a_run_was_stopped(cloth: Path):
     os.truncate(cloth, int(0.7 * cloth.stat().st_size))
-    assert "Not complete" in printed(cloth)
+    assert "Not complete" in print_inspection(cloth)
 
 
 @pytest.mark.parametrize("suffix", [".vtp", ".vtk", ".ply", ".stl", ".obj"])
 def test_a_frame_is_exported_as_a_surface(suffix: str, cloth: Path, tmp_path: Path):
     target = tmp_path / f"mesh{suffix}"
-    printed(cloth, frame=5, export=target)
+    print_inspection(cloth, frame=5, export=target)
     replay = read_replay(cloth, [5])
     mesh = pv.read(target)
     assert mesh.n_cells == len(replay.triangles)
@@ -88,17 +88,17 @@ def test_a_frame_far_from_zero_is_exported_in_double_precision_or_not_at_all(suf
     path, target = write_recording(tmp_path / "a.rrd", of, frame_count=3), tmp_path / f"mesh{suffix}"
     if suffix in (".ply", ".stl"):
         with pytest.raises(InputError, match=r"moves vertices by up to 1 m this far .* export to \.vtp"):
-            printed(path, export=target)
+            print_inspection(path, export=target)
         assert not target.exists()
     else:
-        printed(path, export=target)
+        print_inspection(path, export=target)
         expected = [*generate_waves(of, 3)][-1].positions
         np.testing.assert_allclose(pv.read(target).points, expected, rtol=0, atol=1e-5)  # .obj: text
 
 
 def test_what_is_exported_is_read_as_a_mesh(cloth: Path, chain: Path, tmp_path: Path):
     for recording in (cloth, chain):
-        printed(recording, export=tmp_path / "mesh.vtp")
+        print_inspection(recording, export=tmp_path / "mesh.vtp")
         mesh, replay = FileMesh(path=tmp_path / "mesh.vtp").build_mesh(), read_replay(recording, [-1])
         np.testing.assert_array_equal(mesh.rest_positions, replay.positions[0])
         np.testing.assert_array_equal(mesh.triangles, replay.triangles)
@@ -107,7 +107,7 @@ def test_what_is_exported_is_read_as_a_mesh(cloth: Path, chain: Path, tmp_path: 
 
 
 def test_the_last_frame_of_a_chain_is_exported_as_lines(chain: Path, tmp_path: Path):
-    printed(chain, export=tmp_path / "chain.vtp")
+    print_inspection(chain, export=tmp_path / "chain.vtp")
     mesh, replay = pv.read(tmp_path / "chain.vtp"), read_replay(chain, [-1])
     np.testing.assert_array_equal(mesh.points, replay.positions[0])
     np.testing.assert_array_equal(mesh.lines.reshape(-1, 3)[:, 1:], replay.springs)
@@ -115,7 +115,7 @@ def test_the_last_frame_of_a_chain_is_exported_as_lines(chain: Path, tmp_path: P
 
 
 def test_scalars_are_written_in_long_form(cloth: Path, tmp_path: Path):
-    printed(cloth, csv=tmp_path / "scalars.csv")
+    print_inspection(cloth, csv=tmp_path / "scalars.csv")
     rows = pyarrow.csv.read_csv(tmp_path / "scalars.csv").to_pylist()
     at = {(row["entity"], row["frame"], row["iteration"]): (row["time"], row["value"]) for row in rows}
     assert at["/energy/springs", 4, None] == (0.04, 8.0)
@@ -126,7 +126,7 @@ def test_two_recordings_are_compared_in_metres_and_rest_lengths(cloth: Path, tmp
     of = build_recording_info()
     moved = replace(of.mesh, rest_positions=of.mesh.rest_positions + np.array([0.0, 0.25, 0.0]))
     other = write_recording(tmp_path / "other.rrd", replace(of, mesh=moved), frame_count=9)
-    text = printed(cloth, other)
+    text = print_inspection(cloth, other)
     assert "positions in frame 8" in text  # the last that both have
     shift = np.linalg.norm(
         read_replay(cloth, [8]).positions[0].astype(float) - read_replay(other, [8]).positions[0], axis=1
@@ -138,7 +138,7 @@ def test_two_recordings_are_compared_in_metres_and_rest_lengths(cloth: Path, tmp
 
 
 def test_two_equal_recordings_do_not_differ(cloth: Path, tmp_path: Path):
-    assert "max 0 0 rms 0 0" in printed(cloth, write_recording(tmp_path / "same.rrd"))
+    assert "max 0 0 rms 0 0" in print_inspection(cloth, write_recording(tmp_path / "same.rrd"))
 
 
 def test_recordings_side_by_side_have_the_longest_scale(tmp_path: Path):
@@ -160,9 +160,9 @@ def test_recordings_side_by_side_can_be_inspected(cloth: Path, tmp_path: Path):
     both = tmp_path / "both.rrd"
     paths = {"dense": cloth, "sparse": cloth}
     write_side_by_side(both, paths, "cloth 6", dict.fromkeys(paths, LineStyle("#0072b2")))
-    assert "/1-dense/milliseconds/step 1 6 10.5" in printed(both)
+    assert "/1-dense/milliseconds/step 1 6 10.5" in print_inspection(both)
     with pytest.raises(InputError, match="not of one run"):
-        printed(both, cloth)
+        print_inspection(both, cloth)
 
 
 @pytest.mark.parametrize(
@@ -179,22 +179,22 @@ def test_recordings_side_by_side_can_be_inspected(cloth: Path, tmp_path: Path):
 def test_a_mistake_is_reported_with_the_expected_options(options: dict, message: str, cloth: Path, tmp_path: Path):
     placed = {key: tmp_path / value if isinstance(value, Path) else value for key, value in options.items()}
     with pytest.raises(InputError, match=message):
-        printed(cloth, **placed)
+        print_inspection(cloth, **placed)
 
 
 def test_a_chain_is_not_exported_as_a_surface(chain: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"springs without a surface: one of .vtk, .vtp"):
-        printed(chain, export=tmp_path / "a.stl")
+        print_inspection(chain, export=tmp_path / "a.stl")
 
 
 def test_one_file_takes_one_recording(cloth: Path, chain: Path, tmp_path: Path):
     with pytest.raises(InputError, match="take one recording, not 2"):
-        printed(cloth, chain, csv=tmp_path / "a.csv")
+        print_inspection(cloth, chain, csv=tmp_path / "a.csv")
 
 
 def test_meshes_of_different_sizes_are_not_compared(cloth: Path, chain: Path):
     with pytest.raises(InputError, match="36 and 9 vertices"):
-        printed(cloth, chain)
+        print_inspection(cloth, chain)
 
 
 def test_the_viewer_opens_the_recordings(cloth: Path, monkeypatch: pytest.MonkeyPatch):

@@ -21,12 +21,12 @@ from springbench.solvers.model.step_problem import StopRule
 from tests.scene_builders import build_test_scene
 
 DT, STEPS = 1 / 30, 25
-CONVERGED = StopRule(100, 1e-14)
+CONVERGED_STOP = StopRule(100, 1e-14)
 
-STATED = [name for name in INTEGRATORS if name != "substepping"]
-integrators = pytest.mark.parametrize("name", STATED)
+STAGE_INTEGRATORS = [name for name in INTEGRATORS if name != "substepping"]
+integrators = pytest.mark.parametrize("name", STAGE_INTEGRATORS)
 ALPHAS = [name for name, method in INTEGRATORS.items() if isinstance(method, GeneralisedAlpha)]
-LINEAR = [name for name in STATED if name not in ALPHAS or name == "newmark"]  # a power a step
+LINEAR = [name for name in STAGE_INTEGRATORS if name not in ALPHAS or name == "newmark"]  # a power a step
 TABLEAUX = [name for name, method in INTEGRATORS.items() if isinstance(method, RungeKutta)]
 
 
@@ -44,7 +44,7 @@ def motions(made: Scene, state: MotionState | None = None) -> list[Motion]:
     """The motions at the start and after each step."""
     state = state or build_initial_state(made)
     steps = simulate_scene(
-        made, prepare(made, NewtonSolver()), CONVERGED, initial_guess="previous", frames=STEPS, initial_state=state
+        made, prepare(made, NewtonSolver()), CONVERGED_STOP, initial_guess="previous", frames=STEPS, initial_state=state
     )
     return [state.motion, *(step.state.motion for step in steps)]
 
@@ -138,7 +138,7 @@ def test_an_orbit_decays_by_the_methods_damping(name, power):
 def test_bdf2_starts_with_a_step_of_implicit_euler():
     made = build_test_scene(ChainMesh(), SpringsEffect(stretch=10.0), size=4, velocity=(0.0, 1.0, 0.0))
     first, second = (
-        list(islice(simulate_scene(m, prepare(m, NewtonSolver()), CONVERGED, initial_guess="previous", frames=2), 2))
+        list(islice(simulate_scene(m, prepare(m, NewtonSolver()), CONVERGED_STOP, initial_guess="previous", frames=2), 2))
         for m in (made, by(made, "bdf2"))
     )
     np.testing.assert_array_equal(first[0].positions, second[0].positions)

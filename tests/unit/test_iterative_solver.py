@@ -139,7 +139,7 @@ def test_a_loop_ends_by(what):
     assert state.asked == requested
 
 
-class Batched(SolverState):
+class BatchedState(SolverState):
     """Does several iterations in one call, all but those after the first `able`."""
 
     def __init__(self, able: int) -> None:
@@ -166,7 +166,7 @@ def test_iterations_between_residuals_are_one_call():
         (6, RESIDUAL_EACH, [4, 4], (6, 1.0, REASON_STALLED)),
         (6, RESIDUAL_NEVER, [10], (6, np.nan, REASON_STALLED)),
     ):
-        state = Batched(able)
+        state = BatchedState(able)
         np.testing.assert_equal(state.run_iterations(LoopLimits(10, 0.5, 0.0, mode)), wanted)
         assert state.batches == batches
 

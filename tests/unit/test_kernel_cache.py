@@ -33,7 +33,7 @@ FACTOR = 2.0
 def times(x):
     return 3.0 * x
 """
-ASK = """
+CALL_PROGRAM = """
 from springbench.solvers.kernels.kernel_of_test import product
 print(product(1.0), sum(product.stats.cache_hits.values()))
 """
@@ -80,32 +80,32 @@ def edit(path: Path, old: str, new: str) -> None:
 
 def test_a_changed_kernel_never_runs_stale_in_any_order_of_imports(checkout: Path):
     inner, outer = (checkout / "solvers" / "kernels" / f"{name}_of_test.py" for name in ("inner", "kernel"))
-    assert run_code(checkout, ASK) == "6.0 0"
-    assert run_code(checkout, "import numba\n" + ASK) == "6.0 1"
+    assert run_code(checkout, CALL_PROGRAM) == "6.0 0"
+    assert run_code(checkout, "import numba\n" + CALL_PROGRAM) == "6.0 1"
     edit(inner, "3.0 * x", "6.0 * x")  # a function in another file
-    assert run_code(checkout, ASK) == "12.0 0"
-    assert run_code(checkout, "import numba, springbench.harness\n" + ASK) == "12.0 1"
+    assert run_code(checkout, CALL_PROGRAM) == "12.0 0"
+    assert run_code(checkout, "import numba, springbench.harness\n" + CALL_PROGRAM) == "12.0 1"
     edit(inner, "FACTOR = 2.0", "FACTOR = 4.0")  # a constant from another file
-    assert run_code(checkout, "import springbench, numba\n" + ASK) == "24.0 0"
+    assert run_code(checkout, "import springbench, numba\n" + CALL_PROGRAM) == "24.0 0"
     edit(outer, "* FACTOR", "/ FACTOR")
-    assert run_code(checkout, "import numba\n" + ASK) == "1.5 0"
+    assert run_code(checkout, "import numba\n" + CALL_PROGRAM) == "1.5 0"
     edit(outer, "/ FACTOR", "* FACTOR")  # as it was: what was compiled then serves again
-    assert run_code(checkout, ASK) == "24.0 1"
+    assert run_code(checkout, CALL_PROGRAM) == "24.0 1"
 
 
 def test_options_of_the_compiler_have_code_of_their_own(checkout: Path):
-    assert run_code(checkout, ASK) == "6.0 0"
-    assert run_code(checkout, ASK, NUMBA_BOUNDSCHECK="1") == "6.0 0"
+    assert run_code(checkout, CALL_PROGRAM) == "6.0 0"
+    assert run_code(checkout, CALL_PROGRAM, NUMBA_BOUNDSCHECK="1") == "6.0 0"
     edit(checkout / "solvers" / "jit" / "kernel_compilation.py", '"nogil": True', '"nogil": True, "fastmath": True')
-    assert run_code(checkout, ASK) == "6.0 0"
+    assert run_code(checkout, CALL_PROGRAM) == "6.0 0"
 
 
 @pytest.mark.parametrize("variable", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME"])
 def test_one_folder_serves_many_checkouts(checkout: Path, tmp_path_factory: pytest.TempPathFactory, variable: str):
     shared, other = tmp_path_factory.mktemp("kernels"), tmp_path_factory.mktemp("other") / "checkout"
     shutil.copytree(checkout, other, symlinks=True)
-    assert run_code(checkout, ASK, **{variable: str(shared)}) == "6.0 0"
-    assert run_code(other, ASK, **{variable: str(shared)}) == "6.0 1"
+    assert run_code(checkout, CALL_PROGRAM, **{variable: str(shared)}) == "6.0 0"
+    assert run_code(other, CALL_PROGRAM, **{variable: str(shared)}) == "6.0 1"
     assert not [*checkout.rglob("*.nbc")]
 
 
@@ -138,11 +138,11 @@ kernel_cache.Event, compiler.compile_extra = ShownEvent, refuse
 
 def test_processes_that_need_the_same_code_at_the_same_time_compile_it_once(checkout: Path):
     with ThreadPoolExecutor(2) as pool:
-        first = pool.submit(run_code, checkout, COMPILE_SLOWLY + ASK)
+        first = pool.submit(run_code, checkout, COMPILE_SLOWLY + CALL_PROGRAM)
         while not (checkout / "compiling").exists():
             assert not first.done()
             Event().wait(0.01)
-        second = pool.submit(run_code, checkout, SHOW_WAITING + ASK)
+        second = pool.submit(run_code, checkout, SHOW_WAITING + CALL_PROGRAM)
         while not (checkout / "waiting").exists():
             assert not second.done()
             Event().wait(0.01)
@@ -177,21 +177,21 @@ def test_what_was_edited_since_its_import_is_stored_for_no_other_process(checkou
     editing = "from pathlib import Path\nimport springbench.solvers.kernels.inner_of_test\n"
     editing += "path = Path('solvers/kernels/inner_of_test.py')\n"
     editing += "path.write_text(path.read_text().replace('3.0', '9.0'))\n"
-    assert run_code(checkout, editing + ASK) == "6.0 0"  # its own module is as it was
-    assert run_code(checkout, ASK) == "18.0 0"
-    assert run_code(checkout, ASK) == "18.0 1"
+    assert run_code(checkout, editing + CALL_PROGRAM) == "6.0 0"  # its own module is as it was
+    assert run_code(checkout, CALL_PROGRAM) == "18.0 0"
+    assert run_code(checkout, CALL_PROGRAM) == "18.0 1"
 
 
 def test_a_source_that_is_removed_while_a_process_runs_stops_nothing(checkout: Path):
     removing = "from pathlib import Path\nimport springbench.solvers.kernels.kernel_of_test\n"
     removing += "Path('solvers/kernels/inner_of_test.py').unlink()\n"
-    assert run_code(checkout, removing + ASK) == "6.0 0"
+    assert run_code(checkout, removing + CALL_PROGRAM) == "6.0 0"
 
 
 TYPES = "TYPE_CHECKING"
 
 
-def imported(path: Path) -> set[str]:
+def list_imports(path: Path) -> set[str]:
     """The project's modules that a source imports when it runs, by Python's own grammar."""
     found, tree = set(), ast.parse(path.read_text())
     tree.body = [node for node in tree.body if not (isinstance(node, ast.If) and ast.unparse(node.test) == TYPES)]
@@ -208,7 +208,7 @@ def test_every_import_of_the_project_is_followed():
     for package in source_digest.PACKAGE_NAMES:
         for path in (source_digest.PROJECT_ROOT / package).rglob("*.py"):
             reached = source_digest.find_dependencies(str(path))
-            for name in imported(path):
+            for name in list_imports(path):
                 place = source_digest.PROJECT_ROOT.joinpath(*name.split("."))
                 module = {str(place.with_suffix(".py")), str(place / "__init__.py")}
                 exists = any(os.path.exists(file) for file in module)

@@ -109,13 +109,13 @@ def test_missing_kernels_are_compiled_once_and_then_loaded(run_code: Callable[..
     assert not [*tmp_path.rglob("*.lock")]
 
 
-UNKNOWN = [[NORMALS + "_of_before", [POINTS]], ["springbench.of_before:kernel", [POINTS]]]
+UNKNOWN_KERNELS = [[NORMALS + "_of_before", [POINTS]], ["springbench.of_before:kernel", [POINTS]]]
 WRONG = [NORMALS, [POINTS, NUMBERS, POINTS]]
 
 
 def test_what_cannot_be_compiled_stops_nothing(run_code: Callable[..., str], tmp_path: Path):
-    assert run_code(COMPILE_MISSING, *UNKNOWN) == ""
-    assert run_code(COMPILE_MISSING, WRONG, *UNKNOWN, STRAINS_SIGNATURE) == "compiling 2 kernels on 2 cores (once)\n"
+    assert run_code(COMPILE_MISSING, *UNKNOWN_KERNELS) == ""
+    assert run_code(COMPILE_MISSING, WRONG, *UNKNOWN_KERNELS, STRAINS_SIGNATURE) == "compiling 2 kernels on 2 cores (once)\n"
     assert run_code(CALL_KERNELS) == "0 1\n1 0\n"
     assert not [*tmp_path.rglob("*.lock")]
 

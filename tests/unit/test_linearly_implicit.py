@@ -30,7 +30,7 @@ from springbench.solvers.model.step_problem import StopRule, Unsupported
 from springbench.solvers.registry import SOLVERS, load_target
 
 END, ONCE = 0.3, StopRule(1)
-HELD, SOFT = PinsEffect(parts=("first",), weight="exact"), SpringsEffect(stretch=20.0)
+FIRST_PIN, SOFT = PinsEffect(parts=("first",), weight="exact"), SpringsEffect(stretch=20.0)
 EVENLY = PinsEffect.model_validate(
     {
         "parts": ["first"],
@@ -39,18 +39,18 @@ EVENLY = PinsEffect.model_validate(
     }
 )
 EFFECTS: dict[str, tuple[Any, ...]] = {
-    "none": (HELD,),
+    "none": (FIRST_PIN,),
     "bending": (PinsEffect(parts=("top_corners",), weight="exact"), BendingEffect(stiffness=1e-3)),
-    "ether drag": (HELD, EtherDragEffect(decay_rate=3.0)),
-    "air": (HELD, AirDragEffect(coefficient=2.0)),
-    "Rayleigh's damping of masses": (HELD, RayleighEffect(mass_coefficient=1.5)),
+    "ether drag": (FIRST_PIN, EtherDragEffect(decay_rate=3.0)),
+    "air": (FIRST_PIN, AirDragEffect(coefficient=2.0)),
+    "Rayleigh's damping of masses": (FIRST_PIN, RayleighEffect(mass_coefficient=1.5)),
 }
 ORDERS = {"ros2": 2, "ros3p": 3, "rodas": 4}
 OWN = [("ros2", "substepping"), ("ros3p", "substepping"), ("rodas", "substepping")]
 OF_STEPS = {("baraff-witkin", "implicit-euler"): 1, ("baraff-witkin", "bdf2"): 2, ("baraff-witkin", "midpoint"): 2}
 
 
-def made(
+def build_unit_scene(
     *effects: Any, integrator: str = "substepping", time_step: float = END, mesh: Any = None, size: int = 4
 ) -> Scene:
     """A scene of 1 kg."""
@@ -69,15 +69,15 @@ def mesh_of(effects: str) -> Any:
 
 
 @cache
-def truth(effects: str) -> ReferenceTrajectory:
-    return integrate_motion(made(SOFT, GravityEffect(), *EFFECTS[effects], mesh=mesh_of(effects)), [END])
+def integrate_reference(effects: str) -> ReferenceTrajectory:
+    return integrate_motion(build_unit_scene(SOFT, GravityEffect(), *EFFECTS[effects], mesh=mesh_of(effects)), [END])
 
 
 @pytest.mark.parametrize("effects", EFFECTS)
 @pytest.mark.parametrize("name", ORDERS)
 def test_the_error_falls_with_the_methods_order(name, effects):
-    scene = made(SOFT, GravityEffect(), *EFFECTS[effects], mesh=mesh_of(effects))
-    errors = [truth(effects).measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
+    scene = build_unit_scene(SOFT, GravityEffect(), *EFFECTS[effects], mesh=mesh_of(effects))
+    errors = [integrate_reference(effects).measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
     # The next term of the error is smaller by a step times the fastest frequency, at most a quarter.
     assert ORDERS[name] - 0.3 < np.log2(errors[0] / errors[1]) < ORDERS[name] + 0.6
 
@@ -87,15 +87,15 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 def test_the_linearised_step_has_the_order_of_its_integrator(name, integrator, effects):
     errors = []
     for frames in (48, 96):
-        scene = made(SOFT, GravityEffect(), *EFFECTS[effects], integrator=integrator, time_step=END / frames)
-        errors.append(truth(effects).measure_error(0, run(scene, name, frames)[-1].positions))
+        scene = build_unit_scene(SOFT, GravityEffect(), *EFFECTS[effects], integrator=integrator, time_step=END / frames)
+        errors.append(integrate_reference(effects).measure_error(0, run(scene, name, frames)[-1].positions))
     np.testing.assert_allclose(np.log2(errors[0] / errors[1]), OF_STEPS[name, integrator], atol=0.25)
 
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_pins_that_move_evenly_retain_the_order(name):
-    wanted = integrate_motion(made(SOFT, GravityEffect(), EVENLY, integrator="esdirk-4"), [END])
-    scene = made(SOFT, GravityEffect(), EVENLY)
+    wanted = integrate_motion(build_unit_scene(SOFT, GravityEffect(), EVENLY, integrator="esdirk-4"), [END])
+    scene = build_unit_scene(SOFT, GravityEffect(), EVENLY)
     errors = [wanted.measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
     assert np.log2(errors[0] / errors[1]) > ORDERS[name] - 0.3
 
@@ -104,7 +104,7 @@ def test_the_linearised_step_is_that_of_baraff_and_witkin():
     """(M - dt^2 df/dx) dv = dt (f + dt df/dx v), by a dense matrix."""
     pins = PinsEffect(parts=("top_corners",), weight="exact")
     effects = SpringsEffect(stretch=300.0), GravityEffect(), pins
-    scene = made(*effects, mesh=GridMesh(), integrator="implicit-euler", time_step=1 / 30)
+    scene = build_unit_scene(*effects, mesh=GridMesh(), integrator="implicit-euler", time_step=1 / 30)
     (p, v), dt, free = build_initial_state(scene).motion, 1 / 30, scene.system.free_vertices
     K = np.asarray(scene.all_springs.hessian(p).toarray())
     f = scene.constant_force.copy()
@@ -128,7 +128,7 @@ def test_a_stiff_spring_does_not_ring_after_one_step(name, saved):
     """One spring of 1e5 1/s along its own line, stretched by a thousandth: L-stable methods forget it at once, and
     ROS3P retains 0.73 of it (Lang and Verwer 2001)."""
     integrator = "implicit-euler" if name == "baraff-witkin" else "substepping"
-    scene = made(SpringsEffect(stretch=1e10), HELD, integrator=integrator, time_step=1 / 30, size=2)
+    scene = build_unit_scene(SpringsEffect(stretch=1e10), FIRST_PIN, integrator=integrator, time_step=1 / 30, size=2)
     state = build_initial_state(scene)
     along = scene.mesh.rest_positions[1] - scene.mesh.rest_positions[0]
     p = scene.mesh.rest_positions.copy()
@@ -141,9 +141,9 @@ def test_a_stiff_spring_does_not_ring_after_one_step(name, saved):
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_the_requested_error_controls_the_measured_one(name):
-    scene = made(SOFT, GravityEffect(), HELD, time_step=END / 3)
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, time_step=END / 3)
     requested = (1e-2, 1e-3, 1e-4, 1e-5)
-    errors = [truth("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions) for e in requested]
+    errors = [integrate_reference("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions) for e in requested]
     assert errors[-1] < 1e-3
     assert all(b < a for a, b in pairwise(errors))
 
@@ -152,7 +152,7 @@ def test_the_requested_error_controls_the_measured_one(name):
 def test_a_crushed_sheet_in_long_steps_stays_finite(name):
     """Its springs are compressed to a half, so the exact Hessian of a frame has no factor."""
     integrator = "implicit-euler" if name == "baraff-witkin" else "substepping"
-    scene = made(SpringsEffect(stretch=1e4), PinsEffect(parts=("top_corners",), weight="exact"), mesh=GridMesh(),
+    scene = build_unit_scene(SpringsEffect(stretch=1e4), PinsEffect(parts=("top_corners",), weight="exact"), mesh=GridMesh(),
                  size=6, integrator=integrator, time_step=1 / 30)  # fmt: skip
     state = build_initial_state(scene)
     crushed = type(state)(Motion(0.5 * scene.mesh.rest_positions, np.zeros_like(scene.mesh.rest_positions)), None, 0)
@@ -161,33 +161,33 @@ def test_a_crushed_sheet_in_long_steps_stays_finite(name):
         assert np.isfinite(step.positions).all()
 
 
-REFUSED = {
+REFUSED_EFFECTS = {
     "dashpots": (DashpotsEffect(stretch=0.4), "Dashpots"),
     "contact": (ContactEffect.model_validate({"obstacles": [{"kind": "plane", "point": [0.0, -9.0, 0.0]}]}), "Contact"),
 }
 
 
-@pytest.mark.parametrize("effect", REFUSED)
+@pytest.mark.parametrize("effect", REFUSED_EFFECTS)
 @pytest.mark.parametrize("name", ORDERS)
 def test_what_has_no_exact_derivative_is_refused_by_name(name, effect):
-    more, named = REFUSED[effect]
+    more, named = REFUSED_EFFECTS[effect]
     with pytest.raises(Unsupported, match=named):
-        prepare(made(SOFT, GravityEffect(), HELD, more), load_target(SOLVERS[name])())
+        prepare(build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, more), load_target(SOLVERS[name])())
 
 
 def test_the_linearised_step_refuses_contact_and_stages():
     with pytest.raises(Unsupported, match="Contact"):
         prepare(
-            made(SOFT, HELD, REFUSED["contact"][0], integrator="implicit-euler"),
+            build_unit_scene(SOFT, FIRST_PIN, REFUSED_EFFECTS["contact"][0], integrator="implicit-euler"),
             load_target(SOLVERS["baraff-witkin"])(),
         )
     with pytest.raises(Unsupported, match="implicit-euler, bdf2 or midpoint"):
-        prepare(made(SOFT, HELD, integrator="sdirk-4"), load_target(SOLVERS["baraff-witkin"])())
+        prepare(build_unit_scene(SOFT, FIRST_PIN, integrator="sdirk-4"), load_target(SOLVERS["baraff-witkin"])())
 
 
 def test_newton_from_the_start_begins_with_the_linearised_step():
     """Where the exact Hessian is definite and nothing is halved, both are the same step."""
-    scene = made(SOFT, GravityEffect(), HELD, integrator="implicit-euler", time_step=1e-3)
+    scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, integrator="implicit-euler", time_step=1e-3)
     once = next(
         simulate_scene(scene, prepare(scene, NewtonSolver()), ONCE, initial_guess="previous", frames=1)
     ).positions

@@ -46,16 +46,16 @@ def iterates(backend, problem: StepProblem, count: int) -> list[Positions]:
     return [p.copy() for p in islice(backend.prepare(problem.system).iterates(problem), count)]
 
 
-def collapsed(problem: StepProblem) -> StepProblem:
+def collapse_guess(problem: StepProblem) -> StepProblem:
     """All vertices in one point: no spring has a direction."""
     return replace(problem, initial_guess=np.zeros_like(problem.inertial_target))
 
 
-def scattered(problem: StepProblem) -> StepProblem:
+def scatter_guess(problem: StepProblem) -> StepProblem:
     return replace(problem, initial_guess=np.random.default_rng(1).normal(size=problem.inertial_target.shape))
 
 
-STARTS = {"hanging": lambda problem: problem, "collapsed": collapsed, "scattered": scattered}
+STARTS = {"hanging": lambda problem: problem, "collapsed": collapse_guess, "scattered": scatter_guess}
 NETWORKS = {
     "cloth": lambda: build_first_problem(build_cloth(12)),
     "cloth, exact pins": lambda: build_first_problem(build_cloth(12, "exact")),

@@ -42,7 +42,7 @@ def table_of(rows: list[dict[str, Any]]) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=RUN_SCHEMA)
 
 
-def printed(table: Any) -> str:
+def print_table(table: Any) -> str:
     console = Console(width=300, record=True, file=StringIO())
     console.print(table)
     return " ".join(console.export_text().split())
@@ -51,7 +51,7 @@ def printed(table: Any) -> str:
 def test_a_sweeps_table_names_the_machine_of_each_run_and_what_it_can_do():
     table = table_of(two_machines())
     assert list(label_runs(read_run_times(table)).values()) == ["sparse, machine 000000", "dense, machine 111111"]
-    text = printed(build_summary_table(table))
+    text = print_table(build_summary_table(table))
     assert "8 sparse, machine – – 1 1 – – 50 ok 1.0e-03 – – 000000" in text
     assert "machine 111111: a processor, 2 cores, by one thread 12 GB/s, 40 GFLOP/s, a fixed step 3.1 ms" in text
     assert COMPARISON_NOTE in text
@@ -67,7 +67,7 @@ def test_two_computers_of_one_kind_are_distinguished():
 
 def test_a_table_of_one_machine_names_it_once_and_in_no_row():
     one = [row | {"machine_id": "a" * 12} for row in two_machines()]
-    text = printed(build_summary_table(table_of(one)))
+    text = print_table(build_summary_table(table_of(one)))
     assert len(re.findall("machine aaaaaa", text)) == 1
     assert COMPARISON_NOTE in text
 
@@ -111,7 +111,7 @@ def test_list_query_and_merge_report_other_machines(tmp_path: Path):
 
 
 def test_a_report_states_that_its_counts_may_be_compared():
-    assert "may be compared across machines" in printed(build_score_table([]))
+    assert "may be compared across machines" in print_table(build_score_table([]))
 
 
 def test_the_limits_of_a_machine_are_measured_once_and_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -121,7 +121,7 @@ def test_the_code_hash_follows_names_and_contents_of_the_sources(tmp_path: Path)
     assert all(re.fullmatch(r"[0-9a-f]{12}", each) for each in seen)
 
 
-PINNED = """
+THREAD_PROGRAM = """
 from springbench.harness.execution.machine_info import limit_threads
 from threadpoolctl import threadpool_info
 with limit_threads({threads}):
@@ -134,7 +134,7 @@ with limit_threads({threads}):
 def test_pinned_threads_apply_to_numba_and_every_blas(threads: int):
     # A fresh process, in which neither NumPy nor SciPy was loaded before the threads were pinned.
     completed = subprocess.run(
-        [sys.executable, "-c", PINNED.format(threads=threads)], capture_output=True, text=True, check=True
+        [sys.executable, "-c", THREAD_PROGRAM.format(threads=threads)], capture_output=True, text=True, check=True
     ).stdout.split()
     assert len(completed) >= 2
     assert set(completed) == {str(threads)}
@@ -166,7 +166,7 @@ def test_more_threads_than_usable_cores_are_the_users_mistake(threads: int):
 
 
 @pytest.fixture
-def looked(monkeypatch: pytest.MonkeyPatch):
+def set_core_loads(monkeypatch: pytest.MonkeyPatch):
     """Says how busy four cores are [%]; what was found of them is forgotten before and after."""
 
     def pretend(*busy: float) -> None:
@@ -183,20 +183,20 @@ def looked(monkeypatch: pytest.MonkeyPatch):
     ("busy", "number"),
     [((0, 0, 0, 0), 4), ((2, 1, 5, 3), 4), ((100, 0, 0, 0), 3), ((50, 50, 50, 50), 2), ((100, 100, 100, 90), 1)],
 )
-def test_threads_are_as_many_as_there_are_idle_cores(looked, busy: tuple[float, ...], number: int):
-    looked(*busy)
+def test_threads_are_as_many_as_there_are_idle_cores(set_core_loads, busy: tuple[float, ...], number: int):
+    set_core_loads(*busy)
     found = machine_info.choose_threads("auto")
     assert found.count == number
     assert f"{number} of 4" in found.reason
 
 
-def test_a_number_that_was_given_stays(looked):
-    looked(100, 100, 100, 100)
+def test_a_number_that_was_given_stays(set_core_loads):
+    set_core_loads(100, 100, 100, 100)
     assert machine_info.choose_threads(3) == machine_info.ThreadChoice(3)
 
 
-def test_the_choice_stays_the_same_all_the_process_long(looked):
-    looked(0, 0, 0, 0)
+def test_the_choice_stays_the_same_all_the_process_long(set_core_loads):
+    set_core_loads(0, 0, 0, 0)
     first = machine_info.choose_threads("auto")
-    looked(100, 100, 100, 100)
+    set_core_loads(100, 100, 100, 100)
     assert machine_info.choose_threads("auto") is first

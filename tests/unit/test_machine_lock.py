@@ -121,7 +121,7 @@ def test_a_run_timed_next_to_others_is_reported():
     timed.leave.set()
 
 
-IN_THE_WAY: dict[str, Callable[[Path], object]] = {
+OBSTRUCTIONS: dict[str, Callable[[Path], object]] = {
     "a pipe": os.mkfifo,
     "a link": lambda path: path.symlink_to("/dev/null"),
     "a folder": Path.mkdir,
@@ -129,7 +129,7 @@ IN_THE_WAY: dict[str, Callable[[Path], object]] = {
 }
 
 
-@pytest.mark.parametrize("what", IN_THE_WAY)
+@pytest.mark.parametrize("what", OBSTRUCTIONS)
 def test_what_prevents_a_lock_is_named_at_once(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)  # the name of a socket may not be long
     monkeypatch.setenv("SPRINGBENCH_LOCKS", "locks")
@@ -142,18 +142,18 @@ def test_what_prevents_a_lock_is_named_at_once(what: str, tmp_path: Path, monkey
         ".claims": lambda: closing(UnitClaims(Path(), [])),
     }
     for name, lock in places.items():
-        IN_THE_WAY[what](Path(name))
+        OBSTRUCTIONS[what](Path(name))
         with pytest.raises(InputError, match=f"{name}: is {what}; expected a plain file"), lock():
             pass
         os.rename(name, "elsewhere" + name.replace("/", "-"))
 
 
 def test_a_lock_that_may_not_be_opened_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def refused(path: Path, *flags: int) -> int:
+    def refuse_open(path: Path, *flags: int) -> int:
         raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
     (tmp_path / "lock").touch()
-    monkeypatch.setattr(os, "open", refused)
+    monkeypatch.setattr(os, "open", refuse_open)
     with pytest.raises(InputError, match=r"cannot be opened \(Permission denied\).*, or do so"):
         open_lock_file(tmp_path / "lock", hint=", or do so")
 

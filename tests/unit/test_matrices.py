@@ -18,7 +18,7 @@ ROUND_OFF = 1e-15
 
 SPRINGS = np.array([[0, 1], [2, 1]])
 STIFFNESS, MASS, TIME_STEP = np.array([2.0, 3.0]), np.array([1.0, 2.0, 3.0]), 0.5
-PINNED, WEIGHT = np.array([2]), np.array([10.0])
+PINNED_VERTICES, WEIGHT = np.array([2]), np.array([10.0])
 
 BY_HAND = {
     "A": [[1, -1, 0], [0, -1, 1]],
@@ -79,7 +79,7 @@ def networks(draw):
 @pytest.mark.parametrize("name", BY_HAND)
 @pytest.mark.parametrize("make", [dense_matrices, sparse_matrices])
 def test_matrices_are_those_computed_by_hand(make, name):
-    made = make(SPRINGS, STIFFNESS, MASS, TIME_STEP, PINNED, WEIGHT)[name]
+    made = make(SPRINGS, STIFFNESS, MASS, TIME_STEP, PINNED_VERTICES, WEIGHT)[name]
     np.testing.assert_array_equal(made.toarray() if isinstance(made, csr_array) else made, BY_HAND[name])
 
 
@@ -131,9 +131,9 @@ def test_a_loop_has_an_empty_row_in_the_incidence():
 
 
 def test_one_number_stands_for_the_stiffness_of_every_spring_and_the_weight_of_every_pin():
-    one = sparse_matrices(SPRINGS, 7.0, MASS, TIME_STEP, PINNED, 9.0)["Q"]
-    each = sparse_matrices(SPRINGS, np.full(2, 7.0), MASS, TIME_STEP, PINNED, np.full(1, 9.0))["Q"]
-    dense = dense_matrices(SPRINGS, 7.0, MASS, TIME_STEP, PINNED, 9.0)["Q"]
+    one = sparse_matrices(SPRINGS, 7.0, MASS, TIME_STEP, PINNED_VERTICES, 9.0)["Q"]
+    each = sparse_matrices(SPRINGS, np.full(2, 7.0), MASS, TIME_STEP, PINNED_VERTICES, np.full(1, 9.0))["Q"]
+    dense = dense_matrices(SPRINGS, 7.0, MASS, TIME_STEP, PINNED_VERTICES, 9.0)["Q"]
     np.testing.assert_array_equal(one.toarray(), each.toarray())
     np.testing.assert_array_equal(one.toarray(), dense)
 
@@ -177,7 +177,7 @@ LOOSE = {
     "a loop": ([[1, 1]], [1.0], [1, 0], [], "1 in all (1)"),
     "more than five": (np.empty((0, 2)), [], [0] * 7, [], "7 in all (0, 1, 2, 3, 4, ...)"),
 }
-HELD = {
+DETERMINED = {
     "a mass": (np.empty((0, 2)), [], [1.0], []),
     "a pin": (np.empty((0, 2)), [], [0.0], [0]),
     "springs to a mass": ([[0, 1], [1, 2]], [1.0, 1.0], [0, 0, 1], []),
@@ -202,9 +202,9 @@ def test_vertices_that_nothing_determines_are_named(case):
 
 
 @pytest.mark.parametrize("weight", [1.0, np.inf])
-@pytest.mark.parametrize("case", HELD)
+@pytest.mark.parametrize("case", DETERMINED)
 def test_a_mass_or_a_pin_determines_all_that_springs_tie_to_it(case, weight):
-    springs, stiffness, mass, pinned = HELD[case]
+    springs, stiffness, mass, pinned = DETERMINED[case]
     system, energy = bare_system(springs, stiffness, mass, pinned, weight)
     assert system_matrix_assembly.assemble_system_matrix(system, [energy]).shape == (
         system.num_vertices,

@@ -23,7 +23,7 @@ from springbench.harness.experiments.grading.matrix_comparison import compare_ma
 from springbench.harness.experiments.grading.spring_terms import build_graded_scene, build_step_problem
 from typer.testing import CliRunner
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "scenes"
+SHARED_SCENES = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 ROUND_OFF = 1e-12
 """A few operations in another order, relative to the largest entry."""
 
@@ -90,9 +90,9 @@ def test_matrices_are_those_of_plain_numpy(tmp_path):
 
 @pytest.mark.parametrize("name", ["single-spring-horizontal", "horizontal-chain", "net"])
 def test_matrices_of_the_published_scenes_are_those_of_plain_numpy(name):
-    if not (SHARED / f"{name}.json").exists():
+    if not (SHARED_SCENES / f"{name}.json").exists():
         pytest.skip("the assignment's scenes are not part of this repository")
-    check_against_plain(SHARED / f"{name}.json")
+    check_against_plain(SHARED_SCENES / f"{name}.json")
 
 
 def test_the_files_have_the_same_matrices(tmp_path):

@@ -41,7 +41,7 @@ STIFF = build_first_problem(build_cloth(16, "exact", stretch=1e4))
 """Nine hundred springs, which multigrid takes two levels for."""
 
 
-def solved(problem: StepProblem, iterations: int, solver: MultigridXpbd | Xpbd | None = None) -> np.ndarray:
+def solve_positions(problem: StepProblem, iterations: int, solver: MultigridXpbd | Xpbd | None = None) -> np.ndarray:
     return (solver or MultigridXpbd()).prepare(problem.system).solve(problem, StopRule(iterations)).positions
 
 
@@ -73,7 +73,7 @@ def test_one_spring_ends_where_its_force_is_that_of_inertia():
     problem = StepProblem(system, target, np.zeros((2, 3)), rest[:1], rest, rest, start)
     diagonal = m / dt**2
     wanted = (k * r + diagonal * y) / (k + diagonal)
-    np.testing.assert_allclose(solved(problem, 1), [[0.0, 0.0, 0.0], [0.0, -wanted, 0.0]], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(solve_positions(problem, 1), [[0.0, 0.0, 0.0], [0.0, -wanted, 0.0]], rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("stretch", [2.0, 2e3, 2e6])
@@ -82,7 +82,7 @@ def test_springs_that_do_not_turn_reach_the_minimiser_of_the_step_at_once(stretc
     problem = hanging(stretch, factor)
     wanted = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(50_000, 1e-14)).positions
     # The first iteration is exact but for round-off, which stiff springs multiply, and the second for less.
-    np.testing.assert_allclose(solved(problem, 2), wanted, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(solve_positions(problem, 2), wanted, rtol=0, atol=1e-12)
 
 
 def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_step():
@@ -94,7 +94,7 @@ def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_
         )
         prepared = prepare(made, NewtonSolver())
         *_, last = simulate_scene(made, prepared, StopRule(100, 1e-12), initial_guess="previous", frames=frames)
-        apart.append(np.abs(solved(last.problem, 20) - last.solution.positions).max())
+        apart.append(np.abs(solve_positions(last.problem, 20) - last.solution.positions).max())
     np.testing.assert_allclose([a / b for a, b in pairwise(apart)], 16.0, rtol=0.1)  # the next order
 
 
@@ -116,7 +116,7 @@ def test_a_free_cloth_conserves_momentum():
     problem = replace(
         problem, inertial_target=problem.current_positions + made.system.time_step * velocity, step_start=moving
     )
-    after = moving.velocity_at(solved(problem, 5))
+    after = moving.velocity_at(solve_positions(problem, 5))
     np.testing.assert_allclose(made.system.mass @ after, made.system.mass @ velocity, rtol=0, atol=1e-12)
 
 
@@ -126,7 +126,7 @@ def test_springs_without_stiffness_and_loops_do_nothing():
         problem.current_positions, np.array([[0, 5], [4, 4], [2, 9]]), np.array([0.0, 100.0, 0.0])
     )
     with_, without = (replace(problem, system=replace(problem.system, energies=e)) for e in ((idle,), ()))
-    np.testing.assert_array_equal(solved(with_, 5), solved(without, 5))
+    np.testing.assert_array_equal(solve_positions(with_, 5), solve_positions(without, 5))
 
 
 @pytest.mark.parametrize("smoothed", [False, True], ids=["unsmoothed", "smoothed"])

@@ -63,14 +63,14 @@ def test_bytecode_of_the_source_without_an_error_does_not_hide_it(tmp_path: Path
     (tmp_path / "small.py").write_text("x = 1\n")
     copy, mutation = Small(), replace(TABLE[0], file="small.py", fragment="x = 1", replacement="x = 2")
 
-    def imported() -> tuple[int, str]:
+    def import_module() -> tuple[int, str]:
         return copy.run_command(mutation, ["-c", "import small; print(small.x)"], 60.0)
 
-    found = [imported()]
+    found = [import_module()]
     for _ in range(2):
-        with copy.planted(mutation):
-            found.append(imported())
-        found.append(imported())
+        with copy.plant_mutation(mutation):
+            found.append(import_module())
+        found.append(import_module())
     assert found == [(0, "1\n"), (0, "2\n"), (0, "1\n"), (0, "2\n"), (0, "1\n")]
     assert list((tmp_path / "__pycache__").iterdir()), "bytecode is written"
 
@@ -82,7 +82,7 @@ class ChanceFailures(SourceCopy):
         self.planted_now, self.whole = False, 0
 
     @contextmanager
-    def planted(self, mutation: Mutation) -> Iterator[None]:
+    def plant_mutation(self, mutation: Mutation) -> Iterator[None]:
         self.planted_now = True
         yield
         self.planted_now = False
@@ -102,7 +102,7 @@ def test_a_test_of_the_whole_suite_that_fails_by_chance_catches_nothing():
 
 
 def test_the_test_that_caught_it_last_time_is_run_first():
-    class Recorded(ChanceFailures):
+    class RecordingFailures(ChanceFailures):
         def __init__(self) -> None:
             super().__init__()
             self.commands: list[str] = []
@@ -111,7 +111,7 @@ def test_the_test_that_caught_it_last_time_is_run_first():
             self.commands.append(command[-1])
             return int(len(self.commands) != 2), f"FAILED {command[-1]} - why"
 
-    mutation, copy = TABLE[0], Recorded()
+    mutation, copy = TABLE[0], RecordingFailures()
     before = f"{mutation.tests[0]}::test_before"
     assert examine(copy, mutation, "", failed_before=before).failed == before
     assert examine(copy, mutation, "", failed_before=before).failed == mutation.tests[-1], "it no longer catches it"
@@ -129,16 +129,16 @@ def test_a_time_out_catches_nothing_and_is_repeated(tmp_path: Path, capsys: pyte
             self._root, self._compiled = tmp_path, tmp_path
 
         @contextmanager
-        def planted(self, mutation: Mutation) -> Iterator[None]:
+        def plant_mutation(self, mutation: Mutation) -> Iterator[None]:
             yield
 
         def run_command(self, mutation: Mutation, command: list[str], limit: float) -> tuple[int, str]:
             return super().run_command(mutation, ["waits.py" if "pytest" in command else "ends.py"], 0.5)
 
     found = examine(Waiting(), TABLE[0], "")
-    assert (found.tests, found.decided, found.caught) == ("timed out", False, False)
+    assert (found.tests, found.is_decided, found.is_caught) == ("timed out", False, False)
     caught = replace(found, tests="caught")
-    assert (caught.decided, caught.caught) == (True, True)
+    assert (caught.is_decided, caught.is_caught) == (True, True)
     missed = replace(found, tests="survived")
     assert [summarise_outcomes(some) for some in ([caught], [found, missed], [caught, found])] == [0, 1, 3]
     assert f"1 of 2 caught; undecided, run again: {found.name}" in capsys.readouterr().out
@@ -150,4 +150,4 @@ def test_tests_that_are_all_skipped_decide_nothing():
             return 0, "12 skipped in 3.00s"
 
     found = examine(WithoutBrowser(), replace(TABLE[0], product=None), "")
-    assert (found.tests, found.decided, found.caught) == ("skipped", False, False)
+    assert (found.tests, found.is_decided, found.is_caught) == ("skipped", False, False)

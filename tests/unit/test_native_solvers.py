@@ -31,7 +31,7 @@ effects: [{kind: springs, stretch: 200}]
 """
 
 
-def made(name: str, system: System) -> PreparedLocalGlobal:
+def prepare_native(name: str, system: System) -> PreparedLocalGlobal:
     """The real one; where it cannot be compiled it refuses with the reason, and there is nothing to compare."""
     try:
         return load_target(OPTIONAL_SOLVERS[name])().prepare(system)
@@ -45,7 +45,7 @@ def test_iterates_are_those_of_the_other_backends(name: str, weight: float | str
     scene = build_cloth(12, weight=weight)
     problem = build_first_problem(scene)
     ours = SparseLocalGlobal().prepare(scene.system)
-    theirs = made(name, scene.system)
+    theirs = prepare_native(name, scene.system)
     for p, q in islice(zip(ours.iterates(problem), theirs.iterates(problem), strict=True), 30):
         # Two factorisations of a matrix with weights from 1e2 to 1e10: round-off in positions of a metre.
         np.testing.assert_allclose(q, p, rtol=0, atol=1e-11)
@@ -59,7 +59,7 @@ def test_iterates_are_those_of_the_other_backends(name: str, weight: float | str
 @pytest.mark.parametrize("name", NATIVE)
 def test_a_matrix_without_a_factor_is_refused(name: str):
     scene = build_cloth(3)
-    made(name, scene.system)
+    prepare_native(name, scene.system)
     loose = System(np.full(9, -1.0), scene.system.time_step, scene.system.energies)
     with pytest.raises(NotPositiveDefinite):
         load_target(OPTIONAL_SOLVERS[name])().prepare(loose)

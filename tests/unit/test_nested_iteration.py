@@ -16,7 +16,7 @@ from springbench.solvers.model.step_problem import StopRule, Unsupported
 from tests.scene_builders import CLOTH_SCENE_YAML
 
 
-def made(folder, mesh="{kind: grid}", pins="parts: [top_corners]", size=21, integrator="implicit-euler"):
+def build_cloth_scene(folder, mesh="{kind: grid}", pins="parts: [top_corners]", size=21, integrator="implicit-euler"):
     path = folder / "cloth.yaml"
     text = CLOTH_SCENE_YAML.replace("{kind: grid}", mesh).replace("parts: [top_corners]", pins).replace("300", "3000")
     path.write_text(text, encoding="utf-8")
@@ -27,7 +27,7 @@ def made(folder, mesh="{kind: grid}", pins="parts: [top_corners]", size=21, inte
 @pytest.mark.parametrize("mesh", ["{kind: chain}", "{kind: grid}", "{kind: net}", "{kind: block}"])
 def test_affine_motions_pass_between_meshes_without_change(tmp_path, mesh):
     pins = "stride: 1000"
-    fine, coarse = (made(tmp_path, mesh, pins, size).mesh.rest_positions for size in (12, 5))
+    fine, coarse = (build_cloth_scene(tmp_path, mesh, pins, size).mesh.rest_positions for size in (12, 5))
     rng = np.random.default_rng(0)
     turn, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     for known, wanted in ((fine, coarse), (coarse, fine)):
@@ -36,14 +36,14 @@ def test_affine_motions_pass_between_meshes_without_change(tmp_path, mesh):
 
 
 def test_common_vertices_of_both_meshes_retain_their_values(tmp_path):
-    fine, coarse = (made(tmp_path, size=size).mesh.rest_positions for size in (9, 5))
+    fine, coarse = (build_cloth_scene(tmp_path, size=size).mesh.rest_positions for size in (9, 5))
     value = np.random.default_rng(0).normal(size=len(fine))
     where = [int(np.linalg.norm(fine - x, axis=1).argmin()) for x in coarse]
     np.testing.assert_allclose(build_interpolation(fine, coarse) @ value, value[where], rtol=0, atol=1e-6)
 
 
 def test_the_guess_is_nearer_to_the_minimum_and_saves_iterations(tmp_path):
-    scene = made(tmp_path)
+    scene = build_cloth_scene(tmp_path)
     state, ready = build_initial_state(scene), prepare(scene, Lbfgs())
     current, coarse = (build_problem(scene, state, guess) for guess in ("previous", "coarse-to-fine"))
     np.testing.assert_array_equal(coarse.initial_guess[scene.system.pins.vertices], coarse.pin_targets)
@@ -57,7 +57,7 @@ def test_the_guess_is_nearer_to_the_minimum_and_saves_iterations(tmp_path):
 
 
 def test_nested_iteration_repeats_from_step_to_step(tmp_path):
-    scene = made(tmp_path, integrator="bdf2")
+    scene = build_cloth_scene(tmp_path, integrator="bdf2")
     rule, ready = StopRule(2000, 1e-4), prepare(scene, Lbfgs())
     runs = [
         list(simulate_scene(scene, ready, rule, initial_guess=guess, frames=3))
@@ -80,12 +80,12 @@ def test_nested_iteration_repeats_from_step_to_step(tmp_path):
     ids=["small", "indices", "every", "several unknowns", "an empty box"],
 )
 def test_where_there_is_no_coarser_mesh_it_is_refused(tmp_path, given, why):
-    scene = made(tmp_path, **given)
+    scene = build_cloth_scene(tmp_path, **given)
     with pytest.raises(Unsupported, match=why):
         build_problem(scene, build_initial_state(scene), "coarse-to-fine")
 
 
 def test_a_scene_of_one_size_has_none(tmp_path):
-    scene = replace(made(tmp_path), build_coarser=None)
+    scene = replace(build_cloth_scene(tmp_path), build_coarser=None)
     with pytest.raises(Unsupported, match="the mesh is from a file"):
         build_problem(scene, build_initial_state(scene), "coarse-to-fine")

@@ -33,7 +33,7 @@ ENOUGH = StopRule(300)
 """The hardest case takes 200 iterations to round-off."""
 
 
-def stated(case) -> StepProblem:
+def build_case_step(case) -> StepProblem:
     made = case.scene()
     return build_problem(made, resting(case.start(made.mesh.rest_positions)), "assignment")
 
@@ -46,7 +46,7 @@ def is_certified(found: StepProblem, p: Positions) -> bool:
 @solvers
 @pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 def test_a_hard_case_ends_at_a_certified_minimum(case, solver):
-    given = stated(case)
+    given = build_case_step(case)
     path = [given.initial_guess.copy()]
     for p in islice(solver.prepare(given.system).iterates(given), 300):
         path.append(p.copy())

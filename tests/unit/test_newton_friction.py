@@ -28,30 +28,30 @@ def scene() -> Scene:
 
 
 @pytest.fixture(scope="module")
-def solved(scene) -> list[tuple[StepProblem, Solution]]:
+def solved_steps(scene) -> list[tuple[StepProblem, Solution]]:
     prepared = prepare(scene, NewtonSolver())
     run = simulate_scene(scene, prepared, STOP, initial_guess="previous", frames=FRAMES)
     return [(step.problem, prepared.solve(step.problem, STOP)) for step in run]
 
 
-def test_it_finds_the_minima_of_newtons_method_alone_in_less_than_half_of_the_iterations(scene, solved):
+def test_it_finds_the_minima_of_newtons_method_alone_in_less_than_half_of_the_iterations(scene, solved_steps):
     alone = NewtonSolver().prepare(scene.system)
     assert isinstance(alone, PreparedDescent)
     alone.method._friction_search = None  # pyright: ignore[reportAttributeAccessIssue]
     iterations = 0
-    for problem, solution in solved[20:]:
+    for problem, solution in solved_steps[20:]:
         wanted = alone.solve(problem, STOP)
         np.testing.assert_allclose(solution.positions, wanted.positions, rtol=0, atol=1e-6)
         iterations += wanted.num_iterations
-    assert 2 * sum(solution.num_iterations for _, solution in solved[20:]) < iterations
+    assert 2 * sum(solution.num_iterations for _, solution in solved_steps[20:]) < iterations
 
 
-def test_settling_lowers_the_objective_and_leaves_a_minimum_where_it_is(scene, solved):
+def test_settling_lowers_the_objective_and_leaves_a_minimum_where_it_is(scene, solved_steps):
     prepared, objective = NewtonSolver().prepare(scene.system), FixedObjective(scene.system)
     assert isinstance(prepared, PreparedDescent)
     settling, noise = FrictionGaussSeidel(prepared.metric), np.random.default_rng(0)
     lowered = 0
-    for problem, solution in solved[20:]:
+    for problem, solution in solved_steps[20:]:
         step, p = StepObjective(objective, problem), solution.positions
         np.testing.assert_allclose(
             settling.relax_friction(step, p), p, rtol=0, atol=1e-7
@@ -60,4 +60,4 @@ def test_settling_lowers_the_objective_and_leaves_a_minimum_where_it_is(scene, s
         settled = settling.relax_friction(step, away)
         lowered += settled is not away
         assert problem.value(settled) <= problem.value(away)
-    assert lowered == len(solved[20:])
+    assert lowered == len(solved_steps[20:])

@@ -28,7 +28,7 @@ def header(text: str, body: bytes = b"") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) + 1) + text.encode() + b"\n" + body
 
 
-def packed(**arrays: bytes) -> bytes:
+def pack_arrays(**arrays: bytes) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in arrays.items():
@@ -36,7 +36,7 @@ def packed(**arrays: bytes) -> bytes:
     return file.getvalue()
 
 
-def flipped(content: bytes) -> bytes:
+def flip_bit(content: bytes) -> bytes:
     """Stored without compression, with one bit of a number turned."""
     file = io.BytesIO()
     np.savez(file, positions=FRAMES)
@@ -45,7 +45,7 @@ def flipped(content: bytes) -> bytes:
     return bytes(whole)
 
 
-def encrypted(content: bytes) -> bytes:
+def mark_encrypted(content: bytes) -> bytes:
     """Marked as encrypted, in both heads of its one member."""
     whole = bytearray(content)
     for mark, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
@@ -53,54 +53,54 @@ def encrypted(content: bytes) -> bytes:
     return bytes(whole)
 
 
-WHOLE = packed(positions=npy(FRAMES))
+WHOLE = pack_arrays(positions=npy(FRAMES))
 NAN, WORDS = FRAMES.copy(), np.array([["a"]])
 NAN[1, 2, 0] = np.nan
-BROKEN: dict[str, tuple[bytes | Callable[[bytes], bytes], str]] = {
+BROKEN_FILES: dict[str, tuple[bytes | Callable[[bytes], bytes], str]] = {
     "empty": (b"", "is empty"),
     "a pointer": (b"version https://git-lfs.github.com/spec/v1\n", "Git LFS pointer"),
     "no archive": (b"positions", "no whole .npz"),
     "a bare array": (npy(FRAMES), "no whole .npz"),
     "cut": (lambda whole: whole[:-30], "no whole .npz"),
-    "a flipped bit": (flipped, "Bad CRC-32"),
-    "encrypted": (encrypted, "encrypted"),
+    "a flipped bit": (flip_bit, "Bad CRC-32"),
+    "encrypted": (mark_encrypted, "encrypted"),
     "of another name": (
-        packed(velocities=npy(FRAMES)),
+        pack_arrays(velocities=npy(FRAMES)),
         "contains 0 arrays `positions`, expected one; it contains velocities",
     ),
-    "no member": (packed(), "contains 0 arrays"),
-    "a member that is no array": (packed(positions=b"0 1 2"), "has no head of an array"),
-    "pickled": (packed(positions=npy(np.array([FRAMES, None], object), allow_pickle=True)), "of type object"),
-    "words": (packed(positions=npy(WORDS)), "of type <U1; expected real numbers"),
-    "complex": (packed(positions=npy(FRAMES.astype(complex))), "of type complex128"),
-    "a record": (packed(positions=npy(np.zeros(3, [("x", "f8")]))), "expected real numbers"),
-    "NaN": (packed(positions=npy(NAN)), r"contains nan \(number 18 from 0\)"),
-    "beyond float64": (packed(positions=npy(np.full((1, 1, 3), np.longdouble("1e400")))), "contains inf"),
-    "fewer numbers than promised": (packed(positions=npy(FRAMES)[:-8]), "declares 192 bytes, and 184 are there"),
-    "more numbers": (packed(positions=npy(FRAMES) + bytes(8)), "declares 192 bytes, and 200 are there"),
+    "no member": (pack_arrays(), "contains 0 arrays"),
+    "a member that is no array": (pack_arrays(positions=b"0 1 2"), "has no head of an array"),
+    "pickled": (pack_arrays(positions=npy(np.array([FRAMES, None], object), allow_pickle=True)), "of type object"),
+    "words": (pack_arrays(positions=npy(WORDS)), "of type <U1; expected real numbers"),
+    "complex": (pack_arrays(positions=npy(FRAMES.astype(complex))), "of type complex128"),
+    "a record": (pack_arrays(positions=npy(np.zeros(3, [("x", "f8")]))), "expected real numbers"),
+    "NaN": (pack_arrays(positions=npy(NAN)), r"contains nan \(number 18 from 0\)"),
+    "beyond float64": (pack_arrays(positions=npy(np.full((1, 1, 3), np.longdouble("1e400")))), "contains inf"),
+    "fewer numbers than promised": (pack_arrays(positions=npy(FRAMES)[:-8]), "declares 192 bytes, and 184 are there"),
+    "more numbers": (pack_arrays(positions=npy(FRAMES) + bytes(8)), "declares 192 bytes, and 200 are there"),
     "a negative shape": (
-        packed(positions=header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 4, 3)}")),
+        pack_arrays(positions=header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, 4, 3)}")),
         "the shape",
     ),
     "a vast shape": (
-        packed(positions=header("{'descr': '<f8', 'fortran_order': False, 'shape': (10**6, 10**6, 3)}")),
+        pack_arrays(positions=header("{'descr': '<f8', 'fortran_order': False, 'shape': (10**6, 10**6, 3)}")),
         "no head of an array|declares",
     ),
-    "a head of code": (packed(positions=header("__import__('os').system('true')")), "no head of an array"),
+    "a head of code": (pack_arrays(positions=header("__import__('os').system('true')")), "no head of an array"),
     "100 MB of zeros in 100 kB": (
-        lambda _: packed(positions=npy(np.zeros(MAX_NPZ_BYTES // 8 + 1))),
+        lambda _: pack_arrays(positions=npy(np.zeros(MAX_NPZ_BYTES // 8 + 1))),
         "at most 100,000,000 are read",
     ),
     "bytes that grow": (
-        lambda _: packed(positions=npy(np.zeros(MAX_NPZ_BYTES // 8 + 1, np.uint8))),
+        lambda _: pack_arrays(positions=npy(np.zeros(MAX_NPZ_BYTES // 8 + 1, np.uint8))),
         "at most 12,500,000 are read",
     ),
 }
 
 
-@pytest.mark.parametrize("case", BROKEN)
+@pytest.mark.parametrize("case", BROKEN_FILES)
 def test_a_broken_file_is_refused_with_the_reason(tmp_path, case):
-    content, words = BROKEN[case]
+    content, words = BROKEN_FILES[case]
     path = tmp_path / "walk.npz"
     path.write_bytes(content if isinstance(content, bytes) else content(WHOLE))
     with pytest.raises(InputError, match=words) as caught:

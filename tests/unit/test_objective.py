@@ -81,7 +81,7 @@ PROBLEMS = {
 problems = pytest.mark.parametrize("problem", PROBLEMS.values(), ids=list(PROBLEMS))
 
 
-def stepped(problem: StepProblem) -> tuple[StepObjective, Positions, Positions]:
+def build_step(problem: StepProblem) -> tuple[StepObjective, Positions, Positions]:
     """The step, and two points of it."""
     step = StepObjective(FixedObjective(problem.system), problem)
     rng = np.random.default_rng(0)
@@ -106,14 +106,14 @@ def exact_hessian(problem: StepProblem, p: Positions) -> csr_array:
 
 @problems
 def test_the_gradient_is_that_of_the_reference_evaluator(problem):
-    step, p, _ = stepped(problem)
+    step, p, _ = build_step(problem)
     wanted = problem.gradient(p)
     np.testing.assert_allclose(step.gradient(p), wanted, rtol=0, atol=SUMS * np.abs(wanted).max(initial=1e4))
 
 
 @problems
 def test_the_objective_change_is_the_difference_of_the_reference_values(problem):
-    step, p, q = stepped(problem)
+    step, p, q = build_step(problem)
     wanted = problem.value(q) - problem.value(p)
     assert step.objective_change(p, q)[0] == pytest.approx(wanted, rel=1e-9, abs=SUMS * problem.value_scale(p))
 
@@ -121,7 +121,7 @@ def test_the_objective_change_is_the_difference_of_the_reference_values(problem)
 def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_digits():
     """A step of 1e-9 along the gradient: the rise is the slope, to as many digits as it is short."""
     problem = build_first_problem(build_cloth(7, "exact", stretch=1e6))
-    step, p, _ = stepped(problem)
+    step, p, _ = build_step(problem)
     direction = step.gradient(p)
     q = p - 1e-9 / np.abs(direction).max() * direction
     slope = float((step.gradient(p) * (q - p)).sum())
@@ -133,7 +133,7 @@ def test_the_objective_change_is_accurate_where_the_difference_of_values_has_no_
 
 @problems
 def test_a_product_with_the_hessian_is_that_of_the_energies(problem):
-    step, p, _ = stepped(problem)
+    step, p, _ = build_step(problem)
     free = problem.system.free_vertices
     x = np.zeros_like(p)
     x[free] = np.random.default_rng(1).normal(size=(len(free), 3))
@@ -146,7 +146,7 @@ def test_a_product_with_the_hessian_is_that_of_the_energies(problem):
 
 @problems
 def test_a_solve_undoes_a_product(problem):
-    step, p, _ = stepped(problem)
+    step, p, _ = build_step(problem)
     free = problem.system.free_vertices
     hessian = step.hessian(p)
     shift = 1.1 * float(abs(exact_hessian(problem, p)).sum(axis=1).max()) if len(free) else 0.0
@@ -159,7 +159,7 @@ def test_a_solve_undoes_a_product(problem):
 
 @problems
 def test_the_hessian_has_a_factor_just_where_its_eigenvalues_are_positive(problem):
-    step, p, _ = stepped(problem)
+    step, p, _ = build_step(problem)
     dense = exact_hessian(problem, p).toarray()
     smallest = float(np.linalg.eigvalsh(dense)[0]) if len(dense) else 1.0
     hessian = step.hessian(p)
@@ -171,7 +171,7 @@ def test_the_hessian_has_a_factor_just_where_its_eigenvalues_are_positive(proble
 
 def test_without_negative_lateral_parts_springs_are_positive_semidefinite():
     problem = build_random_problem(4, weights=())
-    step, p, _ = stepped(problem)
+    step, p, _ = build_step(problem)
     hessian = step.hessian(0.01 * p)  # nearly all springs compressed
     assert not hessian.factorise()
     assert hessian.factorise(0.0)
@@ -185,15 +185,15 @@ def test_a_temporary_pattern_leaves_no_trace():
     b = np.random.default_rng(0).normal(size=p.shape)
     b[near.system.pins.vertices] = 0.0
 
-    def solved(objective: FixedObjective, problem: StepProblem) -> Positions:
+    def solve_with_hessian(objective: FixedObjective, problem: StepProblem) -> Positions:
         hessian = StepObjective(objective, problem).hessian(p)
         assert hessian.factorise(shift=1e4)
         return hessian.solve(b)
 
-    first = solved(whole, near)
-    solved(whole, replace(near, system=replace(near.system, energies=far.system.energies)))
-    np.testing.assert_array_equal(solved(whole, near), first)
-    np.testing.assert_array_equal(solved(fresh, near), first)
+    first = solve_with_hessian(whole, near)
+    solve_with_hessian(whole, replace(near, system=replace(near.system, energies=far.system.energies)))
+    np.testing.assert_array_equal(solve_with_hessian(whole, near), first)
+    np.testing.assert_array_equal(solve_with_hessian(fresh, near), first)
 
 
 def test_springs_of_no_length_have_the_curvature_of_the_energy():
@@ -229,7 +229,7 @@ def test_pairs_of_free_vertices_are_listed_once_and_in_order():
 @problems
 @pytest.mark.parametrize("is_view", [False, True])
 def test_a_trial_of_a_line_search_is_the_objective_at_its_end(problem, is_view):
-    step, p, q = stepped(problem)
+    step, p, q = build_step(problem)
     direction = q - p
     if is_view:  # every second row of larger arrays
         p, direction = (np.repeat(x, 2, axis=0)[::2] for x in (p, direction))

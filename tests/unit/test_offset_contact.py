@@ -76,7 +76,7 @@ def test_the_activation_is_that_of_ipctk():
     np.testing.assert_allclose(curvature, [barrier.second_derivative(x, RADIUS) for x in d], rtol=1e-12)
 
 
-def crumpled(seed: int) -> tuple[SelfContact, Positions, np.ndarray]:
+def build_crumpled_sheets(seed: int) -> tuple[SelfContact, Positions, np.ndarray]:
     """Two sheets that touch, with vertices displaced by a third of the cells: all kinds of closest features."""
     contact, p, triangles = build_touching_sheets(seed, size=5, noise=0.0)
     rng = np.random.default_rng(seed)
@@ -104,7 +104,7 @@ def blocks(contact: SelfContact, p: Positions, radius: float) -> tuple[Candidate
 @pytest.mark.parametrize("seed", range(3))
 def test_the_pairs_in_contact_are_those_of_ipctk(seed):
     ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
-    contact, p, triangles = crumpled(seed)
+    contact, p, triangles = build_crumpled_sheets(seed)
     edges = collision_mesh_of(contact).edges.primitives
     mesh = ipctk.CollisionMesh(p, edges, triangles)
     mesh.init_adjacencies()
@@ -124,7 +124,7 @@ def test_the_pairs_in_contact_are_those_of_ipctk(seed):
 
 
 def test_clearances_are_the_smallest_gaps_of_all_pairs():
-    contact, p, _ = crumpled(0)
+    contact, p, _ = build_crumpled_sheets(0)
     pairs, _, clearance = blocks(contact, p, 0.15)
     gaps = compute_distances(pairs, p) - pairs.distance_scale * pairs.min_distance
     expected = np.full(len(p), np.inf)
@@ -132,7 +132,7 @@ def test_clearances_are_the_smallest_gaps_of_all_pairs():
     np.testing.assert_allclose(clearance, expected, rtol=1e-12)
 
 
-def displaced(seed: int, p: Positions, bound: np.ndarray, share: float) -> Positions:
+def displace_vertices(seed: int, p: Positions, bound: np.ndarray, share: float) -> Positions:
     """Each vertex displaced by a share of its bound: at random, or up and down towards the other sheet."""
     rng = np.random.default_rng(seed)
     way = rng.normal(size=p.shape)
@@ -146,21 +146,21 @@ def displaced(seed: int, p: Positions, bound: np.ndarray, share: float) -> Posit
 @pytest.mark.parametrize("seed", range(8))
 def test_displacements_within_their_bounds_never_collide(seed, share):
     ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
-    contact, p, triangles = crumpled(seed)
+    contact, p, triangles = build_crumpled_sheets(seed)
     mesh = ipctk.CollisionMesh(p, collision_mesh_of(contact).edges.primitives, triangles)
     clearance = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION).clearance
     assert (clearance > 0.0).all()
-    q = displaced(seed, p, FRACTION * clearance, share)
+    q = displace_vertices(seed, p, FRACTION * clearance, share)
     assert ipctk.is_step_collision_free(mesh, p, q)
     assert not contact.find_violated_pairs(q)
 
 
 def test_larger_displacements_do_collide():
     ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
-    contact, p, triangles = crumpled(1)
+    contact, p, triangles = build_crumpled_sheets(1)
     mesh = ipctk.CollisionMesh(p, collision_mesh_of(contact).edges.primitives, triangles)
     found = OffsetSurface.from_contact(contact).detect_contacts(contact, p, 0.1, FRACTION)
-    assert not ipctk.is_step_collision_free(mesh, p, displaced(1, p, found.clearance + CONTACT_THICKNESS, 0.6))
+    assert not ipctk.is_step_collision_free(mesh, p, displace_vertices(1, p, found.clearance + CONTACT_THICKNESS, 0.6))
 
 
 @jit_kernel
@@ -184,7 +184,7 @@ def single_contact(x: np.ndarray, edges: bool, friction: float, start: np.ndarra
     )  # fmt: skip
 
 
-def evaluated(x: np.ndarray, edges: bool, i: int, friction: float = 0.0, start: np.ndarray | None = None):
+def evaluate_pair(x: np.ndarray, edges: bool, i: int, friction: float = 0.0, start: np.ndarray | None = None):
     rows = pad_positions(x).ravel()
     gradient, block = np.empty(3), np.empty(6)
     before = rows if start is None else pad_positions(start).ravel()
@@ -212,7 +212,7 @@ def test_the_forces_of_vertices_are_derivatives_of_the_activation(edges, gap):
     x, h = PLACES[edges].copy(), 1e-7
     ends = 2 if edges else 1
     x[:ends, 1] += CONTACT_THICKNESS + gap * CONTACT_DHAT - 0.035
-    found = [evaluated(x, edges, i) for i in range(4)]
+    found = [evaluate_pair(x, edges, i) for i in range(4)]
     for i in range(4):
         for k in range(3):
             up, down = x.copy(), x.copy()
@@ -237,13 +237,13 @@ def test_friction_is_coulombs_smoothed_below_its_length(slip):
     x[0, 1] = CONTACT_THICKNESS + 0.4 * CONTACT_DHAT
     start = x.copy()
     start[0, 0] -= slip
-    pressed, _ = evaluated(x, False, 0)
-    rough, block = evaluated(x, False, 0, 0.5, start)
+    pressed, _ = evaluate_pair(x, False, 0)
+    rough, block = evaluate_pair(x, False, 0, 0.5, start)
     np.testing.assert_allclose(rough - pressed, (0.5 * abs(pressed[1]) * min(1.0, slip / 1e-4), 0.0, 0.0), atol=1e-13)
     assert block[0, 0] == pytest.approx(0.5 * abs(pressed[1]) / max(slip, 1e-4))
 
 
-APART = SelfContactEffect(min_distance=0.01, friction=0.3)
+SELF_CONTACT = SelfContactEffect(min_distance=0.01, friction=0.3)
 
 
 def pressed_sheets(*effects: Any) -> Scene:
@@ -255,7 +255,7 @@ def pressed_sheets(*effects: Any) -> Scene:
 
 def test_sheets_that_meet_stay_apart_and_every_frame_is_reached_without_collision():
     ipctk = pytest.importorskip("ipctk", reason="the reference is an optional extra")
-    made = pressed_sheets(APART)
+    made = pressed_sheets(SELF_CONTACT)
     (contact,) = (energy for energy in made.system.energies if isinstance(energy, BarrierContact))
     edges = collision_mesh_of(contact).edges.primitives
     p, touched = build_initial_state(made).motion.positions, 0
@@ -274,7 +274,7 @@ def test_sheets_that_meet_stay_apart_and_every_frame_is_reached_without_collisio
 
 
 def test_solves_repeat_to_the_last_bit_and_end_at_the_iterate_of_their_number():
-    made = pressed_sheets(APART)
+    made = pressed_sheets(SELF_CONTACT)
     *_, last = simulate_scene(
         made, prepare(made, OffsetContactDescent()), StopRule(40), initial_guess="previous", frames=6
     )

@@ -47,12 +47,12 @@ def test_a_value_on_the_command_line_means_what_it_means_in_a_file(
 ) -> None:
     settings: dict[str, Any] = {}
 
-    def loaded(path: Path, *, solvers: Any, sizes: Any, **options: Any) -> SweepPlan:
+    def load_stub(path: Path, *, solvers: Any, sizes: Any, **options: Any) -> SweepPlan:
         settings.update(options)
         settings["runs"] = load_config(path, sizes=[4], **options).list_runs()
         raise InputError("enough")
 
-    monkeypatch.setattr(config_loader, "load_config", loaded)
+    monkeypatch.setattr(config_loader, "load_config", load_stub)
     values = {"max_iterations": "7", "rtol": "1e-3", "integrator": "bdf2", "time_step": "1/60", "frames": "0x3"}
     values |= {"initial_guess": "inertial", "threads": "auto", "rounds": "1"}
     assert set(values) == set(RUN_OPTIONS) - {"error_target"}, "which would choose most of them"

@@ -50,7 +50,7 @@ def graphs(draw):
     return graph(np.stack([first, (first + rng.integers(0, reach, m)) % n], axis=1), n)
 
 
-def eliminated(matrix, order):
+def eliminate_dense(matrix, order):
     """The structure of L by elimination of a dense matrix of booleans, in `order`."""
     filled = matrix.toarray()[np.ix_(order, order)] != 0
     for k in range(len(order)):
@@ -74,7 +74,7 @@ def test_the_structure_is_that_of_dense_elimination(matrix):
     order = s.vertex_of_slot[s.vertex_of_slot >= 0]
     np.testing.assert_array_equal(np.sort(order), np.arange(matrix.shape[0]))
     np.testing.assert_array_equal(s.vertex_of_slot[s.slot_of_vertex], np.arange(matrix.shape[0]))
-    filled = eliminated(matrix, order)
+    filled = eliminate_dense(matrix, order)
     assert s.nonzeros == filled.sum()
     place = np.cumsum(s.vertex_of_slot >= 0) - 1  # of a slot among the vertices
     for node in range(len(s.parent)):

@@ -16,7 +16,7 @@ from springbench.harness.report.pages.published_queries import PublishedQueries
 from springbench.harness.results.published_set import read_study
 from typer.testing import CliRunner
 
-from tests.bench.scripted_study import describe_moment, publish_rows
+from tests.bench.scripted_study import describe_provenance, publish_rows
 from tests.contracts.hostile import scene
 from tests.synthetic_accuracy_rows import build_work_rows, write_accuracy_rows
 from tests.synthetic_run_rows import write_dummy_runs
@@ -96,7 +96,7 @@ def test_units_of_a_newer_part_replace_those_of_the_same_file(tmp_path: Path) ->
 
 
 def test_rows_of_a_script_are_a_study_with_what_made_them(tmp_path: Path) -> None:
-    begin = describe_moment()
+    begin = describe_provenance()
     rows = [{"solver": "newton", "ratio": 1.5}, {"solver": "vbd", "ratio": None, "reason": "not there"}]
     publish_rows(tmp_path / "ratios", CONFIGS / "speed.yaml", "python -m tests.bench.ratios", rows, begin)
     study = read_study(tmp_path / "ratios")

@@ -32,7 +32,7 @@ from springbench.solvers.model.step_problem import Positions, Solution, StepProb
 from tests.scene_builders import build_test_scene
 
 FRAMES, ROUNDS, ITERATIONS = 3, 2, 4
-MADE = build_test_scene(ChainMesh(), GravityEffect(), size=4)
+SCENE = build_test_scene(ChainMesh(), GravityEffect(), size=4)
 SETTINGS = SteppingSettings(StopRule(ITERATIONS), "previous", FRAMES, ROUNDS)
 TAKES = {"prepare": 0.004, "solve": 0.008, "local": 0.001, "global": 0.002}
 """Seconds that each part sleeps at least."""
@@ -74,10 +74,10 @@ class Sleeper:
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[Sleeper, RunMeasurement, float]:
+def measured_run() -> tuple[Sleeper, RunMeasurement, float]:
     """The solver, what was measured of it, and the seconds of all."""
     solver, began = Sleeper(), perf_counter()
-    measured = measure_run(MADE, solver, SETTINGS, lambda phase: sleep(0.02))
+    measured = measure_run(SCENE, solver, SETTINGS, lambda phase: sleep(0.02))
     return solver, measured, perf_counter() - began
 
 
@@ -85,8 +85,8 @@ def of(measured: RunMeasurement, phase: str) -> list[TimingSample]:
     return [t for t in measured.timings if t.phase == phase]
 
 
-def test_each_phase_is_timed_as_often_as_reported(seen):
-    _, measured, _ = seen
+def test_each_phase_is_timed_as_often_as_reported(measured_run):
+    _, measured, _ = measured_run
     counts = {phase: len(of(measured, phase)) for phase in ("prepare", "local", "global", ITERATION_PHASE, "step")}
     repeated = FRAMES * PHASE_REPEATS
     steps = FRAMES * ROUNDS
@@ -101,8 +101,8 @@ def test_each_phase_is_timed_as_often_as_reported(seen):
     assert [(t.frame, t.round) for t in of(measured, "step")] == [(f, r) for r in range(ROUNDS) for f in (1, 2, 3)]
 
 
-def test_times_include_the_work_of_their_phase(seen):
-    solver, measured, whole = seen
+def test_times_include_the_work_of_their_phase(measured_run):
+    solver, measured, whole = measured_run
     repeats = [call for k, call in enumerate(solver.slept["local"]) if k % (PHASE_REPEATS + 2) >= 2]
     assert all(t.seconds >= slept for t, slept in zip(of(measured, "local"), repeats, strict=True))
     repeats = [call for k, call in enumerate(solver.slept["global"]) if k % (PHASE_REPEATS + 2) >= 2]
@@ -114,15 +114,15 @@ def test_times_include_the_work_of_their_phase(seen):
     assert sum(t.seconds * t.num_calls for t in measured.timings) <= whole
 
 
-def test_what_is_shown_between_steps_is_in_no_time(seen):
-    _, measured, whole = seen
+def test_what_is_shown_between_steps_is_in_no_time(measured_run):
+    _, measured, whole = measured_run
     shown = 0.02 * FRAMES * (1 + ROUNDS)
     assert sum(t.seconds * t.num_calls for t in measured.timings) <= whole - shown
     assert sum(watch.wall_seconds for watch in measured.watches.values()) <= whole - shown
 
 
-def test_every_time_is_within_the_time_of_its_watch(seen):
-    _, measured, _ = seen
+def test_every_time_is_within_the_time_of_its_watch(measured_run):
+    _, measured, _ = measured_run
     assert set(measured.watches) == {("prepare", None), ("local", None), ("global", None), (ITERATION_PHASE, None)} | {
         ("step", round) for round in range(ROUNDS)
     }
@@ -132,8 +132,8 @@ def test_every_time_is_within_the_time_of_its_watch(seen):
         assert total_seconds <= watch.wall_seconds * (1 + 5e-4)
 
 
-def test_rows_state_both_clocks_and_mark_a_solver_that_sleeps_as_preempted(seen):
-    _, measured, _ = seen
+def test_rows_state_both_clocks_and_mark_a_solver_that_sleeps_as_preempted(measured_run):
+    _, measured, _ = measured_run
     for row in timing_pass.build_timing_rows(measured):
         assert row["wall_seconds_sum"] <= row["wall_seconds_check"] * (1 + 5e-4)
         assert row["cpu_seconds"] < row["wall_seconds_check"]
@@ -151,8 +151,8 @@ def test_rows_state_both_clocks_and_mark_a_solver_that_sleeps_as_preempted(seen)
 
 
 @pytest.mark.parametrize("phase", ["prepare", "local", "global", ITERATION_PHASE, "step"])
-def test_no_row_is_made_of_times_that_are_scaled(seen, phase: str):
-    _, measured, _ = seen
+def test_no_row_is_made_of_times_that_are_scaled(measured_run, phase: str):
+    _, measured, _ = measured_run
     scaled = [
         TimingSample(t.phase, t.frame, t.round, t.seconds / (1000 if t.phase == phase else 1), t.num_calls)
         for t in measured.timings

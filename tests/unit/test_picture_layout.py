@@ -18,7 +18,7 @@ from springbench.harness.report.plot_style import PAGE_HEIGHT, PAGE_WIDTH
 from springbench.harness.report.run_picture import draw_run_picture, layout_frames
 from springbench.harness.report.site.mesh_scripts import _select_iterates
 
-from tests.unit.test_report_pictures import broken, cloth, falling
+from tests.unit.test_report_pictures import break_frame, cloth, falling
 
 
 @pytest.mark.parametrize("shape", [0.2, 1.0, 1.3, 4.0])
@@ -75,7 +75,7 @@ def test_distances_are_taken_from_the_lowest_residual_that_ends_finite() -> None
         return replace(cloth(), scalars={"/residual": (np.array([1]), np.array([residual]))})
 
     assert find_reference_run([ending(1e-2), ending(1e-9), ending(1e-6)]) == 1
-    assert find_reference_run([ending(1e-2), broken(ending(1e-9), 3)]) == 0
+    assert find_reference_run([ending(1e-2), break_frame(ending(1e-9), 3)]) == 0
     assert find_reference_run([replace(cloth(), scalars={}), ending(1e-2)]) == 1
     assert find_reference_run([ending(np.nan), ending(1e-2)]) == 1
 

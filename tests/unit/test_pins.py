@@ -14,10 +14,10 @@ from tests.scene_builders import LOCAL_GLOBAL_BACKENDS, build_cloth, build_first
 
 backends = pytest.mark.parametrize("backend", LOCAL_GLOBAL_BACKENDS, ids=lambda b: type(b).__name__)
 
-CONVERGED = StopRule(3000, 1e-13)
+CONVERGED_STOP = StopRule(3000, 1e-13)
 
 
-def pinned(problem: StepProblem, vertices: list[int], weight: float, seed: int = 0) -> StepProblem:
+def add_pins(problem: StepProblem, vertices: list[int], weight: float, seed: int = 0) -> StepProblem:
     """The problem with these pins, their targets away from the rest positions."""
     pins = DirichletPins(np.array(vertices, np.int64), np.full(len(vertices), weight))
     targets = problem.current_positions[vertices] + 0.1 * np.random.default_rng(seed).normal(size=(len(vertices), 3))
@@ -27,8 +27,8 @@ def pinned(problem: StepProblem, vertices: list[int], weight: float, seed: int =
 @backends
 @pytest.mark.parametrize("weight", [1e4, 1e7, 1e10])
 def test_a_penalty_pin_yields_by_the_force_on_it_over_its_weight(backend, weight):
-    problem = pinned(build_random_problem(0), [0, 3], weight)
-    p = backend.prepare(problem.system).solve(problem, CONVERGED).positions
+    problem = add_pins(build_random_problem(0), [0, 3], weight)
+    p = backend.prepare(problem.system).solve(problem, CONVERGED_STOP).positions
     free = replace(problem, system=replace(problem.system, pins=DirichletPins()), pin_targets=np.empty((0, 3)))
     reaction = -free.gradient(p)[[0, 3]]  # what springs, inertia and forces pull at the pins with
     gives = p[[0, 3]] - problem.pin_targets
@@ -38,12 +38,12 @@ def test_a_penalty_pin_yields_by_the_force_on_it_over_its_weight(backend, weight
 
 @backends
 def test_a_penalty_becomes_an_exact_pin_in_proportion_to_its_weight(backend):
-    exact = pinned(build_random_problem(0), [0, 3], np.inf)
-    wanted = backend.prepare(exact.system).solve(exact, CONVERGED).positions
+    exact = add_pins(build_random_problem(0), [0, 3], np.inf)
+    wanted = backend.prepare(exact.system).solve(exact, CONVERGED_STOP).positions
     away = []
     for weight in (1e6, 1e7, 1e8):
-        soft = pinned(build_random_problem(0), [0, 3], weight)
-        away.append(np.abs(backend.prepare(soft.system).solve(soft, CONVERGED).positions - wanted).max())
+        soft = add_pins(build_random_problem(0), [0, 3], weight)
+        away.append(np.abs(backend.prepare(soft.system).solve(soft, CONVERGED_STOP).positions - wanted).max())
     # 1/w is the leading term; the next is smaller by stiffness / weight, at most 1e4 / 1e6.
     np.testing.assert_allclose([away[0] / away[1], away[1] / away[2]], 10.0, rtol=0.02)
 
@@ -60,7 +60,7 @@ def test_the_weight_of_the_assignment_pins_a_cloth_to_a_billionth(backend):
 
 @backends
 def test_all_vertices_may_be_pinned_exactly(backend):
-    problem = pinned(build_random_problem(1), list(range(12)), np.inf)
+    problem = add_pins(build_random_problem(1), list(range(12)), np.inf)
     prepared = backend.prepare(problem.system)
     solution = prepared.solve(problem, StopRule(5, 1e-6))
     np.testing.assert_array_equal(solution.positions, problem.pin_targets)
@@ -70,7 +70,7 @@ def test_all_vertices_may_be_pinned_exactly(backend):
 
 @backends
 def test_all_vertices_may_be_pinned_by_penalties(backend):
-    problem = pinned(build_random_problem(1), list(range(12)), 1e10)
+    problem = add_pins(build_random_problem(1), list(range(12)), 1e10)
     p = backend.prepare(problem.system).solve(problem, StopRule(5, 1e-6)).positions
     # Forces of some thousand newtons over the weight.
     np.testing.assert_allclose(p, problem.pin_targets, rtol=0, atol=1e-5)
@@ -79,7 +79,7 @@ def test_all_vertices_may_be_pinned_by_penalties(backend):
 @backends
 @pytest.mark.parametrize("weight", [1e3, np.inf])
 def test_a_vertex_alone_may_be_pinned(backend, weight):
-    problem = pinned(build_random_problem(2, n=1, m=0, weights=()), [0], weight)
+    problem = add_pins(build_random_problem(2, n=1, m=0, weights=()), [0], weight)
     (p,) = islice(backend.prepare(problem.system).iterates(problem), 1)
     inertia = problem.system.mass[0] / problem.system.time_step**2
     pulled = (inertia * problem.inertial_target + problem.external_force + 1e3 * problem.pin_targets) / (inertia + 1e3)
@@ -88,10 +88,10 @@ def test_a_vertex_alone_may_be_pinned(backend, weight):
 
 @backends
 def test_massless_vertices_follow_springs_and_pins(backend):
-    problem = pinned(build_random_problem(3), [0, 1], np.inf)
+    problem = add_pins(build_random_problem(3), [0, 1], np.inf)
     light = replace(problem.system, mass=np.where(np.arange(12) % 2, 0.0, problem.system.mass))
     problem = replace(problem, system=light)
-    p = backend.prepare(light).solve(problem, CONVERGED).positions
+    p = backend.prepare(light).solve(problem, CONVERGED_STOP).positions
     # Without inertia to hold it the slack part of the network settles slowly: six digits in 3000 iterations.
     assert np.abs(problem.gradient(p)).max() <= 1e-6 * np.abs(problem.gradient(problem.initial_guess)).max()
 

@@ -31,14 +31,14 @@ from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
 from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem, build_test_scene
-from tests.unit.test_surface_contact import BALL, contact, count_intersections, draped
+from tests.unit.test_surface_contact import BALL, contact, count_intersections, build_draped_sheet
 
 OTHERS: list[PreconditionerName] = [name for name in get_args(PreconditionerName) if name != "cholesky"]
 others = pytest.mark.parametrize("name", OTHERS)
 METHODS = {"newton-cg": NewtonCG, "pncg": NonlinearCG}
 
 
-def made(
+def build_preconditioner(
     size: int, stretch: float = 300.0
 ) -> tuple[csr_array, AdditiveSchwarz, NDArray[np.int64], NDArray[np.float64]]:
     """The clamped Hessian (3f, 3f) of a cloth that was disturbed, its S, the order, and its diagonal blocks."""
@@ -74,7 +74,7 @@ def by_levels(A: csr_array, order: NDArray[np.int64], b: NDArray[np.float64]) ->
 
 @pytest.mark.parametrize(("size", "levels"), [(4, 1), (12, 2), (33, 3)])
 def test_schwarz_is_the_sum_of_its_levels(size, levels):
-    A, S, order, _ = made(size)
+    A, S, order, _ = build_preconditioner(size)
     assert len(S.subdomain_inverses) == levels
     np.testing.assert_array_equal(np.sort(order), np.arange(len(order)))
     b = np.random.default_rng(1).normal(size=(len(order), 3))
@@ -95,7 +95,7 @@ def condition(A: NDArray[np.float64], S: NDArray[np.float64]) -> float:
 
 
 def test_schwarz_is_symmetric_positive_definite_and_better_than_blocks_on_stiff_cloth():
-    A, S, order, blocks = made(12, 1e5)
+    A, S, order, blocks = build_preconditioner(12, 1e5)
     found, dense = whole(S, len(order)), A.toarray()
     np.testing.assert_allclose(found, found.T, rtol=0, atol=1e-12 * np.abs(found).max())
     assert np.linalg.eigvalsh(found).min() > 0.0
@@ -118,13 +118,13 @@ def metric(size: int) -> ResidualMetric:
     return ResidualMetric(build_first_problem(build_cloth(size, "exact")).system)
 
 
-def given(scene: str) -> StepProblem:
+def build_effect_step(scene: str) -> StepProblem:
     return build_moving_problem(EFFECT_SCENES[scene]())
 
 
 @pytest.mark.parametrize("scene", [s for s in EFFECT_SCENES if "gas" not in s])
 def test_diagonal_blocks_are_those_of_the_clamped_matrix(scene):
-    stated = given(scene)
+    stated = build_effect_step(scene)
     step = StepObjective(FixedObjective(stated.system), stated)
     p = step.apply_exact_pins(stated.current_positions)
     hessian = step.hessian(p)
@@ -138,7 +138,7 @@ def test_diagonal_blocks_are_those_of_the_clamped_matrix(scene):
 @others
 @pytest.mark.parametrize("method", METHODS)
 def test_the_minimum_is_that_of_newtons_method(method, name):
-    stated = given("all that are projective")
+    stated = build_effect_step("all that are projective")
     wanted = NewtonSolver().prepare(stated.system).solve(stated, StopRule(200)).positions
     solution = METHODS[method](preconditioner=name).prepare(stated.system).solve(stated, StopRule(3000, 1e-9))
     assert solution.termination_reason != "max-iter"
@@ -148,7 +148,7 @@ def test_the_minimum_is_that_of_newtons_method(method, name):
 @others
 def test_a_body_on_a_floor_is_at_a_minimum(name):
     """Which of them, friction leaves to the way there."""
-    stated = given("contact")
+    stated = build_effect_step("contact")
     p = NewtonCG(preconditioner=name).prepare(stated.system).solve(stated, StopRule(500, 1e-9)).positions
     assert np.abs(stated.gradient(p)).max() <= 1e-6 * np.abs(stated.gradient(stated.current_positions)).max()
     step = StepObjective(FixedObjective(stated.system), stated)
@@ -157,7 +157,7 @@ def test_a_body_on_a_floor_is_at_a_minimum(name):
 
 @pytest.mark.parametrize(("method", "name"), [*(("newton-cg", name) for name in OTHERS), ("pncg", "block-jacobi")])
 def test_a_sheet_on_a_ball_is_supported_by_it(method, name):
-    made = draped(BALL, size=6)
+    made = build_draped_sheet(BALL, size=6)
     rule, ends = StopRule(2000, 1e-8), list[Positions]()
     for solver in (NewtonSolver(), METHODS[method](preconditioner=name)):
         *_, last = simulate_scene(made, prepare(made, solver), rule, initial_guess="previous", frames=9)
@@ -195,7 +195,7 @@ def test_schwarz_takes_fewer_iterations_of_conjugate_gradients_than_blocks_on_st
 @pytest.mark.parametrize("method", METHODS)
 @others
 def test_energies_without_elements_are_refused_by_name(method, name):
-    stated = given("gas")
+    stated = build_effect_step("gas")
     with pytest.raises(Unsupported, match=f"{method}, preconditioner: {name}.*Gas.*take preconditioner: cholesky"):
         METHODS[method](preconditioner=name).prepare(stated.system)
 

@@ -11,7 +11,7 @@ from springbench.solvers.model.step_problem import StepProblem
 from tests.scene_builders import build_random_problem
 
 
-def named(name: str) -> StepProblem:
+def add_named_energy(name: str) -> StepProblem:
     """A problem with an energy more, of a class of this name."""
     problem = build_random_problem(3)
     (springs,) = problem.system.energies
@@ -22,7 +22,7 @@ def named(name: str) -> StepProblem:
 
 @pytest.mark.parametrize("name", ["Inertia", "Force", "Pins", "Springs", "Glue"])
 def test_an_energy_counts_whatever_its_class_is_called(name: str):
-    plain, problem = build_random_problem(3), named(name)
+    plain, problem = build_random_problem(3), add_named_energy(name)
     p, (springs, _) = problem.current_positions + 0.01, problem.system.energies
     assert springs.value(p) > 0.0
     # Sums of a dozen terms in another order.

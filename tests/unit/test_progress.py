@@ -48,7 +48,7 @@ SWEEP = [
 
 @pytest.mark.parametrize("kind", [ProgressLines, ProgressBars])
 def test_the_time_left_follows_from_the_runs_of_each_kind(kind: Callable[..., ProgressDisplay], clock: list[float]):
-    def does(display: ProgressDisplay) -> None:
+    def run_display(display: ProgressDisplay) -> None:
         display.start_sweep(SWEEP)
         for effort, seconds in zip(SWEEP, (3.0, 5.0, 9.0, 35.0), strict=False):
             run = display.start_run("one", 10, effort)
@@ -57,7 +57,7 @@ def test_the_time_left_follows_from_the_runs_of_each_kind(kind: Callable[..., Pr
             clock[0] += seconds
             run.finish_run("ok")
 
-    lines = capture_progress(kind, does)
+    lines = capture_progress(kind, run_display)
     # 3 s come with any run. After the second one: fast 0 s and slow 0.2 s for each of the amount, so 3, 3 + 8 and 3 s.
     # After the third one: fast 0 + 6 s for 10 + 40, so 3 + 8 s and 3 + 12 s. After the fourth one 3 + 12 s.
     for seconds in (17, 26, 15):
@@ -87,7 +87,7 @@ def test_a_run_that_is_done_elsewhere_is_left_out(clock: list[float]):
 
 
 def test_a_started_run_is_estimated_by_its_own_pace(clock: list[float]):
-    def does(display: ProgressDisplay) -> None:
+    def run_display(display: ProgressDisplay) -> None:
         display.start_sweep([RunCost(), RunCost()])
         display.start_run("one", 10, RunCost()).finish_run("ok")
         run = display.start_run("two", 10, RunCost())
@@ -95,11 +95,11 @@ def test_a_started_run_is_estimated_by_its_own_pace(clock: list[float]):
             clock[0] += 12.0
             run.report_tick("timed pass")
 
-    assert "40 %; about 72 s left" in capture_progress(ProgressLines, does)
+    assert "40 %; about 72 s left" in capture_progress(ProgressLines, run_display)
 
 
 def test_a_line_comes_though_no_run_ends(clock: list[float]):
-    def does(display: ProgressDisplay) -> None:
+    def run_display(display: ProgressDisplay) -> None:
         display.start_sweep([RunCost()])
         run = display.start_run("one", 10, RunCost())
         run.report_tick("timed pass")
@@ -107,16 +107,16 @@ def test_a_line_comes_though_no_run_ends(clock: list[float]):
             clock[0] += 1.0
             run.report_tick(POLL)
 
-    lines = capture_progress(ProgressLines, does).splitlines()
+    lines = capture_progress(ProgressLines, run_display).splitlines()
     assert lines == ["[0/1] starting", *["[0/1] one: timed pass, 10 %"] * 3]
 
 
 def test_progress_names_what_is_being_compiled(clock: list[float]):
-    def does(display: ProgressDisplay) -> None:
+    def run_display(display: ProgressDisplay) -> None:
         display.start_sweep([RunCost()])
         run = display.start_run("one", 10, RunCost())
         with report_activity(run.report_tick, COMPILING):
             clock[0] += 11.0
             run.report_tick(POLL)
 
-    assert "one: compiling (once), 0 %" in capture_progress(ProgressLines, does)
+    assert "one: compiling (once), 0 %" in capture_progress(ProgressLines, run_display)

@@ -57,7 +57,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
-def changed(archive: Path, into: Path, change: Callable[[dict[str, bytes]], None], *, sums: bool) -> Path:
+def change_archive(archive: Path, into: Path, change: Callable[[dict[str, bytes]], None], *, sums: bool) -> Path:
     """An archive with another content; sums: with the checksums of that."""
     with zipfile.ZipFile(archive) as packed:
         content = {name: packed.read(name) for name in packed.namelist()}
@@ -109,7 +109,7 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
         content["mine.py"] = b"raise SystemExit"
         del content["CITATION.cff"]
 
-    result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=False))
+    result = command("verify-archive", change_archive(home / "x.zip", tmp_path / "y.zip", change, sums=False))
     assert result.exit_code == 1
     for line in ("sweep.yaml: refuted (was changed)", "mine.py: refuted (was not", "(missing)"):
         assert line in result.output
@@ -117,7 +117,9 @@ def test_an_archive_that_was_changed_is_named_and_none_of_it_is_run(home: Path, 
 
 
 @pytest.fixture(scope="module")
-def repeated(home: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list[PublishedRun], list[list[ResultRow]]]:
+def repeated_runs(
+    home: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[list[PublishedRun], list[list[ResultRow]]]:
     """The published runs, dense and sparse, and what they leave when they are done again."""
     with archive_verification.unpack_archive(home / "x.zip") as folder:
         runs, _ = archive_verification.load_published_runs(folder, print, with_user_code=False)
@@ -126,7 +128,7 @@ def repeated(home: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[list
         )
 
 
-def scaled(name: str, factor: float) -> Callable[[ResultRow], ResultRow]:
+def scale_column(name: str, factor: float) -> Callable[[ResultRow], ResultRow]:
     return lambda row: row if row[name] is None else row | {name: row[name] * factor}
 
 
@@ -134,7 +136,7 @@ def only(change: Callable[[ResultRow], ResultRow], **at: Any) -> Callable[[Resul
     return lambda row: change(row) if all(row[name] == value for name, value in at.items()) else row
 
 
-FORGED: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
+FORGED_COLUMNS: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
     "solvers exchanged": (
         lambda row: row | {"solver": "sparse" if row["solver"] == "dense" else "dense"},
         "names and options",
@@ -142,22 +144,22 @@ FORGED: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
     "another scene": (lambda row: row | {"scene": "silk"}, "names and options"),
     "another size": (lambda row: row | {"size": 64}, "names and options"),
     "other parameters": (lambda row: row | {"parameters": '{"a": 1}'}, "names and options"),
-    "another time step": (scaled("time_step", 0.5), "names and options"),
-    "more iterations allowed": (scaled("max_iterations", 10), "names and options"),
+    "another time step": (scale_column("time_step", 0.5), "names and options"),
+    "more iterations allowed": (scale_column("max_iterations", 10), "names and options"),
     "an integrator": (lambda row: row | {"integrator": "bdf2"}, "names and options"),
     "one row of another solver": (only(lambda row: row | {"solver": "fast"}, phase="step", frame=2), "names and"),
-    "small residuals": (scaled("residual", 1e-6), "columns: .*residual"),
-    "small last residuals": (scaled("residual_last", 1e-6), "columns: .*residual_last"),
-    "halved energies": (scaled("energy_springs", 0.5), "columns: .*energy_springs"),
-    "an objective": (only(scaled("objective", 0.999), frame=2), "columns: .*objective"),
-    "fewer iterations": (only(scaled("num_iterations", 2), phase="step"), "columns: .*num_iterations"),
+    "small residuals": (scale_column("residual", 1e-6), "columns: .*residual"),
+    "small last residuals": (scale_column("residual_last", 1e-6), "columns: .*residual_last"),
+    "halved energies": (scale_column("energy_springs", 0.5), "columns: .*energy_springs"),
+    "an objective": (only(scale_column("objective", 0.999), frame=2), "columns: .*objective"),
+    "fewer iterations": (only(scale_column("num_iterations", 2), phase="step"), "columns: .*num_iterations"),
     "another end of iterations": (
         lambda row: row | {"termination_reason": row["termination_reason"] and "converged"},
         "columns: .*termination_reason",
     ),
-    "more vertices": (scaled("vertices", 100), "columns: .*vertices"),
-    "a smaller strain": (scaled("max_strain", 0.9), "columns: .*max_strain"),
-    "fewer numbers in the factor": (scaled("nnz_system", 2), "columns: .*nnz_system"),
+    "more vertices": (scale_column("vertices", 100), "columns: .*vertices"),
+    "a smaller strain": (scale_column("max_strain", 0.9), "columns: .*max_strain"),
+    "fewer numbers in the factor": (scale_column("nnz_system", 2), "columns: .*nnz_system"),
     "a family": (lambda row: row | {"family": "mine"}, "columns: .*family"),
     "positions of one step": (
         only(lambda row: row | {"positions_digest": "0" * 64}, frame=2),
@@ -167,11 +169,11 @@ FORGED: dict[str, tuple[Callable[[ResultRow], ResultRow], str]] = {
         lambda row: row | ({"status": "diverged", "reason": "it is bad"} if row["solver"] == "dense" else {}),
         "end: refuted",
     ),
-    "all 1,000 times as fast": (scaled("seconds", 1e-3), "time of a step: refuted"),
-    "all 1,000 times as slow": (scaled("seconds", 1e3), "time of a step: refuted"),
+    "all 1,000 times as fast": (scale_column("seconds", 1e-3), "time of a step: refuted"),
+    "all 1,000 times as slow": (scale_column("seconds", 1e3), "time of a step: refuted"),
     "no time": (lambda row: row | {"seconds": None}, "time of a step: refuted"),
-    "no time at all": (scaled("seconds", 0.0), "time of a step: refuted"),
-    "one 2.5 times as fast": (only(scaled("seconds", 0.4), solver="dense"), "takes .*refuted"),
+    "no time at all": (scale_column("seconds", 0.0), "time of a step: refuted"),
+    "one 2.5 times as fast": (only(scale_column("seconds", 0.4), solver="dense"), "takes .*refuted"),
     "another frame": (only(lambda row: row | {"frame": 7}, frame=2), "positions: .*refuted|positions: refuted"),
     "another phase": (only(lambda row: row | {"phase": "magic"}, phase="prepare"), "a repeat has no magic"),
     "a phase that is null": (only(lambda row: row | {"phase": None}, phase="prepare"), "a repeat has no None"),
@@ -197,25 +199,27 @@ def with_rows_of(runs: list[PublishedRun], new: list[list[ResultRow]]) -> list[P
     return [replace(one, rows=found) for one, found in zip(runs, undisturbed, strict=True)]
 
 
-@pytest.mark.parametrize("kind", FORGED)
-def test_a_forged_column_is_refuted(kind: str, repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
-    runs, new = repeated
+@pytest.mark.parametrize("kind", FORGED_COLUMNS)
+def test_a_forged_column_is_refuted(kind: str, repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]]):
+    runs, new = repeated_runs
     honest = with_rows_of(runs, new)
     assert claims_of(honest, new) == []
-    change, said = FORGED[kind]
+    change, said = FORGED_COLUMNS[kind]
     forged = [replace(one, rows=[change(row) for row in one.rows]) for one in honest]
     refuted = claims_of(forged, new)
     assert any(re.search(said, line) for line in refuted), refuted
 
 
-def test_a_repetition_without_a_recording_has_another_id(repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
-    runs, new = repeated
+def test_a_repetition_without_a_recording_has_another_id(
+    repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]]
+):
+    runs, new = repeated_runs
     renamed = [[row | {"run_id": "0" * 12} for row in found] for found in new]
     assert claims_of(with_rows_of(runs, new), renamed) == []
 
 
-def test_missing_or_repeated_rows_are_refuted(repeated: tuple[list[PublishedRun], list[list[ResultRow]]]):
-    runs, new = repeated
+def test_missing_or_repeated_rows_are_refuted(repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]]):
+    runs, new = repeated_runs
     for one, here in zip(runs, new, strict=True):
         fewer = replace(one, rows=[row for row in here if row["phase"] != "step" or row["frame"] == 1])
         assert any("positions" in line for line in claims_of([fewer], [here]))
@@ -225,10 +229,10 @@ def test_missing_or_repeated_rows_are_refuted(repeated: tuple[list[PublishedRun]
 
 
 def test_elsewhere_what_differs_refutes_nothing_and_confirms_nothing(
-    repeated: tuple[list[PublishedRun], list[list[ResultRow]]],
+    repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]],
 ):
-    runs, new = repeated
-    for change in (scaled("residual", 0.5), scaled("seconds", 1e-3), lambda row: row | {"positions_digest": "0"}):
+    runs, new = repeated_runs
+    for change in (scale_column("residual", 0.5), scale_column("seconds", 1e-3), lambda row: row | {"positions_digest": "0"}):
         there = [replace(one, rows=[change(row) | {"machine_id": "another"} for row in one.rows]) for one in runs]
         assert claims_of(there, new) == []
         assert ClaimVerdict.INCONCLUSIVE in {claim.verdict for claim in archive_verification.verify_reruns(there, new)}
@@ -239,7 +243,7 @@ def test_runs_that_no_config_requests_cannot_be_decided(home: Path, tmp_path: Pa
         made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in build_dummy_rows(1)]
         content["results/sweep/rows/cloth-4-magic.parquet"] = parquet_rows.encode_rows(made_up)
 
-    result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
+    result = command("verify-archive", change_archive(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
     assert "1 of 3 runs of sweep: undecided (the config expands to no such run)" in result.output
     assert result.exit_code == (1 if "refuted" in result.output else 3), result.output
     assert "no repeat confirms these columns: " in result.output
@@ -256,7 +260,7 @@ def test_false_rows_with_valid_checksums_are_refuted(home: Path, tmp_path: Path)
             )
             content[name] = (tmp_path / "x.parquet").read_bytes()
 
-    result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
+    result = command("verify-archive", change_archive(home / "x.zip", tmp_path / "y.zip", change, sums=True))
     assert result.exit_code == 1, result.output
     assert "positions: refuted (they differ from step 1 of 2 on)" in result.output
 
@@ -265,7 +269,7 @@ def test_an_archive_whose_results_lead_to_another_config_is_refused(home: Path, 
     def change(content: dict[str, bytes]) -> None:
         content["results/sweep/.config"] = str(home / "sweep.yaml").encode()
 
-    result = command("verify-archive", changed(home / "x.zip", tmp_path / "y.zip", change, sums=True))
+    result = command("verify-archive", change_archive(home / "x.zip", tmp_path / "y.zip", change, sums=True))
     assert (result.exit_code, "leads out of the archive" in result.output) == (2, True)
 
 

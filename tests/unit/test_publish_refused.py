@@ -33,49 +33,49 @@ def home(tmp_path: Path) -> Path:
     return home
 
 
-def published(home: Path, said: Callable[[str], None] = lambda line: None) -> dict[str, bytes]:
+def publish_files(home: Path, said: Callable[[str], None] = lambda line: None) -> dict[str, bytes]:
     """The files of the results' archive."""
     publish_results(home / "results", home.parent / "x.zip", said)
     with zipfile.ZipFile(home.parent / "x.zip") as packed:
         return {name: packed.read(name) for name in packed.namelist()}
 
 
-def linked(home: Path, place: str, to: str) -> None:
+def link_file(home: Path, place: str, to: str) -> None:
     (home / place).parent.mkdir(exist_ok=True)
     (home / place).symlink_to(to)
 
 
-def renamed(home: Path, name: bytes) -> None:
+def add_file_by_name(home: Path, name: bytes) -> None:
     (home / "results" / "sweep" / "report").mkdir()
     with open(os.path.join(os.fsencode(home / "results" / "sweep" / "report"), name), "w"):
         pass
 
 
-def moved(home: Path) -> None:
+def move_scene(home: Path) -> None:
     (home.parent / "cloth.yaml").write_text(scene())
     (home / "sweep.yaml").write_text(SWEEP.replace("cloth", "../cloth"))
 
 
-REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
+REFUSED_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     "a link in the results": (
-        lambda home: linked(home, "results/sweep/report/a.png", "/etc/passwd"),
+        lambda home: link_file(home, "results/sweep/report/a.png", "/etc/passwd"),
         r"/a\.png: leads",
     ),
-    "a link to a folder": (lambda home: linked(home, "results/sweep/recordings", "/etc"), "recordings: leads to /etc"),
+    "a link to a folder": (lambda home: link_file(home, "results/sweep/recordings", "/etc"), "recordings: leads to /etc"),
     "rows that are a link": (
         lambda home: (
             (home / "results/sweep/rows").rename(home.parent / "rows"),
-            linked(home, "results/sweep/rows", "../../../rows"),
+            link_file(home, "results/sweep/rows", "../../../rows"),
         ),
         "sweep/rows: leads to",
     ),
     "a broken link": (
-        lambda home: linked(home, "results/sweep/report/a.png", "none"),
+        lambda home: link_file(home, "results/sweep/report/a.png", "none"),
         r"a\.png: is a link to what is no file",
     ),
-    "a scene elsewhere": (moved, r"cloth\.yaml: lies outside of"),
+    "a scene elsewhere": (move_scene, r"cloth\.yaml: lies outside of"),
     "a scene that is a link": (
-        lambda home: (home / "cloth.yaml").rename(home.parent / "a.yaml") and linked(home, "cloth.yaml", "../a.yaml"),
+        lambda home: (home / "cloth.yaml").rename(home.parent / "a.yaml") and link_file(home, "cloth.yaml", "../a.yaml"),
         r"cloth\.yaml: leads to .*a\.yaml, which lies outside",
     ),
     "a parameter of a mesh of one's own": (
@@ -86,17 +86,17 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda home: (home / "cloth.yaml").write_text(scene(mesh=OWN.replace("PATH", "/etc/passwd"))),
         "/etc/passwd: lies outside of",
     ),
-    "a name that is no UTF-8": (lambda home: renamed(home, b"\xff.png"), r"\.png: its name is no UTF-8"),
-    "a name of two lines": (lambda home: renamed(home, b"a\nb.png"), "its name .* breaks a line"),
+    "a name that is no UTF-8": (lambda home: add_file_by_name(home, b"\xff.png"), r"\.png: its name is no UTF-8"),
+    "a name of two lines": (lambda home: add_file_by_name(home, b"a\nb.png"), "its name .* breaks a line"),
 }
 
 
-@pytest.mark.parametrize("kind", REFUSED)
+@pytest.mark.parametrize("kind", REFUSED_FILES)
 def test_a_file_outside_of_the_folders_is_refused_by_name(kind: str, home: Path):
-    change, said = REFUSED[kind]
+    change, said = REFUSED_FILES[kind]
     change(home)
     with pytest.raises(InputError, match=said):
-        published(home)
+        publish_files(home)
     assert not (home.parent / "x.zip").exists()
 
 
@@ -104,19 +104,19 @@ def test_a_file_outside_of_the_folders_is_refused_by_name(kind: str, home: Path)
 def test_a_file_that_is_no_config_is_not_published_as_one(config: str, home: Path):
     (home / "results" / "sweep" / ".config").write_text(config)
     said: list[str] = []
-    assert not [name for name in published(home, said.append) if name.startswith("configs/")]
+    assert not [name for name in publish_files(home, said.append) if name.startswith("configs/")]
     assert "its runs cannot be repeated" in said[0]
 
 
 def test_effects_and_meshes_of_ones_own_are_published_with_the_files_that_they_name(home: Path):
     effects = "[{kind: './mine.py:Effect', also: data.txt}]"
     (home / "cloth.yaml").write_text(scene(mesh=OWN.replace("PATH", "data.txt"), effects=effects))
-    linked(home, "results/sweep/report/a.txt", "../rows/../.config")  # which stays in the results
-    found = published(home)
+    link_file(home, "results/sweep/report/a.txt", "../rows/../.config")  # which stays in the results
+    found = publish_files(home)
     assert {f"configs/sweep/{name}" for name in ("cloth.yaml", "data.txt", "mine.py", "sweep.yaml")} <= set(found)
     assert found["configs/sweep/data.txt"] == b"data.txt"
     assert found["results/sweep/report/a.txt"] == b"../../sweep.yaml\n"
-    assert len(published(home)) == len(found), "an archive is not part of the next one"
+    assert len(publish_files(home)) == len(found), "an archive is not part of the next one"
 
 
 def test_files_from_before_1980_and_after_2107_are_published(home: Path):
@@ -124,7 +124,7 @@ def test_files_from_before_1980_and_after_2107_are_published(home: Path):
         path = home / "results" / "sweep" / name
         path.touch()
         os.utime(path, (time, time))
-    published(home)
+    publish_files(home)
     with zipfile.ZipFile(home.parent / "x.zip") as packed:
         years = [packed.getinfo(f"results/sweep/{name}").date_time[0] for name in ("old", "new")]
     assert years == [1980, 2107]

@@ -9,7 +9,7 @@ import rerun as rr
 from springbench.harness.recording import curve_drawing
 
 
-class Logged:
+class LogStream:
     """A stream that records what is logged."""
 
     def __init__(self) -> None:
@@ -22,7 +22,7 @@ class Logged:
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5])
 def test_each_curve_and_its_name_have_its_colour(count: int) -> None:
     given = [0xE69F00FF, 0x56B4E9FF, 0x009E73FF, 0xCC79A7FF, 0xF0E442FF][:count]
-    logged = Logged()
+    logged = LogStream()
     drawn = {f"frame {k}": [1.0, 0.1 / (k + 1)] for k in range(count)}
     curve_drawing.draw_curves(cast(rr.RecordingStream, logged), "/curves", drawn, curve_drawing.pack_colours(given))
     for entity in ("/curves/lines", "/curves/words"):

@@ -24,7 +24,7 @@ from tests.synthetic_recordings import MESHES_BY_KIND, build_recording_info
 CORNER = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 2.0]])
 
 
-def listed(batch: Any) -> np.ndarray:
+def to_array(batch: Any) -> np.ndarray:
     return np.array(batch.as_arrow_array().to_pylist())
 
 
@@ -33,7 +33,7 @@ def numbers(component: Any) -> np.ndarray:
     return np.array(component.as_arrow_array().to_pylist()[0])
 
 
-def seen(box: ViewExtent, points: np.ndarray, aspect: float) -> np.ndarray:
+def project_points(box: ViewExtent, points: np.ndarray, aspect: float) -> np.ndarray:
     """How far points are from the middle of the picture, 1 at its edge, (n, 2): across, up."""
     controls = box.build_eye_controls()
     eye, target = numbers(controls.position), numbers(controls.look_target)
@@ -63,14 +63,14 @@ def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: f
     box = ViewExtent(CORNER, aspect)
     box.add_positions(CORNER)
     box.add_positions(CORNER + np.array([0.0, fall, 0.0]))
-    places = seen(box, points, aspect)
+    places = project_points(box, points, aspect)
     assert places.max() <= 1.0
     if fall:  # else the nearest camera is nearer than any that has room around it
         assert places.max() > 0.65, "of half the view; the rest of the lower half is the scale's, and 4 % margin"
     strip, numbers_below = box.build_colour_scale(0.1)
-    below = listed(strip.vertex_positions)
-    assert seen(box, below, aspect).max() <= 1.0
-    assert listed(numbers_below.labels).tolist() == ["−10 %", "−5 %", "strain 0", "+5 %", "+10 %"]
+    below = to_array(strip.vertex_positions)
+    assert project_points(box, below, aspect).max() <= 1.0
+    assert to_array(numbers_below.labels).tolist() == ["−10 %", "−5 %", "strain 0", "+5 %", "+10 %"]
     lowest = height(box, points).min()
     assert height(box, below).max() < lowest, "the scale covers no data"
 
@@ -80,8 +80,8 @@ def test_the_camera_sees_all_that_happens_and_little_more(aspect: float, fall: f
 )
 def test_the_scale_ends_in_a_tip_with_a_figure_where_strain_exceeds_it(ends: tuple[float, float], labels: list[str]):
     strip, words = ViewExtent(MESHES_BY_KIND["cloth"].rest_positions).build_colour_scale(0.1, ends)
-    assert listed(words.labels).tolist()[5:] == labels
-    assert len(listed(strip.triangle_indices)) == 2 * (NUM_LEVELS - 1) + len(labels)
+    assert to_array(words.labels).tolist()[5:] == labels
+    assert len(to_array(strip.triangle_indices)) == 2 * (NUM_LEVELS - 1) + len(labels)
 
 
 def test_a_wide_and_low_mesh_is_centred_above_the_scale():

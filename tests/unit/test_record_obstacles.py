@@ -42,21 +42,21 @@ def rows(path: Path, entity: str) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_recording(
         tmp_path_factory.mktemp("obstacles") / "a.rrd", build_recording_info(obstacles=OBSTACLES), frame_count=11
     )
 
 
-def test_a_recording_declares_its_obstacles_as_a_scene_does(recorded: Path):
-    assert parse_obstacles(str(read_replay(recorded).properties["obstacles"])) == OBSTACLES
+def test_a_recording_declares_its_obstacles_as_a_scene_does(recording_path: Path):
+    assert parse_obstacles(str(read_replay(recording_path).properties["obstacles"])) == OBSTACLES
 
 
-def test_each_shape_is_recorded_once_with_its_extents(recorded: Path):
-    sphere, box = rows(recorded, "/scene/obstacles/0-sphere"), rows(recorded, "/scene/obstacles/3-box")
+def test_each_shape_is_recorded_once_with_its_extents(recording_path: Path):
+    sphere, box = rows(recording_path, "/scene/obstacles/0-sphere"), rows(recording_path, "/scene/obstacles/3-box")
     assert (sphere["half_sizes"], sphere["centers"]) == ([[[0.5] * 3]], [[[1.0, 2.0, 3.0]]])
     assert (box["half_sizes"], box["centers"]) == ([[[1.0, 0.25, 1.0]]], [[[0.0, 0.25, 1.0]]])
-    (corners,) = rows(recorded, "/scene/obstacles/4-plane")["vertex_positions"]
+    (corners,) = rows(recording_path, "/scene/obstacles/4-plane")["vertex_positions"]
     np.testing.assert_allclose(
         OBSTACLES[4].build_obstacle().signed_distance(np.array(corners), 0.0), 0.0, atol=1e-6
     )  # float32
@@ -67,8 +67,8 @@ def test_each_shape_is_recorded_once_with_its_extents(recorded: Path):
 
 
 @pytest.mark.parametrize("k", [1, 2])
-def test_a_capsule_is_turned_from_the_axis_z_to_its_own(recorded: Path, k: int):
-    found, obstacle = rows(recorded, f"/scene/obstacles/{k}-capsule"), OBSTACLES[k]
+def test_a_capsule_is_turned_from_the_axis_z_to_its_own(recording_path: Path, k: int):
+    found, obstacle = rows(recording_path, f"/scene/obstacles/{k}-capsule"), OBSTACLES[k]
     assert isinstance(obstacle, CapsuleObstacle)
     ((turn,),), ((length,),), ((start,),) = (found[n] for n in ("rotation_axis_angles", "lengths", "translations"))
     x, y, z = np.array(turn["axis"]) / np.linalg.norm(turn["axis"])
@@ -77,9 +77,9 @@ def test_a_capsule_is_turned_from_the_axis_z_to_its_own(recorded: Path, k: int):
     np.testing.assert_allclose([start, end], obstacle.end_points, atol=1e-6)  # float32
 
 
-def test_moving_obstacles_have_a_transform_in_each_frame_and_resting_ones_none(recorded: Path):
-    moved = rows(recorded, "/scene/obstacles/0-sphere")
-    assert "translation" not in rows(recorded, "/scene/obstacles/1-capsule")
+def test_moving_obstacles_have_a_transform_in_each_frame_and_resting_ones_none(recording_path: Path):
+    moved = rows(recording_path, "/scene/obstacles/0-sphere")
+    assert "translation" not in rows(recording_path, "/scene/obstacles/1-capsule")
     centers = [
         np.array(m).reshape(3, 3).T @ OBSTACLES[0].center + t
         for (m,), (t,) in zip([v for v in moved["mat3x3"] if v], [v for v in moved["translation"] if v], strict=True)
@@ -88,8 +88,8 @@ def test_moving_obstacles_have_a_transform_in_each_frame_and_resting_ones_none(r
     np.testing.assert_allclose(centers, wanted, atol=1e-5)  # float32, of positions of some metres
 
 
-def test_pictures_see_the_obstacles_where_they_are(recorded: Path):
-    replay = read_replay(recorded, [0, 10])
+def test_pictures_see_the_obstacles_where_they_are(recording_path: Path):
+    replay = read_replay(recording_path, [0, 10])
     assert len(build_obstacle_meshes(replay, 0)) == len(OBSTACLES)
     for frame, time in ((0, 0.0), (1, 10 * TIME_STEP)):
         sphere = np.asarray(build_obstacle_meshes(replay, frame)[0].points, np.float64)

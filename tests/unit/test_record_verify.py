@@ -50,7 +50,7 @@ def test_a_mesh_without_springs_passes(tmp_path: Path):
     require_last(write_recording(tmp_path / "a.rrd", of, COUNT), of, COUNT - 1, TIME, ends())
 
 
-def moved(p: np.ndarray) -> np.ndarray:
+def displace_positions(p: np.ndarray) -> np.ndarray:
     out = p.copy()
     out[7, 1] = np.nextafter(np.float32(out[7, 1]), np.float32(np.inf))
     return out
@@ -59,7 +59,7 @@ def moved(p: np.ndarray) -> np.ndarray:
 ENDS = {
     "another frame": (COUNT, TIME, lambda p: p, "ends with frame 11, the run with frame 12"),
     "another time": (COUNT - 1, TIME + 0.01, lambda p: p, "frame 11 was recorded at 0.11 s, it is at 0.12 s"),
-    "another last bit": (COUNT - 1, TIME, moved, "other positions"),
+    "another last bit": (COUNT - 1, TIME, displace_positions, "other positions"),
 }
 
 
@@ -103,14 +103,14 @@ def whole(of: RecordingInfo) -> dict[int, np.ndarray]:
 
 
 TIMES = {k: 0.01 * k for k in range(COUNT)}
-LIES = {
+FALSE_FRAMES = {
     "one step late in odd frames": lambda f, before: replace(f, positions=(before if f.index % 2 else f).positions),
     "late in one frame": lambda f, before: replace(f, positions=before.positions if f.index == 4 else f.positions),
     "its time late": lambda f, before: replace(f, time=before.time if f.index == 4 else f.time),
 }
 
 
-@pytest.mark.parametrize("lie", LIES.values(), ids=LIES)
+@pytest.mark.parametrize("lie", FALSE_FRAMES.values(), ids=FALSE_FRAMES)
 def test_a_recording_that_is_wrong_before_its_end_is_refused(
     lie: Callable[[RecordedFrame, RecordedFrame], RecordedFrame], tmp_path: Path
 ):

@@ -33,7 +33,7 @@ def case(name: str) -> tuple[Scene, StepProblem]:
     return made, build_problem(made, build_initial_state(made), "previous")
 
 
-def solved(stated: StepProblem) -> Positions:
+def solve_to_roundoff(stated: StepProblem) -> Positions:
     """Where Newton's method leads, and then Newton's steps by the reference, to round-off."""
     return refine_minimum(stated, stated.current_positions, NewtonSolver()).positions.copy()
 
@@ -44,7 +44,7 @@ def test_limits_that_are_not_reached_do_not_make_a_chain_in_the_air_right(name: 
     oracle = ReferenceEvaluator(stated.system)
     assert oracle.measure_stationarity(stated, stated.current_positions).above_roundoff == pytest.approx(1.0)
     assert oracle.measure_stationarity(stated, stated.current_positions).roundoff_bound < 1e-9
-    best = solved(stated)
+    best = solve_to_roundoff(stated)
     assert oracle.measure_stationarity(stated, best).above_roundoff <= 1e-6
     assert stated.value(best) < stated.value(stated.current_positions) - 1e-3
 
@@ -53,7 +53,7 @@ def test_limits_that_are_not_reached_do_not_make_a_chain_in_the_air_right(name: 
 def test_a_far_component_does_not_hide_that_a_near_one_is_moved(name: str):
     """At 1e9 m positions are rounded to 1e-7 m, which is 10 N for springs of 1e8 N/m: none of the near cube's."""
     _, stated = case(name)
-    oracle, best = ReferenceEvaluator(stated.system), solved(stated)
+    oracle, best = ReferenceEvaluator(stated.system), solve_to_roundoff(stated)
     assert oracle.measure_stationarity(stated, best).above_roundoff <= 1e-6
     moved = best.copy()
     moved[0] += 0.087 / 3**0.5
@@ -62,7 +62,7 @@ def test_a_far_component_does_not_hide_that_a_near_one_is_moved(name: str):
 
 def test_a_distance_counts_by_the_size_of_its_own_component():
     made, stated = case("scales-cubes-1e6-m-apart")
-    known = solved(stated)
+    known = solve_to_roundoff(stated)
     moved = known.copy()
     moved[0, 0] += 0.087
     state = MotionState(Motion(moved, np.zeros_like(moved)), None, 1)
@@ -86,7 +86,7 @@ def test_a_component_is_as_large_as_its_box_and_a_lone_vertex_as_the_others():
 
 def test_a_scene_at_rest_is_stationary_by_round_off_alone():
     made, stated = case("topology-components")
-    p = solved(stated)
+    p = solve_to_roundoff(stated)
     at_rest = replace(stated, current_positions=p, initial_guess=p)
     oracle = ReferenceEvaluator(made.system)
     assert oracle.measure_stationarity(at_rest, p).above_roundoff == 0.0

@@ -31,7 +31,7 @@ def benchmark(name: str = "numba", minimum: float = MINIMUM, **extra: Any) -> di
     return {"fullname": f"tests/bench/test_gates.py::test_gate[{name}]", "stats": {"min": minimum}, "extra_info": extra}
 
 
-def stored(path: Path, *benchmarks: dict[str, Any], machine: dict[str, Any] = HERE) -> Path:
+def write_benchmarks(path: Path, *benchmarks: dict[str, Any], machine: dict[str, Any] = HERE) -> Path:
     path.write_text(json.dumps({"machine_info": machine, "benchmarks": benchmarks, "version": "5.3.1"}))
     return path
 
@@ -65,8 +65,8 @@ WIDE = ratio(1.2, spread=0.12)  # from 1.08 to 1.32: above 1.00 +- 0.01, but not
     ],
 )
 def test_a_benchmark_is_compared(old: dict, new: dict, machine: dict, words: str, tmp_path: Path):
-    base = stored(tmp_path / "base.json", benchmark(**old))
-    verdict, text = compare(base, stored(tmp_path / "new.json", benchmark(**new), machine=machine))
+    base = write_benchmarks(tmp_path / "base.json", benchmark(**old))
+    verdict, text = compare(base, write_benchmarks(tmp_path / "new.json", benchmark(**new), machine=machine))
     assert verdict == words.partition(":")[0]
     (row,) = [line for line in text.splitlines() if "test_gate[numba]" in line]
     assert row.rstrip().endswith(words)
@@ -75,14 +75,14 @@ def test_a_benchmark_is_compared(old: dict, new: dict, machine: dict, words: str
 
 
 def test_a_ratio_is_compared_whatever_the_times_were(tmp_path: Path):
-    base = stored(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
-    verdict, _ = compare(base, stored(tmp_path / "new.json", benchmark(minimum=5 * MINIMUM, ratio=ratio(1.0))))
+    base = write_benchmarks(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
+    verdict, _ = compare(base, write_benchmarks(tmp_path / "new.json", benchmark(minimum=5 * MINIMUM, ratio=ratio(1.0))))
     assert verdict == "pass"
 
 
 def test_a_missing_benchmark_fails_and_a_new_one_has_no_verdict(tmp_path: Path):
-    one, both = stored(tmp_path / "one.json", benchmark("a")), tmp_path / "both.json"
-    stored(both, benchmark("a"), benchmark("b"))
+    one, both = write_benchmarks(tmp_path / "one.json", benchmark("a")), tmp_path / "both.json"
+    write_benchmarks(both, benchmark("a"), benchmark("b"))
     verdict, text = compare(both, one)
     assert verdict == "fail"
     assert [line.split()[-2:] for line in text.splitlines() if "[b]" in line] == [["fail:", "missing"]]
@@ -112,7 +112,7 @@ def test_a_missing_benchmark_fails_and_a_new_one_has_no_verdict(tmp_path: Path):
     ],
 )
 def test_a_foreign_file_is_the_users_mistake(content: str | None, problem: str, tmp_path: Path):
-    good, bad = stored(tmp_path / "good.json", benchmark()), tmp_path / "bad.json"
+    good, bad = write_benchmarks(tmp_path / "good.json", benchmark()), tmp_path / "bad.json"
     if content is not None:
         bad.write_text(content)
     for pair in ((good, bad), (bad, good)):
@@ -125,15 +125,15 @@ def test_a_foreign_file_is_the_users_mistake(content: str | None, problem: str, 
 
 
 def test_files_without_a_common_benchmark_are_inconclusive(tmp_path: Path):
-    verdict, text = compare(stored(tmp_path / "a.json", benchmark("a")), stored(tmp_path / "b.json", benchmark("b")))
+    verdict, text = compare(write_benchmarks(tmp_path / "a.json", benchmark("a")), write_benchmarks(tmp_path / "b.json", benchmark("b")))
     assert verdict == "inconclusive"
     assert "no benchmark in common" in " ".join(text.split())  # long paths wrap
 
 
 @pytest.mark.parametrize(("new", "code"), [(1.0, 0), (1.5, 1), (None, 2)])
 def test_the_verdict_is_the_exit_code(new: float | None, code: int, tmp_path: Path):
-    base = stored(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
-    other = stored(tmp_path / "new.json", benchmark(ratio=ratio(new))) if new else tmp_path / "missing.json"
+    base = write_benchmarks(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
+    other = write_benchmarks(tmp_path / "new.json", benchmark(ratio=ratio(new))) if new else tmp_path / "missing.json"
     assert CliRunner().invoke(app, ["regress", str(other), "--baseline", str(base)]).exit_code == code
 
 

@@ -37,7 +37,7 @@ needs_opengl = pytest.mark.skipif(
     opengl_probe.find_opengl_problem() is not None, reason=opengl_probe.find_opengl_problem() or ""
 )
 
-STRETCHED = 0.1  # strain at the ends of the scale in these tests
+MAX_STRAIN = 0.1  # strain at the ends of the scale in these tests
 
 
 def cloth(n: int = 6, frames: int = 8, *, stretch: float = 1.05, triangles: bool = True) -> RecordingReplay:
@@ -61,7 +61,7 @@ def cloth(n: int = 6, frames: int = 8, *, stretch: float = 1.05, triangles: bool
         springs=springs,
         rest_lengths=np.full(len(springs), 1 / (n - 1)),
         pinned_vertices=k[[0, -1], 0],
-        strain_range=STRETCHED,
+        strain_range=MAX_STRAIN,
         scalars={"/residual": (2 * np.arange(1, frames), np.geomspace(1e-2, 1e-6, frames - 1))},
         properties={"scene": "cloth", "size": n, "solver": "sparse", "milliseconds_per_step": 1.25},
     )
@@ -76,7 +76,7 @@ def chain(n: int = 10) -> RecordingReplay:
     )
 
 
-def broken(replay: RecordingReplay, frame: int, value: float = np.nan) -> RecordingReplay:
+def break_frame(replay: RecordingReplay, frame: int, value: float = np.nan) -> RecordingReplay:
     positions = replay.positions.copy()
     positions[frame:, 3] = value
     return replace(replay, positions=positions)
@@ -87,7 +87,7 @@ def pixels(path: Path) -> NDArray[np.float64]:
         return np.asarray(image.convert("RGB")).astype(float)
 
 
-def drawn(image: NDArray[np.float64], left: int, top: int, width: int, height: int) -> float:
+def measure_drawn_share(image: NDArray[np.float64], left: int, top: int, width: int, height: int) -> float:
     """The share of pixels in a region that are far from the colour of the page."""
     region = image[top : top + height, left : left + width]
     return float((np.abs(region - 255 * np.array(to_rgb(BACKGROUND_COLOUR))).max(axis=-1) > 60).mean())
@@ -130,9 +130,9 @@ def test_a_run_is_drawn_large_and_four_frames_before_it(
     assert image.shape == (PAGE_HEIGHT, PAGE_WIDTH, 3)
     # A chain covers the fewest pixels: a rod of about 10 x 400 of 1244 x 750.
     main, tiles = boxes()
-    assert drawn(image, *main) > 0.002
+    assert measure_drawn_share(image, *main) > 0.002
     for tile in tiles:
-        assert drawn(image, *tile) > 0.0005
+        assert measure_drawn_share(image, *tile) > 0.0005
     assert [file.name for file in tmp_path.iterdir()] == ["run.png"], "no partial file is left"
 
 
@@ -161,7 +161,7 @@ def seen_colour(image: NDArray[np.float64] | NDArray[np.uint8]) -> NDArray[np.fl
     return np.median(image[60:100, 60:100].reshape(-1, 3), axis=0) / 255
 
 
-def pulled(triangles: bool) -> tuple[RecordingReplay, list[RecordingReplay]]:
+def build_strained_frames(triangles: bool) -> tuple[RecordingReplay, list[RecordingReplay]]:
     """A cloth or a net in three frames, compressed, at rest, and stretched; and each of them alone."""
     frames = [cloth(frames=1, stretch=1 + strain, triangles=triangles) for strain in (-0.1, 0.0, 0.1)]
     whole = cloth(frames=3, triangles=triangles)
@@ -171,7 +171,7 @@ def pulled(triangles: bool) -> tuple[RecordingReplay, list[RecordingReplay]]:
 @needs_opengl
 @pytest.mark.parametrize("triangles", [True, False], ids=["cloth", "net"])
 def test_each_frame_is_drawn_as_it_would_be_alone(triangles: bool) -> None:
-    replay, frames = pulled(triangles)
+    replay, frames = build_strained_frames(triangles)
     view = fit_camera(frames[1].positions[0], aspect=1.0, angles=(20.0, 10.0))
     with OffscreenRenderer(160, 160) as studio:
         together = [studio.render_frame(replay, k, view) for k in range(3)]
@@ -184,14 +184,14 @@ def test_each_frame_is_drawn_as_it_would_be_alone(triangles: bool) -> None:
 @needs_opengl
 def test_each_frame_is_drawn_in_its_own_colours_and_positions() -> None:
     """Drawn out of order, by one window."""
-    replay, frames = pulled(True)
+    replay, frames = build_strained_frames(True)
     view = fit_camera(frames[1].positions[0], aspect=1.0, angles=(0.0, 0.0))
     with OffscreenRenderer(160, 160) as studio:
         seen = {k: studio.render_frame(replay, k, view) for k in (2, 0, 1)}
     for k, colour in zip((0, 1, 2), STRAIN_COLOURS[::2], strict=True):
         # As above.
         assert np.abs(seen_colour(seen[k]) - to_rgb(colour)).max() < 0.1
-    shares = [drawn(seen[k].astype(float), 0, 0, 160, 160) for k in (0, 1, 2)]
+    shares = [measure_drawn_share(seen[k].astype(float), 0, 0, 160, 160) for k in (0, 1, 2)]
     assert shares[0] < shares[2], "a stretched cloth covers more"
     for k, frame in enumerate(frames):
         assert compute_spring_strain(replay, k) == pytest.approx(compute_spring_strain(frame, 0))
@@ -261,7 +261,7 @@ def test_a_picture_does_not_depend_on_the_unit_of_length(make: Callable[[], Reco
                 )
             )
     np.testing.assert_array_equal(*images)
-    assert drawn(images[0].astype(float), 0, 0, 80, 80) > 0.01
+    assert measure_drawn_share(images[0].astype(float), 0, 0, 80, 80) > 0.01
 
 
 @needs_opengl
@@ -300,7 +300,7 @@ def test_a_mesh_without_springs_is_drawn_by_its_vertices(tmp_path: Path) -> None
     draw_run_picture(
         replace(plain, springs=plain.springs[:0], rest_lengths=plain.rest_lengths[:0]), tmp_path / "run.png"
     )
-    assert drawn(pixels(tmp_path / "run.png"), 0, 114, PAGE_WIDTH, 750) > 0.0001
+    assert measure_drawn_share(pixels(tmp_path / "run.png"), 0, 114, PAGE_WIDTH, 750) > 0.0001
 
 
 def falling(replay: RecordingReplay, vertices: slice, metres: float) -> RecordingReplay:
@@ -388,7 +388,7 @@ def test_a_picture_states_how_many_vertices_are_outside(words: list[str], tmp_pa
     replay = falling(cloth(), slice(3, 4), 44.0)
     draw_run_picture(replay, tmp_path / "run.png")
     assert sum("1 of 36 vertices is outside" in word for word in words) == 1, words
-    assert drawn(pixels(tmp_path / "run.png"), 36, 114, 700, 750) > 0.05, "the cloth is no dot"
+    assert measure_drawn_share(pixels(tmp_path / "run.png"), 36, 114, 700, 750) > 0.05, "the cloth is no dot"
     words.clear()
     draw_comparison_picture({"a": replay, "b": cloth()}, tmp_path / "both.png")
     assert words.count("1 of 36 vertices is outside") == 1
@@ -397,21 +397,21 @@ def test_a_picture_states_how_many_vertices_are_outside(words: list[str], tmp_pa
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
 def test_frames_are_drawn_up_to_the_first_that_is_not_finite(value: float) -> None:
     assert find_drawable_frames(cloth()).tolist() == list(range(8))
-    assert find_drawable_frames(broken(cloth(), 5, value)).tolist() == [0, 1, 2, 3, 4]
+    assert find_drawable_frames(break_frame(cloth(), 5, value)).tolist() == [0, 1, 2, 3, 4]
 
 
 @needs_opengl
 def test_positions_that_are_not_finite_are_reported_in_words(
     words: list[str], boxes: Callable[[], tuple[PixelBox, list[PixelBox]]], tmp_path: Path
 ) -> None:
-    draw_run_picture(broken(cloth(), 5), tmp_path / "run.png")
+    draw_run_picture(break_frame(cloth(), 5), tmp_path / "run.png")
     assert "not finite from frame 10 on" in "\n".join(words)
-    assert drawn(pixels(tmp_path / "run.png"), *boxes()[0]) > 0.01, "the last finite frame is drawn"
+    assert measure_drawn_share(pixels(tmp_path / "run.png"), *boxes()[0]) > 0.01, "the last finite frame is drawn"
 
 
 @needs_opengl
 def test_a_run_without_a_finite_frame_is_a_picture_that_states_it(words: list[str], tmp_path: Path) -> None:
-    draw_run_picture(broken(cloth(), 0), tmp_path / "run.png")
+    draw_run_picture(break_frame(cloth(), 0), tmp_path / "run.png")
     assert "not finite from frame 0 on" in "\n".join(words)
     assert pixels(tmp_path / "run.png").shape == (PAGE_HEIGHT, PAGE_WIDTH, 3)
 
@@ -421,16 +421,16 @@ def test_a_comparison_shows_solvers_side_by_side_with_their_distance(words: list
     first = cloth()
     moved = first.positions + np.array([0.0, 0.0, 0.1], np.float32)
     second = replace(first, positions=moved, properties={**first.properties, "solver": "dense"})
-    third = replace(broken(first, 4), properties={**first.properties, "solver": "xpbd"})
+    third = replace(break_frame(first, 4), properties={**first.properties, "solver": "xpbd"})
     draw_comparison_picture({"a": first, "b": second, "c": third}, tmp_path / "side.png")
     for said in ("cloth, size 6", "sparse", "dense", "xpbd", "reference", "1.0e-06", "not finite\nfrom frame 8 on"):
         assert said in words
     assert "0.5" in words, "0.1 m are half a rest length of 0.2 m"
     image = pixels(tmp_path / "side.png")
     assert image.shape[1:] == (PAGE_WIDTH, 3)
-    assert drawn(image, 40, 118, 480, image.shape[0] - 118) > 0.01
-    assert drawn(image, 540, 118, 480, image.shape[0] - 118) > 0.01
-    assert drawn(image, 0, image.shape[0] - 60, PAGE_WIDTH, 60) > 0.0, "nothing is left empty below"
+    assert measure_drawn_share(image, 40, 118, 480, image.shape[0] - 118) > 0.01
+    assert measure_drawn_share(image, 540, 118, 480, image.shape[0] - 118) > 0.01
+    assert measure_drawn_share(image, 0, image.shape[0] - 60, PAGE_WIDTH, 60) > 0.0, "nothing is left empty below"
 
 
 @needs_opengl

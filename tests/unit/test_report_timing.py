@@ -103,7 +103,7 @@ def run_rows(scene: str, size: int, solver: str, omega: float, *, failed: bool) 
     return prepare + steps + phases
 
 
-def learned(**how: Any) -> list[str]:
+def summarise_rows(**how: Any) -> list[str]:
     """Whole sentences of what rows say."""
     return learned_from(rows(**how).to_pylist())
 
@@ -222,7 +222,9 @@ def test_the_summary_and_the_words_after_it_fit_a_hundred_columns() -> None:
     assert max(map(len, summarise_sweep(read_run_times(table)))) <= 98, "two more go before each"
 
 
-def changed(solvers: Sequence[str], sizes: Sequence[int] = (20,), **by: Callable[[dict[str, Any]], Any]) -> list[str]:
+def summarise_changed_rows(
+    solvers: Sequence[str], sizes: Sequence[int] = (20,), **by: Callable[[dict[str, Any]], Any]
+) -> list[str]:
     """What is learned of rows whose columns are changed where they are not null."""
     given_rows = rows(sizes=sizes, solvers=solvers).to_pylist()
     for row in given_rows:
@@ -231,7 +233,7 @@ def changed(solvers: Sequence[str], sizes: Sequence[int] = (20,), **by: Callable
 
 
 def test_times_are_compared_at_equal_errors_by_the_median_step() -> None:
-    (speed, limit) = learned(sizes=(10, 20), failed=[(20, "dense")])
+    (speed, limit) = summarise_rows(sizes=(10, 20), failed=[(20, "dense")])
     assert speed.startswith("cloth 10: fastest at equal accuracy is sparse, 0.1 ms a step; xpbd 10 times, dense 100")
     assert "(largest residual 1.0e+00 to 10 times that" in speed
     assert limit.startswith("All 5 runs stopped at the limit of iterations")
@@ -241,14 +243,14 @@ def test_times_are_compared_at_equal_errors_by_the_median_step() -> None:
 
 
 def test_times_at_unequal_or_unknown_errors_are_not_compared() -> None:
-    worse = changed(
+    worse = summarise_changed_rows(
         ("sparse", "dense"), residual=lambda row: row["residual"] * (100 if row["solver"] == "dense" else 1)
     )
     assert worse[0].startswith("cloth 20: most accurate is sparse, largest residual 1.0e+00; no other")
     assert worse[1] == "cloth 20: not compared with it: dense (its error is 100 times as large)."
-    unknown = changed(("sparse", "xpbd"), residual=lambda row: None if row["solver"] == "xpbd" else row["residual"])
+    unknown = summarise_changed_rows(("sparse", "xpbd"), residual=lambda row: None if row["solver"] == "xpbd" else row["residual"])
     assert unknown[1] == "cloth 20: not compared with it: xpbd (its error is unknown)."
-    once = changed(("sparse", "xpbd"), residual=lambda row: None if row["frame"] == 2 else row["residual"])
+    once = summarise_changed_rows(("sparse", "xpbd"), residual=lambda row: None if row["frame"] == 2 else row["residual"])
     assert once[0] == "cloth 20: times are not compared, for no run's error is known."
     assert not [line for line in worse + unknown + once if "fastest" in line or "times as long" in line]
 
@@ -286,7 +288,7 @@ def test_steps_of_other_lengths_or_integrators_are_not_compared() -> None:
 
 
 def test_a_limit_of_iterations_stops_only_what_has_one() -> None:
-    own = changed(("sparse", "xpbd"), is_substepping=lambda row: True)
+    own = summarise_changed_rows(("sparse", "xpbd"), is_substepping=lambda row: True)
     assert own[-1].startswith("All 2 runs stopped"), "of others it is not known"
     given_rows = rows(sizes=(20,), solvers=("sparse", "symplectic-euler")).to_pylist()
     for row in given_rows:

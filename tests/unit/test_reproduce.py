@@ -60,7 +60,7 @@ def publish_sweep(home: Path, timing: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def untimed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def untimed_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return publish_sweep(tmp_path_factory.mktemp("untimed"), "none")
 
 
@@ -89,8 +89,8 @@ def test_curves_agree_by_the_iterations_to_each_stationarity(repeated: list[dict
 
 
 @pytest.mark.slow
-def test_a_study_agrees_with_itself(untimed: Path, tmp_path: Path) -> None:
-    again = ("reproduce", "sweep", "--published", untimed, "--results", tmp_path)
+def test_a_study_agrees_with_itself(untimed_study: Path, tmp_path: Path) -> None:
+    again = ("reproduce", "sweep", "--published", untimed_study, "--results", tmp_path)
     result = command(*again)
     assert result.exit_code == 0, result.output
     assert "sweep: 2 runs; when it was published this took" in result.output
@@ -102,8 +102,8 @@ def test_a_study_agrees_with_itself(untimed: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_another_number_of_iterations_does_not_agree(untimed: Path, tmp_path: Path) -> None:
-    study = read_study(untimed / "sweep")
+def test_another_number_of_iterations_does_not_agree(untimed_study: Path, tmp_path: Path) -> None:
+    study = read_study(untimed_study / "sweep")
     table = study.read_table("rows")
     changed = [9 * count if count else count for count in table["num_iterations"].to_pylist()]
     at = table.column_names.index("num_iterations")
@@ -119,12 +119,12 @@ def test_another_number_of_iterations_does_not_agree(untimed: Path, tmp_path: Pa
 
 @pytest.mark.slow
 def test_an_entry_is_verified_and_a_changed_one_is_not(
-    untimed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    untimed_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(archive_verification, "MAX_RATIO_SAME_MACHINE", math.inf)  # steps of some microseconds
     entry = tmp_path / "entries" / "mine.zip"
     entry.parent.mkdir()
-    published = command("publish", untimed.parent / "results", "-o", entry)
+    published = command("publish", untimed_study.parent / "results", "-o", entry)
     assert published.exit_code == 0, published.output
     again = ("reproduce", "entries", "--published", tmp_path, "--seed", 1)
     result = command(*again)
@@ -281,7 +281,7 @@ def test_runs_without_their_optional_software_are_not_compared() -> None:
 
 
 @pytest.mark.slow
-def test_an_untimed_study_publishes_no_times(untimed: Path) -> None:
-    columns = set(read_study(untimed / "sweep").read_table("rows").column_names)
+def test_an_untimed_study_publishes_no_times(untimed_study: Path) -> None:
+    columns = set(read_study(untimed_study / "sweep").read_table("rows").column_names)
     assert {"num_iterations", "residual"} <= columns
     assert not columns & {"seconds", "cpu_seconds", "load_average", "cold_seconds"}

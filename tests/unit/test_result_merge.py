@@ -14,11 +14,11 @@ from springbench.harness.results import parquet_rows, row_store
 from tests.synthetic_run_rows import build_dummy_rows, write_dummy_runs
 
 
-def merged(folder: Path, *names: str) -> MergeReport:
+def merge_folders(folder: Path, *names: str) -> MergeReport:
     return merge_results([folder / name for name in names], folder / "all", lambda line: None)
 
 
-def rewritten(unit: Path, **changed: Any) -> None:
+def rewrite_rows(unit: Path, **changed: Any) -> None:
     """A unit's rows with other values."""
     parquet_rows.write_rows(unit, [row | changed for row in build_dummy_rows(int(unit.stem[-12:], 16))])
 
@@ -37,20 +37,20 @@ def two(tmp_path: Path) -> Path:
 
 
 def test_all_runs_are_there_once_with_their_recordings_and_again_changes_nothing(two: Path):
-    found = merged(two, "a", "b")
+    found = merge_folders(two, "a", "b")
     assert found == MergeReport(5, 1, [], [], found.machine_summary)
     units = row_store.list_units(two / "all" / "sweep" / "rows")
     assert sorted(set(map(str, parquet_rows.read_rows(units)["run_id"].to_pylist()))) == [f"{k:012x}" for k in range(5)]
     for part in ("recordings", "pictures"):
         assert [path.stem for path in sorted((two / "all" / "sweep" / part).iterdir())] == [u.stem for u in units]
     before = {path: path.stat().st_mtime_ns for path in two.rglob("*") if path.is_file()}
-    assert merged(two, "b", "a").num_written == 0
+    assert merge_folders(two, "b", "a").num_written == 0
     assert {path: path.stat().st_mtime_ns for path in two.rglob("*") if path.is_file()} == before
 
 
 def test_a_run_that_was_done_twice_has_both_rows_and_the_newer_has_its_name(two: Path):
     (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
-    rewritten(unit, started_at="2027-01-01T00:00:00+00:00", seconds=9.0)
+    rewrite_rows(unit, started_at="2027-01-01T00:00:00+00:00", seconds=9.0)
     for order in (("a", "b"), ("b", "a")):
         found = merge_results([two / name for name in order], two / f"all-{order[0]}", lambda line: None)
         assert found == MergeReport(6, 0, [], [], found.machine_summary)
@@ -62,8 +62,8 @@ def test_a_run_that_was_done_twice_has_both_rows_and_the_newer_has_its_name(two:
 
 def test_positions_that_differ_are_a_conflict_on_one_machine_and_reported_between_two(two: Path):
     (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
-    rewritten(unit, positions_digest="f" * 64)
-    found = merged(two, "a", "b")
+    rewrite_rows(unit, positions_digest="f" * 64)
+    found = merge_folders(two, "a", "b")
     assert found.conflicts == found.cross_machine_differences == ["scene2 10 hybrid: from step 1"]
     parquet_rows.write_rows(
         unit.with_name("there.parquet"),
@@ -85,14 +85,14 @@ def test_folders_that_look_like_columns_or_patterns_are_merged_as_all_are(two: P
 
 
 def test_rows_that_are_not_written_as_they_were_replace_nothing(two: Path, monkeypatch: pytest.MonkeyPatch):
-    merged(two, "a")
+    merge_folders(two, "a")
     before = {path: path.read_bytes() for path in (two / "all").rglob("*.parquet")}
     (unit,) = (unit for unit in row_store.list_units(two / "a" / "sweep" / "rows") if unit.stem.endswith("2"))
-    rewritten(unit, started_at="2027-01-01T00:00:00+00:00")
+    rewrite_rows(unit, started_at="2027-01-01T00:00:00+00:00")
     write = pq.write_table
     monkeypatch.setattr(pq, "write_table", lambda table, file: write(table.slice(1), file))
     with pytest.raises(InputError, match="differ from those written"):
-        merged(two, "a")
+        merge_folders(two, "a")
     assert {path: path.read_bytes() for path in (two / "all").rglob("*.parquet")} == before
 
 
@@ -102,7 +102,7 @@ def test_a_column_of_another_type_is_named_before_anything_is_written(two: Path)
     for name, values in (("size", ["large", "small"]), ("positions_digest", [1.5, 2.5])):
         pq.write_table(table.set_column(table.schema.get_field_index(name), name, pa.array(values)), unit)
         with pytest.raises(InputError, match=rf"{unit.name}: rows do not fit .*{name}"):
-            merged(two, "b", "a")
+            merge_folders(two, "b", "a")
     assert not (two / "all").exists()
 
 
@@ -113,8 +113,8 @@ def test_what_cannot_be_merged_is_the_users_mistake(two: Path):
         merge_results([two / "a", two / "b"], two / "a" / "all", lambda line: None)
     (two / "empty").mkdir()
     with pytest.raises(InputError, match="contains no rows"):
-        merged(two, "a", "empty")
+        merge_folders(two, "a", "empty")
     unit = row_store.list_units(two / "a" / "sweep" / "rows")[0]
     unit.write_bytes(b"PAR1")
     with pytest.raises(InputError, match=unit.name):
-        merged(two, "a", "b")
+        merge_folders(two, "a", "b")

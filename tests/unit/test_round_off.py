@@ -26,7 +26,7 @@ NUDGES = 20
 """Of the last bit: as many ways to round the positions."""
 
 
-def nudged(p: Positions, seed: int) -> Positions:
+def perturb_last_bits(p: Positions, seed: int) -> Positions:
     """The positions with each coordinate moved by its last bit, up, down or not at all."""
     return p * (1.0 + EPS * np.random.default_rng(seed).integers(-1, 2, p.shape))
 
@@ -40,7 +40,7 @@ def test_the_rounding_of_positions_moves_the_gradient_by_no_more_than_the_bound(
     for p in (problem.current_positions, problem.inertial_target, problem.current_positions + 1e3):
         bound = 2.0 * gradient_roundoff(problem, p)
         for seed in range(NUDGES):
-            change = problem.gradient(nudged(p, seed)) - problem.gradient(p)
+            change = problem.gradient(perturb_last_bits(p, seed)) - problem.gradient(p)
             assert (stable_row_norms(change) <= bound).all()
 
 
@@ -51,7 +51,7 @@ def test_the_bound_is_not_slack(case: str):
     p, bound = problem.current_positions, gradient_roundoff(problem, problem.current_positions)
     free = problem.system.free_vertices
     changes = [
-        stable_row_norms(problem.gradient(nudged(p, seed)) - problem.gradient(p))[free] for seed in range(NUDGES)
+        stable_row_norms(problem.gradient(perturb_last_bits(p, seed)) - problem.gradient(p))[free] for seed in range(NUDGES)
     ]
     assert (np.max(changes, axis=0) / bound[free]).max() > 1 / 300
 
@@ -80,7 +80,7 @@ def test_a_limit_that_is_not_reached_adds_nothing_however_stiff():
 
 
 @dataclass(frozen=True)
-class Unstated:
+class PlainEnergy:
     """An energy that states nothing but what it must."""
 
     inner: Energy
@@ -99,11 +99,11 @@ class Unstated:
 def test_an_energy_that_states_no_terms_has_a_sound_bound_by_its_hessian(case: str):
     problem = build_moving_problem(EFFECT_SCENES[case]())
     assert all(isinstance(energy, RoundingBoundEnergy) for energy in problem.energies)
-    stated = replace(problem, system=replace(problem.system, energies=tuple(map(Unstated, problem.energies))))
+    stated = replace(problem, system=replace(problem.system, energies=tuple(map(PlainEnergy, problem.energies))))
     assert not any(isinstance(energy, RoundingBoundEnergy) for energy in stated.energies)
     p, bound = problem.current_positions, 2.0 * gradient_roundoff(stated, problem.current_positions)
     for seed in range(NUDGES):
-        change = problem.gradient(nudged(p, seed)) - problem.gradient(p)
+        change = problem.gradient(perturb_last_bits(p, seed)) - problem.gradient(p)
         assert (stable_row_norms(change) <= bound).all()
 
 

@@ -181,14 +181,14 @@ def killed_at(call: int, sweep: Path) -> None:
     count = 0
 
     def deadly(function: Callable[..., object]) -> Callable[..., object]:
-        def counted(*arguments: object, **named: object) -> object:
+        def count_call(*arguments: object, **named: object) -> object:
             nonlocal count
             count += 1
             if count > call:
                 os.kill(os.getpid(), signal.SIGKILL)
             return function(*arguments, **named)
 
-        return counted
+        return count_call
 
     os.replace, Path.unlink, os.fsync = deadly(os.replace), deadly(Path.unlink), deadly(os.fsync)  # type: ignore[assignment]
     pq.ParquetWriter.write_table = deadly(pq.ParquetWriter.write_table)  # type: ignore[method-assign]

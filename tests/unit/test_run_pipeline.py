@@ -28,10 +28,10 @@ def test_a_run_that_fails_now_removes_its_earlier_results(tmp_path: Path, monkey
     assert files.recording_path.exists()
     assert files.recording_path.name == f"{spec.build_file_stem(machine_info.describe_machine().machine_id)}.rrd"
 
-    def broken(*_):
+    def fail_run(*_):
         raise ZeroDivisionError("nothing to divide by")
 
-    monkeypatch.setattr(timing_pass, "measure_run", broken)
+    monkeypatch.setattr(timing_pass, "measure_run", fail_run)
     (row,) = execute_run(spec, files, lambda phase: None)
     assert row["status"] == "failed"
     assert "ZeroDivisionError: nothing to divide by (test_run_pipeline.py:" in row["reason"]

@@ -35,7 +35,7 @@ def pair(edges: bool) -> Candidates:
     return Candidates(np.arange(4)[None], 0 if edges else 1, one, one, 0 * one, CONTACT_THICKNESS, CONTACT_DHAT)
 
 
-def pushed(pairs: Candidates, p: np.ndarray) -> np.ndarray:
+def compute_gradient(pairs: Candidates, p: np.ndarray) -> np.ndarray:
     """The gradient."""
     out = np.zeros_like(p)
     energy_and_gradient(
@@ -48,7 +48,7 @@ def pushed(pairs: Candidates, p: np.ndarray) -> np.ndarray:
     return out
 
 
-def sampled(p: np.ndarray, edges: bool) -> float:
+def sample_distance(p: np.ndarray, edges: bool) -> float:
     """The least distance among a few thousand places on both."""
     s, t = np.meshgrid(np.linspace(0, 1, 81), np.linspace(0, 1, 81))
     s, t = s.ravel(), t.ravel()
@@ -70,7 +70,7 @@ SHAPES = {"any": (1.0, 1.0, 1.0), "in a plane": FLAT, "needles": (1.0, 1e-6, 1e-
 def test_distances_are_the_least_of_all_places(shape, edges):
     for seed in range(40):
         p = np.random.default_rng(seed).normal(size=(4, 3)) * SHAPES[shape]
-        found, least = compute_distances(pair(edges), p)[0], sampled(p, edges)
+        found, least = compute_distances(pair(edges), p)[0], sample_distance(p, edges)
         # A place of the finest sampling is at most a cell of 1/80 from the nearest: the lengths here are below 6 m.
         assert least - 6.0 / 80 <= found <= least + 1e-12
 
@@ -172,11 +172,11 @@ def test_candidates_are_all_that_are_near():
     every = Candidates(np.array(wanted), first, one, one, 0 * one, CONTACT_THICKNESS, CONTACT_DHAT)
     near = compute_distances(every, p) < reach
     found = surface.find_proximity_candidates(p, reach)
-    assert named(found.vertices, found.num_point_triangle) == named(every.vertices[near], int(near[:first].sum()))
+    assert name_pairs(found.vertices, found.num_point_triangle) == name_pairs(every.vertices[near], int(near[:first].sum()))
     assert len(found.vertices) == int(near.sum())
 
 
-def named(vertices: np.ndarray, points: int) -> set[Any]:
+def name_pairs(vertices: np.ndarray, points: int) -> set[Any]:
     """Points with their triangles, and edges with each other, whichever of two comes first."""
     one, two = vertices[:points].tolist(), vertices[points:].tolist()
     return {tuple(x) for x in one} | {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in two}
@@ -288,11 +288,11 @@ def _shrunk(by: float):
 @pytest.mark.parametrize("gap", [1e-2, 1e-5, 1e-7, 1e-9])
 def test_forces_are_the_slope_of_the_value_down_to_gaps_of_round_off(gap: float):
     p = np.array([[0.2, CONTACT_THICKNESS + gap * CONTACT_DHAT, 0.2], [0, 0, 0], [0, 0, 1], [1, 0, 0]], float)
-    out, x = pushed(pair(False), p), (p[0, 1] - CONTACT_THICKNESS) / CONTACT_DHAT
+    out, x = compute_gradient(pair(False), p), (p[0, 1] - CONTACT_THICKNESS) / CONTACT_DHAT
     slope = (1 - x) * (2 * np.log(x) - (1 - x) / x)
     assert out[0, 1] == pytest.approx(CONTACT_DHAT * slope, rel=1e-6)
     closed = p - [[0, 2 * gap * CONTACT_DHAT, 0], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
-    assert -2e6 * CONTACT_DHAT < pushed(pair(False), closed)[0, 1] < 0.0  # finite, and apart
+    assert -2e6 * CONTACT_DHAT < compute_gradient(pair(False), closed)[0, 1] < 0.0  # finite, and apart
 
 
 def test_friction_of_nearly_parallel_edges_has_the_barriers_force():

@@ -21,10 +21,10 @@ from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
 from springbench.harness.scenes.scene_spec import SceneSpec
 
 END = 0.2
-HELD = PinsEffect(parts=("first",), weight="exact")
+FIRST_PIN = PinsEffect(parts=("first",), weight="exact")
 
 
-def thrown(*effects: Any, velocity: tuple[float, float, float]) -> SceneSpec:
+def build_thrown_chain(*effects: Any, velocity: tuple[float, float, float]) -> SceneSpec:
     """A chain of 1 kg."""
     given = {"mesh": ChainMesh(), "effects": (GravityEffect(), *effects), "velocity": velocity, "time_step": END / 4}
     return SceneSpec(mass=1.0, frames=4, path=Path("scene.yaml"), default_size=3, **given)
@@ -35,8 +35,8 @@ def floor(y: float) -> ContactEffect:
 
 
 def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_again(tmp_path, monkeypatch):
-    effects, velocity = (SpringsEffect(stretch=40.0), HELD), (0.5, 1.0, 2.0)
-    other, alone = thrown(*effects, floor(-9.0), velocity=velocity), thrown(*effects, velocity=velocity)
+    effects, velocity = (SpringsEffect(stretch=40.0), FIRST_PIN), (0.5, 1.0, 2.0)
+    other, alone = build_thrown_chain(*effects, floor(-9.0), velocity=velocity), build_thrown_chain(*effects, velocity=velocity)
     found = ReferenceStore(tmp_path).load_trajectory(other, 3, [END], error=0.1)
     truth = integrate_motion(build_exact_scene(alone, 3), [END])
     assert (found.reference_kind, truth.reference_kind) == ("self-converged", "integrated")
@@ -54,7 +54,7 @@ def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_
 
 def test_an_impact_that_the_steps_do_not_resolve_has_no_reference():
     """The end is as far off as the chain has moved: what it gave back is the integrator's."""
-    bouncing = thrown(SpringsEffect(stretch=400.0), floor(-0.05), velocity=(0.0, -2.0, 0.0))
+    bouncing = build_thrown_chain(SpringsEffect(stretch=400.0), floor(-0.05), velocity=(0.0, -2.0, 0.0))
     found = self_converged_trajectory.compute_self_converged(
         lambda h, name: build_exact_scene(bouncing.with_time_step(h), 3, name),
         bouncing.time_step,

@@ -53,7 +53,7 @@ frames: 8
 default_size: 6
 effects: [{kind: springs, stretch: 200}, {kind: gravity}, {kind: pins, parts: [ends]}]
 """
-GIVEN = StepSetting(2, 4)
+GIVEN_SETTING = StepSetting(2, 4)
 END = 0.2
 
 
@@ -67,7 +67,9 @@ def simulate(scene: Path, solver: str, **parameters: Any) -> SettingSimulator:
     return SettingSimulator(load_scene(scene), 6, SolverSpec(solver, parameters), None, END)
 
 
-def study(scene: Path, solver: str = "sparse", given: StepSetting = GIVEN, error: float = 0.05) -> ConvergenceStudy:
+def study(
+    scene: Path, solver: str = "sparse", given: StepSetting = GIVEN_SETTING, error: float = 0.05
+) -> ConvergenceStudy:
     return study_simulator(simulate(scene, solver), scene, [given], error)
 
 
@@ -84,7 +86,7 @@ def synthetic(errors: dict[tuple[int, int], float], **how: Any) -> ConvergenceSt
         for setting, error in errors.items()
     )
     changes = SettingChange(2.0, how.pop("substeps", 0.2)), SettingChange(2.0, how.pop("iterations", 0.03))
-    given = how.pop("given", [GIVEN])
+    given = how.pop("given", [GIVEN_SETTING])
     assessments = tuple(SettingAssessment(one, *changes, 0.5) for one in given)
     return ConvergenceStudy("sparse", 0.05, "the integrated motion", results, assessments, **how)
 
@@ -131,7 +133,7 @@ def test_the_verdict_names_what_is_wrong_and_the_cheapest_setting_for_each_error
 
 
 def test_the_verdict_on_several_settings_has_a_line_for_each_and_what_the_nearest_lacks():
-    given = [GIVEN, StepSetting(4, 8)]
+    given = [GIVEN_SETTING, StepSetting(4, 8)]
     drawn = synthetic(MAP, given=given, largest_difference=SettingDifference(given[0], given[1], 0.17))
     lines = drawn.describe_verdict()
     assert lines[0].startswith("None of the 2 settings is converged to 5 %. 4 x 8 is the nearest to the integrated")
@@ -183,7 +185,7 @@ def test_the_change_of_two_motions_is_relative_to_the_largest_displacement():
 
 
 def test_the_effective_stiffness_is_the_true_sag_over_that_of_the_setting(monkeypatch: pytest.MonkeyPatch, scene: Path):
-    sags = {None: 0.1, GIVEN: 0.4}
+    sags = {None: 0.1, GIVEN_SETTING: 0.4}
     monkeypatch.setattr(SettingSimulator, "measure_sag", lambda self, setting: sags[setting])
     monkeypatch.setattr(setting_convergence, "_find_reference", lambda *given: None)
     (assessment,) = study(scene).assessments
@@ -278,7 +280,7 @@ def test_with_contact_motions_are_compared_up_to_the_time_until_which_theirs_is_
     scene: Path, monkeypatch: pytest.MonkeyPatch
 ):
     simulator = touching(scene, monkeypatch, [0.001, 0.002, 0.01, 0.012, 0.016, 0.001])
-    found = study_simulator(simulator, scene, [GIVEN], 0.05, is_end_given=False)
+    found = study_simulator(simulator, scene, [GIVEN_SETTING], 0.05, is_end_given=False)
     assert simulator.num_frames == 4
     assert found.reference == "the self-converged motion (known to 1.2 %)"
     assert found.min_error == pytest.approx(0.04)
@@ -294,7 +296,7 @@ def test_with_contact_a_time_that_is_too_long_is_refused(
 ):
     simulator = touching(scene, monkeypatch, [first, *[0.5] * 5])
     with pytest.raises(RunFailed, match=message):
-        study_simulator(simulator, scene, [GIVEN], 0.05)
+        study_simulator(simulator, scene, [GIVEN_SETTING], 0.05)
 
 
 def test_a_setting_that_is_not_supported_ends_the_study(scene: Path):

@@ -30,7 +30,7 @@ from tests.scene_builders import LOCAL_GLOBAL_BACKENDS, SCENE_BUILDERS, build_te
 
 DT = 1 / 30
 VELOCITY = (1.0, -2.0, 0.5)
-MADE = build_test_scene(
+SCENE = build_test_scene(
     ChainMesh(),
     SpringsEffect(stretch=10.0),
     GravityEffect(),
@@ -45,7 +45,7 @@ STATE = MotionState(NOW, BEFORE, 7)
 
 
 @dataclass
-class Pushed:
+class ShiftingSolver:
     """A prepared solver that moves every vertex by one, and records its arguments."""
 
     asked: list[tuple[StepProblem, StopRule]] = field(default_factory=list)
@@ -67,40 +67,40 @@ class Pushed:
 
 
 def test_a_scene_starts_at_rest_or_with_its_velocity():
-    state = build_initial_state(MADE)
-    np.testing.assert_array_equal(state.motion.positions, MADE.mesh.rest_positions)
+    state = build_initial_state(SCENE)
+    np.testing.assert_array_equal(state.motion.positions, SCENE.mesh.rest_positions)
     np.testing.assert_array_equal(state.motion.velocity, np.tile(VELOCITY, (4, 1)))
     assert (state.previous_motion, state.index) == (None, 0)
-    assert not build_initial_state(replace(MADE, initial_velocity=(0.0, 0.0, 0.0))).motion.velocity.any()
+    assert not build_initial_state(replace(SCENE, initial_velocity=(0.0, 0.0, 0.0))).motion.velocity.any()
 
 
 @pytest.mark.parametrize("first_guess", INITIAL_GUESSES)
 def test_the_target_is_where_inertia_leads(first_guess):
-    stated = build_problem(MADE, STATE, first_guess)
+    stated = build_problem(SCENE, STATE, first_guess)
     np.testing.assert_allclose(stated.inertial_target, NOW.positions + DT * NOW.velocity, rtol=1e-14)
-    np.testing.assert_array_equal(stated.external_force, np.outer(MADE.system.mass, [0.0, -9.81, 0.0]))
-    np.testing.assert_array_equal(stated.pin_targets, MADE.mesh.rest_positions[[0]])
+    np.testing.assert_array_equal(stated.external_force, np.outer(SCENE.system.mass, [0.0, -9.81, 0.0]))
+    np.testing.assert_array_equal(stated.pin_targets, SCENE.mesh.rest_positions[[0]])
 
 
 @pytest.mark.parametrize("first_guess", INITIAL_GUESSES)
 def test_the_current_positions_have_their_pins_on_target(first_guess):
-    current = build_problem(MADE, STATE, first_guess).current_positions
-    np.testing.assert_array_equal(current[0], MADE.mesh.rest_positions[0])
+    current = build_problem(SCENE, STATE, first_guess).current_positions
+    np.testing.assert_array_equal(current[0], SCENE.mesh.rest_positions[0])
     np.testing.assert_array_equal(current[1:], NOW.positions[1:])
 
 
 def test_the_assignments_first_guess_leaves_pins_where_the_penalty_left_them():
-    np.testing.assert_array_equal(build_problem(MADE, STATE, "assignment").initial_guess, NOW.positions)
+    np.testing.assert_array_equal(build_problem(SCENE, STATE, "assignment").initial_guess, NOW.positions)
 
 
 def test_the_current_first_guess_puts_pins_on_target():
-    guess = build_problem(MADE, STATE, "previous").initial_guess
-    np.testing.assert_array_equal(guess, [MADE.mesh.rest_positions[0], *NOW.positions[1:]])
+    guess = build_problem(SCENE, STATE, "previous").initial_guess
+    np.testing.assert_array_equal(guess, [SCENE.mesh.rest_positions[0], *NOW.positions[1:]])
 
 
 def test_the_inertial_first_guess_is_the_target_with_pins_on_theirs():
-    stated = build_problem(MADE, STATE, "inertial")
-    np.testing.assert_array_equal(stated.initial_guess, [MADE.mesh.rest_positions[0], *stated.inertial_target[1:]])
+    stated = build_problem(SCENE, STATE, "inertial")
+    np.testing.assert_array_equal(stated.initial_guess, [SCENE.mesh.rest_positions[0], *stated.inertial_target[1:]])
 
 
 @pytest.mark.parametrize("first_guess", INITIAL_GUESSES)
@@ -109,7 +109,7 @@ def test_stating_a_problem_writes_to_nothing(first_guess):
     for array in now:
         array.flags.writeable = False
     frozen = MotionState(now, BEFORE, 7)
-    stated = build_problem(MADE, frozen, first_guess)
+    stated = build_problem(SCENE, frozen, first_guess)
     np.testing.assert_array_equal(now.positions, NOW.positions)
     assert not np.shares_memory(stated.inertial_target, now.positions)
 
@@ -121,12 +121,12 @@ def test_forces_are_taken_at_the_start_of_the_step():
         seen.append((p.copy(), v.copy(), t))
         return np.ones_like(p)
 
-    stated = build_problem(replace(MADE, varying_forces=(force, force)), STATE, "previous")
+    stated = build_problem(replace(SCENE, varying_forces=(force, force)), STATE, "previous")
     (p, v, t), _ = seen
     np.testing.assert_array_equal(p, NOW.positions)
     np.testing.assert_array_equal(v, NOW.velocity)
     assert t == 7 * DT
-    np.testing.assert_array_equal(stated.external_force, MADE.constant_force + 2.0)
+    np.testing.assert_array_equal(stated.external_force, SCENE.constant_force + 2.0)
 
 
 def test_filters_change_the_velocity_before_inertia_and_forces_see_it():
@@ -137,7 +137,7 @@ def test_filters_change_the_velocity_before_inertia_and_forces_see_it():
         return 0.0 * p
 
     made = replace(
-        MADE, varying_forces=(force,), velocity_filters=(lambda v: 0.5 * v, lambda v: v + np.array([1.0, 0.0, 0.0]))
+        SCENE, varying_forces=(force,), velocity_filters=(lambda v: 0.5 * v, lambda v: v + np.array([1.0, 0.0, 0.0]))
     )
     stated = build_problem(made, STATE, "previous")
     wanted = 0.5 * NOW.velocity + [1.0, 0.0, 0.0]  # in the order of the effects
@@ -146,10 +146,10 @@ def test_filters_change_the_velocity_before_inertia_and_forces_see_it():
 
 
 def test_each_step_starts_from_the_two_before_it():
-    prepared, rule = Pushed(), StopRule(9, 0.1)
-    done = list(simulate_scene(MADE, prepared, rule, initial_guess="assignment", frames=3))
+    prepared, rule = ShiftingSolver(), StopRule(9, 0.1)
+    done = list(simulate_scene(SCENE, prepared, rule, initial_guess="assignment", frames=3))
     assert [step.index for step in done] == [1, 2, 3]
-    rest = MADE.mesh.rest_positions
+    rest = SCENE.mesh.rest_positions
     for k, (stated, stop) in enumerate(prepared.asked):
         np.testing.assert_allclose(stated.initial_guess, rest + k, rtol=1e-15)
         moved = np.array(VELOCITY) * DT if k == 0 else 1.0
@@ -158,7 +158,7 @@ def test_each_step_starts_from_the_two_before_it():
     assert all(step.problem is stated for step, (stated, _) in zip(done, prepared.asked, strict=True))
 
 
-class Slow(Pushed):
+class Slow(ShiftingSolver):
     """It sleeps while it solves."""
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
@@ -170,7 +170,7 @@ class Slow(Pushed):
 
 def test_the_seconds_of_a_step_include_its_solve_and_nothing_between_steps():
     prepared, clock = Slow(), Stopwatch(PhaseWatch())
-    run = iterate_steps(MADE, prepared, SteppingSettings(StopRule(), "previous", 3, 1), clock)
+    run = iterate_steps(SCENE, prepared, SteppingSettings(StopRule(), "previous", 3, 1), clock)
     for _ in range(3):
         began = perf_counter()
         next(run)
@@ -180,8 +180,8 @@ def test_the_seconds_of_a_step_include_its_solve_and_nothing_between_steps():
 
 
 def test_steps_are_done_only_on_request():
-    prepared = Pushed()
-    run = simulate_scene(MADE, prepared, StopRule(), initial_guess="previous", frames=1000)
+    prepared = ShiftingSolver()
+    run = simulate_scene(SCENE, prepared, StopRule(), initial_guess="previous", frames=1000)
     next(run)
     assert len(prepared.asked) == 1
 

@@ -135,13 +135,13 @@ def test_checks_take_no_timed_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """The solver that the timed passes use is the one that was prepared, without anything around it."""
     seen = []
 
-    def spied(*arguments: Any) -> Any:
+    def spy_measurement(*arguments: Any) -> Any:
         measured = sound(*arguments)
         seen.append(type(measured.prepared).__module__)
         return measured
 
     sound = timing_pass.measure_run
-    monkeypatch.setattr(timing_pass, "measure_run", spied)
+    monkeypatch.setattr(timing_pass, "measure_run", spy_measurement)
     made = write_plugin_solver(tmp_path, monkeypatch)
     rows_of(made, tmp_path)
     assert seen == [made.solver_path.stem]
@@ -162,7 +162,7 @@ effects:
 """
 
 
-PRESTRESSED = """
+PRESTRESSED_SCENE = """
 mesh:
   kind: network
   positions: [[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]
@@ -194,7 +194,7 @@ def test_a_reported_residual_is_not_compared_where_the_gradient_is_round_off():
 
 
 @pytest.mark.parametrize(
-    ("scene", "newton"), [(TURNING, 1e-6), (PRESTRESSED, 1.0)], ids=["springs that turn", "prestress"]
+    ("scene", "newton"), [(TURNING, 1e-6), (PRESTRESSED_SCENE, 1.0)], ids=["springs that turn", "prestress"]
 )  # of an equilibrium round-off is left, of what was round-off before
 def test_the_stationarity_of_a_solver_that_does_not_minimise_is_reported(scene: str, newton: float, tmp_path: Path):
     """XPBD ends elsewhere than at the minimum, however many iterations it takes."""

@@ -15,16 +15,16 @@ from springbench.solvers.model.step_problem import NotPositiveDefinite, Unsuppor
 from tests.network_matrices import backward_error, grid_matrix, grid_springs, network_matrix, random_right_hand_sides
 
 PLENTY = 1e12
-FORCED = ["inverse", "cholespy", "supernodal", "cg"]
+LINEAR_SOLVERS = ["inverse", "cholespy", "supernodal", "cg"]
 
 
-def entangled():
+def build_random_network():
     """Six thousand vertices with springs at random: no few of them separate the others."""
     ends = np.random.default_rng(0).integers(0, 6000, (36000, 2))
     return network_matrix(ends, 1.0, np.full(6000, 0.1))
 
 
-def needed(Q, name, memory=0.0):
+def read_needed_bytes(Q, name, memory=0.0):
     """The bytes that a refusal names."""
     with pytest.raises(Unsupported, match="does not fit in") as error:
         select_solver(Q, name, memory_limit=memory)
@@ -49,14 +49,14 @@ def test_a_solid_gets_a_factor_in_every_precision(precision):
 
 
 def test_a_graph_that_nothing_separates_gets_conjugate_gradients():
-    choice = select_solver(entangled(), memory_limit=PLENTY)
+    choice = select_solver(build_random_network(), memory_limit=PLENTY)
     assert choice.solver_name == "cg"
     assert "a factor would cost more" in choice.reason
 
 
 def test_conjugate_gradients_replace_a_factor_that_does_not_fit():
     Q = grid_matrix(15, 15, 15)
-    direct, iterative = needed(Q, "supernodal"), needed(Q, "cg")
+    direct, iterative = read_needed_bytes(Q, "supernodal"), read_needed_bytes(Q, "cg")
     assert iterative < direct
     assert select_solver(Q, memory_limit=1.01 * direct).solver_name == "supernodal"
     choice = select_solver(Q, memory_limit=0.5 * (direct + iterative))
@@ -77,22 +77,22 @@ def test_what_fits_nowhere_is_refused_with_the_bytes_of_each_and_the_limit():
 @pytest.mark.parametrize("name", ["inverse", "supernodal", "cg"])
 def test_a_solver_that_is_forced_is_refused_too_where_it_does_not_fit(name):
     Q = grid_matrix(15, 15, 15)
-    assert select_solver(Q, name, memory_limit=1.01 * needed(Q, name)).solver_name == name
-    assert needed(Q, name, memory=0.9 * needed(Q, name)) > 0
+    assert select_solver(Q, name, memory_limit=1.01 * read_needed_bytes(Q, name)).solver_name == name
+    assert read_needed_bytes(Q, name, memory=0.9 * read_needed_bytes(Q, name)) > 0
 
 
 def test_the_estimate_of_a_factor_covers_its_panels():
     for shape in ((60, 60), (15, 15, 15)):
         Q = grid_matrix(*shape)
         # The panels, and in addition no more than those of L, as large again, and updates.
-        assert SupernodalCholesky(Q).factor_bytes < needed(Q, "supernodal") < 3 * SupernodalCholesky(Q).factor_bytes
+        assert SupernodalCholesky(Q).factor_bytes < read_needed_bytes(Q, "supernodal") < 3 * SupernodalCholesky(Q).factor_bytes
 
 
 def test_the_limit_of_the_machine_is_below_its_memory():
     assert 2**28 < compute_memory_limit() < 2**46
 
 
-@pytest.mark.parametrize("linear", ["auto", *FORCED])
+@pytest.mark.parametrize("linear", ["auto", *LINEAR_SOLVERS])
 @pytest.mark.parametrize("shape", [(10, 10), (33, 33), (9, 9, 9)], ids=str)
 def test_every_choice_solves_the_same_system(shape, linear):
     Q = grid_matrix(*shape)
@@ -148,7 +148,7 @@ def test_no_choice_takes_a_matrix_that_is_not_positive_definite(side, linear):
         build_linear_solver(Q, linear)
 
 
-@pytest.mark.parametrize("linear", ["auto", *FORCED])
+@pytest.mark.parametrize("linear", ["auto", *LINEAR_SOLVERS])
 @pytest.mark.parametrize("side", [10, 20])
 def test_no_choice_takes_a_matrix_that_is_not_finite(side, linear):
     Q = grid_matrix(side, side)

@@ -48,7 +48,7 @@ def run(solver: str, **parameters: Any) -> RunSpec:
     return made.replace_options(solver=SolverSpec(solver, parameters))
 
 
-class Scripted:
+class ScriptedCandidate:
     """A candidate that records when it is called, and behaves as specified."""
 
     def __init__(self, solver: str, calls: list[str], *, at: float = 0.0, fails: Exception | None = None) -> None:
@@ -72,7 +72,7 @@ class Scripted:
 
 def test_candidates_are_interleaved():
     calls: list[str] = []
-    found = measure_round_robin([Scripted("a", calls), Scripted("b", calls)], COUNTS, {}, budget=1.0)
+    found = measure_round_robin([ScriptedCandidate("a", calls), ScriptedCandidate("b", calls)], COUNTS, {}, budget=1.0)
     assert calls == ["prepare a", "prepare b"] * NUM_PREPARATIONS + ["a", "b"] * ROUNDS
     for rows, solver in zip(found, "ab", strict=True):
         assert [row["round"] for row in rows if row["phase"] == "prepare"] == list(range(NUM_PREPARATIONS))
@@ -86,7 +86,7 @@ def test_candidates_are_interleaved():
 )
 def test_a_candidate_that_fails_states_why_and_the_others_continue(error: Exception, status: str):
     calls: list[str] = []
-    bad, good = measure_round_robin([Scripted("a", calls, fails=error), Scripted("b", calls)], COUNTS, {}, budget=1.0)
+    bad, good = measure_round_robin([ScriptedCandidate("a", calls, fails=error), ScriptedCandidate("b", calls)], COUNTS, {}, budget=1.0)
     assert [(row["phase"], row["status"]) for row in bad] == [("run", status)]
     assert str(error) in bad[0]["reason"]
     assert calls.count("b") == ROUNDS
@@ -95,7 +95,7 @@ def test_a_candidate_that_fails_states_why_and_the_others_continue(error: Except
 
 def test_times_of_a_candidate_with_another_solution_are_rejected():
     first, near, far = measure_round_robin(
-        [Scripted("a", []), Scripted("b", [], at=1e-10), Scripted("c", [], at=1e-8)], COUNTS, {}, budget=1.0
+        [ScriptedCandidate("a", []), ScriptedCandidate("b", [], at=1e-10), ScriptedCandidate("c", [], at=1e-8)], COUNTS, {}, budget=1.0
     )
     assert first[-1]["status"] == near[-1]["status"] == "ok"
     assert [row["status"] for row in far] == ["failed"]
@@ -105,7 +105,7 @@ def test_times_of_a_candidate_with_another_solution_are_rejected():
 
 def test_a_candidate_that_would_take_too_long_is_omitted_with_a_row_that_states_it():
     calls: list[str] = []
-    slow = Scripted("a", calls)
+    slow = ScriptedCandidate("a", calls)
     past = {format_candidate_name(slow.run): [PastTiming(4, prepare_seconds=1.0, iteration_seconds=1.0)]}
     (rows,) = measure_round_robin([slow], COUNTS, past, budget=10.0)
     assert calls == []
@@ -115,7 +115,7 @@ def test_a_candidate_that_would_take_too_long_is_omitted_with_a_row_that_states_
 
 def test_a_long_preparation_is_not_repeated(monkeypatch: pytest.MonkeyPatch):
     calls: list[str] = []
-    slow, quick = Scripted("a", calls), Scripted("b", calls)
+    slow, quick = ScriptedCandidate("a", calls), ScriptedCandidate("b", calls)
     monkeypatch.setattr(round_robin, "MAX_REPEATED_SECONDS", 0.7)
     monkeypatch.setattr(slow, "prepare", lambda: calls.append("prepare a") or 1.0)
     found, _ = measure_round_robin([slow, quick], COUNTS, {}, budget=10.0)
@@ -212,10 +212,10 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
     said: list[str] = []
     display = SilentDisplay()
 
-    def done() -> pa.Table:
+    def run_report() -> pa.Table:
         return run_roofline(sweep, tmp_path / "out", display, said.append, isolated=False)
 
-    table = done()
+    table = run_report()
     titles = [f"yardstick-cloth {size}: 5 candidates take turns" for size in (4, 5)]
     assert (display.titles, said) == (titles, [])
     found = compute_speed_figures(table)
@@ -234,11 +234,11 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
     assert build_speed_table(found).row_count == len(found)
     assert sum("there is no C++ compiler" in line and line.endswith("(at 4, 5)") for line in describe_speed(found)) == 2
     # What is there is not measured again.
-    assert done().equals(table)
+    assert run_report().equals(table)
     assert (display.titles, said) == (titles, ["2 of 2 sizes are there already"])
     # What other code measured is shown, and said to be so.
     monkeypatch.setattr(machine_info, "hash_sources", lambda: "another")
-    done()
+    run_report()
     assert said[2] == f"2 of them by other code than today's: {', '.join(titles)}"
     assert all((tmp_path / "out" / "rows").glob("*.parquet"))
 
@@ -249,12 +249,12 @@ def test_a_time_that_another_clock_contradicts_is_a_failure(monkeypatch: pytest.
         while thread_time() - began < 0.005:
             pass
 
-    def timed() -> tuple[list[dict[str, Any]], float]:
+    def measure_busy_calls() -> tuple[list[dict[str, Any]], float]:
         calls = benchmark_candidates.RepeatedCall(busy)
         found = compute_call_seconds(calls)
         return [{"preempted": calls.preempted}], found
 
-    assert timed()[1] >= 0.005
+    assert measure_busy_calls()[1] >= 0.005
     monkeypatch.setattr(benchmark_candidates, "perf_counter", lambda: perf_counter() / 1000)
     with pytest.raises(RunFailed, match="the times of calls add up to"):
-        retry_if_preempted(timed)
+        retry_if_preempted(measure_busy_calls)

@@ -47,7 +47,7 @@ def test_bandwidth_is_read_off_between_the_measured_working_sets():
     assert machine.measured_flops(1, "float16") == machine.measured_flops(1, "float32") == 2000.0
 
 
-def timed(solver: str, parameters: str, seconds: list[float], **columns: Any) -> list[dict[str, Any]]:
+def build_candidate_rows(solver: str, parameters: str, seconds: list[float], **columns: Any) -> list[dict[str, Any]]:
     """Rows of a candidate on the cloth, with these seconds in each of its phases."""
     shared = {
         "run_id": solver + parameters,
@@ -72,11 +72,11 @@ def timed(solver: str, parameters: str, seconds: list[float], **columns: Any) ->
 def test_figures_state_how_near_the_binding_limit_is():
     rows = [
         *LIMITS,
-        *timed("eigen", '{"temporaries": "default"}', [9.0, 8.0, 8.0]),
-        *timed("eigen", '{"temporaries": "cheap"}', [4.0, 4.0, 4.0]),
-        *timed("cholmod", "{}", [2.0, 2.0, 2.0]),
-        *timed("numba", '{"linear_solver": "cholespy"}', [3.0, 3.0, 3.0]),
-        *timed("numba", '{"linear_solver": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400),
+        *build_candidate_rows("eigen", '{"temporaries": "default"}', [9.0, 8.0, 8.0]),
+        *build_candidate_rows("eigen", '{"temporaries": "cheap"}', [4.0, 4.0, 4.0]),
+        *build_candidate_rows("cholmod", "{}", [2.0, 2.0, 2.0]),
+        *build_candidate_rows("numba", '{"linear_solver": "cholespy"}', [3.0, 3.0, 3.0]),
+        *build_candidate_rows("numba", '{"linear_solver": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400),
     ]
     found = {f.label: f for f in compute_speed_figures(pa.Table.from_pylist(rows, schema=RUN_SCHEMA))}
     assert list(found) == ["eigen default", "eigen cheap", "cholmod", "numba cholespy", "numba supernodal"]
@@ -108,7 +108,7 @@ def test_figures_state_how_near_the_binding_limit_is():
 def test_the_growth_of_a_solve_is_the_power_in_its_times():
     rows = []
     for size in (100, 200, 400):
-        for row in timed("sparse", "{}", [1e-9 * size ** (2 * 1.25)]):
+        for row in build_candidate_rows("sparse", "{}", [1e-9 * size ** (2 * 1.25)]):
             rows.append(row | {"run_id": f"s{size}", "size": size, "vertices": size**2})
     found = compute_speed_figures(pa.Table.from_pylist(rows, schema=RUN_SCHEMA))
     assert fit_exponents(found) == {("cloth", "sparse"): pytest.approx(1.25, rel=1e-9)}  # the fit's round-off

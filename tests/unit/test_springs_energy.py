@@ -105,14 +105,14 @@ def test_the_energy_is_the_least_over_all_directions(seed):
     i, j = springs.edges.T
     v = p[i] - p[j]
 
-    def stored(unit):
+    def stored_energy(unit):
         return 0.5 * springs.stiffness @ np.sum((v - springs.rest_length[:, None] * unit) ** 2, axis=1)
 
     length = np.linalg.norm(v, axis=1)
     best = v / np.where(length, length, 1.0)[:, None]
-    assert stored(best) == pytest.approx(springs.value(p), rel=ROUND_OFF)
+    assert stored_energy(best) == pytest.approx(springs.value(p), rel=ROUND_OFF)
     other = rng.normal(size=v.shape)
-    assert stored(other / np.linalg.norm(other, axis=1)[:, None]) >= springs.value(p)
+    assert stored_energy(other / np.linalg.norm(other, axis=1)[:, None]) >= springs.value(p)
 
 
 @given(seeds)

@@ -29,16 +29,16 @@ from tests.plugin_solvers import SCENE_SOURCE, SWEEP_OPTIONS, PluginSweep, write
 
 
 @pytest.fixture
-def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PluginSweep:
+def changed_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PluginSweep:
     """A sweep of two solvers that was run, and one of them changed since."""
     made = write_plugin_solver(tmp_path, monkeypatch)
-    result = ran(made)
+    result = run_command(made)
     assert "other code" not in result
     made.solver_path.write_text(made.solver_path.read_text() + "\n# changed\n")
     return made
 
 
-def ran(made: PluginSweep, *options: str) -> str:
+def run_command(made: PluginSweep, *options: str) -> str:
     """What the command says, in lines without breaks."""
     result = CliRunner().invoke(
         app, ["run", str(made.sweep_path), "--in-process", "--results", str(made.sweep_path.parent / "r"), *options]
@@ -47,7 +47,7 @@ def ran(made: PluginSweep, *options: str) -> str:
     return re.sub(r"\s+", " ", result.output)
 
 
-def started(made: PluginSweep) -> dict[str, int]:
+def read_write_times(made: PluginSweep) -> dict[str, int]:
     """When each solver's rows were written [ns]."""
     folder = made.sweep_path.parent / "r" / "sweep"
     return {
@@ -56,30 +56,30 @@ def started(made: PluginSweep) -> dict[str, int]:
     }
 
 
-def test_a_run_names_rows_of_other_code_and_the_table_marks_them(done: PluginSweep):
-    before = started(done)
-    result = ran(done)
+def test_a_run_names_rows_of_other_code_and_the_table_marks_them(changed_sweep: PluginSweep):
+    before = read_write_times(changed_sweep)
+    result = run_command(changed_sweep)
     assert "2 of 2 runs are there already" in result
     assert "1 of them by other code than today's: scene 4 mine --rerun-stale does these again" in result
     assert re.search(r" 4 mine [^a-z]+ max-iter† ", result)
     assert "† by other code than today's" in result
     assert re.search(r" 4 sparse [^a-z]+ max-iter [^†]", result)
-    assert started(done) == before
+    assert read_write_times(changed_sweep) == before
 
 
 @pytest.mark.parametrize(("option", "redone"), [("--rerun-stale", {"mine"}), ("--rerun", {"mine", "sparse"})])
-def test_other_code_s_rows_are_done_again_on_request(done: PluginSweep, option: str, redone: set[str]):
-    before = started(done)
-    assert "other code" not in ran(done, option)
-    after = started(done)
+def test_other_code_s_rows_are_done_again_on_request(changed_sweep: PluginSweep, option: str, redone: set[str]):
+    before = read_write_times(changed_sweep)
+    assert "other code" not in run_command(changed_sweep, option)
+    after = read_write_times(changed_sweep)
     assert {name for name in after if after[name] != before[name]} == redone
-    assert "other code" not in ran(done)
+    assert "other code" not in run_command(changed_sweep)
 
 
-def test_the_code_of_a_row_covers_the_solver_s_module_wherever_it_lives(done: PluginSweep):
-    for path in (done.sweep_path.parent / "r" / "sweep" / "rows").iterdir():
+def test_the_code_of_a_row_covers_the_solver_s_module_wherever_it_lives(changed_sweep: PluginSweep):
+    for path in (changed_sweep.sweep_path.parent / "r" / "sweep" / "rows").iterdir():
         row = pq.read_table(path).slice(0, 1).to_pylist()[0]
-        (run,) = (run for run in load_config(done.sweep_path).list_runs() if run.solver.name == row["solver"])
+        (run,) = (run for run in load_config(changed_sweep.sweep_path).list_runs() if run.solver.name == row["solver"])
         assert (row["source_fingerprint"] == compute_source_fingerprint(collect_source_parts(run))) == (
             row["solver"] == "sparse"
         )
@@ -145,12 +145,12 @@ def test_the_code_of_a_run_covers_what_its_solver_compiles_in_another_language(
 
 def test_pictures_are_drawn_later_without_a_run_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     made = write_plugin_solver(tmp_path, monkeypatch, options=SWEEP_OPTIONS.replace("record: false", "record: true"))
-    ran(made)
-    before = started(made)
+    run_command(made)
+    before = read_write_times(made)
     made.sweep_path.write_text(made.sweep_path.read_text().replace("pictures: false", "pictures: true"))
-    result = ran(made)
+    result = run_command(made)
     assert "2 of 2 runs are there already" in result
-    assert started(made) == before
+    assert read_write_times(made) == before
     assert len([*(tmp_path / "r" / "sweep" / "pictures").glob("scene-4-*-????????????.png")]) == 2
 
 

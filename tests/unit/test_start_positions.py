@@ -66,21 +66,21 @@ def test_a_spin_turns_about_the_mean_and_carries_no_momentum():
 SCENE = "mesh: {{kind: grid}}\nmass: 1\ntime_step: 0.1\nframes: 2\ndefault_size: 3\nvelocity: [1, 0, 0]\nstart: {}\n"
 
 
-def written(folder: Path, text: str) -> Path:
+def write_scene(folder: Path, text: str) -> Path:
     path = folder / "scene.yaml"
     path.write_text(text)
     return path
 
 
 def test_a_scene_starts_as_stated_and_its_digest_includes_the_start(tmp_path: Path):
-    spec = load_scene(written(tmp_path, SCENE.format("{kind: collapsed, angular_velocity: [0, 5, 0]}")))
+    spec = load_scene(write_scene(tmp_path, SCENE.format("{kind: collapsed, angular_velocity: [0, 5, 0]}")))
     begun = build_initial_state(build_scene(spec, 3)).motion
     np.testing.assert_allclose(
         begun.positions, np.tile(GridMesh().build_mesh(3).rest_positions.mean(axis=0), (9, 1)), atol=1e-15
     )
     np.testing.assert_allclose(begun.velocity, np.tile([1.0, 0.0, 0.0], (9, 1)), atol=1e-14)  # no arm, no spin
-    other = load_scene(written(tmp_path, SCENE.format("{kind: rest}")))
-    plain = load_scene(written(tmp_path, SCENE.format("null")))
+    other = load_scene(write_scene(tmp_path, SCENE.format("{kind: rest}")))
+    plain = load_scene(write_scene(tmp_path, SCENE.format("null")))
     assert len({spec.scene_digest, other.scene_digest, plain.scene_digest}) == 3
 
 
@@ -96,7 +96,7 @@ def test_a_scene_starts_as_stated_and_its_digest_includes_the_start(tmp_path: Pa
 )
 def test_an_invalid_start_is_refused(tmp_path: Path, text: str, needle: str):
     with pytest.raises(InputError) as caught:
-        load_config(written(tmp_path, text))
+        load_config(write_scene(tmp_path, text))
     assert needle in str(caught.value)
     assert str(tmp_path / "scene.yaml:7: ") in str(caught.value)
 
@@ -126,7 +126,7 @@ def test_a_network_that_cannot_be_simulated_is_refused_with_its_place_and_a_reme
     tmp_path: Path, mesh: str, mass: str, needles: list[str]
 ):
     with pytest.raises(InputError) as caught:
-        load_config(written(tmp_path, NETWORK.format(mesh, mass)))
+        load_config(write_scene(tmp_path, NETWORK.format(mesh, mass)))
     assert len(caught.value.mistakes) == 1
     assert str(tmp_path / "scene.yaml:") in str(caught.value)
     for needle in needles:
@@ -136,7 +136,7 @@ def test_a_network_that_cannot_be_simulated_is_refused_with_its_place_and_a_reme
 def test_a_massless_vertex_may_be_pinned(tmp_path: Path):
     text = NETWORK.format(f"{{kind: network, {PAIR}, mass: [1, 0]}}", "")
     pinned = text.replace("stretch: 1}]", "stretch: 1}, {kind: pins, indices: [1]}]")
-    assert len(load_config(written(tmp_path, pinned)).list_runs()) == 1
+    assert len(load_config(write_scene(tmp_path, pinned)).list_runs()) == 1
 
 
 def test_a_network_is_read_as_it_was_written():

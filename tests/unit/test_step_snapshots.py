@@ -50,7 +50,7 @@ SIZE = 4
 integrators = pytest.mark.parametrize("integrator", [name for name in INTEGRATORS if name != "substepping"])
 
 
-def changed(**values) -> SceneSpec:
+def change_spec(**values) -> SceneSpec:
     """The scene with other values."""
     return SceneSpec.model_construct(None, **{k: getattr(SPEC, k) for k in SceneSpec.model_fields} | values)
 
@@ -71,7 +71,7 @@ def arrays(frozen: StepSnapshot) -> dict[str, np.ndarray]:
     return named | {"after p": frozen.end_motion.positions, "after v": frozen.end_motion.velocity}
 
 
-def same(one: StepSnapshot, other: StepSnapshot) -> bool:
+def is_identical(one: StepSnapshot, other: StepSnapshot) -> bool:
     """Whether two frozen problems are the same to the last bit."""
     pairs = zip(arrays(one).values(), arrays(other).values(), strict=True)
     systems = one.problem.system, other.problem.system
@@ -87,7 +87,7 @@ def test_a_step_snapshot_is_restored_from_disk_to_the_last_bit(tmp_path, integra
     taken = ReferenceStore(tmp_path).load_snapshots(SPEC, SIZE, integrator)
     found = ReferenceStore(tmp_path, Refuses()).load_snapshots(SPEC, SIZE, integrator)
     assert list(taken) == list(found) == ["early", "middle", "peak"]
-    assert all(same(taken[moment], found[moment]) for moment in taken)
+    assert all(is_identical(taken[moment], found[moment]) for moment in taken)
     assert not any(array.flags.writeable for one in found.values() for array in arrays(one).values() if array.ndim)
     p = np.random.default_rng(0).normal(size=(SIZE * SIZE, 3))
     for moment, one in taken.items():
@@ -116,9 +116,9 @@ def test_a_run_resumes_from_a_step_snapshot_as_if_it_had_never_stopped(tmp_path,
     at_once = ReferenceStore(tmp_path / "once").load_frames(SPEC, SIZE, [3, 4, 9], integrator)
     store = ReferenceStore(tmp_path / "bits")
     bit_by_bit = {frame: store.load_frames(SPEC, SIZE, [frame], integrator)[frame] for frame in (3, 4, 9)}
-    assert all(same(at_once[frame], bit_by_bit[frame]) for frame in at_once)
+    assert all(is_identical(at_once[frame], bit_by_bit[frame]) for frame in at_once)
     backwards = store.load_frames(SPEC, SIZE, [2, 3], integrator)
-    assert same(backwards[3], at_once[3])
+    assert is_identical(backwards[3], at_once[3])
 
 
 def test_the_first_guess_is_chosen_at_use(tmp_path):
@@ -133,7 +133,7 @@ def test_the_first_guess_is_chosen_at_use(tmp_path):
 
 def test_a_first_guess_beyond_an_obstacle_is_where_the_step_starts(tmp_path):
     below = SurfaceContactEffect(min_distance=0.01, obstacles=(PlaneObstacle(point=(0.0, -0.05, 0.0)),))
-    spec = changed(effects=(SpringsEffect(stretch=50.0), GravityEffect(), below), velocity=(0.0, -8.0, 0.0))
+    spec = change_spec(effects=(SpringsEffect(stretch=50.0), GravityEffect(), below), velocity=(0.0, -8.0, 0.0))
     made = build_exact_scene(spec, 3)
     state = build_initial_state(made)
     stated = StepSnapshot(1, build_problem(made, state, "previous"), state.motion, "").build_problem("inertial")
@@ -182,9 +182,9 @@ CHANGES = {
 @pytest.mark.parametrize("change", CHANGES)
 def test_another_scene_is_another_problem(tmp_path, change):
     store = ReferenceStore(tmp_path)
-    one, other = (store.load_frames(spec, SIZE, [4])[4] for spec in (SPEC, changed(**CHANGES[change])))
+    one, other = (store.load_frames(spec, SIZE, [4])[4] for spec in (SPEC, change_spec(**CHANGES[change])))
     assert one.digest != other.digest
-    assert same(ReferenceStore(tmp_path, Refuses()).load_frames(SPEC, SIZE, [4])[4], one)
+    assert is_identical(ReferenceStore(tmp_path, Refuses()).load_frames(SPEC, SIZE, [4])[4], one)
 
 
 def test_a_problem_that_the_same_scene_states_differently_now_is_prepared_again(tmp_path, monkeypatch):
@@ -197,11 +197,11 @@ def test_a_problem_that_the_same_scene_states_differently_now_is_prepared_again(
     after = store.load_frames(SPEC, SIZE, [4])[4]
     assert after.digest != before.digest
     fresh = ReferenceStore(tmp_path / "fresh").load_frames(SPEC, SIZE, [4])[4]
-    assert same(after, fresh)
+    assert is_identical(after, fresh)
 
 
 def test_a_reference_run_that_does_not_converge_is_no_reference(tmp_path):
-    stiff = changed(effects=(SpringsEffect(stretch=1e9), *SPEC.effects[1:]))
+    stiff = change_spec(effects=(SpringsEffect(stretch=1e9), *SPEC.effects[1:]))
     with pytest.raises(RunFailed, match="step 1 of the reference run does not converge"):
         ReferenceStore(tmp_path, SparseLocalGlobal()).load_snapshots(stiff, SIZE)
 

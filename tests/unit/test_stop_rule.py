@@ -221,11 +221,11 @@ def test_a_tolerance_far_from_the_origin_ends_where_round_off_does(away: float):
         pin_targets=here.pin_targets + shift,
     )
 
-    def ended(bound: Scene, tolerance: float | None) -> NDArray[np.float64]:
+    def simulate_ends(bound: Scene, tolerance: float | None) -> NDArray[np.float64]:
         rule = StopRule(100, tolerance)
         run = simulate_scene(bound, prepare(bound, NewtonSolver()), rule, initial_guess="previous", frames=9)
         return np.array([step.positions for step in run])
 
-    best = ended(here, 1e-12)
-    with_tolerance, without = (np.abs(ended(there, t) - shift - best).max() for t in (1e-6, None))
+    best = simulate_ends(here, 1e-12)
+    with_tolerance, without = (np.abs(simulate_ends(there, t) - shift - best).max() for t in (1e-6, None))
     assert with_tolerance <= 2.0 * without + 1e-7  # which the tolerance itself leaves at the origin

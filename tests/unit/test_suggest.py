@@ -26,7 +26,7 @@ def suggest(
     )
 
 
-def folded(made: Scene, angle: float) -> np.ndarray:
+def fold_cloth(made: Scene, angle: float) -> np.ndarray:
     """The level cloth, folded along its middle."""
     x, y, z = made.mesh.rest_positions.T
     right = np.maximum(x, 0.0)
@@ -41,7 +41,7 @@ def still() -> Scene:
 
 def test_a_motion_without_special_needs_gets_no_suggestion():
     made = still()
-    assert suggest(made, set(), folded(made, np.deg2rad(20.0))) == []
+    assert suggest(made, set(), fold_cloth(made, np.deg2rad(20.0))) == []
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_a_suggestion_comes_with_its_evidence_unless_the_effect_is_listed(effect
     made = still()
     places = {
         "strain-limits": 1.12 * made.mesh.rest_positions,
-        "bending": folded(made, 0.8 * np.pi),
+        "bending": fold_cloth(made, 0.8 * np.pi),
         "air-drag": made.mesh.rest_positions,
     }
     speed = 1.0 if effect == "air-drag" else 0.0
@@ -76,7 +76,7 @@ def test_a_corner_alone_suggests_no_effect():
 
 def test_vertices_that_come_close_are_counted():
     made = still()
-    found = {s.effect_kind: s.evidence for s in suggest(made, set(), folded(made, np.pi * 0.99))}
+    found = {s.effect_kind: s.evidence for s in suggest(made, set(), fold_cloth(made, np.pi * 0.99))}
     # Of 6 columns the inner two are joined by springs; each outer pair lies on each other in all 6 rows.
     assert found["self-contact"].startswith("12 pairs of vertices without a spring")
 

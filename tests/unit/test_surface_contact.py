@@ -54,7 +54,7 @@ BALL = MeshObstacle(mesh=BalloonMesh(radius=0.3), size=4, offset=(0.02, -0.33, 0
 RULE = StopRule(100, 1e-4)
 
 
-def draped(*obstacles: object, size: int = 7, **options: float) -> Scene:
+def build_draped_sheet(*obstacles: object, size: int = 7, **options: float) -> Scene:
     """A level sheet of 1 m over obstacles."""
     effect = SurfaceContactEffect.model_validate({"min_distance": 0.01, "obstacles": obstacles or (BALL,), **options})
     return build_test_scene(GridMesh(), SpringsEffect(stretch=100.0, shear=20.0), GravityEffect(), effect, size=size)
@@ -67,7 +67,7 @@ def contact(made: Scene) -> ObstacleContact:
 
 def touching(friction: float = 0.0) -> tuple[ObstacleContact, Positions]:
     """The contact in a step, and positions where it presses, and slips."""
-    made = draped(friction=friction)
+    made = build_draped_sheet(friction=friction)
     *_, last = simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="previous", frames=8)
     stated = build_problem(made, last.state, "previous")
     (energy,) = (e for e in stated.energies if isinstance(e, ObstacleContact))
@@ -121,7 +121,7 @@ OBSTACLES = {
 
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_nothing_passes_through_any_obstacle(name):
-    made = draped(OBSTACLES[name])
+    made = build_draped_sheet(OBSTACLES[name])
     touched = 0
     for step in simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="previous", frames=12):
         assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
@@ -139,7 +139,7 @@ def test_an_obstacle_that_moves_pushes_the_sheet_and_never_passes_it(name, sidew
     )
     speed = {"motion": KeyFrameMotion(key_frames=keys, axis=(0.0, 1.0, 0.3))}
     table = PlaneObstacle(point=(0.0, -0.7, 0.0))
-    made = draped(BALL.model_copy(update=speed), table, friction=0.3, size=6)
+    made = build_draped_sheet(BALL.model_copy(update=speed), table, friction=0.3, size=6)
     begun = build_initial_state(made).motion
     state = MotionState(Motion(begun.positions, begun.velocity + np.array([sideways, 0.0, 0.0])), None, 0)
     prepared = prepare(made, load_target(SOLVERS[name])())
@@ -168,7 +168,7 @@ def deforming(path: Path, rate: float) -> MeshObstacle:
 
 def test_an_obstacle_that_deforms_along_stored_frames_lifts_the_sheet(tmp_path):
     one = deforming(tmp_path, 30.0)
-    made, highest = draped(one, friction=0.3, size=6), 0.0
+    made, highest = build_draped_sheet(one, friction=0.3, size=6), 0.0
     for step in simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="previous", frames=8):
         assert count_intersections(made, step.positions, made.compute_time(step.index)) == 0
         highest = float(step.positions[:, 1].max())
@@ -198,7 +198,7 @@ def test_frames_of_another_mesh_are_refused(tmp_path):
     frames = {"positions": str(tmp_path / "ball.npz")}
     for given, words in ((frames, "got 5 points for a mesh of"), ({"positions": [[[0, 0, 0]]]}, "got 1 points")):
         with pytest.raises(ValidationError, match=words):
-            draped(BALL.model_dump() | {"mesh": {"kind": "balloon"}, "frames": given})
+            build_draped_sheet(BALL.model_dump() | {"mesh": {"kind": "balloon"}, "frames": given})
 
 
 def test_clearance_of_an_obstacle_far_away_is_nearly_its_distance_and_never_more():
@@ -218,7 +218,7 @@ def test_clearance_of_an_obstacle_far_away_is_nearly_its_distance_and_never_more
 def test_a_vertex_squeezed_between_obstacles_is_reported():
     down = KeyFrameMotion(key_frames=(KeyFrame(time=0.0), KeyFrame(time=1.0, offset=(0.0, -5.0, 0.0))))
     press = PlaneObstacle(point=(0.0, 0.05, 0.0), normal=(0.0, -1.0, 0.0), motion=down)
-    made = draped(PlaneObstacle(point=(0, -0.05, 0)), press, size=4)
+    made = build_draped_sheet(PlaneObstacle(point=(0, -0.05, 0)), press, size=4)
     with pytest.raises(NoClearance, match="obstacles leave no room"):
         list(simulate_scene(made, prepare(made, NewtonSolver()), RULE, initial_guess="previous", frames=12))
 
@@ -235,7 +235,7 @@ def test_a_vertex_squeezed_between_obstacles_is_reported():
 )
 def test_an_intersecting_start_is_refused_with_the_pairs(obstacle, words):
     with pytest.raises(InputError, match=words):
-        draped(obstacle)
+        build_draped_sheet(obstacle)
 
 
 def test_surfaces_of_round_obstacles_are_inside_by_at_most_the_stated_distance():

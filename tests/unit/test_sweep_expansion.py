@@ -69,7 +69,7 @@ def test_a_sweep_is_every_combination_in_the_order_of_its_lists(folder: Path) ->
     assert points(sweep_of(folder, SWEEP).list_runs()) == GRID
 
 
-KEPT = {
+REMAINING_POINTS = {
     "{solver: dense}": lambda s, n, v, i: v != "dense",
     "{solver: dense, size_above: 4}": lambda s, n, v, i: not (v == "dense" and n > 4),
     "{size_below: 8, scene: cloth}": lambda s, n, v, i: not (s == "cloth" and n < 8),
@@ -80,13 +80,13 @@ KEPT = {
 }
 
 
-@pytest.mark.parametrize("entry", KEPT)
+@pytest.mark.parametrize("entry", REMAINING_POINTS)
 def test_a_grid_point_that_matches_all_keys_of_an_exclude_is_left_out(folder: Path, entry: str) -> None:
     runs = sweep_of(folder, f"{SWEEP}exclude: [{entry}]\n").list_runs()
-    assert points(runs) == [point for point in GRID if KEPT[entry](*point)]
+    assert points(runs) == [point for point in GRID if REMAINING_POINTS[entry](*point)]
 
 
-ADDED = {
+ADDED_POINTS = {
     "{scene: cloth, size: 16, solver: dense}": [("cloth", 16, "dense", 10)],
     "{size: [16, 24], solver: dense, max_iterations: [5, 6]}": [
         *[("cloth", size, "dense", its) for size in (16, 24) for its in (5, 6)],
@@ -97,9 +97,9 @@ ADDED = {
 }
 
 
-@pytest.mark.parametrize("entry", ADDED)
+@pytest.mark.parametrize("entry", ADDED_POINTS)
 def test_an_include_adds_its_runs_and_no_run_twice(folder: Path, entry: str) -> None:
-    assert points(sweep_of(folder, f"{SWEEP}include: [{entry}]\n").list_runs()) == GRID + ADDED[entry]
+    assert points(sweep_of(folder, f"{SWEEP}include: [{entry}]\n").list_runs()) == GRID + ADDED_POINTS[entry]
 
 
 def test_an_include_survives_the_excludes(folder: Path) -> None:
@@ -149,7 +149,7 @@ def test_options_of_the_command_line_make_the_grid_of_a_lone_scene(folder: Path)
     ]
 
 
-def identified(folder: Path, text: str = "", machine: str = "machine", **options: Any) -> str:
+def compute_run_id(folder: Path, text: str = "", machine: str = "machine", **options: Any) -> str:
     if text:
         (folder / "cloth.yaml").write_text(text)
     (run,) = load_config(folder / "cloth.yaml", sizes=[4], **options).list_runs()
@@ -177,7 +177,7 @@ CHANGES = {
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_all_that_determines_a_result_changes_the_run_id(folder: Path, change: str) -> None:
-    assert identified(folder) != identified(folder, **CHANGES[change])
+    assert compute_run_id(folder) != compute_run_id(folder, **CHANGES[change])
 
 
 SAME = {
@@ -191,12 +191,12 @@ SAME = {
 
 
 def test_pictures_are_no_part_of_the_run_id_for_they_are_drawn_from_recordings(folder: Path) -> None:
-    assert identified(folder) == identified(folder, pictures=False)
+    assert compute_run_id(folder) == compute_run_id(folder, pictures=False)
 
 
 @pytest.mark.parametrize("change", SAME)
 def test_equivalent_configs_have_the_same_run_id(folder: Path, change: str) -> None:
-    assert identified(folder) == identified(folder, SAME[change])
+    assert compute_run_id(folder) == compute_run_id(folder, SAME[change])
 
 
 def test_the_names_of_the_sweep_and_of_the_mesh_file_are_no_part_of_the_run_id(folder: Path) -> None:

@@ -34,7 +34,7 @@ from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.model.step_problem import StopRule
 
-SHARED = Path(__file__).resolve().parents[3] / "shared" / "scenes"
+SHARED_SCENES = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 G = 9.81
 TIMES = (0.3, 0.8)
 
@@ -44,18 +44,18 @@ def spec(mesh: MeshSource, *effects: SceneEffect, velocity=(0.0, 0.0, 0.0), time
     return SceneSpec(mass=2.0, frames=30, path=Path("scene.yaml"), **given)
 
 
-def made(mesh: MeshSource, *effects: SceneEffect, size: int, velocity=(0.0, 0.0, 0.0)) -> Scene:
+def build_unit_scene(mesh: MeshSource, *effects: SceneEffect, size: int, velocity=(0.0, 0.0, 0.0)) -> Scene:
     return build_exact_scene(spec(mesh, *effects, velocity=velocity), size)
 
 
 K, C, SPEED = 40.0, 1.5, 0.4
-SPRING, HELD = SpringsEffect(scaling_rule="fixed", stretch=K), PinsEffect(parts=("first",))
-DRAGGED = PinsEffect.model_validate(
+SPRING, FIRST_PIN = SpringsEffect(scaling_rule="fixed", stretch=K), PinsEffect(parts=("first",))
+MOVING_PIN = PinsEffect.model_validate(
     {"parts": ["first"], "motion": {"key_frames": [{"time": 0.0}, {"time": 9.0, "offset": [9.0 * SPEED, 0.0, 0.0]}]}}
 )
 
 
-def damped(t: np.ndarray, rate: float) -> np.ndarray:
+def evaluate_damped_motion(t: np.ndarray, rate: float) -> np.ndarray:
     """u'' + rate u' + K u = 0 with u(0) = 0 and u'(0) = SPEED, of a mass of 1 kg."""
     omega = np.sqrt(K - rate**2 / 4.0)
     return SPEED / omega * np.exp(-0.5 * rate * t) * np.sin(omega * t)
@@ -63,17 +63,17 @@ def damped(t: np.ndarray, rate: float) -> np.ndarray:
 
 FAST = (SPEED, 0.0, 0.0)
 ALONG = {  # the place of the second vertex of two along x, each of 1 kg, less 1 m
-    "spring": ((SPRING, HELD), FAST, lambda t: damped(t, 0.0)),
-    "spring and ether drag": ((SPRING, HELD, EtherDragEffect(decay_rate=C)), FAST, lambda t: damped(t, C)),
-    "spring and air drag": ((SPRING, HELD, AirDragEffect(coefficient=2.0 * C)), FAST, lambda t: damped(t, C)),
+    "spring": ((SPRING, FIRST_PIN), FAST, lambda t: evaluate_damped_motion(t, 0.0)),
+    "spring and ether drag": ((SPRING, FIRST_PIN, EtherDragEffect(decay_rate=C)), FAST, lambda t: evaluate_damped_motion(t, C)),
+    "spring and air drag": ((SPRING, FIRST_PIN, AirDragEffect(coefficient=2.0 * C)), FAST, lambda t: evaluate_damped_motion(t, C)),
     "spring and dashpot": (
-        (SPRING, HELD, DashpotsEffect(scaling_rule="fixed", stretch=C)), FAST, lambda t: damped(t, C)
+        (SPRING, FIRST_PIN, DashpotsEffect(scaling_rule="fixed", stretch=C)), FAST, lambda t: evaluate_damped_motion(t, C)
     ),
     "ether drag": ((EtherDragEffect(decay_rate=C),), FAST, lambda t: SPEED / C * (1.0 - np.exp(-C * t))),
-    "spring whose pin moves": ((SPRING, DRAGGED), (0.0, 0.0, 0.0), lambda t: SPEED * t - damped(t, 0.0)),
+    "spring whose pin moves": ((SPRING, MOVING_PIN), (0.0, 0.0, 0.0), lambda t: SPEED * t - evaluate_damped_motion(t, 0.0)),
     "dashpot whose pin moves": (
-        (SPRING, DashpotsEffect(scaling_rule="fixed", stretch=C), DRAGGED),
-        (0.0, 0.0, 0.0), lambda t: SPEED * t - damped(t, C),
+        (SPRING, DashpotsEffect(scaling_rule="fixed", stretch=C), MOVING_PIN),
+        (0.0, 0.0, 0.0), lambda t: SPEED * t - evaluate_damped_motion(t, C),
     ),
 }  # fmt: skip
 
@@ -81,7 +81,7 @@ ALONG = {  # the place of the second vertex of two along x, each of 1 kg, less 1
 @pytest.mark.parametrize("case", ALONG)
 def test_a_mass_on_a_line_follows_the_closed_form_of_its_equation(case):
     effects, velocity, wanted = ALONG[case]
-    found = integrate_motion(made(ChainMesh(), *effects, size=2, velocity=velocity), TIMES)
+    found = integrate_motion(build_unit_scene(ChainMesh(), *effects, size=2, velocity=velocity), TIMES)
     # rtol 1e-12 a step, some hundred steps. A dashpot feels the pin's start, which is rounded over 1e-5 s: the impulse
     # of half of its pull in that time is 3e-6 N s.
     atol = 3e-6 if "dashpot whose" in case else 1e-11
@@ -92,9 +92,9 @@ def test_a_mass_on_a_line_follows_the_closed_form_of_its_equation(case):
 
 def test_free_fall_is_a_parabola_and_the_velocity_its_slope():
     found = integrate_motion(
-        made(GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), size=3, velocity=(1.0, 2.0, 0.0)), TIMES
+        build_unit_scene(GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), size=3, velocity=(1.0, 2.0, 0.0)), TIMES
     )
-    rest = made(GridMesh(), size=3).mesh.rest_positions
+    rest = build_unit_scene(GridMesh(), size=3).mesh.rest_positions
     for k, t in enumerate(TIMES):
         moved = [t, 2.0 * t - 0.5 * G * t**2, 0.0]
         np.testing.assert_allclose(found.positions[k], rest + moved, rtol=0, atol=1e-11)
@@ -104,12 +104,12 @@ def test_free_fall_is_a_parabola_and_the_velocity_its_slope():
 
 def test_the_acceleration_is_the_force_of_the_scene_over_the_mass():
     """Springs of zero length and twins included; wind, which is a force of place and time, too."""
-    scene = made(
+    scene = build_unit_scene(
         GridMesh(),
         SpringsEffect(stretch=70.0, shear=9.0),
         GravityEffect(),
         WindEffect(field="assignment"),
-        HELD_CORNERS,
+        PINNED_CORNERS,
         size=4,
     )
     field, rng = OdeField(scene), np.random.default_rng(0)
@@ -126,24 +126,24 @@ def test_the_acceleration_is_the_force_of_the_scene_over_the_mass():
         np.testing.assert_allclose(field(0.7, y), wanted, rtol=1e-12, atol=1e-10)  # sums of terms of some hundred
 
 
-HELD_CORNERS = PinsEffect(parts=("corners",))
+PINNED_CORNERS = PinsEffect(parts=("corners",))
 
 # The position errors at 1 s that a prototype found, relative to the displacement from the start.
-KNOWN = {
+KNOWN_ERRORS = {
     "single-spring-horizontal": {"implicit-euler": 0.18, "bdf2": 0.020, "midpoint": 0.0034},
     "horizontal-chain": {"implicit-euler": 1.61, "bdf2": 0.31, "midpoint": 0.196},
     "net": {"implicit-euler": 0.80, "bdf2": 0.20, "midpoint": 0.11},
 }
 
 
-@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("name", KNOWN_ERRORS)
 def test_the_assignments_scenes_have_the_known_errors_of_time_stepping(name):
-    if not SHARED.is_dir():
+    if not SHARED_SCENES.is_dir():
         pytest.skip("the assignment's scenes lie in a folder `shared` next to the repository, which is not there")
-    scene = load_scene(SHARED / f"{name}.json")
+    scene = load_scene(SHARED_SCENES / f"{name}.json")
     truth = integrate_motion(build_exact_scene(scene, 0), [1.0])
     truth.require_accuracy(1e-3)
-    for integrator, wanted in KNOWN[name].items():
+    for integrator, wanted in KNOWN_ERRORS[name].items():
         run = build_exact_scene(scene, 0, integrator)
         *_, last = simulate_scene(
             run, prepare(run, NewtonSolver()), StopRule(100, 1e-12), initial_guess="previous", frames=30
@@ -180,31 +180,31 @@ def test_how_far_a_trajectory_is_known_depends_on_the_error_to_be_measured():
 
 def test_a_scene_that_does_not_move_has_no_relative_error(tmp_path):
     with pytest.raises(UnpredictableMotion):
-        ReferenceStore(tmp_path).load_trajectory(spec(ChainMesh(), SPRING, HELD), 2, [1.0], error=1e-3)
+        ReferenceStore(tmp_path).load_trajectory(spec(ChainMesh(), SPRING, FIRST_PIN), 2, [1.0], error=1e-3)
 
 
-def halved(v):
+def halve_x(v):
     return v * np.array([0.5, 1.0, 1.0])
 
 
 UNINTEGRABLE = {
-    "a filter of some directions": (lambda s: replace(s, velocity_filters=(halved,)), "filter"),
+    "a filter of some directions": (lambda s: replace(s, velocity_filters=(halve_x,)), "filter"),
     "a filter that turns speeds around": (lambda s: replace(s, velocity_filters=(lambda v: -v,)), "filter"),
     "no mass": (lambda s: replace(s, system=replace(s.system, mass=np.array([1.0, 0.0]))), "without mass"),
     "penalty pins": (lambda s: replace(s, system=replace(s.system, pins=SOFT_PIN)), "penalty"),
 }
-SOFT_PIN = replace(made(ChainMesh(), SPRING, HELD, size=2).system.pins, weight=np.array([1e10]))
+SOFT_PIN = replace(build_unit_scene(ChainMesh(), SPRING, FIRST_PIN, size=2).system.pins, weight=np.array([1e10]))
 
 
 @pytest.mark.parametrize("case", UNINTEGRABLE)
 def test_what_has_no_equation_of_motion_is_refused_with_the_reason(case):
     change, reason = UNINTEGRABLE[case]
     with pytest.raises(NotIntegrable, match=reason):
-        integrate_motion(change(made(ChainMesh(), SPRING, HELD, size=2)), [0.1])
+        integrate_motion(change(build_unit_scene(ChainMesh(), SPRING, FIRST_PIN, size=2)), [0.1])
     assert issubclass(NotIntegrable, RunFailed)
 
 
-SWING = (SPRING, HELD, GravityEffect(), EtherDragEffect(decay_rate=C))
+SWING = (SPRING, FIRST_PIN, GravityEffect(), EtherDragEffect(decay_rate=C))
 
 
 def test_a_trajectory_is_integrated_once_for_all_time_steps(tmp_path, monkeypatch):

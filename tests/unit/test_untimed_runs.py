@@ -25,7 +25,7 @@ effects: [{kind: springs, stretch: 10}, {kind: gravity}, {kind: self-contact}]
 """
 
 
-def executed(folder: Path, timing: str) -> tuple[list[dict[str, Any]], list[str]]:
+def execute_with_timing(folder: Path, timing: str) -> tuple[list[dict[str, Any]], list[str]]:
     """The rows of a run, and the passes that it reported."""
     (folder / "scene.yaml").write_text(SCENE)
     options: dict[str, Any] = {"solvers": ["newton"], "timing": timing, "record": False, "rtol": 1e-3}
@@ -36,7 +36,7 @@ def executed(folder: Path, timing: str) -> tuple[list[dict[str, Any]], list[str]
 
 
 def test_an_untimed_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_path: Path):
-    (timed, _), (rough, passes) = executed(tmp_path, "exclusive"), executed(tmp_path, "none")
+    (timed, _), (rough, passes) = execute_with_timing(tmp_path, "exclusive"), execute_with_timing(tmp_path, "none")
     assert [(row["phase"], row["frame"]) for row in rough] == [("prepare", None), ("step", 1), ("step", 2), ("step", 3)]
     assert passes.count("second pass") == 3
     assert {said for said in passes if "pass" in said} == {"second pass"}
@@ -47,7 +47,7 @@ def test_an_untimed_run_does_its_steps_once_and_ends_where_a_timed_one_does(tmp_
 
 
 def test_certificates_count_intersection_free_frames(tmp_path: Path):
-    rows, _ = executed(tmp_path, "none")
+    rows, _ = execute_with_timing(tmp_path, "none")
     rows += [row | {"run_id": "other", "solver": "broken", "num_intersections": int(row["frame"] == 2)} for row in rows]
     rows.append(rows[0] | {"run_id": "none", "solver": "refuses", "phase": "run", "status": "unsupported"})
     (path,) = write_certificates(pa.Table.from_pylist(rows, schema=RUN_SCHEMA), tmp_path)

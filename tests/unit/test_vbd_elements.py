@@ -55,14 +55,14 @@ def test_the_force_on_a_vertex_is_that_of_the_reference_evaluator(effect):
     energy: Any = problem.energies[other.energy_indices[0]]
     total, felt, risen = VertexFunctions.from_kinds([ElementKind(energy.element_law, 2)])
 
-    def tell(around, p, d, gradient, block, rises, value):
+    def evaluate_vertex(around, p, d, gradient, block, rises, value):
         value[0] = total(around, p)
         for i in range(len(rises)):
             gradient[i], block[i] = felt(around, i, p, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
             rises[i] = risen(around, i, p, (d[i, 0], d[i, 1], d[i, 2]))
 
     gradient, block, rises, value = (np.empty(shape) for shape in ((n, 3), (n, 6), n, 1))
-    jit_kernel(tell)(around, np.pad(p, ((0, 0), (0, 1))).ravel(), d, gradient, block, rises, value)
+    jit_kernel(evaluate_vertex)(around, np.pad(p, ((0, 0), (0, 1))).ravel(), d, gradient, block, rises, value)
     wanted = np.zeros_like(p)
     energy.add_gradient(p, wanted)
     blocks = energy.hessian(p).toarray().reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]

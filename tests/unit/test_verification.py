@@ -46,16 +46,16 @@ from springbench.solvers.model.step_problem import Positions, StepProblem, StopR
 from tests.scene_builders import build_cloth, build_first_problem, build_random_problem, build_test_scene
 
 
-def stated() -> StepProblem:
+def build_random_step() -> StepProblem:
     return build_random_problem(3)
 
 
-def solved(problem: StepProblem, iterations: int = 200) -> Positions:
+def solve_newton(problem: StepProblem, iterations: int = 200) -> Positions:
     return NewtonSolver().prepare(problem.system).solve(problem, StopRule(iterations)).positions
 
 
 def test_the_residual_is_the_length_of_a_local_global_step():
-    problem = stated()
+    problem = build_random_step()
     p = problem.initial_guess.copy()
     exact = problem.system.pins.vertices[problem.system.pins.exact_mask]
     p[exact] = problem.pin_targets[problem.system.pins.exact_mask]
@@ -70,8 +70,8 @@ def test_a_heavy_pin_does_not_blind_the_stationarity():
     problem = build_first_problem(build_cloth(5, 1e16))
     oracle = ReferenceEvaluator(problem.system)
     assert oracle.measure_stationarity(problem, problem.current_positions)[0] == 1.0
-    assert oracle.measure_stationarity(problem, solved(problem))[0] < 1e-6
-    moved = solved(problem)
+    assert oracle.measure_stationarity(problem, solve_newton(problem))[0] < 1e-6
+    moved = solve_newton(problem)
     moved[12] += 1e-3  # a millimetre at a free vertex
     assert oracle.measure_stationarity(problem, moved)[0] > 1e-3
 
@@ -83,7 +83,7 @@ def test_a_stretched_spring_is_a_minimum_and_a_compressed_one_is_not():
     assert not is_minimum(problem, 0.5 * made.mesh.rest_positions)  # each spring would rather turn aside
 
 
-def walked(made: Scene, judge: StepVerifier, tolerance: float) -> list[dict]:
+def verify_steps(made: Scene, judge: StepVerifier, tolerance: float) -> list[dict]:
     prepared = NewtonSolver().prepare(made.system)
     steps = simulate_scene(made, prepared, StopRule(200, tolerance), initial_guess="previous", frames=4)
     return [judge(step) for step in steps]
@@ -101,17 +101,17 @@ def test_a_converged_run_is_stationary_and_where_the_reference_is():
     made = build_cloth(4)
     known = compute_reference_positions(made, NewtonSolver(), initial_guess="previous", frames=4)
     assert np.isfinite(known).all()
-    for row in walked(made, StepVerifier(made, known, is_minimiser=True), 1e-8):
+    for row in verify_steps(made, StepVerifier(made, known, is_minimiser=True), 1e-8):
         assert row["stationarity"] <= 1.1e-8
         assert row["is_local_minimum"]
         assert row["reference_distance"] < 1e-6  # errors of 1e-8 of a step's motion, and what four steps make of them
-    assert {"reference_distance"} == set(walked(made, StepVerifier(made, known, is_minimiser=False), 1e-2)[0])
+    assert {"reference_distance"} == set(verify_steps(made, StepVerifier(made, known, is_minimiser=False), 1e-2)[0])
 
 
 def test_a_reference_that_is_lost_is_no_reference():
     made = build_cloth(4)
     known = np.full((4, 16, 3), np.nan)
-    assert walked(made, StepVerifier(made, known, is_minimiser=True), 1e-8)[2]["reference_distance"] is None
+    assert verify_steps(made, StepVerifier(made, known, is_minimiser=True), 1e-8)[2]["reference_distance"] is None
 
 
 OK = {

@@ -41,7 +41,7 @@ def surface() -> vtkPolyData:
     return data
 
 
-def written(path: Path, mode: str, compressor: str, wide: bool) -> Path:
+def write_vtp(path: Path, mode: str, compressor: str, wide: bool) -> Path:
     writer = vtkXMLPolyDataWriter()
     writer.SetFileName(str(path))
     writer.SetInputData(surface())
@@ -56,7 +56,7 @@ def written(path: Path, mode: str, compressor: str, wide: bool) -> Path:
 @pytest.mark.parametrize("mode", ["ascii", "binary", "base64", "raw"])
 def test_every_encoding_has_the_same_contents(tmp_path, mode):
     for compressor, wide in product(("None", "ZLib", "LZMA"), (False, True)):
-        read = vtp_reader.read_vtp(written(tmp_path / "mesh.vtp", mode, compressor, wide).read_bytes())
+        read = vtp_reader.read_vtp(write_vtp(tmp_path / "mesh.vtp", mode, compressor, wide).read_bytes())
         np.testing.assert_array_equal(read.points, MESH.rest_positions)
         corners = [polygon.tolist() for polygon in read.polygons]
         assert corners == [[0, 1, 6, 5], [1, 2, 7], [10, 11, 15], [11, 16, 15], [15, 16, 20]]
@@ -65,7 +65,7 @@ def test_every_encoding_has_the_same_contents(tmp_path, mode):
 
 
 def test_it_becomes_a_mesh_and_what_was_cut_is_refused(tmp_path):
-    path = written(tmp_path / "mesh.vtp", "raw", "None", wide=False)
+    path = write_vtp(tmp_path / "mesh.vtp", "raw", "None", wide=False)
     mesh = FileMesh(path=path).build_mesh()
     assert len(mesh.triangles) == 6
     np.testing.assert_array_equal(mesh.attributes["heat"], HEAT)

@@ -47,22 +47,22 @@ ROWS = (
 
 
 @pytest.fixture
-def found(tmp_path: Path) -> dict[float, WinnerCell]:
+def winner_cells(tmp_path: Path) -> dict[float, WinnerCell]:
     return {
         cell.error: cell
         for cell in build_winner_cells(read_accuracy(made.write_accuracy_rows(tmp_path, ROWS)).work_points)
     }
 
 
-def test_the_cheapest_by_processor_time_within_the_error_wins(found):
-    assert [found[10.0**-k].fastest_solver for k in range(1, 6)] == [
+def test_the_cheapest_by_processor_time_within_the_error_wins(winner_cells):
+    assert [winner_cells[10.0**-k].fastest_solver for k in range(1, 6)] == [
         "implicit, order 1",
         "linearly implicit",
         "linearly implicit",
         "implicit, order 2",
         NO_WINNER,
     ]
-    assert found[0.1].cheapest_by_family["implicit, order 2"].cpu_seconds_per_simulated_second == 0.8, (
+    assert winner_cells[0.1].cheapest_by_family["implicit, order 2"].cpu_seconds_per_simulated_second == 0.8, (
         "seconds a simulated second, the cheaper of the two"
     )
 
@@ -80,14 +80,14 @@ def test_the_map_has_a_winner_for_each_error_that_is_reached(tmp_path: Path):
     )
 
 
-def test_a_cell_states_the_lead_of_its_winner(found):
-    assert found[0.1].lead_ratio == pytest.approx(3.0)
-    assert found[1e-4].lead_ratio == inf
-    assert not found[1e-8].cheapest_by_family, "what no reference certifies wins nothing"
+def test_a_cell_states_the_lead_of_its_winner(winner_cells):
+    assert winner_cells[0.1].lead_ratio == pytest.approx(3.0)
+    assert winner_cells[1e-4].lead_ratio == inf
+    assert not winner_cells[1e-8].cheapest_by_family, "what no reference certifies wins nothing"
 
 
-def test_the_stiffness_number_is_that_of_a_frame_whatever_the_step(found):
-    assert found[0.1].stiffness_number == pytest.approx(1.0)
+def test_the_stiffness_number_is_that_of_a_frame_whatever_the_step(winner_cells):
+    assert winner_cells[0.1].stiffness_number == pytest.approx(1.0)
 
 
 def test_an_integrator_from_outside_is_a_family_by_its_name(tmp_path):

@@ -30,7 +30,7 @@ def refuse(tick: ProgressCallback) -> None:
     raise InputError("no")
 
 
-def patient(tick: ProgressCallback) -> str:
+def report_waiting(tick: ProgressCallback) -> str:
     with report_activity(tick, WAITING):
         sleep(3.0)
     return "done"
@@ -69,7 +69,7 @@ def test_an_error_that_ends_an_experiment_ends_it():
 
 def test_the_time_that_a_task_waits_for_others_does_not_count_for_its_limit():
     workers = IsolatedWorker()
-    assert workers.run_task(patient, quiet, TaskLimits(wall_seconds=2.5)) == "done"
+    assert workers.run_task(report_waiting, quiet, TaskLimits(wall_seconds=2.5)) == "done"
     workers.stop_worker()
 
 

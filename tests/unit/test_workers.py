@@ -161,17 +161,17 @@ def test_much_output_takes_a_task_little_time(
     assert (tmp_path / "said.txt").stat().st_size == 200 * 18_001
 
 
-HOW = ["a child", "a session of its own", "an orphan"]
+START_KINDS = ["a child", "a session of its own", "an orphan"]
 
 
-@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize("how", START_KINDS)
 def test_processes_started_by_a_task_end_with_it(how: str, workers: IsolatedWorker):
     first = workers.run_task(partial(does.start_orphans, how), quiet, NONE)
     assert workers.run_task(partial(does.double_number, 21), quiet, NONE) == 42
     assert not psutil.pid_exists(first)
 
 
-@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize("how", START_KINDS)
 def test_processes_started_by_a_task_end_when_it_crashes(how: str, workers: IsolatedWorker, tmp_path: Path):
     with pytest.raises(TaskFailure, match="SIGSEGV"):
         workers.run_task(partial(does.start_orphans_and_crash, how, tmp_path / "pid"), quiet, NONE)

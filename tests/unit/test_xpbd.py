@@ -40,7 +40,7 @@ def chain(time_step: float = DT, *, direction=(1.0, 0.0, 0.0), stretch: float = 
     return build_test_scene(mesh, SpringsEffect(stretch=stretch), GravityEffect(), pins, size=10, time_step=time_step)
 
 
-def solved(method, problem: StepProblem, iterations: int) -> np.ndarray:
+def solve_positions(method, problem: StepProblem, iterations: int) -> np.ndarray:
     return method.prepare(problem.system).solve(problem, StopRule(iterations)).positions
 
 
@@ -54,7 +54,7 @@ def test_springs_that_do_not_turn_reach_the_minimiser_of_the_step(stretch, facto
     problem = build_first_problem(chain(direction=(0.0, -1.0, 0.0), stretch=stretch, at="first"))
     problem = replace(problem, system=replace(problem.system, inertia_factor=factor))
     # A chain of ten: Gauss-Seidel needs some hundred passes where springs outweigh inertia. The rest is round-off.
-    np.testing.assert_allclose(solved(Xpbd(), problem, 5000), minimiser(problem), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(solve_positions(Xpbd(), problem, 5000), minimiser(problem), rtol=0, atol=1e-12)
 
 
 def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_step():
@@ -64,7 +64,7 @@ def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_
         made = chain(0.2 / frames)
         prepared, stop = prepare(made, CompiledLocalGlobal()), StopRule(2000, 1e-12)
         *_, last = simulate_scene(made, prepared, stop, initial_guess="previous", frames=frames)
-        apart.append(np.abs(solved(Xpbd(), last.problem, 2000) - last.solution.positions).max())
+        apart.append(np.abs(solve_positions(Xpbd(), last.problem, 2000) - last.solution.positions).max())
     ratios = [a / b for a, b in pairwise(apart)]
     np.testing.assert_allclose(ratios, 16.0, rtol=0.1)  # the next order
 
@@ -72,7 +72,7 @@ def test_springs_that_turn_in_a_step_leave_an_error_of_fourth_order_in_the_time_
 def test_multipliers_add_up_over_iterations_instead_of_stiffening_the_springs():
     """Position based dynamics without them would pull springs to their rest lengths as the iterations go on."""
     problem = build_first_problem(chain())
-    few, many = solved(Xpbd(), problem, 500), solved(Xpbd(), problem, 5000)
+    few, many = solve_positions(Xpbd(), problem, 500), solve_positions(Xpbd(), problem, 5000)
     np.testing.assert_allclose(many, few, rtol=0, atol=1e-14)  # it has converged, and stays
 
 
@@ -113,7 +113,7 @@ def test_linear_momentum_is_conserved(method):
 def test_one_small_step_is_one_iteration():
     problem = build_first_problem(build_cloth(8))
     np.testing.assert_allclose(
-        solved(XpbdSmallSteps(), problem, 1), solved(Xpbd(), problem, 1), rtol=0, atol=1e-14
+        solve_positions(XpbdSmallSteps(), problem, 1), solve_positions(Xpbd(), problem, 1), rtol=0, atol=1e-14
     )  # the same terms, added in another order
 
 
@@ -132,7 +132,7 @@ def test_small_steps_converge_to_the_motion_in_first_order():
 
     begin = np.concatenate([stated.step_start.positions.ravel(), stated.step_start.velocity.ravel()])
     truth = solve_ivp(motion, (0.0, 0.1), begin, "DOP853", rtol=1e-10, atol=1e-12).y[: 3 * n, -1].reshape(n, 3)
-    errors = [np.abs(solved(XpbdSmallSteps(), stated, k) - truth).max() for k in (200, 400, 800)]
+    errors = [np.abs(solve_positions(XpbdSmallSteps(), stated, k) - truth).max() for k in (200, 400, 800)]
     ratios = [a / b for a, b in pairwise(errors)]
     np.testing.assert_allclose(ratios, 2.0, rtol=0.05)  # the next order
     assert errors[-1] <= 5e-3 * np.abs(truth - stated.current_positions).max()  # of order 1/800
@@ -155,7 +155,7 @@ def test_pins_that_move_do_so_evenly_in_small_steps():
 @methods
 @pytest.mark.parametrize("name", ["chain", "net", "cloth"])
 def test_the_heaviest_pins_by_penalty_are_exact_pins(method, name):
-    heavy, exact = (solved(method, build_first_problem(SCENE_BUILDERS[name](w)), 20) for w in (1e14, "exact"))
+    heavy, exact = (solve_positions(method, build_first_problem(SCENE_BUILDERS[name](w)), 20) for w in (1e14, "exact"))
     np.testing.assert_allclose(heavy, exact, rtol=0, atol=1e-10)  # 1e14 N/m give way by 1e-13 m under the cloth
 
 
@@ -166,7 +166,7 @@ def test_springs_without_stiffness_and_loops_do_nothing(method):
         problem.current_positions, np.array([[0, 5], [4, 4], [2, 9]]), np.array([0.0, 100.0, 0.0])
     )
     with_, without = (replace(problem, system=replace(problem.system, energies=e)) for e in ((idle,), ()))
-    np.testing.assert_array_equal(solved(method, with_, 5), solved(method, without, 5))
+    np.testing.assert_array_equal(solve_positions(method, with_, 5), solve_positions(method, without, 5))
 
 
 @methods
@@ -182,7 +182,7 @@ def test_coincident_vertices_come_apart_along_the_rest_shape(method):
         pin_targets=np.zeros((2, 3)),
         external_force=0.0 * problem.external_force,
     )
-    p = solved(method, problem, 4)
+    p = solve_positions(method, problem, 4)
     assert np.isfinite(p).all()
     assert np.abs(p[1:-1, 0]).min() > 0.0
     np.testing.assert_array_equal(p[:, 1:], 0.0)
@@ -226,7 +226,7 @@ def test_small_steps_take_the_place_of_the_integrator():
 def test_a_vertex_without_mass_may_be_pinned(method):
     made = chain()
     system = replace(made.system, mass=np.where(np.arange(10) == 0, 0.0, made.system.mass))
-    assert np.isfinite(solved(method, replace(build_first_problem(made), system=system), 3)).all()
+    assert np.isfinite(solve_positions(method, replace(build_first_problem(made), system=system), 3)).all()
 
 
 @methods
@@ -248,7 +248,7 @@ def test_nothing_but_pins_needs_no_springs():
     system = System(np.ones(3), DT, (), DirichletPins(np.array([1]), np.array([np.inf])))
     problem = replace(build_random_problem(0, n=3, m=0, weights=(np.inf,)), system=system)
     np.testing.assert_allclose(
-        solved(Xpbd(), problem, 2)[[0, 2]],
+        solve_positions(Xpbd(), problem, 2)[[0, 2]],
         (problem.inertial_target + DT**2 * problem.external_force)[[0, 2]],
         rtol=1e-15,
     )
