@@ -36,7 +36,7 @@ SLOW_NAME_PARTS = (
         *("effects-strain-limits-1e13-vbd", "effects-strain-limits-1e18-vbd", "effects-strain-limits-rigid-vbd"),
     ),  # a kernel for each set of effects
     *("test_a_factor_in_single_precision", "test_compiled.py::test_no_iter", "test_compiled.py::test_all_vertices_may"),
-    *("stability/test_hard_answers.py", "stability/test_properties", "contracts/test_backends_agree.py"),
+    *("stability/test_hard_solutions.py", "stability/test_properties", "contracts/test_backends_agree.py"),
 )
 """Parts of names of slow tests that are not in the list."""
 

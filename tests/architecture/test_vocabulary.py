@@ -31,6 +31,12 @@ TEXT_DIALECT = DIALECT | _split_words(
 )
 """Words that are in no text of the product: messages, help, labels, docstrings and comments. A file contains or states,
 a method supports or reaches, a user requests, a condition is satisfied, and results remain."""
+NAME_DIALECT = TEXT_DIALECT | _split_words(
+    "say says said saying telling lie lies lying know knowing way ways keep keeping hold answer answers answered "
+    "answering oracles peer blamed truth judge judges judged doubt doubted doubtful ours theirs mine race races raced"
+)
+"""Words that are in no name of a test, helper, fixture or class of tests. A message states, a solver reports, a call
+returns, a value is within a range, a body conserves its momentum, an interval contains a number."""
 ALLOWED_TEXTS = {
     "wanted": "name of a lock file, which other versions of the program on the machine lock as well",
 }
@@ -154,15 +160,40 @@ def find_docstrings(tree: ast.Module) -> Iterator[str]:
             yield ast.get_docstring(node) or ""
 
 
+@cache
+def parse_tests() -> list[ParsedSource]:
+    """Parse all files of the tests, once."""
+    texts = ((path, path.read_text()) for path in sorted((ROOT / "tests").rglob("*.py")))
+    return [ParsedSource(path, text, ast.parse(text)) for path, text in texts]
+
+
 def test_docstrings_of_tests_use_the_terms_of_the_field() -> None:
     texts = [
-        (path, re.sub("`[^`]*`", "", text))  # names of files and commands
-        for path in sorted((ROOT / "tests").rglob("*.py"))
-        for text in find_docstrings(ast.parse(path.read_text()))
+        (one.path, re.sub("`[^`]*`", "", text))  # names of files and commands
+        for one in parse_tests()
+        for text in find_docstrings(one.tree)
     ]
     assert not {
         f"{path.name}: {text}" for path, text in texts if TEXT_DIALECT & set(re.findall(r"[a-z_]+", text.lower()))
     }
+
+
+def find_dialect_names(tree: ast.Module) -> set[str]:
+    """Return the functions and classes, however deep, and the module's constants that have a word of the dialect."""
+    names = {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef | ast.FunctionDef)}
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        names |= {one.id for target in targets if target for one in ast.walk(target) if isinstance(one, ast.Name)}
+    return {name for name in names if NAME_DIALECT & set(Definition("", name, "").words)}
+
+
+def test_names_of_tests_use_the_terms_of_the_field() -> None:
+    assert not {f"{one.path.name}: {name}" for one in parse_tests() for name in find_dialect_names(one.tree)}
+
+
+def test_words_of_the_dialect_are_found_in_names_of_tests() -> None:
+    source = "HELD, SIZE = 1, 2\nKEPT: int = 3\ndef test_it_says_so(oracle):\n    def ours(): ...\nclass Answer: ...\n"
+    assert find_dialect_names(ast.parse(source)) == {"HELD", "KEPT", "test_it_says_so", "ours", "Answer"}
 
 
 def test_each_allowed_text_is_still_there() -> None:

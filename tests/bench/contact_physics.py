@@ -40,7 +40,7 @@ GRAVITY, SLOPE, NUM_STEPS, THICKNESS = 9.81, 0.5, 60, 0.005
 SIN, COS = SLOPE / np.hypot(1.0, SLOPE), 1.0 / np.hypot(1.0, SLOPE)
 SLIPS, STICKS = 0.4, 0.6
 """Coefficients of friction on either side of the slope's tangent."""
-THROWN = (0.1, -2.0, 0.0)
+SHEET_VELOCITY = (0.1, -2.0, 0.0)
 """Velocity of the upper sheet of a collision [m/s]."""
 
 
@@ -61,7 +61,7 @@ def measure_collision(friction: float) -> tuple[float, float]:
     sheets = StackMesh(layer_spacing=0.05)
     scene = build_test_scene(sheets, SpringsEffect(stretch=100.0, shear=20.0), contact, size=5)
     p, v = scene.mesh.rest_positions, np.zeros_like(scene.mesh.rest_positions)
-    v[len(p) // 2 :] = THROWN
+    v[len(p) // 2 :] = SHEET_VELOCITY
     mass, state = scene.system.mass[:, None], MotionState(Motion(p, v), None, 0)
     steps = simulate_scene(
         scene,

@@ -188,16 +188,16 @@ class Ipctk:
         return near.compute_collision_free_stepsize(self._surface, V, W, self._thickness, self._of.AdditiveCCD())
 
 
-Solved = tuple[Positions, int]
+SolveResult = tuple[Positions, int]
 """Where a solve ended (n, 3) [m], and after how many iterations."""
 
 
-def newton_ipc(problem: StepProblem) -> Callable[[], Solved]:
+def newton_ipc(problem: StepProblem) -> Callable[[], SolveResult]:
     """A solve by Newton-IPC, whose tolerance is satisfied where it ends."""
     metric, whole = ResidualMetric(problem.system), FixedObjective(problem.system)
     assert whole.hessian_matrix.factor.nonzeros  # analysed now, as what ours prepare
 
-    def solve() -> Solved:
+    def solve() -> SolveResult:
         step, p = StepObjective(whole, problem), problem.initial_guess
         at, count = DescentPoint(p, step.gradient(p)), 0
         limit = TOLERANCE * metric.residual(at.gradient)
@@ -212,11 +212,11 @@ def newton_ipc(problem: StepProblem) -> Callable[[], Solved]:
     return solve
 
 
-def build_own_solve(problem: StepProblem, name: str) -> Callable[[], Solved | None]:
+def build_own_solve(problem: StepProblem, name: str) -> Callable[[], SolveResult | None]:
     """A solve by one of our solvers; None where it does not converge."""
     prepared = load_target(SOLVERS[name])().prepare(problem.system)
 
-    def solve() -> Solved | None:
+    def solve() -> SolveResult | None:
         found = prepared.solve(problem, StopRule(MOST, TOLERANCE))
         return (found.positions, found.num_iterations) if found.termination_reason == "converged" else None
 

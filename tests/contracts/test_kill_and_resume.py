@@ -142,7 +142,7 @@ CASES = [Case("dense, sparse, numba", pictures=False, kills=7), Case("sparse, nu
 
 
 @dataclass(frozen=True)
-class Undisturbed:
+class UndisturbedSweep:
     """A sweep that was left alone, and how long it took [s]."""
 
     case: Case
@@ -151,14 +151,14 @@ class Undisturbed:
 
 
 @pytest.fixture(scope="module", params=CASES, ids=["without pictures", "with pictures"])
-def undisturbed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+def undisturbed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> UndisturbedSweep:
     imported = PROCESSES.Process(target=int)
     imported.start()
     imported.join()
     sweep = request.param.write(tmp_path_factory.mktemp("undisturbed") / "home")
     began = monotonic()
     sweep.finish()
-    return Undisturbed(request.param, sweep, monotonic() - began)
+    return UndisturbedSweep(request.param, sweep, monotonic() - began)
 
 
 def assert_equal(sweep: Sweep, other: Sweep) -> None:
@@ -174,7 +174,7 @@ def assert_equal(sweep: Sweep, other: Sweep) -> None:
         assert imread(picture).std() > 0
 
 
-def test_a_sweep_leaves_its_files_and_nothing_else(undisturbed: Undisturbed):
+def test_a_sweep_leaves_its_files_and_nothing_else(undisturbed: UndisturbedSweep):
     runs = {path.stem for path in (undisturbed.sweep.folder / "rows").iterdir()}
     assert len(runs) == len(undisturbed.case.solvers.split())
     expected = {".lock", ".claims", ".config", "references.bib", "recordings/cloth-6-solvers.rrd"}
@@ -186,7 +186,7 @@ def test_a_sweep_leaves_its_files_and_nothing_else(undisturbed: Undisturbed):
     assert undisturbed.sweep.files() == expected
 
 
-def test_a_killed_sweep_resumes_where_it_was(undisturbed: Undisturbed, tmp_path: Path):
+def test_a_killed_sweep_resumes_where_it_was(undisturbed: UndisturbedSweep, tmp_path: Path):
     """It is killed at seeded moments; if it comes to its end before that, a new one begins."""
     chance, case, kills, lasts = random.Random(2013), undisturbed.case, 0, undisturbed.seconds
     sweep, complete = case.write(tmp_path / "0"), {}

@@ -62,7 +62,7 @@ work: [{t_end: 0.1, rounds: 1}]
 
 
 @dataclass(frozen=True)
-class Mine(SparseLocalGlobal):
+class OwnSolver(SparseLocalGlobal):
     """A method from user code."""
 
     solver_info: ClassVar[SolverInfo] = SolverInfo(
@@ -86,7 +86,7 @@ class Hum(ConfigModel):
 
 @pytest.fixture(autouse=True)
 def registered_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(SOLVERS, "mine", f"{__name__}:Mine")
+    monkeypatch.setitem(SOLVERS, "mine", f"{__name__}:OwnSolver")
     monkeypatch.setitem(EFFECT_CLASSES, "hum", f"{__name__}:Hum")
 
 

@@ -70,10 +70,11 @@ def test_a_type_checker_finds_names_and_keys_that_do_not_exist(tmp_path: Path):
     assert found == {i for i, line in enumerate(MISTAKEN_CODE.splitlines(), 1) if "  # " in line}, completed
 
 
-class Mine:
+class UserSolver:
     """Arguments that a user might pass as a solver."""
 
 
 def test_a_class_in_a_sweep_is_refused_with_the_name_to_use():
-    with pytest.raises(InputError, match=r'solvers\[1\]: got the class Mine; expected .* "./test_api_types.py:Mine"'):
-        springbench.run_config({"scenes": ["a.yaml"], "solvers": ["sparse", Mine]}, name="a")  # type: ignore[list-item]
+    message = r'solvers\[1\]: got the class UserSolver; expected .* "./test_api_types.py:UserSolver"'
+    with pytest.raises(InputError, match=message):
+        springbench.run_config({"scenes": ["a.yaml"], "solvers": ["sparse", UserSolver]}, name="a")  # type: ignore[list-item]

@@ -177,7 +177,7 @@ LOOSE = {
     "a loop": ([[1, 1]], [1.0], [1, 0], [], "1 in all (1)"),
     "more than five": (np.empty((0, 2)), [], [0] * 7, [], "7 in all (0, 1, 2, 3, 4, ...)"),
 }
-DETERMINED = {
+DETERMINED_SYSTEMS = {
     "a mass": (np.empty((0, 2)), [], [1.0], []),
     "a pin": (np.empty((0, 2)), [], [0.0], [0]),
     "springs to a mass": ([[0, 1], [1, 2]], [1.0, 1.0], [0, 0, 1], []),
@@ -202,9 +202,9 @@ def test_vertices_that_nothing_determines_are_named(case):
 
 
 @pytest.mark.parametrize("weight", [1.0, np.inf])
-@pytest.mark.parametrize("case", DETERMINED)
+@pytest.mark.parametrize("case", DETERMINED_SYSTEMS)
 def test_a_mass_or_a_pin_determines_all_that_springs_tie_to_it(case, weight):
-    springs, stiffness, mass, pinned = DETERMINED[case]
+    springs, stiffness, mass, pinned = DETERMINED_SYSTEMS[case]
     system, energy = bare_system(springs, stiffness, mass, pinned, weight)
     assert system_matrix_assembly.assemble_system_matrix(system, [energy]).shape == (
         system.num_vertices,

@@ -276,7 +276,7 @@ def test_barriers_are_contact_and_their_motion_is_compared(scene: Path, monkeypa
 
 
 @pytest.mark.slow
-def test_with_contact_motions_are_compared_up_to_the_time_until_which_theirs_is_known(
+def test_with_contact_motions_are_compared_within_the_predictability_horizon(
     scene: Path, monkeypatch: pytest.MonkeyPatch
 ):
     simulator = touching(scene, monkeypatch, [0.001, 0.002, 0.01, 0.012, 0.016, 0.001])

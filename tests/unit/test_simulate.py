@@ -98,7 +98,7 @@ def test_the_current_first_guess_puts_pins_on_target():
     np.testing.assert_array_equal(guess, [SCENE.mesh.rest_positions[0], *NOW.positions[1:]])
 
 
-def test_the_inertial_first_guess_is_the_target_with_pins_on_theirs():
+def test_the_inertial_first_guess_is_the_target_with_pins_on_their_targets():
     stated = build_problem(SCENE, STATE, "inertial")
     np.testing.assert_array_equal(stated.initial_guess, [SCENE.mesh.rest_positions[0], *stated.inertial_target[1:]])
 
