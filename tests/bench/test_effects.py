@@ -8,7 +8,7 @@ from springbench.harness.execution.machine_info import limit_threads
 from springbench.harness.experiments.ablation.iteration_overhead import measure_overhead, prepare_scene
 from springbench.solvers.registry import SOLVERS, load_target
 
-from tests.bench.effects import GATES, KINDS, PRICES, SINGLE_EFFECTS, DEFAULT_SOLVERS, STOP
+from tests.bench.effects import DEFAULT_SOLVERS, GATES, KINDS, PRICES, SINGLE_EFFECTS, STOP
 
 
 @pytest.mark.long

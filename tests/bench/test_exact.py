@@ -22,7 +22,7 @@ from springbench.solvers.model.step_problem import StopRule
 from springbench.solvers.registry import SOLVERS, load_target
 
 from tests.bench.contact import FAR, build_fall
-from tests.bench.gates import STOP, THREADS, prepare, record, sheet, build_simulation, steps
+from tests.bench.gates import STOP, THREADS, build_simulation, prepare, record, sheet, steps
 from tests.bench.solves import system_matrix
 from tests.scene_builders import SCENE_BUILDERS
 

@@ -21,12 +21,12 @@ from tests.stability.random_networks import (
     EPS,
     MINIMISERS,
     Case,
-    transform_problem,
     examples,
     networks,
     renumber_problem,
-    springs_of,
     rotate_problem,
+    springs_of,
+    transform_problem,
 )
 
 GLOBAL = ("dense", "sparse", "numba", "anderson", "chebyshev", "newton")

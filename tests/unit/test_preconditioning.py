@@ -31,7 +31,7 @@ from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
 from tests.effect_scenes import EFFECT_SCENES, build_moving_problem
 from tests.scene_builders import build_cloth, build_first_problem, build_test_scene
-from tests.unit.test_surface_contact import BALL, contact, count_intersections, build_draped_sheet
+from tests.unit.test_surface_contact import BALL, build_draped_sheet, contact, count_intersections
 
 OTHERS: list[PreconditionerName] = [name for name in get_args(PreconditionerName) if name != "cholesky"]
 others = pytest.mark.parametrize("name", OTHERS)
