@@ -22,7 +22,9 @@ def find_class_clashes(trees: Trees) -> list[str]:
         for node in tree.body:
             if isinstance(node, ast.ClassDef):
                 homes[node.name].add(module)
-    return sorted(f"{module}: {name}" for module, tree in trees.items() for name in _find_ambiguous_names(module, tree, homes))
+    return sorted(
+        f"{module}: {name}" for module, tree in trees.items() for name in _find_ambiguous_names(module, tree, homes)
+    )
 
 
 def _find_ambiguous_names(module: str, tree: ast.Module, homes: dict[str, set[str]]) -> Iterable[str]:
@@ -74,8 +76,13 @@ def test_a_public_name_is_defined_once() -> None:
 def test_a_clash_is_found_under_another_name_too() -> None:
     texts = [("a.x", "class Step: ..."), ("a.y", "class Step: ..."), ("a.z", "from a.x import Step as Other")]
     assert find_class_clashes(parse_modules(texts)) == []
-    assert find_class_clashes(parse_modules([*texts, ("a.w", "from a.x import Step as One\nfrom a.y import Step")])) == ["a.w: Step"]
-    assert find_class_clashes(parse_modules([*texts, ("a.v", "from a.x import Step as Energy\nfrom a.y import Step")])) == []
+    assert find_class_clashes(
+        parse_modules([*texts, ("a.w", "from a.x import Step as One\nfrom a.y import Step")])
+    ) == ["a.w: Step"]
+    assert (
+        find_class_clashes(parse_modules([*texts, ("a.v", "from a.x import Step as Energy\nfrom a.y import Step")]))
+        == []
+    )
 
 
 def find_unresolved(text: str, root: Path) -> set[str]:

@@ -105,7 +105,12 @@ def build_grid() -> list[dict[str, Any]]:
     return [
         {"solver": own, "max_iterations": 1, "integrator": ["substepping"]},
         {"solver": ["numba", "xpbd", "baraff-witkin", "vbd"], "max_iterations": [1, 2, 5, 10, 20]},
-        {"solver": ["newton", "lbfgs"], "rtol": [1e-1, 1e-2], "max_iterations": 100, "integrator": IMPLICIT_INTEGRATORS},
+        {
+            "solver": ["newton", "lbfgs"],
+            "rtol": [1e-1, 1e-2],
+            "max_iterations": 100,
+            "integrator": IMPLICIT_INTEGRATORS,
+        },
     ]
 
 

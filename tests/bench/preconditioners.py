@@ -69,7 +69,11 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", type=Path, default=SCENES, metavar="SCENE")
     parser.add_argument("--publish", type=Path, help="folder of a published study")
     options = parser.parse_args()
-    table, begin, rows = Table("scene", "solver", *NAMES, box=SIMPLE_HEAD), describe_provenance(), list[dict[str, Any]]()
+    table, begin, rows = (
+        Table("scene", "solver", *NAMES, box=SIMPLE_HEAD),
+        describe_provenance(),
+        list[dict[str, Any]](),
+    )
     with limit_threads(1):
         for path in options.scenes:
             for name, solver in SOLVERS.items():

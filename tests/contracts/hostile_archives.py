@@ -278,11 +278,15 @@ RAW: dict[str, Callable[[], bytes]] = {
     "a file and a folder of one name": lambda: entries(("a", b"a"), ("a/b", b"a")),
     "a folder and a file of one name": lambda: entries(("a/b", b"a"), ("a", b"a")),
     "a link for the sums": link_entry,
-    "a damaged sum": lambda: patch_bytes(entries(("SHA256SUMS", b"hello"), method=zipfile.ZIP_STORED), b"hello", b"jello"),
+    "a damaged sum": lambda: patch_bytes(
+        entries(("SHA256SUMS", b"hello"), method=zipfile.ZIP_STORED), b"hello", b"jello"
+    ),
     "a damaged stream": lambda: patch_bytes(
         entries(("SHA256SUMS", b"hello" * 9)), b"\xcbH\xcd\xc9\xc9", b"\xff\xff\xff\xff\xff"
     ),
-    "a name that is no UTF-8": lambda: patch_bytes(entries(("é" * 3, b"a")), "ééé".encode(), b"\xff\xfe\xff\xfe\xff\xfe"),
+    "a name that is no UTF-8": lambda: patch_bytes(
+        entries(("é" * 3, b"a")), "ééé".encode(), b"\xff\xfe\xff\xfe\xff\xfe"
+    ),
     "a name twice": lambda: entries(("SHA256SUMS", b""), ("SHA256SUMS", b"b")),
     "210,000 files": lambda: entries(*((str(k), b"") for k in range(210_000)), method=zipfile.ZIP_STORED),
 }

@@ -64,7 +64,9 @@ RECORDS: dict[str, str | bytes | Callable[[Path], object]] = {
     "a device": lambda path: path.symlink_to("/dev/zero"),
     "a folder": Path.mkdir,
     "a link to itself": lambda path: path.symlink_to(path.name),
-    "a machine of lists": json.dumps(build_benchmark_file() | {"machine_info": {"cpu": {"brand_raw": ["a"], "count": {}}}}),
+    "a machine of lists": json.dumps(
+        build_benchmark_file() | {"machine_info": {"cpu": {"brand_raw": ["a"], "count": {}}}}
+    ),
     "a commit of a number": json.dumps(build_benchmark_file() | {"commit_info": {"id": 3, "time": 7}}),
     "a date of a list": json.dumps(build_benchmark_file() | {"datetime": []}),
     "names of markup": json.dumps(build_benchmark_file(fullname="[/bold][link=file:///etc/passwd]\x1b[2J")),

@@ -304,7 +304,9 @@ _SUBMISSION_MESSAGES = {
     "good.yaml": (2, "suffix '.yaml'"),
     "published-file": (2, "suffix ''"),
 }
-GRADE_CASES = {name: CommandCase(f"grade {name} good.yaml --budget 1", *found) for name, found in _SUBMISSION_MESSAGES.items()}
+GRADE_CASES = {
+    name: CommandCase(f"grade {name} good.yaml --budget 1", *found) for name, found in _SUBMISSION_MESSAGES.items()
+}
 
 _FINE = "grade fine.npz good.yaml --budget 1"
 OPTIONS = {

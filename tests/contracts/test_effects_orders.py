@@ -58,13 +58,17 @@ SMOOTH: dict[str, Case] = {
     "constant-force": Case((SPRINGS, {"kind": "constant-force", "force": [0.5, -1.0, 2.0]}, FIRST_PIN)),
     "attachments": Case((SPRINGS, {"kind": "attachments", "parts": ["first"], "stiffness": 30.0})),
     "air-drag": Case((SPRINGS, GRAVITY, {"kind": "air-drag", "coefficient": 2.0}, FIRST_PIN)),
-    "ether-drag": Case((SPRINGS, GRAVITY, {"kind": "ether-drag", "decay_rate": 3.0}, FIRST_PIN), velocity=(0.0, 0.0, 0.0)),
+    "ether-drag": Case(
+        (SPRINGS, GRAVITY, {"kind": "ether-drag", "decay_rate": 3.0}, FIRST_PIN), velocity=(0.0, 0.0, 0.0)
+    ),
     "dashpots": Case((SPRINGS, GRAVITY, {"kind": "dashpots", "stretch": 0.4}, FIRST_PIN)),
     "rayleigh": Case(
         (SPRINGS, GRAVITY, {"kind": "rayleigh", "mass_coefficient": 0.5, "stiffness_coefficient": 0.02}, FIRST_PIN)
     ),
     "bending": Case((SPRINGS, {"kind": "bending", "stiffness": 0.05}, TOP_PINS), GridMesh(), 4, steps=32),
-    "wind": Case((SPRINGS, {"kind": "wind", "field": "assignment", "strength": 0.5}, TOP_PINS), GridMesh(), 4, steps=32),
+    "wind": Case(
+        (SPRINGS, {"kind": "wind", "field": "assignment", "strength": 0.5}, TOP_PINS), GridMesh(), 4, steps=32
+    ),
     "gas": Case(({"kind": "springs", "stretch": 40.0}, {"kind": "gas", "pressure": 100.0}), BalloonMesh(), 3, steps=48),
 }
 STILL = (0.0, 0.0, 0.0)
@@ -86,7 +90,9 @@ SEWN_ROWS = {
 SOFT = SPRINGS | {"stretch": 5.0}
 ROUGH: dict[str, Case] = {
     "contact": Case((SPRINGS, GRAVITY, {"kind": "contact", "obstacles": [PLANE]}, FIRST_PIN), velocity=STILL),
-    "strain-limits": Case((SOFT, GRAVITY, {"kind": "strain-limits", "max_stretch": 1.05, "stiffness": 40.0}, FIRST_PIN)),
+    "strain-limits": Case(
+        (SOFT, GRAVITY, {"kind": "strain-limits", "max_stretch": 1.05, "stiffness": 40.0}, FIRST_PIN)
+    ),
     "sewing": Case((SOFT, GRAVITY, SEWN_ROWS, FIRST_PIN)),
     "surface-contact": Case((SPRINGS, GRAVITY, SURFACE | {"kind": "surface-contact"}, FIRST_PIN), velocity=STILL),
     "self-contact": Case((SPRINGS, GRAVITY, SELF, FIRST_PIN), velocity=(-4.0, 0.0, 0.6)),  # a chain thrown onto itself
@@ -120,12 +126,18 @@ def test_every_effect_states_its_maximum_order() -> None:
 
 @pytest.mark.parametrize(
     "integrator",
-    [pytest.param(i, marks=[pytest.mark.long] * (i not in MEASURED_INTEGRATORS)) for i in INTEGRATORS if i != "substepping"],
+    [
+        pytest.param(i, marks=[pytest.mark.long] * (i not in MEASURED_INTEGRATORS))
+        for i in INTEGRATORS
+        if i != "substepping"
+    ],
 )
 @pytest.mark.parametrize("effect", [pytest.param(e, marks=[pytest.mark.long] * (e == "gas")) for e in SMOOTH])
 def test_integrators_have_their_order_up_to_that_of_the_effect(effect, integrator):
     order, case = INTEGRATORS[integrator].order, SMOOTH[effect]
-    errors = [integrate_reference(effect).measure_error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)]
+    errors = [
+        integrate_reference(effect).measure_error(0, end(case, integrator, n)) for n in (case.steps, 2 * case.steps)
+    ]
     stated = min(order, load_target(EFFECT_CLASSES[effect]).max_convergence_order)
     # The next term of the error is smaller by a time step times the fastest frequency; signs may make it larger.
     assert np.log2(errors[0] / errors[1]) > stated - 0.35

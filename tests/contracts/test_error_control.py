@@ -208,7 +208,10 @@ CRUMPLING = SceneSpec(
         (CRUMPLING, 7, 1.0),
         (
             chain(
-                SpringsEffect(stretch=40.0), GravityEffect(), AirDragEffect(drag_law="quadratic", coefficient=0.5), FIRST_PIN
+                SpringsEffect(stretch=40.0),
+                GravityEffect(),
+                AirDragEffect(drag_law="quadratic", coefficient=0.5),
+                FIRST_PIN,
             ),
             5,
             0.5,

@@ -52,7 +52,11 @@ def build_unit_scene(
 
 
 def run(
-    scene: Scene, steps: int, solver: Solver | None = None, stop: StopRule = CONVERGED_STOP, state: MotionState | None = None
+    scene: Scene,
+    steps: int,
+    solver: Solver | None = None,
+    stop: StopRule = CONVERGED_STOP,
+    state: MotionState | None = None,
 ) -> list[Motion]:
     """The motions at the start and after each step."""
     state, prepared = state or build_initial_state(scene), prepare(scene, solver or NewtonSolver())
@@ -211,7 +215,12 @@ def test_the_energy_stays_near_over_a_hundred_thousand_steps(name):
     )  # omega h = .3
     begun = MotionState(Motion(1.1 * scene.mesh.rest_positions, np.random.default_rng(0).normal(size=(3, 3))), None, 0)
     path = simulate_scene(
-        scene, prepare(scene, NewtonSolver()), CONVERGED_STOP, initial_guess="inertial", frames=100_000, initial_state=begun
+        scene,
+        prepare(scene, NewtonSolver()),
+        CONVERGED_STOP,
+        initial_guess="inertial",
+        frames=100_000,
+        initial_state=begun,
     )
     found = energies(scene, [begun.motion, *(step.state.motion for step in path if step.index % 500 == 0)])
     # It swings by (omega h)^2 at most, and does not drift.

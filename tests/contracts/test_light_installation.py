@@ -62,8 +62,8 @@ COMMANDS: dict[str, CommandResult] = {
     "gallery net": CommandResult(2, PICTURES),
     "inspect mine.rrd": CommandResult(2, RECORD),
     "view mine.rrd": CommandResult(2, RECORD),
-    "run recorded.yaml": CommandResult(2, f"recorded.yaml:4: options.record: recordings need Rerun, which this installation "
-                                   f"lacks; to have it: {RECORD}; or set `record: false`"),
+    "run recorded.yaml": CommandResult(2, "recorded.yaml:4: options.record: recordings need Rerun, which this "
+                                          f"installation lacks; to have it: {RECORD}; or set `record: false`"),
 }  # fmt: skip
 RECORDED_SWEEP = "scenes: [net]\nsolvers: [sparse]\noptions:\n  record: true\n"
 

@@ -56,7 +56,9 @@ def test_a_scene_has_the_effects_that_its_motion_calls_for_and_no_others(name: s
         run_ablation(sweep, tmp_path, SilentDisplay(), lambda line: None, with_pairs=False, isolated=False)
     )
     values = {row["name"]: describe_effect(row, rows) for row in select_kind(rows, "ablated")}
-    assert {name: words for name, words in values.items() if not any(called in words for called in NEEDED_VERDICTS)} == {}
+    assert {
+        name: words for name, words in values.items() if not any(called in words for called in NEEDED_VERDICTS)
+    } == {}
     # Scenes that all solvers take leave out contact of a mesh with itself, which few solvers know.
     assert {
         row["name"]: row["reason"] for row in select_kind(rows, "suggestion") if row["name"] != "self-contact"

@@ -195,7 +195,9 @@ def test_an_iterate_without_contact_counts_only_where_its_path_is_free():
 
 
 def test_two_free_sheets_that_collide_conserve_momentum():
-    made = build_test_scene(StackMesh(layer_spacing=0.05), SpringsEffect(stretch=100.0, shear=20.0), SELF_CONTACT, size=5)
+    made = build_test_scene(
+        StackMesh(layer_spacing=0.05), SpringsEffect(stretch=100.0, shear=20.0), SELF_CONTACT, size=5
+    )
     p, v = made.mesh.rest_positions, np.zeros_like(made.mesh.rest_positions)
     v[len(p) // 2 :] = (0.1, -2.0, 0.0)
     state, mass = MotionState(integrators.Motion(p, v), None, 0), made.system.mass

@@ -102,5 +102,7 @@ if __name__ == "__main__":
     dispatcher: Any = import_module("numba.cuda.dispatcher")
     dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=CAPABILITY)
     there, launches = kernels(), pickle.loads(Path(sys.argv[1]).read_bytes())
-    done = {name: [compile_kernel(there[name], pickle.loads(one)) for one in launches[name]] for name in sorted(launches)}
+    done = {
+        name: [compile_kernel(there[name], pickle.loads(one)) for one in launches[name]] for name in sorted(launches)
+    }
     sys.stdout.write(json.dumps(done))

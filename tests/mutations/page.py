@@ -32,7 +32,13 @@ PAGE = (
         (_QUANTITY_TESTS,),
     ),
     Mutation("step-mean-of-rows", _QUANTITIES, "1e3 * median(seconds)", "1e3 * avg(seconds)", (_QUANTITY_TESTS,)),
-    Mutation("step-mean-of-recording", _QUANTITIES, "float(np.median(seconds))", "float(np.mean(seconds))", (_QUANTITY_TESTS,)),
+    Mutation(
+        "step-mean-of-recording",
+        _QUANTITIES,
+        "float(np.median(seconds))",
+        "float(np.mean(seconds))",
+        (_QUANTITY_TESTS,),
+    ),
     Mutation(
         "map-same-5-percent",
         "harness/report/robustness.py",

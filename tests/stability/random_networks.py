@@ -113,7 +113,9 @@ def renumber_problem(problem: StepProblem, seed: int) -> tuple[StepProblem, Map]
     where = np.argsort(place[pins.vertices])
     moved = DirichletPins(place[pins.vertices][where], pins.weight[where])
     system = System(problem.system.mass[back], problem.system.time_step, (renamed,), moved)
-    other = transform_problem(replace(problem, pin_targets=problem.inertial_target), lambda p: p[back], lambda v: v[back])
+    other = transform_problem(
+        replace(problem, pin_targets=problem.inertial_target), lambda p: p[back], lambda v: v[back]
+    )
     return replace(other, system=system, pin_targets=problem.pin_targets[where]), lambda p: p[back]
 
 

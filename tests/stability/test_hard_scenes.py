@@ -99,7 +99,10 @@ def build_evaluator(case: str) -> ReferenceEvaluator:
 def slack(case: str, stated: StepProblem, iterates: list[Positions]) -> float:
     """What round-off may raise the objective by [J]."""
     of_values = VALUE * max(map(stated.value_scale, iterates)) + 0.5 * (POSITION_ROUNDOFF * rounding_scale(stated)) ** 2
-    return of_values + 0.5 * max(build_evaluator(case).compute_energy_norm(bound_gradient_error(stated, p)) for p in iterates) ** 2
+    return (
+        of_values
+        + 0.5 * max(build_evaluator(case).compute_energy_norm(bound_gradient_error(stated, p)) for p in iterates) ** 2
+    )
 
 
 @methods  # which vary faster than the cases, so that each scene is built once

@@ -53,7 +53,10 @@ def test_a_solution_is_as_stationary_as_reported(case: str):
     stated, found = solve_first_step(case, STOP)
     oracle = ReferenceEvaluator(stated.system)
     for name, solution in found.items():
-        reading, said = oracle.measure_stationarity(stated, solution.positions), solution.termination_reason in CLAIMED_REASONS
+        reading, said = (
+            oracle.measure_stationarity(stated, solution.positions),
+            solution.termination_reason in CLAIMED_REASONS,
+        )
         assert not said or reading.above_roundoff <= SLACK * TOLERANCE, (name, solution.termination_reason, reading)
         assert solution.termination_reason != "max-iter" or solution.num_iterations == STOP.max_iterations, name
 

@@ -109,7 +109,9 @@ def orders(sizes: list[float], errors: list[float]) -> list[float]:
 def test_a_hanging_elastic_chain_tends_to_the_elastic_catenary_with_order_two(solver, support, EA):
     """From an extension of a half of the cable's length to one of 1e-5 of it."""
     counts = [17, 33, 65, 129]
-    errors = [np.abs(equilibrium(n, EA, support, solver) - solve_hanging_shape(cable(n, EA), support)).max() for n in counts]
+    errors = [
+        np.abs(equilibrium(n, EA, support, solver) - solve_hanging_shape(cable(n, EA), support)).max() for n in counts
+    ]
     assert errors[-1] <= 1e-3 * LENGTH
     # The next term of the midpoint rule is smaller by a link's share of the bow's radius, squared: at most 1/10.
     np.testing.assert_allclose(orders([1.0 / (n - 1) for n in counts], errors), 2.0, rtol=0, atol=0.1)
@@ -130,7 +132,10 @@ def test_a_stiffer_and_stiffer_chain_tends_to_inextensible_links_with_order_one(
 @supports
 def test_inextensible_links_tend_to_the_catenary_with_order_two(support):
     counts = [17, 33, 65, 129]
-    errors = [np.abs(solve_hanging_shape(links(n), support) - solve_hanging_shape(cable(n, np.inf), support)).max() for n in counts]
+    errors = [
+        np.abs(solve_hanging_shape(links(n), support) - solve_hanging_shape(cable(n, np.inf), support)).max()
+        for n in counts
+    ]
     np.testing.assert_allclose(orders([1.0 / (n - 1) for n in counts], errors), 2.0, rtol=0, atol=0.1)  # as above
 
 

@@ -123,7 +123,9 @@ def test_the_budget_is_that_of_both_comparisons(monkeypatch: pytest.MonkeyPatch)
         budgets.append(budget)
         return replace(slow, sequential_test=rule, elapsed_seconds=45.0)
 
-    monkeypatch.setattr("springbench.harness.experiments.regression.abba_benchmark._run_restarted_benchmark", run_comparison)
+    monkeypatch.setattr(
+        "springbench.harness.experiments.regression.abba_benchmark._run_restarted_benchmark", run_comparison
+    )
     for budget in (60.0, 30.0):
         run_confirmed_benchmark(pairs(1.0)[0], RULE, time_budget=budget)  # type: ignore[arg-type]
     assert budgets == [60.0, 15.0, 30.0, 0.0]

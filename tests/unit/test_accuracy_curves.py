@@ -168,11 +168,17 @@ def at_a_saddle(iterate: Callable[[int], Positions]) -> ScoredCurve:
     above = refine_minimum(FLAT, FLAT.current_positions, NewtonSolver())
     limits: dict[str, Any] = {"max_iterations": 40, "time_limit": 60.0, "num_rounds": 1}
     return measure_convergence(
-        cast("Any", ScriptedSolver(iterate)), STARTED_NEAR_SADDLE, ReferenceEvaluator(FLAT.system), above.objective, **limits
+        cast("Any", ScriptedSolver(iterate)),
+        STARTED_NEAR_SADDLE,
+        ReferenceEvaluator(FLAT.system),
+        above.objective,
+        **limits,
     )
 
 
-STARTED_NEAR_SADDLE = replace(FLAT, current_positions=FLAT.current_positions + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]]))
+STARTED_NEAR_SADDLE = replace(
+    FLAT, current_positions=FLAT.current_positions + np.array([[0.0], [0.0], [0.0], [0.0], [1e-3]])
+)
 """A step whose current positions are near the saddle at which FLAT's are."""
 
 

@@ -16,7 +16,9 @@ from springbench.harness.scenes.scene_spec import InitialGuess
 from springbench.harness.simulation.time_loop import COARSE_TO_FINE, INITIAL_GUESSES
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-SHIPPED_CONFIGS = [path for path in sorted(CONFIGS.glob("*.yaml")) if {"curves:", "work:"} & {*path.read_text().splitlines()}]
+SHIPPED_CONFIGS = [
+    path for path in sorted(CONFIGS.glob("*.yaml")) if {"curves:", "work:"} & {*path.read_text().splitlines()}
+]
 
 CLOTH = """
 mesh: {kind: grid}

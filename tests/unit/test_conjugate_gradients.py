@@ -90,7 +90,8 @@ def test_solves_random_networks_as_superlu_does(seed, n, degree):
 @pytest.mark.parametrize("shapes", [[(60, 60), (240, 240)], [(13, 13, 13), (30, 30, 30)]], ids=["sheets", "solids"])
 def test_iterations_do_not_grow_with_the_mesh(shapes):
     counts = [
-        solve_system(grid_matrix(*shape), random_right_hand_sides(int(np.prod(shape))))[1].num_iterations for shape in shapes
+        solve_system(grid_matrix(*shape), random_right_hand_sides(int(np.prod(shape))))[1].num_iterations
+        for shape in shapes
     ]
     # 16 times the vertices; without a coarse level they take four times the iterations
     assert counts[1] <= counts[0] + 3

@@ -60,7 +60,9 @@ def test_a_mesh_in_between_that_is_slower_moves_the_size(ratios: list[float], fi
 
 
 def test_without_a_device_nothing_is_claimed_and_the_command_is_named() -> None:
-    said = describe_report([*build_device_rows(0, "hybrid", 10_000, 0.1), build_refused_row(1, "vbd: there is no CUDA device")])
+    said = describe_report(
+        [*build_device_rows(0, "hybrid", 10_000, 0.1), build_refused_row(1, "vbd: there is no CUDA device")]
+    )
     assert "nothing is said of what one saves (vbd: there is no CUDA device)" in said
     assert "`.venv/bin/springbench run configs/gpu.yaml` fills this in" in said
     assert "times as fast" not in said

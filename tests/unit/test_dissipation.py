@@ -178,7 +178,10 @@ def test_pins_that_the_start_has_displaced_are_projected_before_the_motion(integ
 def test_a_perturbed_start_is_dissipated_alike_with_exact_and_penalty_pins(integrator: str):
     """Energy that a method of order 4 takes is a hundredth; accelerations of penalties were 10^4 times all energy."""
     lost = list[float]()
-    for scene in (build_shipped_scene("spinning-skirt", integrator), make_pins_exact(build_shipped_scene("spinning-skirt", integrator))):
+    for scene in (
+        build_shipped_scene("spinning-skirt", integrator),
+        make_pins_exact(build_shipped_scene("spinning-skirt", integrator)),
+    ):
         found = [now for _, now in observe(scene, 3)]
         assert all(abs(now.balance_error or 0.0) <= ROUND_OFF * size_of(now) for now in found)
         lost.append(sum(now.dissipation_integrator or 0.0 for now in found) / (found[-1].provided_energy or 1.0))
@@ -204,7 +207,10 @@ def test_energies_of_the_last_frame_are_those_of_the_start_plus_all_terms():
 
 def test_an_unconverged_solve_takes_more_than_a_converged_one():
     lost = [
-        sum(abs(now.dissipation_solve or 0.0) for _, now in observe(build_shipped_scene("hanging-cloth"), 5, "sparse", StopRule(n)))
+        sum(
+            abs(now.dissipation_solve or 0.0)
+            for _, now in observe(build_shipped_scene("hanging-cloth"), 5, "sparse", StopRule(n))
+        )
         for n in (2, 20, 200)
     ]
     assert lost[0] > 3.0 * lost[1] > 9.0 * lost[2]

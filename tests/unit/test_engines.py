@@ -114,7 +114,9 @@ def test_an_engine_refuses_unsupported_effects_by_name(name: str):
 
 def test_drag_that_an_engine_does_not_have_is_refused():
     with pytest.raises(Unsupported, match="pypbd: expresses springs; the scene has EtherDrag as well"):
-        load_target(OPTIONAL_SOLVERS["pypbd"])().prepare(build_engine_scene(*HANGING, EtherDragEffect(decay_rate=1.0)).system)
+        load_target(OPTIONAL_SOLVERS["pypbd"])().prepare(
+            build_engine_scene(*HANGING, EtherDragEffect(decay_rate=1.0)).system
+        )
 
 
 def semi_implicit(scene: Scene, stated: StepProblem, substeps: int, damping: float) -> tuple[Positions, Positions]:
@@ -163,7 +165,9 @@ def test_mujoco_steps_a_network_as_documented(integrator: str, damping: float):
 
 
 def test_the_drag_that_mujoco_takes_is_that_of_the_scene():
-    scene = build_engine_scene(GravityEffect(), EtherDragEffect(decay_rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0))
+    scene = build_engine_scene(
+        GravityEffect(), EtherDragEffect(decay_rate=2.0), HANGING[2], size=3, velocity=(1.0, 0.0, 0.0)
+    )
     found = ready("mujoco", scene.system).solve(
         build_problem(scene, build_initial_state(scene), "previous"), StopRule(400)
     )

@@ -42,7 +42,7 @@ def test_a_ratio_is_of_the_best_settings_that_end_within_the_error(works: list[W
 
 
 def test_the_table_names_programs_that_refuse_that_have_no_rival_and_that_miss_the_error(
-    works: list[WorkPoint]
+    works: list[WorkPoint],
 ) -> None:
     head, _, *rows = format_markdown_table(works)
     assert [cell.strip() for cell in head.split("|")[3:5]] == ["mujoco", "pypbd"]

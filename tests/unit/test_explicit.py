@@ -106,7 +106,9 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 def test_the_requested_error_controls_the_measured_one(name):
     scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, time_step=END / 3)
     errors = [
-        integrate_reference("none").measure_error(0, run(scene, prepare_explicit(name, scene, error_tolerance=requested), 3)[-1].positions)
+        integrate_reference("none").measure_error(
+            0, run(scene, prepare_explicit(name, scene, error_tolerance=requested), 3)[-1].positions
+        )
         for requested in (1e-4, 1e-6, 1e-8, 1e-10)
     ]
     assert errors[0] < 1e-3

@@ -46,7 +46,7 @@ def write_overheads(folder: Path, solvers: list[str], refused: str, codes: dict[
 
 
 def test_the_most_expensive_effect_is_first_all_last_and_a_ratio_within_round_off_of_one_is_no_overhead(
-    tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     figure, (grid,) = compose_kind(
         "prices", write_overheads(tmp_path, ["numba", "dense"], "dense", {"dense": "before"}), FigureOptions()

@@ -262,7 +262,8 @@ SLIDING, STICKING, LESS_PRESSED = (2e-3, -2e-3), (1e-7, 1e-4), (1e-3, -1e-3)
 
 
 @pytest.mark.parametrize(
-    ("cycle", "rounds", "end", "change"), [((SLIDING, STICKING), 4, STICKING, 1.0), ((SLIDING, LESS_PRESSED, STICKING), 5, LESS_PRESSED, 0.5)]
+    ("cycle", "rounds", "end", "change"),
+    [((SLIDING, STICKING), 4, STICKING, 1.0), ((SLIDING, LESS_PRESSED, STICKING), 5, LESS_PRESSED, 0.5)],
 )
 def test_rounds_that_repeat_end_where_most_friction_acts_and_report_what_is_left(cycle, rounds, end, change):
     made = pebble(1e3)

@@ -138,7 +138,9 @@ def test_an_orbit_decays_by_the_methods_damping(name, power):
 def test_bdf2_starts_with_a_step_of_implicit_euler():
     made = build_test_scene(ChainMesh(), SpringsEffect(stretch=10.0), size=4, velocity=(0.0, 1.0, 0.0))
     first, second = (
-        list(islice(simulate_scene(m, prepare(m, NewtonSolver()), CONVERGED_STOP, initial_guess="previous", frames=2), 2))
+        list(
+            islice(simulate_scene(m, prepare(m, NewtonSolver()), CONVERGED_STOP, initial_guess="previous", frames=2), 2)
+        )
         for m in (made, by(made, "bdf2"))
     )
     np.testing.assert_array_equal(first[0].positions, second[0].positions)

@@ -115,7 +115,10 @@ WRONG = [NORMALS, [POINTS, NUMBERS, POINTS]]
 
 def test_what_cannot_be_compiled_stops_nothing(run_code: Callable[..., str], tmp_path: Path):
     assert run_code(COMPILE_MISSING, *UNKNOWN_KERNELS) == ""
-    assert run_code(COMPILE_MISSING, WRONG, *UNKNOWN_KERNELS, STRAINS_SIGNATURE) == "compiling 2 kernels on 2 cores (once)\n"
+    assert (
+        run_code(COMPILE_MISSING, WRONG, *UNKNOWN_KERNELS, STRAINS_SIGNATURE)
+        == "compiling 2 kernels on 2 cores (once)\n"
+    )
     assert run_code(CALL_KERNELS) == "0 1\n1 0\n"
     assert not [*tmp_path.rglob("*.lock")]
 

@@ -77,7 +77,10 @@ def integrate_reference(effects: str) -> ReferenceTrajectory:
 @pytest.mark.parametrize("name", ORDERS)
 def test_the_error_falls_with_the_methods_order(name, effects):
     scene = build_unit_scene(SOFT, GravityEffect(), *EFFECTS[effects], mesh=mesh_of(effects))
-    errors = [integrate_reference(effects).measure_error(0, run(scene, name, refinement_factor=k)[-1].positions) for k in (24, 48)]
+    errors = [
+        integrate_reference(effects).measure_error(0, run(scene, name, refinement_factor=k)[-1].positions)
+        for k in (24, 48)
+    ]
     # The next term of the error is smaller by a step times the fastest frequency, at most a quarter.
     assert ORDERS[name] - 0.3 < np.log2(errors[0] / errors[1]) < ORDERS[name] + 0.6
 
@@ -87,7 +90,9 @@ def test_the_error_falls_with_the_methods_order(name, effects):
 def test_the_linearised_step_has_the_order_of_its_integrator(name, integrator, effects):
     errors = []
     for frames in (48, 96):
-        scene = build_unit_scene(SOFT, GravityEffect(), *EFFECTS[effects], integrator=integrator, time_step=END / frames)
+        scene = build_unit_scene(
+            SOFT, GravityEffect(), *EFFECTS[effects], integrator=integrator, time_step=END / frames
+        )
         errors.append(integrate_reference(effects).measure_error(0, run(scene, name, frames)[-1].positions))
     np.testing.assert_allclose(np.log2(errors[0] / errors[1]), OF_STEPS[name, integrator], atol=0.25)
 
@@ -143,7 +148,10 @@ def test_a_stiff_spring_does_not_ring_after_one_step(name, saved):
 def test_the_requested_error_controls_the_measured_one(name):
     scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, time_step=END / 3)
     requested = (1e-2, 1e-3, 1e-4, 1e-5)
-    errors = [integrate_reference("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions) for e in requested]
+    errors = [
+        integrate_reference("none").measure_error(0, run(scene, name, 3, error_tolerance=e)[-1].positions)
+        for e in requested
+    ]
     assert errors[-1] < 1e-3
     assert all(b < a for a, b in pairwise(errors))
 
@@ -152,8 +160,8 @@ def test_the_requested_error_controls_the_measured_one(name):
 def test_a_crushed_sheet_in_long_steps_stays_finite(name):
     """Its springs are compressed to a half, so the exact Hessian of a frame has no factor."""
     integrator = "implicit-euler" if name == "baraff-witkin" else "substepping"
-    scene = build_unit_scene(SpringsEffect(stretch=1e4), PinsEffect(parts=("top_corners",), weight="exact"), mesh=GridMesh(),
-                 size=6, integrator=integrator, time_step=1 / 30)  # fmt: skip
+    effects = SpringsEffect(stretch=1e4), PinsEffect(parts=("top_corners",), weight="exact")
+    scene = build_unit_scene(*effects, mesh=GridMesh(), size=6, integrator=integrator, time_step=1 / 30)
     state = build_initial_state(scene)
     crushed = type(state)(Motion(0.5 * scene.mesh.rest_positions, np.zeros_like(scene.mesh.rest_positions)), None, 0)
     ready = prepare(scene, load_target(SOLVERS[name])())

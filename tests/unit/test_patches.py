@@ -73,7 +73,9 @@ class ClusteredMesh:
 
 @pytest.fixture(scope="module", params=["sheet", "balloon"])
 def clustered_mesh(request) -> ClusteredMesh:
-    return ClusteredMesh(GridMesh().build_mesh(9) if request.param == "sheet" else BalloonMesh(radius=0.9).build_mesh(3))
+    return ClusteredMesh(
+        GridMesh().build_mesh(9) if request.param == "sheet" else BalloonMesh(radius=0.9).build_mesh(3)
+    )
 
 
 def deform_positions(rest: Positions, seed: int) -> Positions:
@@ -110,14 +112,21 @@ def test_clearance_bounds_are_valid_at_any_speed(clustered_mesh, share):
 
 def test_stored_bounds_of_earlier_displacements_are_valid(clustered_mesh):
     # From each way's end, or from its begin, go on by steps long and short; far things were looked at long before.
-    said, skipped, limits, near = 0, 0, CollisionQuery(INFLATION_RADIUS, 0.3 * INFLATION_RADIUS, MIN_GAP_FRACTION), clustered_mesh.near_at_rest
+    said, skipped, limits, near = (
+        0,
+        0,
+        CollisionQuery(INFLATION_RADIUS, 0.3 * INFLATION_RADIUS, MIN_GAP_FRACTION),
+        clustered_mesh.near_at_rest,
+    )
     for seed in range(2):
         rng = np.random.default_rng(seed)
         p = clustered_mesh.rest_positions @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
         clustered_mesh.patches.recent_poses.clear()
         for _ in range(8):
             size = 10.0 ** rng.uniform(-2.5, 0.0)
-            q = p + size * np.sin(clustered_mesh.rest_positions @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(size=3)
+            q = p + size * np.sin(clustered_mesh.rest_positions @ rng.normal(size=3) * 2.0)[:, None] * rng.normal(
+                size=3
+            )
             looked = list(clustered_mesh.patches.remote_clearances)
             gaps = clustered_mesh.patches.compute_clearance_bounds(p, q, limits)
             if gaps:
@@ -164,7 +173,14 @@ def test_resolved_patches_contain_no_near_pairs(clustered_mesh):
         memory = patches.scratch
         doubted = np.empty((patches.num_rest_pairs, 2), np.int64)
         count, near = cluster_bounds.unresolved_cluster_pairs(
-            *lies, patches.cluster_pairs, patches.num_rest_pairs, limits, INFLATION_RADIUS, memory.projection, memory.tile, doubted
+            *lies,
+            patches.cluster_pairs,
+            patches.num_rest_pairs,
+            limits,
+            INFLATION_RADIUS,
+            memory.projection,
+            memory.tile,
+            doubted,
         )
         known = {tuple(x) for x in patches.cluster_pairs.clusters[: patches.num_rest_pairs].tolist()}
         clear, apart = known - {tuple(x) for x in doubted[:count].tolist()}, compute_distances(clustered_mesh.pairs, q)
@@ -179,7 +195,10 @@ def test_resolved_patches_contain_no_near_pairs(clustered_mesh):
 def test_what_is_near_at_rest_moves_relative_to_itself_by_at_most_the_max_relative_displacement(clustered_mesh):
     near = clustered_mesh.pairs.vertices[clustered_mesh.near_at_rest]
     for seed in range(3):
-        p, q = deform_positions(clustered_mesh.rest_positions, seed), deform_positions(clustered_mesh.rest_positions, 50 + seed)
+        p, q = (
+            deform_positions(clustered_mesh.rest_positions, seed),
+            deform_positions(clustered_mesh.rest_positions, 50 + seed),
+        )
         way = q - p
         other = np.linalg.norm(way[near[:, :, None]] - way[near[:, None, :]], axis=-1).max()
         found = clustered_mesh.patches.max_relative_displacement(p, q)
@@ -200,7 +219,9 @@ def test_boxes_leave_out_no_pair_that_comes_to_its_limits(clustered_mesh, share)
     points, edges, triangles = clustered_mesh.trees
     p, bound = 0.3 * deform_positions(clustered_mesh.rest_positions, 504), 0
     for way in build_displacements(p):
-        limits = CollisionQuery(0.5 * INFLATION_RADIUS, 0.2 * INFLATION_RADIUS, share, max_relative_displacement(p, p + way))
+        limits = CollisionQuery(
+            0.5 * INFLATION_RADIUS, 0.2 * INFLATION_RADIUS, share, max_relative_displacement(p, p + way)
+        )
         x, y = pad_positions(p), pad_positions(p + way)
         one, two = (
             find_candidate_pairs(points, triangles, x, y, limits),
@@ -209,7 +230,10 @@ def test_boxes_leave_out_no_pair_that_comes_to_its_limits(clustered_mesh, share)
         names = {(*points.primitives[i], *triangles.primitives[j]) for i, j in one}
         names |= {frozenset((tuple(edges.primitives[i]), tuple(edges.primitives[j]))) for i, j in two}
         met = clustered_mesh.find_close_pairs(p, p + way, limits)
-        wanted, many = clustered_mesh.pairs.vertices[met].tolist(), int(met[: clustered_mesh.pairs.num_point_triangle].sum())
+        wanted, many = (
+            clustered_mesh.pairs.vertices[met].tolist(),
+            int(met[: clustered_mesh.pairs.num_point_triangle].sum()),
+        )
         assert {tuple(x) for x in wanted[:many]} <= names
         assert {frozenset((tuple(x[:2]), tuple(x[2:]))) for x in wanted[many:]} <= names
         bound += len(wanted)
@@ -247,7 +271,9 @@ def test_patches_of_a_stack_give_no_bounds():
     trees = [BVH.from_primitives(rest, x) for x in (np.arange(len(rest))[:, None], unique_edges(triangles), triangles)]
     patches = ClusterCulling.from_rest_shape(rest, trees[0], trees[1], trees[2], 20 * INFLATION_RADIUS)
     assert patches.is_dense
-    assert not patches.compute_clearance_bounds(rest, rest + 5.0, CollisionQuery(INFLATION_RADIUS, 0.0, MIN_GAP_FRACTION))
+    assert not patches.compute_clearance_bounds(
+        rest, rest + 5.0, CollisionQuery(INFLATION_RADIUS, 0.0, MIN_GAP_FRACTION)
+    )
 
 
 def test_idle_contact_allows_only_free_displacements_and_mostly_without_a_query(monkeypatch):

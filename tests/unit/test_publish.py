@@ -211,7 +211,7 @@ def test_a_forged_column_is_refuted(kind: str, repeated_runs: tuple[list[Publish
 
 
 def test_a_repetition_without_a_recording_has_another_id(
-    repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]]
+    repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]],
 ):
     runs, new = repeated_runs
     renamed = [[row | {"run_id": "0" * 12} for row in found] for found in new]
@@ -232,7 +232,11 @@ def test_elsewhere_what_differs_refutes_nothing_and_confirms_nothing(
     repeated_runs: tuple[list[PublishedRun], list[list[ResultRow]]],
 ):
     runs, new = repeated_runs
-    for change in (scale_column("residual", 0.5), scale_column("seconds", 1e-3), lambda row: row | {"positions_digest": "0"}):
+    for change in (
+        scale_column("residual", 0.5),
+        scale_column("seconds", 1e-3),
+        lambda row: row | {"positions_digest": "0"},
+    ):
         there = [replace(one, rows=[change(row) | {"machine_id": "another"} for row in one.rows]) for one in runs]
         assert claims_of(there, new) == []
         assert ClaimVerdict.INCONCLUSIVE in {claim.verdict for claim in archive_verification.verify_reruns(there, new)}
@@ -243,7 +247,9 @@ def test_runs_that_no_config_requests_cannot_be_decided(home: Path, tmp_path: Pa
         made_up = [row | {"run_id": "f" * 12, "solver": "magic"} for row in build_dummy_rows(1)]
         content["results/sweep/rows/cloth-4-magic.parquet"] = parquet_rows.encode_rows(made_up)
 
-    result = command("verify-archive", change_archive(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1")
+    result = command(
+        "verify-archive", change_archive(home / "x.zip", tmp_path / "y.zip", change, sums=True), "--seed", "1"
+    )
     assert "1 of 3 runs of sweep: undecided (the config expands to no such run)" in result.output
     assert result.exit_code == (1 if "refuted" in result.output else 3), result.output
     assert "no repeat confirms these columns: " in result.output

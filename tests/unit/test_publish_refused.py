@@ -61,7 +61,10 @@ REFUSED_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda home: link_file(home, "results/sweep/report/a.png", "/etc/passwd"),
         r"/a\.png: leads",
     ),
-    "a link to a folder": (lambda home: link_file(home, "results/sweep/recordings", "/etc"), "recordings: leads to /etc"),
+    "a link to a folder": (
+        lambda home: link_file(home, "results/sweep/recordings", "/etc"),
+        "recordings: leads to /etc",
+    ),
     "rows that are a link": (
         lambda home: (
             (home / "results/sweep/rows").rename(home.parent / "rows"),
@@ -75,7 +78,9 @@ REFUSED_FILES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a scene elsewhere": (move_scene, r"cloth\.yaml: lies outside of"),
     "a scene that is a link": (
-        lambda home: (home / "cloth.yaml").rename(home.parent / "a.yaml") and link_file(home, "cloth.yaml", "../a.yaml"),
+        lambda home: (
+            (home / "cloth.yaml").rename(home.parent / "a.yaml") and link_file(home, "cloth.yaml", "../a.yaml")
+        ),
         r"cloth\.yaml: leads to .*a\.yaml, which lies outside",
     ),
     "a parameter of a mesh of one's own": (

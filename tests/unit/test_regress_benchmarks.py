@@ -76,7 +76,9 @@ def test_a_benchmark_is_compared(old: dict, new: dict, machine: dict, words: str
 
 def test_a_ratio_is_compared_whatever_the_times_were(tmp_path: Path):
     base = write_benchmarks(tmp_path / "base.json", benchmark(ratio=ratio(1.0)))
-    verdict, _ = compare(base, write_benchmarks(tmp_path / "new.json", benchmark(minimum=5 * MINIMUM, ratio=ratio(1.0))))
+    verdict, _ = compare(
+        base, write_benchmarks(tmp_path / "new.json", benchmark(minimum=5 * MINIMUM, ratio=ratio(1.0)))
+    )
     assert verdict == "pass"
 
 
@@ -125,7 +127,9 @@ def test_a_foreign_file_is_the_users_mistake(content: str | None, problem: str, 
 
 
 def test_files_without_a_common_benchmark_are_inconclusive(tmp_path: Path):
-    verdict, text = compare(write_benchmarks(tmp_path / "a.json", benchmark("a")), write_benchmarks(tmp_path / "b.json", benchmark("b")))
+    verdict, text = compare(
+        write_benchmarks(tmp_path / "a.json", benchmark("a")), write_benchmarks(tmp_path / "b.json", benchmark("b"))
+    )
     assert verdict == "inconclusive"
     assert "no benchmark in common" in " ".join(text.split())  # long paths wrap
 

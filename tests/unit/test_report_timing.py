@@ -248,9 +248,13 @@ def test_times_at_unequal_or_unknown_errors_are_not_compared() -> None:
     )
     assert worse[0].startswith("cloth 20: most accurate is sparse, largest residual 1.0e+00; no other")
     assert worse[1] == "cloth 20: not compared with it: dense (its error is 100 times as large)."
-    unknown = summarise_changed_rows(("sparse", "xpbd"), residual=lambda row: None if row["solver"] == "xpbd" else row["residual"])
+    unknown = summarise_changed_rows(
+        ("sparse", "xpbd"), residual=lambda row: None if row["solver"] == "xpbd" else row["residual"]
+    )
     assert unknown[1] == "cloth 20: not compared with it: xpbd (its error is unknown)."
-    once = summarise_changed_rows(("sparse", "xpbd"), residual=lambda row: None if row["frame"] == 2 else row["residual"])
+    once = summarise_changed_rows(
+        ("sparse", "xpbd"), residual=lambda row: None if row["frame"] == 2 else row["residual"]
+    )
     assert once[0] == "cloth 20: times are not compared, for no run's error is known."
     assert not [line for line in worse + unknown + once if "fastest" in line or "times as long" in line]
 

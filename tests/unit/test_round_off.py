@@ -51,7 +51,8 @@ def test_the_bound_is_not_slack(case: str):
     p, bound = problem.current_positions, gradient_roundoff(problem, problem.current_positions)
     free = problem.system.free_vertices
     changes = [
-        stable_row_norms(problem.gradient(perturb_last_bits(p, seed)) - problem.gradient(p))[free] for seed in range(NUDGES)
+        stable_row_norms(problem.gradient(perturb_last_bits(p, seed)) - problem.gradient(p))[free]
+        for seed in range(NUDGES)
     ]
     assert (np.max(changes, axis=0) / bound[free]).max() > 1 / 300
 

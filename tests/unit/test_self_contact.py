@@ -172,7 +172,9 @@ def test_candidates_are_all_that_are_near():
     every = Candidates(np.array(wanted), first, one, one, 0 * one, CONTACT_THICKNESS, CONTACT_DHAT)
     near = compute_distances(every, p) < reach
     found = surface.find_proximity_candidates(p, reach)
-    assert name_pairs(found.vertices, found.num_point_triangle) == name_pairs(every.vertices[near], int(near[:first].sum()))
+    assert name_pairs(found.vertices, found.num_point_triangle) == name_pairs(
+        every.vertices[near], int(near[:first].sum())
+    )
     assert len(found.vertices) == int(near.sum())
 
 

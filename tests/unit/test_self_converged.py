@@ -36,7 +36,10 @@ def floor(y: float) -> ContactEffect:
 
 def test_where_nothing_touches_it_is_the_motion_that_is_integrated_and_is_found_again(tmp_path, monkeypatch):
     effects, velocity = (SpringsEffect(stretch=40.0), FIRST_PIN), (0.5, 1.0, 2.0)
-    other, alone = build_thrown_chain(*effects, floor(-9.0), velocity=velocity), build_thrown_chain(*effects, velocity=velocity)
+    other, alone = (
+        build_thrown_chain(*effects, floor(-9.0), velocity=velocity),
+        build_thrown_chain(*effects, velocity=velocity),
+    )
     found = ReferenceStore(tmp_path).load_trajectory(other, 3, [END], error=0.1)
     truth = integrate_motion(build_exact_scene(alone, 3), [END])
     assert (found.reference_kind, truth.reference_kind) == ("self-converged", "integrated")

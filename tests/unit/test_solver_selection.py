@@ -85,7 +85,11 @@ def test_the_estimate_of_a_factor_covers_its_panels():
     for shape in ((60, 60), (15, 15, 15)):
         Q = grid_matrix(*shape)
         # The panels, and in addition no more than those of L, as large again, and updates.
-        assert SupernodalCholesky(Q).factor_bytes < read_needed_bytes(Q, "supernodal") < 3 * SupernodalCholesky(Q).factor_bytes
+        assert (
+            SupernodalCholesky(Q).factor_bytes
+            < read_needed_bytes(Q, "supernodal")
+            < 3 * SupernodalCholesky(Q).factor_bytes
+        )
 
 
 def test_the_limit_of_the_machine_is_below_its_memory():

@@ -86,7 +86,9 @@ def test_candidates_are_interleaved():
 )
 def test_a_candidate_that_fails_states_why_and_the_others_continue(error: Exception, status: str):
     calls: list[str] = []
-    bad, good = measure_round_robin([ScriptedCandidate("a", calls, fails=error), ScriptedCandidate("b", calls)], COUNTS, {}, budget=1.0)
+    bad, good = measure_round_robin(
+        [ScriptedCandidate("a", calls, fails=error), ScriptedCandidate("b", calls)], COUNTS, {}, budget=1.0
+    )
     assert [(row["phase"], row["status"]) for row in bad] == [("run", status)]
     assert str(error) in bad[0]["reason"]
     assert calls.count("b") == ROUNDS
@@ -95,7 +97,10 @@ def test_a_candidate_that_fails_states_why_and_the_others_continue(error: Except
 
 def test_times_of_a_candidate_with_another_solution_are_rejected():
     first, near, far = measure_round_robin(
-        [ScriptedCandidate("a", []), ScriptedCandidate("b", [], at=1e-10), ScriptedCandidate("c", [], at=1e-8)], COUNTS, {}, budget=1.0
+        [ScriptedCandidate("a", []), ScriptedCandidate("b", [], at=1e-10), ScriptedCandidate("c", [], at=1e-8)],
+        COUNTS,
+        {},
+        budget=1.0,
     )
     assert first[-1]["status"] == near[-1]["status"] == "ok"
     assert [row["status"] for row in far] == ["failed"]

@@ -76,7 +76,9 @@ def test_figures_state_how_near_the_binding_limit_is():
         *build_candidate_rows("eigen", '{"temporaries": "cheap"}', [4.0, 4.0, 4.0]),
         *build_candidate_rows("cholmod", "{}", [2.0, 2.0, 2.0]),
         *build_candidate_rows("numba", '{"linear_solver": "cholespy"}', [3.0, 3.0, 3.0]),
-        *build_candidate_rows("numba", '{"linear_solver": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400),
+        *build_candidate_rows(
+            "numba", '{"linear_solver": "supernodal"}', [1.0, 2.0, 1.0], nnz_factor=100, flops_per_solve=2400
+        ),
     ]
     found = {f.label: f for f in compute_speed_figures(pa.Table.from_pylist(rows, schema=RUN_SCHEMA))}
     assert list(found) == ["eigen default", "eigen cheap", "cholmod", "numba cholespy", "numba supernodal"]

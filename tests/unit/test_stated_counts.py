@@ -30,14 +30,18 @@ def read_page(page: str) -> str:
 def test_the_first_page_counts_solvers_engines_and_integrators():
     integrators = len(set(INTEGRATORS) - {"substepping"})
     assert SUBSTEPPING is INTEGRATORS["substepping"]
-    words = f"any of {WORDS[len(OWN_SOLVERS)]} solvers, {WORDS[len(ENGINES)]} outside engines and {WORDS[integrators]} time"
+    words = (
+        f"any of {WORDS[len(OWN_SOLVERS)]} solvers, {WORDS[len(ENGINES)]} outside engines and {WORDS[integrators]} time"
+    )
     assert words in read_page("README.md")
 
 
 def test_the_page_of_configs_counts_the_solvers_of_the_hard_cases():
     runs = load_config(ROOT / "configs" / "hard.yaml", imports_code=False).list_runs()
     names = {run.solver.name for run in runs}
-    words = f"by {WORDS[len(names & OWN_SOLVERS)]} of the shipped solvers and {WORDS[len(names & ENGINES)]} outside engines"
+    words = (
+        f"by {WORDS[len(names & OWN_SOLVERS)]} of the shipped solvers and {WORDS[len(names & ENGINES)]} outside engines"
+    )
     assert words in read_page("configs/README.md")
 
 

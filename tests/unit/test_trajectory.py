@@ -55,7 +55,7 @@ MOVING_PIN = PinsEffect.model_validate(
 )
 
 
-def evaluate_damped_motion(t: np.ndarray, rate: float) -> np.ndarray:
+def move_damped(t: np.ndarray, rate: float) -> np.ndarray:
     """u'' + rate u' + K u = 0 with u(0) = 0 and u'(0) = SPEED, of a mass of 1 kg."""
     omega = np.sqrt(K - rate**2 / 4.0)
     return SPEED / omega * np.exp(-0.5 * rate * t) * np.sin(omega * t)
@@ -63,17 +63,17 @@ def evaluate_damped_motion(t: np.ndarray, rate: float) -> np.ndarray:
 
 FAST = (SPEED, 0.0, 0.0)
 ALONG = {  # the place of the second vertex of two along x, each of 1 kg, less 1 m
-    "spring": ((SPRING, FIRST_PIN), FAST, lambda t: evaluate_damped_motion(t, 0.0)),
-    "spring and ether drag": ((SPRING, FIRST_PIN, EtherDragEffect(decay_rate=C)), FAST, lambda t: evaluate_damped_motion(t, C)),
-    "spring and air drag": ((SPRING, FIRST_PIN, AirDragEffect(coefficient=2.0 * C)), FAST, lambda t: evaluate_damped_motion(t, C)),
+    "spring": ((SPRING, FIRST_PIN), FAST, lambda t: move_damped(t, 0.0)),
+    "spring and ether drag": ((SPRING, FIRST_PIN, EtherDragEffect(decay_rate=C)), FAST, lambda t: move_damped(t, C)),
+    "spring and air drag": ((SPRING, FIRST_PIN, AirDragEffect(coefficient=2.0 * C)), FAST, lambda t: move_damped(t, C)),
     "spring and dashpot": (
-        (SPRING, FIRST_PIN, DashpotsEffect(scaling_rule="fixed", stretch=C)), FAST, lambda t: evaluate_damped_motion(t, C)
+        (SPRING, FIRST_PIN, DashpotsEffect(scaling_rule="fixed", stretch=C)), FAST, lambda t: move_damped(t, C)
     ),
     "ether drag": ((EtherDragEffect(decay_rate=C),), FAST, lambda t: SPEED / C * (1.0 - np.exp(-C * t))),
-    "spring whose pin moves": ((SPRING, MOVING_PIN), (0.0, 0.0, 0.0), lambda t: SPEED * t - evaluate_damped_motion(t, 0.0)),
+    "spring whose pin moves": ((SPRING, MOVING_PIN), (0.0, 0.0, 0.0), lambda t: SPEED * t - move_damped(t, 0.0)),
     "dashpot whose pin moves": (
         (SPRING, DashpotsEffect(scaling_rule="fixed", stretch=C), MOVING_PIN),
-        (0.0, 0.0, 0.0), lambda t: SPEED * t - evaluate_damped_motion(t, C),
+        (0.0, 0.0, 0.0), lambda t: SPEED * t - move_damped(t, C),
     ),
 }  # fmt: skip
 
@@ -92,7 +92,8 @@ def test_a_mass_on_a_line_follows_the_closed_form_of_its_equation(case):
 
 def test_free_fall_is_a_parabola_and_the_velocity_its_slope():
     found = integrate_motion(
-        build_unit_scene(GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), size=3, velocity=(1.0, 2.0, 0.0)), TIMES
+        build_unit_scene(GridMesh(), SpringsEffect(stretch=100.0), GravityEffect(), size=3, velocity=(1.0, 2.0, 0.0)),
+        TIMES,
     )
     rest = build_unit_scene(GridMesh(), size=3).mesh.rest_positions
     for k, t in enumerate(TIMES):
