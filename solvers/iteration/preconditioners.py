@@ -50,7 +50,7 @@ def build_preconditioner(
 
     Args:
         name: name of the preconditioner.
-        metric: Q, whose factor is the preconditioner or whose diagonal keeps its blocks regular.
+        metric: Q, whose factor is the preconditioner or whose diagonal regularises its blocks.
         objective: the objective, whose other energies must be barriers for a preconditioner of the clamped Hessian.
         solver: name of the solver, for the message.
 
