@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import math
 import os
 import tempfile
 from collections.abc import Generator
@@ -52,12 +53,15 @@ again. Long ones follow, which should not be the last."""
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--find-slow", type=float, metavar="SECONDS", help="write tests/slow.txt: what takes longer")
+    parser.addoption(
+        "--find-long", type=float, default=math.inf, metavar="SECONDS", help="add to tests/long.txt what takes longer"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
     limit: float | None = config.getoption("--find-slow")
     if limit and not hasattr(config, "workerinput"):  # the test runner's processes report to the first
-        config.pluginmanager.register(slow_tests.SlowTestFinder(limit))
+        config.pluginmanager.register(slow_tests.SlowTestFinder(limit, config.getoption("--find-long")))
 
 
 @pytest.hookimpl(tryfirst=True)  # before tests are chosen by their marks

@@ -1,14 +1,17 @@
-"""The list of slow tests names what is there."""
+"""The lists of slow and long tests name existing tests."""
 
 from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
 
 from tests import slow_tests
 
 
-def test_each_line_names_a_file_or_a_test_in_it() -> None:
-    for line in slow_tests.read_slow_names():
+@pytest.mark.parametrize("names", [slow_tests.SLOW_LIST, slow_tests.LONG_LIST], ids=lambda path: path.stem)
+def test_each_line_names_a_file_or_a_test_in_it(names: Path) -> None:
+    for line in slow_tests.read_names(names):
         path, _, name = line.partition("::")
         source = (slow_tests.TESTS_FOLDER.parent / path).read_text()
-        assert not name or f"def {name.partition('[')[0]}(" in source, (
-            f"{line}: mend tests/slow.txt, see tests/slow_tests.py"
-        )
+        assert not name or f"def {name.partition('[')[0]}(" in source, f"{line}: mend {names}, see tests/slow_tests.py"
