@@ -305,12 +305,14 @@ def query(
 ) -> None:
     """Run an SQL query over the rows of all sweeps."""
     from springbench.harness.report.machine_footer import COMPARISON_NOTE
-    from springbench.harness.report.sql_query import MAX_CSV_ROWS, MAX_SHOWN_ROWS, run_query
+    from springbench.harness.report.sql_query import MANY_FILES, MAX_CSV_ROWS, MAX_SHOWN_ROWS, run_query
 
     found = run_query(sql, results, max_rows=MAX_CSV_ROWS if csv else MAX_SHOWN_ROWS, cpu_seconds=cpu_limit)
     if found.is_truncated:
         more = "" if csv else "; --csv prints more"
-        print_message(f"only the first {len(found.values):,} rows of the answer are shown{more}")
+        print_message(f"only the first {len(found.values):,} rows of the result are shown{more}")
+    if found.num_files >= MANY_FILES:
+        print_message(f"read {found.num_files:,} files; `springbench compact {results}` packs them for faster queries")
     if csv:
         found.write_csv(sys.stdout)
     else:

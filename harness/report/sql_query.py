@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
@@ -37,6 +37,8 @@ _FILE_ERRORS = (duckdb.IOException, duckdb.InvalidInputException)
 _MAX_ATTEMPTS = 2
 """Number of attempts: files that are packed while a query reads them are located again."""
 
+MANY_FILES = 500
+"""Number of files from which on opening them takes most of a query's time."""
 MAX_SHOWN_ROWS, MAX_CSV_ROWS = 1_000, 1_000_000
 """Maximum number of rows of a result in a table and in CSV; the rest is omitted."""
 QUERY_MEMORY_BYTES = 2**30
@@ -49,11 +51,19 @@ _MAX_CHARACTERS = 50_000_000
 
 @dataclass(frozen=True, slots=True)
 class QueryResult:
-    """Column names and rows of a query result; `is_truncated` states whether further rows were omitted."""
+    """Result of a query.
+
+    Attributes:
+        columns: names of the columns.
+        values: the rows.
+        is_truncated: whether further rows were omitted.
+        num_files: number of files of rows that the tables consist of, without packed ones.
+    """
 
     columns: list[str]
     values: list[tuple[Any, ...]]
     is_truncated: bool = False
+    num_files: int = 0
 
     def build_table(self) -> Table:
         """Build a printable table of the result; cell contents are plain text, not markup."""
@@ -99,9 +109,10 @@ def run_query(sql: str, results: Path, *, max_rows: int = MAX_SHOWN_ROWS, cpu_se
         raise InputError(f"{results}: contains no rows; run a sweep first, or name its folder with --results")
     limits = sandbox.CallLimits(cpu_seconds + _SECONDS_PER_FILE * files, QUERY_MEMORY_BYTES)
     try:
-        return sandbox.call_in_sandbox(_run_with_retries, sql, folders, max_rows, limits=limits)
+        found = sandbox.call_in_sandbox(_run_with_retries, sql, folders, max_rows, limits=limits)
     except sandbox.SandboxError as error:
         raise InputError(f"query: {error}; request less, or raise --cpu-limit") from None
+    return replace(found, num_files=files)
 
 
 def _run_with_retries(sql: str, folders: dict[str, list[Path]], max_rows: int) -> QueryResult:
