@@ -84,7 +84,7 @@ class BarrierContact:
         return self.collision_mesh.min_distance + self.collision_mesh.dhat
 
     def begin_step(self, start: StepStart) -> Self:
-        """Return the energy of a step; pairs active at `start.pressed` have friction."""
+        """Return the energy of a step; pairs active at `start.normal_force_positions` have friction."""
         if not self.friction:
             return self
         begun = self.append_obstacle_positions(start.positions)

@@ -31,7 +31,7 @@ def blocks(threads: int) -> int:
 
 
 class DeviceStream:
-    """A stream with its uploaded arrays and its events; device arrays live as long as the stream."""
+    """A stream with copies to and from the device, and its events."""
 
     def __init__(self) -> None:
         self.cuda_stream: Any = cuda.stream()

@@ -190,7 +190,7 @@ class LoadedStep:
         first, edges = len(network.spring_form.springs_and_forms.edges), len(network.ends)
         if first < edges:
             over = device_sums.count_blocks(edges - first), device_sums.THREADS_PER_BLOCK, queue
-            write_lagged_positions[over](
+            write_dashpot_edges[over](
                 first,
                 places.vertex_indices,
                 step.velocity_origin,
@@ -246,7 +246,7 @@ def write_initial_rows(row_data, num_free, initial_guess, pin_targets, rows):
 
 
 @cuda.jit
-def write_lagged_positions(first_dashpot, row_vertices, velocity_origin, lagged_positions, default_directions, edges):
+def write_dashpot_edges(first_dashpot, row_vertices, velocity_origin, lagged_positions, default_directions, edges):
     """Write the directions and offsets of the dashpots.
 
     Args:

@@ -52,7 +52,7 @@ def edge_direction_and_tension(edges, e, v0, v1, v2):
 
 
 @cuda.jit
-def gradient_bytes(edges, step_data, p, out):
+def write_gradient(edges, step_data, p, out):
     """Write the gradient of the objective at the free rows.
 
     Args:
@@ -158,7 +158,7 @@ def build_hessian_kernels(real: type[np.float32] | type[np.float64]) -> HessianK
     def multiply(edges, hold, linear, x, out, which, partials, now):
         """Write H x (f, 3) to `out` and store the first stage of x'H x.
 
-        Do nothing if now[ENDED] is not 0.
+        Do nothing if now[STATUS] is not RUNNING.
         """
         if now[0] != 0.0:
             return

@@ -34,7 +34,7 @@ _MAX_HALVINGS = 40
 
 WINDOW_STATE_DTYPE = np.dtype(
     [
-        ("coefficient_rule", np.int64),  # see `accelerate_coefficients`
+        ("coefficient_rule", np.int64),  # see `acceleration_coefficients`
         ("max_retries", np.int64),  # shorter steps along d before the plain correction
         ("num_pairs", np.int64),  # pairs in the window
         ("newest_pair", np.int64),  # the latest of them

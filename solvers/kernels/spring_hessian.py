@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
 from springbench.solvers.kernels.objective_kernels import spring_direction
-from springbench.solvers.kernels.quadratic_form_kernels import add_product
-from springbench.solvers.kernels.quadratic_form_kernels import add_to_diagonal as hold_block
+from springbench.solvers.kernels.quadratic_form_kernels import add_product, add_to_diagonal
 from springbench.solvers.kernels.spring_law import transverse_stiffness
 from springbench.solvers.model.energies.element_energies import add_products, axial_hessian
 from springbench.solvers.model.step_problem import System
@@ -193,9 +192,9 @@ def write_constant_blocks(terms, places, values):
 def _write_constant_blocks(terms, places, values):
     values[:] = 0.0
     for v in places.free_vertices:
-        hold_block(values, places.diagonal_block[v], terms.inertia_diagonal[v])
+        add_to_diagonal(values, places.diagonal_block[v], terms.inertia_diagonal[v])
     for q in range(len(terms.pinned_vertices)):
-        hold_block(values, places.diagonal_block[terms.pinned_vertices[q]], terms.pin_weight[q])
+        add_to_diagonal(values, places.diagonal_block[terms.pinned_vertices[q]], terms.pin_weight[q])
 
 
 @jit_kernel

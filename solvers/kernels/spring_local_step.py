@@ -142,7 +142,7 @@ class SpringPackets(NamedTuple):
     ) -> NDArray[np.float64]:
         """Build the constant right-hand side y of the packets, with the anchor stiffness of each row [N/m].
 
-        A packet has RIGHT numbers: eight x, y and z each, and eight stiffnesses. Rows in no packet follow at the end.
+        A packet has RHS_STRIDE numbers: eight x, y and z each, and eight stiffnesses. Rows in no packet follow it all.
 
         Args:
             anchor_stiffness: anchor stiffness of each row [N/m].

@@ -90,7 +90,7 @@ class StepJudge:
     """Judge of the steps of submissions of one scene."""
 
     def __init__(self, scene: Scene) -> None:
-        """Assemble and factorise Q; raises NotPositiveDefinite."""
+        """Assemble Q, which is factorised when it is first needed."""
         self._scene, self._evaluator = scene, ReferenceEvaluator(scene.system)
         self._size = scene.mesh.bounding_box_diagonal or 1.0
         self._solver = NewtonSolver()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from springbench.harness.report.plot_style import (
@@ -35,8 +34,6 @@ _PLOTLY_SYMBOLS: dict[Any, str] = {
     SPEARHEAD_MARKERS[3]: "arrow-up",
 }  # fmt: skip
 
-LOG_AXIS = {"type": "log"}
-
 
 def plotly_style(mark: SeriesStyle) -> dict[str, str]:
     """Return a style in Plotly's terms."""
@@ -45,14 +42,3 @@ def plotly_style(mark: SeriesStyle) -> dict[str, str]:
         "symbol": _PLOTLY_SYMBOLS[mark.marker],
         "dash": "solid" if mark.dash == "-" else ",".join(f"{2 * length:g}px" for length in mark.dash[1]),
     }
-
-
-def axis_choice(column: str, title: str, layout: Mapping[str, Any] = LOG_AXIS) -> dict[str, Any]:
-    """Return a possible axis of a chart.
-
-    Args:
-        column: column of the items whose values the axis shows.
-        title: title of the axis.
-        layout: properties of the axis in Plotly's terms.
-    """
-    return {"column": column, "title": title, "axis": layout}

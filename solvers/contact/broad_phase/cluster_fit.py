@@ -149,7 +149,7 @@ def fit_affine(rest_clusters, x, leaf, boxes, tile, out):
 
 
 @jit_kernel
-def max_cluster_displacement(vertices, pairs, rest_clusters, p, q, displacement, tile, low, high):
+def max_cluster_displacement(vertices, pairs, num_pairs, p, q, displacement, tile, low, high):
     """Return the largest relative displacement [m] of two vertices in any cluster pair.
 
     The bound is the diagonal of the box of their displacements.
@@ -157,7 +157,7 @@ def max_cluster_displacement(vertices, pairs, rest_clusters, p, q, displacement,
     Args:
         vertices: vertices of each cluster (m, k).
         pairs: cluster pairs (k, 2).
-        rest_clusters: number of pairs to include.
+        num_pairs: number of pairs to include.
         p: start positions (n, 3) [m].
         q: end positions (n, 3) [m].
         displacement, low, high: scratch, (n, 4), (m, 4) and (m, 4).
@@ -178,14 +178,14 @@ def max_cluster_displacement(vertices, pairs, rest_clusters, p, q, displacement,
         store_vectors(least, tile, first, low)
         store_vectors(most, tile, first, high)
     square = 0.0
-    for first in range(0, rest_clusters, 8):
+    for first in range(0, num_pairs, 8):
         a, b = (
-            gather_rows(low, pairs, first, rest_clusters - 1, 0),
-            gather_rows(low, pairs, first, rest_clusters - 1, 1),
+            gather_rows(low, pairs, first, num_pairs - 1, 0),
+            gather_rows(low, pairs, first, num_pairs - 1, 1),
         )
         c, d = (
-            gather_rows(high, pairs, first, rest_clusters - 1, 0),
-            gather_rows(high, pairs, first, rest_clusters - 1, 1),
+            gather_rows(high, pairs, first, num_pairs - 1, 0),
+            gather_rows(high, pairs, first, num_pairs - 1, 1),
         )
         wide = subtract3(componentwise_max(c, d), componentwise_min(a, b))
         store_packet(dot3(wide, wide), tile, 0)

@@ -4,10 +4,11 @@
 
 n_i, d_i: the half-space that contains the vertex during this step
 (`springbench.solvers.contact.half_space.separating_planes`). a_i: position of the vertex if it moved with the obstacle.
-F_i = mu k_i depth_i, with the depth at `start.pressed`, an iterate of this step, or at the step's start if that is None
-(Li et al. 2020, "Incremental potential contact", section 5; `springbench.solvers.contact.lagged_friction` iterates it
-to convergence). h is the length, smoothed where a vertex moves by less than the smoothing length s = eps_v (t_x - t),
-with t_x the time of the stage (`springbench.solvers.contact.potentials.friction_law`).
+F_i = mu k_i depth_i, with the depth at `start.normal_force_positions`, an iterate of this step, or at the step's start
+if that is None (Li et al. 2020, "Incremental potential contact", section 5;
+`springbench.solvers.contact.lagged_friction` iterates it to convergence). h is the length, smoothed where a vertex
+moves by less than the smoothing length s = eps_v (t_x - t), with t_x the time of the stage
+(`springbench.solvers.contact.potentials.friction_law`).
 
 A sticking vertex moves at most at the speed `eps_v`. Half-spaces, depth and friction refer to the end of the step. If
 the stage is the position at another time (`springbench.solvers.model.integrators`), both are moved towards the start

@@ -2,10 +2,10 @@
 
     E(p) = sum over pairs of mu F h(|u|),     u = (I - nn') sum_i c_i (x_i - x_i^t)
 
-F: the barrier's normal force at `start.pressed`, an iterate of this step, or at the step's start if that is None; c, n:
-coefficients and direction of the closest points there; x^t: positions at the step's start (Li et al. 2020, "Incremental
-potential contact", section 5; `springbench.solvers.contact.lagged_friction` iterates them to convergence). h is the
-length, smoothed where a pair slips by less than s in a step, by the law of half-spaces
+F: the barrier's normal force at `start.normal_force_positions`, an iterate of this step, or at the step's start if that
+is None; c, n: coefficients and direction of the closest points there; x^t: positions at the step's start (Li et al.
+2020, "Incremental potential contact", section 5; `springbench.solvers.contact.lagged_friction` iterates them to
+convergence). h is the length, smoothed where a pair slips by less than s in a step, by the law of half-spaces
 (`springbench.solvers.contact.potentials.friction_law`). The paper's h, u^2/s - u^3/(3 s^2) for u < s, has a continuous
 second derivative; Newton's method needs no fewer iterations with it, and up to a third more.
 """

@@ -215,7 +215,7 @@ class _NewtonCGState(DeviceSolverState):
         return float(self.stream.download_array(self._sums)[0])
 
     def _launch_linearisation(self) -> None:
-        objective_kernels.gradient_bytes[self._over](self._edges, self._given, self._p, self._g)
+        objective_kernels.write_gradient[self._over](self._edges, self._given, self._p, self._g)
         self._kernels.linearise_hessian[self._over](self._edges, len(self._g), self._p, self._linear)
         self._preconditioner.set_linearisation(self._edges, self._p)
         write_negated[self._over](self._g, self._preconditioner.r)
@@ -285,7 +285,7 @@ class _NewtonCGState(DeviceSolverState):
             self._partials,
             self._cg_status,
         )
-        evaluate_barrier_blocks[one](self._partials, 0, count, self._cg_status)
+        evaluate_curvature[one](self._partials, 0, count, self._cg_status)
         self._cg_kernels.update_iterate[launch](self._s, self._y, self._d, self._preconditioner.r, self._cg_status)
         self._preconditioner.apply_preconditioner(self._w, 1, self._partials, self._cg_status)
         check_convergence[one](self._partials, 1, count, self._cg_status)
@@ -387,7 +387,7 @@ def build_conjugate_gradient_kernels(real: type[np.float32] | type[np.float64]) 
 
 
 @cuda.jit
-def evaluate_barrier_blocks(partials, which, count, now):
+def evaluate_curvature(partials, which, count, now):
     """Second stage of p'Hp, and its sign; one block.
 
     Args:
