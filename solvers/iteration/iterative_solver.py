@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.solvers.kernels import iteration_loop
+from springbench.solvers.jit.typed_kernel import as_kernel_array
+from springbench.solvers.kernels import iteration_loop, objective_kernels
 from springbench.solvers.kernels.iteration_loop import LoopLimits, iteration_limit
 from springbench.solvers.model.rounding_bound import is_gradient_roundoff
 from springbench.solvers.model.step_problem import (
@@ -386,8 +387,8 @@ def is_far_from_origin(p: Positions) -> bool:
 
 def compute_max_coordinate(problem: StepProblem) -> float:
     """Return the largest coordinate [m] of the initial guess, with exactly pinned vertices on their targets."""
-    s, p = problem.system, problem.initial_guess
-    if len(s.free_vertices) < s.num_vertices:
+    p, (indices, vertices) = problem.initial_guess, problem.system.exact_pins
+    if len(vertices):
         p = p.copy()
-        p[s.pins.vertices[s.pins.exact_mask]] = problem.pin_targets[s.pins.exact_mask]
-    return float(np.abs(p).max(initial=0.0))
+        p[vertices] = problem.pin_targets[indices]
+    return objective_kernels.compute_max_magnitude(as_kernel_array(p))

@@ -207,7 +207,7 @@ class System:
     @cached_property
     def free_vertices(self) -> NDArray[np.int64]:
         """Vertices that are degrees of freedom, i.e. all except the exactly pinned ones, shape (f,)."""
-        return np.setdiff1d(np.arange(self.num_vertices), self.pins.vertices[self.pins.exact_mask])
+        return np.setdiff1d(np.arange(self.num_vertices), self.exact_pins[1])
 
     @cached_property
     def unpinned_mask(self) -> NDArray[np.bool_]:
@@ -215,6 +215,12 @@ class System:
         mask = np.ones(self.num_vertices, bool)
         mask[self.pins.vertices] = False
         return mask
+
+    @cached_property
+    def exact_pins(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Exact pins: their indices within `pins` (x,), and their vertices (x,)."""
+        indices = np.flatnonzero(self.pins.exact_mask)
+        return indices, self.pins.vertices[indices]
 
     @cached_property
     def penalty_pins(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.float64]]:

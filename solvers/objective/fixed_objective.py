@@ -65,8 +65,7 @@ class FixedObjective:
         self.system, self.pinned_vertices = system, np.array(system.pins.vertices)
         self.springs = Springs.from_parts([e for e in system.energies if isinstance(e, Springs)])
         self.objective_terms = objective_kernels.ObjectiveTerms.from_system(system, self.springs)
-        self.exact_pin_indices = np.flatnonzero(system.pins.exact_mask)
-        self.exact_pins = system.pins.vertices[self.exact_pin_indices]
+        self.exact_pin_indices, self.exact_pins = system.exact_pins
         self.kernels = ObjectiveKernels(
             TypedKernel(objective_kernels.gradient),
             TypedKernel(objective_kernels.objective_change),
