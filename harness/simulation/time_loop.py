@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import reduce
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -118,12 +117,15 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
     dt = scene.system.time_step
     # The previous motion was filtered when it was the current one. The second filtering makes it decay for as long as
     # the current one (an integrating factor); without that, BDF2 would decay at twice the rate.
-    now, before = (_filter_velocity(scene, motion) for motion in (state.motion, state.previous_motion or state.motion))
+    now = before = _filter_velocity(scene, state.motion)
+    a, is_extrapolated = usual.extrapolation_fraction, initial_guess == "extrapolated"
+    if state.previous_motion and (usual.needs_history or is_extrapolated or (a and scene.varying_forces)):
+        before = _filter_velocity(scene, state.previous_motion)
     starts = usual.needs_history and state.previous_motion is None
     method, system = (IMPLICIT_EULER, _build_first_system(scene)) if starts else (usual, scene.system)
     target, origin = method.predict_target(now, before, dt)
     when, ahead = time + method.stage_fraction * dt, method.extrapolation_fraction * dt
-    led = (now.velocity - before.velocity) / dt if initial_guess == "extrapolated" and state.previous_motion else None
+    led = (now.velocity - before.velocity) / dt if is_extrapolated and state.previous_motion else None
     begun = StepStart(
         now.positions,
         now.velocity,
@@ -139,7 +141,8 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
     if scene.varying_forces:
         a = method.extrapolation_fraction
         p, v = (x + a * (x - y) for x, y in zip(now, before, strict=True)) if a and state.previous_motion else now
-        force = reduce(lambda total, effect: total + effect(p, v, time + a * dt), scene.varying_forces, force)
+        for effect in scene.varying_forces:
+            force = force + effect(p, v, time + a * dt)
     pin_targets = scene.pin_targets_at(time + dt)
     if method.stage_fraction < 1.0:
         pin_targets = now.positions[system.pins.vertices] + method.stage_fraction * (
@@ -297,7 +300,12 @@ class AlternatingSolver:
 
 
 def _filter_velocity(scene: Scene, motion: Motion) -> Motion:
-    return Motion(motion.positions, reduce(lambda v, filtered: filtered(v), scene.velocity_filters, motion.velocity))
+    if not scene.velocity_filters:
+        return motion
+    p, v = motion
+    for velocity_filter in scene.velocity_filters:
+        v = velocity_filter(v)
+    return Motion(p, v)
 
 
 def _build_first_system(scene: Scene) -> System:

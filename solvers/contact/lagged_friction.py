@@ -134,7 +134,11 @@ def has_friction(energy: Energy) -> TypeGuard[FrictionEnergy]:
 
 def _max_friction_iterations(system: System) -> int:
     """Return the maximum number of friction iterations of all energies, 0 without friction."""
-    return max((energy.friction_iterations for energy in system.energies if has_friction(energy)), default=0)
+    most = 0
+    for energy in system.energies:
+        if has_friction(energy):
+            most = max(most, energy.friction_iterations)
+    return most
 
 
 class _Round(NamedTuple):

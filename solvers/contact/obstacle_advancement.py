@@ -42,9 +42,9 @@ def intersection_free_guess(problem: StepProblem) -> StepProblem:
     Raises:
         NoClearance: no intersection-free start was found.
     """
-    energies = [energy for energy in problem.energies if is_barrier_energy(energy)]
-    if not energies:
+    if not any(map(is_barrier_energy, problem.system.energies)):
         return problem
+    energies = [energy for energy in problem.energies if is_barrier_energy(energy)]
     p = problem.step_start.positions
 
     def free(q: Positions) -> bool:
