@@ -16,12 +16,13 @@ from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
+from springbench.solvers.methods.newton import hybrid_newton
 from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, PreparedHybrid, _MeasuredRule
 from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
-from springbench.solvers.model.step_problem import DirichletPins, StepProblem, StopRule, System
+from springbench.solvers.model.step_problem import DirichletPins, Positions, StepProblem, StopRule, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
@@ -102,16 +103,48 @@ def test_a_path_to_a_saddle_is_left_where_curvature_is_negative(size):
         assert np.ptp(found.positions[:, 1]) > 0.0
 
 
-def test_soft_springs_are_left_to_lbfgs():
-    """Its iterates are some of those of L-BFGS, from the same start, bit for bit."""
-    given, numbers = stiff(0.1), (2, 4, 7, 10)
-    hybrid = [p.copy() for p in islice(HybridNewton().prepare(given.system).iterates(given), len(numbers))]
+def inertial_prediction(given: StepProblem) -> Positions:
     fall = given.inertial_target + given.external_force / given.system.inertia_diagonal[:, None]
     fall[given.system.pins.vertices] = given.pin_targets
-    assert given.value(fall) < given.value(given.current_positions)
-    prepared = Lbfgs().prepare(given.system)
-    lbfgs = [p.copy() for p in islice(prepared.iterates(replace(given, initial_guess=fall)), 20)]
-    np.testing.assert_array_equal(hybrid, [lbfgs[number - 1] for number in numbers])
+    return fall
+
+
+@pytest.mark.parametrize("guess", ["previous", "solution"])
+def test_soft_springs_are_left_to_lbfgs(guess):
+    """Its iterates are some of those of L-BFGS, bit for bit, from the lower one of the guess and the prediction."""
+    given = stiff(0.1)
+    prepared, lbfgs = HybridNewton().prepare(given.system), Lbfgs().prepare(given.system)
+    fall = inertial_prediction(given)
+    if guess == "solution":
+        given = replace(given, initial_guess=lbfgs.solve(given, StopRule(4)).positions)
+    assert (given.value(fall) < given.value(given.initial_guess)) == (guess == "previous")
+    start = fall if guess == "previous" else given.initial_guess
+    path = [p.copy() for p in islice(lbfgs.iterates(replace(given, initial_guess=start)), 10)]
+    numbers = [0]
+    for p in prepared.iterates(given):
+        numbers.append(next(i for i in range(numbers[-1] + 1, 11) if np.array_equal(path[i - 1], p)))
+        if numbers[-1] == len(path):
+            break
+    assert {4, 10} <= set(numbers)  # where the rule decides
+
+
+def test_a_solve_by_lbfgs_alone_prepares_nothing_for_the_other_methods(monkeypatch):
+    given, prepared = stiff(0.1), HybridNewton().prepare(stiff(0.1).system)
+    wanted = prepared.residual_at(given, given.current_positions)
+    monkeypatch.setattr(hybrid_newton, "StepObjective", None)
+    monkeypatch.setattr(hybrid_newton, "_Approach", None)
+    found = prepared.solve(given, StopRule(50, 1e-3))
+    assert found.solver_phases is not None
+    assert set(found.solver_phases) == {"lbfgs"}
+    assert found.termination_reason == "converged"
+    assert found.initial_residual == wanted
+
+
+def test_a_solve_without_iterations_stays_at_the_guess():
+    given, prepared = stiff(0.1), HybridNewton().prepare(stiff(0.1).system)
+    found = prepared.solve(given, StopRule(0))
+    np.testing.assert_array_equal(found.positions, given.initial_guess)
+    assert found.residual == pytest.approx(prepared.residual_at(given, given.initial_guess), rel=1e-9)
 
 
 @pytest.mark.parametrize("guess", ["fall", "rest"])
@@ -121,7 +154,7 @@ def test_free_flight_is_found_at_once_from_any_guess(guess):
     given = build_random_problem(0, n=n, m=1, weights=())
     system = System(given.system.mass, given.system.time_step, (), DirichletPins())
     given = replace(given, system=system)
-    fall = given.inertial_target + given.external_force / system.inertia_diagonal[:, None]
+    fall = inertial_prediction(given)
     given = replace(given, initial_guess=fall if guess == "fall" else given.current_positions)
     found = next(HybridNewton().prepare(system).iterates(given))
     np.testing.assert_allclose(found, fall, rtol=1e-14, atol=1e-14)  # a sum and a quotient, in another order

@@ -45,7 +45,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +86,10 @@ from springbench.solvers.methods.newton.negative_curvature import (
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration
 from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, objective_decrease
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
-from springbench.solvers.methods.quasi_newton.windowed_acceleration import PreparedAccelerated
+from springbench.solvers.methods.quasi_newton.windowed_acceleration import (
+    CompiledAccelerationState,
+    PreparedAccelerated,
+)
 from springbench.solvers.model.barrier_energy import ignore_barriers, without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System
 from springbench.solvers.objective.fixed_objective import FixedObjective
@@ -197,7 +200,8 @@ class PreparedHybrid(PreparedDescent):
             problem: step whose objective is minimised.
             initial_guess: positions (n, 3) [m], not modified.
         """
-        return _HybridState(self, StepObjective(self.fixed_objective, problem), initial_guess)
+        starts_lower = self.hybrid_iteration.starts_lower
+        return (_LbfgsFirstState if starts_lower else _HybridState)(self, problem, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)], by L-BFGS if its residuals are those of the metric.
@@ -221,7 +225,6 @@ class SolveControl:
         is_minimum: whether the last point was reached by an unmodified Newton step that agrees with its model.
         residual: residual at the last point [J^(1/2)], None if it is not known.
         solver_phases: iterations and cost in Newton steps of each method so far.
-        first_run: L-BFGS started at the initial guess, if it is.
     """
 
     limits: LoopLimits = ONE_ITERATION
@@ -230,7 +233,6 @@ class SolveControl:
     is_minimum: bool = False
     residual: float | None = None
     solver_phases: dict[str, tuple[int, float]] = field(default_factory=dict)
-    first_run: AcceleratedState | None = None
 
     def add_phase(self, name: str, num_iterations: int, cost: float) -> None:
         """Record iterations and the cost of a method, and set `num_iterations`.
@@ -248,19 +250,20 @@ class SolveControl:
 class _HybridState(SolverState):
     """The state of a solve, which does many rounds of L-BFGS at once."""
 
-    def __init__(self, prepared: PreparedHybrid, step: StepObjective, guess: Positions) -> None:
-        self._prepared, self._metric, self._step, self._control = prepared, prepared.metric, step, SolveControl()
-        self.positions = step.apply_exact_pins(guess)
-        self._points = prepared.hybrid_iteration.iterate_from(step, self.positions, self._control)
+    def __init__(self, prepared: PreparedHybrid, problem: StepProblem, guess: Positions) -> None:
+        self._prepared, self._problem, self._control = prepared, problem, SolveControl()
         self._point: DescentPoint | None = None
+        self.positions = guess
+        self._start_points()
 
-    def compute_start_residual(self) -> float | None:
-        """Return the residual at the initial guess [J^(1/2)] by L-BFGS, which then continues from there."""
-        method = self._prepared.hybrid_iteration
-        if method.exact_lbfgs is None:
-            return None
-        self._control.first_run = method.start_lbfgs(self._step, self.positions)
-        return self._control.first_run.start_residual
+    def _start_points(self) -> None:
+        """Start the iteration at the initial guess."""
+        self.positions = self._step.apply_exact_pins(self.positions)
+        self._points = self._prepared.hybrid_iteration.iterate_from(self._step, self.positions, self._control)
+
+    @cached_property
+    def _step(self) -> StepObjective:
+        return StepObjective(self._prepared.fixed_objective, self._problem)
 
     def step_state(self) -> bool:
         return self._advance(ONE_ITERATION)
@@ -276,7 +279,7 @@ class _HybridState(SolverState):
     def residual(self) -> float:
         if self._control.residual is not None:
             return self._control.residual
-        return self._metric.residual(self._current_point().gradient)
+        return self._prepared.metric.residual(self._current_point().gradient)
 
     def _current_point(self) -> DescentPoint:
         return self._point or DescentPoint(self.positions, self._step.gradient(self.positions))
@@ -309,6 +312,83 @@ class _HybridState(SolverState):
     def solver_phases(self) -> dict[str, tuple[int, float]]:
         """Iterations and cost of each method so far."""
         return self._control.solver_phases
+
+
+class _LbfgsFirstState(_HybridState):
+    """The state of a solve that prepares nothing for other methods while L-BFGS is the only one.
+
+    Most steps of small meshes end so, and the other methods would take as long to start as L-BFGS takes for them.
+    """
+
+    _run: CompiledAccelerationState | None = None
+    _num_rounds = 0
+    _is_lbfgs_alone = True
+
+    def _start_points(self) -> None:
+        """Leave the start to the first round."""
+
+    def compute_start_residual(self) -> float:
+        return self._start_run(measures_guess=True).guess_residual
+
+    def _start_run(self, *, measures_guess: bool) -> CompiledAccelerationState:
+        """Start L-BFGS; `measures_guess` states whether the residual at the guess is needed."""
+        method = self._prepared.hybrid_iteration
+        run = self._run = method.start_lower(self._problem, self.positions, measures_guess=measures_guess)
+        self._start, self._rounds = run.positions.copy(), method.init_rounds()
+        self._floor = method.round_off(self._start)
+        self._one_round = _limit_rounds(ONE_ITERATION, self._floor)
+        return run
+
+    def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        if self._num_rounds == 0 and limits.max_iterations == 0:
+            self.positions = self._step.apply_exact_pins(self.positions)
+        return super().run_iterations(limits)
+
+    def _advance(self, limits: LoopLimits) -> bool:
+        """Do rounds of L-BFGS as long as it is alone."""
+        if not self._is_lbfgs_alone:
+            return super()._advance(limits)
+        control, run = self._control, self._run or self._start_run(measures_guess=False)
+        if control.must_escape:
+            self._end_lbfgs_alone(run, np.inf, REASON_ITERATIONS)
+            return super()._advance(limits)
+        limits = self._one_round if limits is ONE_ITERATION else _limit_rounds(limits, self._floor)
+        count, residual, ended = run.run_rounds(self._rounds, limits)
+        control.num_iterations, control.residual = count, residual
+        self._num_rounds += count
+        self.positions = run.positions
+        if ended in (REASON_STALLED, REASON_SWITCH) or residual <= self._floor:
+            self._end_lbfgs_alone(run, residual, ended)
+        return True
+
+    def _end_lbfgs_alone(self, run: CompiledAccelerationState, residual: float, ended: int) -> None:
+        """Let the rule choose the method from now on."""
+        method, control = self._prepared.hybrid_iteration, self._control
+        control.solver_phases, self._is_lbfgs_alone, self._run = dict(self.solver_phases), False, None
+        self._point = DescentPoint(run.positions.copy(), _NO_GRADIENT)
+        self.positions = self._point.positions
+        approach = _Approach(method, self._step, self._start, run, control, self._rounds, self._point)
+        approach.record_rounds(residual, ended)
+        self._points = method.continue_from(self._step, self._point, control, approach)
+
+    @property
+    def solver_phases(self) -> dict[str, tuple[int, float]]:
+        """Iterations and cost of each method so far."""
+        if not self._is_lbfgs_alone:
+            return self._control.solver_phases
+        groups = int(self._rounds["num_iterations"][0]) / GROUP_ITERATIONS if self._num_rounds else 0.0
+        return {"lbfgs": (self._num_rounds, groups / self._prepared.hybrid_iteration.newton_cost)}
+
+
+def _limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
+    """Return the limits of rounds, which also end where the residual is due to rounded positions.
+
+    Args:
+        limits: limits of the solve.
+        floor: residual [J^(1/2)] that rounded positions leave.
+    """
+    limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
+    return LoopLimits(limits.max_iterations, limit, max(floor, limits.residual_floor), RESIDUAL_EACH)
 
 
 class _MeasuredRule(ShiftScheduleRule):
@@ -362,7 +442,8 @@ class HybridIteration:
         metric: norm of residuals.
         newton: the exact method.
         factor: factor of the Hessian.
-        exact_lbfgs: L-BFGS, if its residuals are those of the metric and its start is that of a solve; else None.
+        exact_lbfgs: L-BFGS, if its residuals are those of the metric; else None.
+        starts_lower: whether L-BFGS itself starts at the lower one of the initial guess and the inertial prediction.
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
     """
 
@@ -382,11 +463,21 @@ class HybridIteration:
         is_exact = is_double and not objective.has_barriers
         is_exact = is_exact and objective.system is without_vertex_contact(objective.system)
         self.exact_lbfgs = lbfgs if is_exact else None
+        is_projective = objective.projective_indices.issuperset(objective.element_energy_indices)
+        self.starts_lower = is_exact and is_projective and lbfgs.can_start_lower
         constant, per_spring, per_entry = _LBFGS_NANOSECONDS
         springs, entries = len(objective.springs.stiffness), lbfgs.stats.get("nnz_factor", 0.0)
         lbfgs_cost = GROUP_ITERATIONS * (constant + per_spring * springs + per_entry * entries)
         constant, per_flop, per_entry = _NEWTON_NANOSECONDS
         self.newton_cost = (constant + per_flop * factor.flops + per_entry * factor.nonzeros) / lbfgs_cost
+
+    def init_rounds(self) -> NDArray[Any]:
+        """Return the state of the rounds of a solve."""
+        return init_rounds(self.newton_cost)
+
+    def round_off(self, p: Positions) -> float:
+        """Return the residual [J^(1/2)] that rounded positions p (n, 3) [m] leave."""
+        return self.metric.energy_roundoff(p) ** 0.5
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points after `start`.
@@ -405,13 +496,25 @@ class HybridIteration:
             p: positions (n, 3) [m]; the inertial prediction replaces them if it is lower.
             control: limits of the next iterations, read for each point; counts and costs are recorded there.
         """
-        lower, point = lower_start_positions(step, p), None
-        first, control.first_run = control.first_run if lower is p else None, None
-        p = lower
+        yield from self.continue_from(step, DescentPoint(lower_start_positions(step, p), _NO_GRADIENT), control)
+
+    def continue_from(
+        self, step: StepObjective, start: DescentPoint, control: SolveControl, approach: _Approach | None = None
+    ) -> Iterator[DescentPoint]:
+        """Yield the points after a point; restart after an escape from a saddle.
+
+        Args:
+            step: objective of the step.
+            start: point from which the iteration continues, of which only the positions are used.
+            control: as in `iterate_from`.
+            approach: choice between the methods that continues from there; a new one is started if omitted.
+        """
+        p, point = start.positions, start if approach else None
         while point is None or not point.is_stalled:
             if not (step.has_contact_elements or has_active_barrier(step, p)):
-                run, first = first or self.start_lbfgs(step, p), None
-                for following in _Approach(self, step, p, run, control).iterate_points():
+                approach = approach or _Approach(self, step, p, self.start_lbfgs(step, p), control, self.init_rounds())
+                points, approach = approach.iterate_points(), None
+                for following in points:
                     if not _is_collision_free(step, p, following.positions):
                         break
                     p, point = following.positions, following
@@ -436,7 +539,20 @@ class HybridIteration:
             step: objective of the step, whose barrier energies are ignored.
             p: initial guess (n, 3) [m].
         """
-        return self._lbfgs.init_state(ignore_barriers(step.problem) if self._system_has_barriers else step.problem, p)
+        return self._lbfgs.init_state(self._without_barriers(step.problem), p)
+
+    def start_lower(self, problem: StepProblem, guess: Positions, *, measures_guess: bool) -> CompiledAccelerationState:
+        """Start L-BFGS at the lower one of the guess and the inertial prediction, if `starts_lower`.
+
+        Args:
+            problem: step whose objective is minimised.
+            guess: initial guess (n, 3) [m].
+            measures_guess: whether the residual at the guess is needed.
+        """
+        return self._lbfgs.init_lower_state(self._without_barriers(problem), guess, measures_guess=measures_guess)
+
+    def _without_barriers(self, problem: StepProblem) -> StepProblem:
+        return ignore_barriers(problem) if self._system_has_barriers else problem
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return whether a stationary point is a minimum, as far as the method can determine.
@@ -478,15 +594,17 @@ class _Approach:
         start: Positions,
         run: AcceleratedState,
         control: SolveControl,
+        rounds: NDArray[Any],
+        at: DescentPoint | None = None,
     ) -> None:
-        """Start at positions (n, 3) [m], with L-BFGS started there."""
+        """Start at positions (n, 3) [m], or continue at a point `at` after rounds of L-BFGS from there."""
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = run
-        self._point, self._rounds = DescentPoint(start, _NO_GRADIENT), init_rounds(method.newton_cost)
+        self._point, self._rounds = at or DescentPoint(start, _NO_GRADIENT), rounds
         self._num_lbfgs_iterations, self._rival_gain = 0, 0.0  # those of the rounds
         self._measured_rule: _MeasuredRule | None = None
         self._steepest = 0.0
-        self._floor = method.metric.energy_roundoff(start) ** 0.5  # [J^(1/2)]
+        self._floor = method.round_off(start)
         self._predicting: PredictedTensionNewton | None = None
         self._gains = {"lbfgs": np.inf, "predicted tensions": 0.0, "newton": 0.0}  # [J] per cost of a group
         self._name = ""
@@ -544,31 +662,39 @@ class _Approach:
             rounds["gain"], rounds["group_residual"] = np.inf, 0.0
         if step.barrier_energies:  # each round is checked for collisions
             limits = limits._replace(max_iterations=1)
-        floor, rival_gain = self._floor, max(self._gains["predicted tensions"], self._gains["newton"])
-        limit = limits.residual_limit if limits.residual_mode == RESIDUAL_EACH else 0.0
-        limits = LoopLimits(limits.max_iterations, limit, max(floor, limits.residual_floor), RESIDUAL_EACH)
+        rival_gain = max(self._gains["predicted tensions"], self._gains["newton"])
         if rival_gain != self._rival_gain:
             rounds["rival_gain"] = self._rival_gain = rival_gain
-        count, residual, ended = self._run.run_rounds(rounds, limits)
-        before, self._num_lbfgs_iterations = self._num_lbfgs_iterations, int(rounds["num_iterations"][0])
-        cost = (self._num_lbfgs_iterations - before) / GROUP_ITERATIONS
-        self._control.add_phase("lbfgs", count, cost / self._method.newton_cost)
+        count, residual, ended = self._run.run_rounds(rounds, _limit_rounds(limits, self._floor))
+        done = int(rounds["num_iterations"][0]) - self._num_lbfgs_iterations
+        self._control.add_phase("lbfgs", count, done / GROUP_ITERATIONS / self._method.newton_cost)
         if self._method.exact_lbfgs:
             point, self._control.residual = DescentPoint(self._run.positions.copy(), _NO_GRADIENT), residual
         else:
             point = _current_point(self._run)
-        self._spent += cost
+        self.record_rounds(residual, ended)
+        return point
+
+    def record_rounds(self, residual: float, ended: int) -> None:
+        """Record the cost of rounds of L-BFGS and what follows from their end.
+
+        Args:
+            residual: last residual [J^(1/2)].
+            ended: termination reason.
+        """
+        rounds = self._rounds
+        before, self._num_lbfgs_iterations = self._num_lbfgs_iterations, int(rounds["num_iterations"][0])
+        self._spent += (self._num_lbfgs_iterations - before) / GROUP_ITERATIONS
         if ended == REASON_SWITCH and rounds["is_unsuited"]:
-            self._predicting = PredictedTensionNewton(self._method, step, self._origin())
+            self._predicting = PredictedTensionNewton(self._method, self._step, self._origin())
             self._gains |= {"lbfgs": 0.0, "predicted tensions": np.inf}
             rounds["is_unsuited"], rounds["initial_residual"] = 0, np.inf
         elif ended == REASON_SWITCH:
             gain = float(rounds["gain"][0])
             self._gains["lbfgs"] = max(gain, 0.0)
-            self._is_trial_due = gain >= rival_gain
-        elif ended == REASON_STALLED or residual <= floor:
+            self._is_trial_due = gain >= self._rival_gain
+        elif ended == REASON_STALLED or residual <= self._floor:
             self._gains["lbfgs"], self._is_trial_due = 0.0, True
-        return point
 
     def _take_newton_step(self) -> DescentPoint:
         """Return the point after a step of the exact method; without a factor the first attempt is none."""

@@ -23,6 +23,7 @@ from springbench.solvers.kernels.accelerated_descent import (
 from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
 from springbench.solvers.kernels.iteration_loop import build_compiled_loop
 from springbench.solvers.kernels.local_global_iteration import IterationPlan
+from springbench.solvers.kernels.objective_kernels import predict_positions
 from springbench.solvers.kernels.spring_local_step import SpringPackets, squared_norm
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights, value_and_descent
 from springbench.solvers.kernels.step_setup import VertexRows, read_positions, write_positions, write_right_hand_side
@@ -55,28 +56,65 @@ class AcceleratedStep(NamedTuple):
     objective_values: NDArray[np.float64]
 
 
+START_AT_GUESS, START_LOWER, START_LOWER_MEASURED = range(3)
+"""Where a solve starts: at the guess, or at the lower one of the guess and the inertial prediction; the last one also
+measures the residual at the guess."""
+
+
 @jit_kernel
-def start_solve(step: AcceleratedStep, window: AccelerationWindow, target, force, pin_targets, guess):
-    """Start the solve of a step and return the residual [J^(1/2)] at the guess.
+def start_solve(
+    step: AcceleratedStep, window: AccelerationWindow, target, force, pin_targets, guess, external_force, start, out
+):
+    """Start the solve of a step.
 
     Args:
         step: data of the system; its vectors and objective values are overwritten.
-        window: state of the solve, initialised at the guess.
+        window: state of the solve, initialised at the start.
         target: inertial target (n, 3) [m].
         force: external force and constant force of the forms (n, 3) [N].
         pin_targets: target positions of the pins (q, 3) [m].
         guess: initial guess (n, 3) [m].
+        external_force: force of the inertial prediction (n, 3) [N].
+        start: START_AT_GUESS, START_LOWER or START_LOWER_MEASURED.
+        out: output (n, 3) [m], the positions at the start; unchanged by START_AT_GUESS.
+
+    Returns:
+        The residual [J^(1/2)] at the guess, NaN unless it is measured or the solve starts there, and at the start.
     """
-    write_right_hand_side(step.vertex_rows, target, force, pin_targets, step.right_hand_side)
-    write_positions(step.vertex_rows, guess, pin_targets, window.trial_position)
+    rows, size = step.vertex_rows, len(window.direction)
+    write_right_hand_side(rows, target, force, pin_targets, step.right_hand_side)
+    write_positions(rows, guess, pin_targets, window.trial_position)
     step.objective_values[0] = _evaluate_trial(step, window)
-    size = step.objective_weights.energy_scale
-    for k in range(len(window.direction)):
-        size += step.iteration_plan.anchor_stiffness[k // 4] * window.trial_position[k] ** 2
-    step.objective_values[1] = size
+    at_guess, is_lower = np.nan, False
+    if start == START_LOWER_MEASURED:
+        at_guess = _start_window(step, window)
+    if start != START_AT_GUESS:
+        for k in range(size):
+            window.position[k], window.descent[k] = window.trial_position[k], window.trial_descent[k]
+        predict_positions(rows.inertia_diagonal, target, external_force, rows.pinned_vertices, pin_targets, out)
+        write_positions(rows, out, pin_targets, window.trial_position)
+        there = _evaluate_trial(step, window)
+        is_lower = there < step.objective_values[0]
+        if is_lower:
+            step.objective_values[0] = there
+        else:
+            for k in range(size):
+                window.trial_position[k], window.trial_descent[k] = window.position[k], window.descent[k]
+            read_positions(rows, window.trial_position, out)
+    total = step.objective_weights.energy_scale
+    for k in range(size):
+        total += step.iteration_plan.anchor_stiffness[k // 4] * window.trial_position[k] ** 2
+    step.objective_values[1] = total
+    at_start = _start_window(step, window) if is_lower or start != START_LOWER_MEASURED else at_guess
+    window.window_state[0].objective_decrease = 0.0
+    return (at_guess if is_lower else at_start), at_start
+
+
+@jit_inner
+def _start_window(step, window):
+    """Start the window at the trial point and return the residual [J^(1/2)] there."""
     _solve_rows(step.iteration_plan, window.trial_descent, len(window.direction), step.solution_rows)
     init_window(window, step.solution_rows)
-    window.window_state[0].objective_decrease = 0.0
     return _residual((step, window))
 
 

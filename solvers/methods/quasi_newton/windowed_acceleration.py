@@ -106,7 +106,7 @@ def prepare_without_barriers(
         return PreparedAccelerated(
             base, _build_interpreted_engine(scheme, FixedObjective(system).ignore_barriers(), base)
         )
-    engine = _CompiledEngine(scheme, found)
+    engine = CompiledEngine(scheme, found)
     if without_vertex_contact(system) is system:
         return PreparedAccelerated(found.base, engine)
     objective = FixedObjective(system).ignore_barriers()
@@ -179,12 +179,30 @@ class PreparedAccelerated(IterativeSolver):
         """
         return self.acceleration_engine.init_state(problem, initial_guess)
 
+    @property
+    def can_start_lower(self) -> bool:
+        """Whether `init_lower_state` is available: all iterations are compiled."""
+        return isinstance(self.acceleration_engine, CompiledEngine)
+
+    def init_lower_state(
+        self, problem: StepProblem, initial_guess: Positions, *, measures_guess: bool
+    ) -> CompiledAccelerationState:
+        """Start a solve at the lower one of an initial guess and the inertial prediction.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+            measures_guess: whether the residual at the guess is needed.
+        """
+        assert isinstance(self.acceleration_engine, CompiledEngine)
+        return self.acceleration_engine.init_lower_state(problem, initial_guess, measures_guess=measures_guess)
+
     def residual_scale(self, problem: StepProblem) -> float:
         """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
         return compute_max_coordinate(problem) * self.local_global.unpinned_trace**0.5
 
 
-class _CompiledEngine:
+class CompiledEngine:
     """Compiled iteration for springs and similar energies, with a factor that is split into blocks."""
 
     def __init__(self, scheme: AccelerationScheme, compiled: PreparedCompiledLocalGlobal) -> None:
@@ -221,10 +239,32 @@ class _CompiledEngine:
         ), window
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> AcceleratedState:
-        """Start a solve from an initial guess (n, 3) [m]."""
-        state = self._free_states.pop() if self._free_states else self._allocate_state()
-        kernels = self._solve_kernels
-        return _CompiledAccelerationState(self._free_states, state, kernels, self._spring_form, problem, initial_guess)
+        """Start a solve from an initial guess.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+        """
+        return self._init_state(problem, initial_guess, accelerated_step.START_AT_GUESS)
+
+    def init_lower_state(
+        self, problem: StepProblem, initial_guess: Positions, *, measures_guess: bool
+    ) -> CompiledAccelerationState:
+        """Start a solve at the lower one of an initial guess and the inertial prediction.
+
+        Args:
+            problem: step whose objective is minimised.
+            initial_guess: positions (n, 3) [m], not modified.
+            measures_guess: whether the residual at the guess is needed.
+        """
+        start = accelerated_step.START_LOWER_MEASURED if measures_guess else accelerated_step.START_LOWER
+        return self._init_state(problem, initial_guess, start)
+
+    def _init_state(self, problem: StepProblem, guess: Positions, start: int) -> CompiledAccelerationState:
+        memory = self._free_states.pop() if self._free_states else self._allocate_state()
+        return CompiledAccelerationState(
+            self._free_states, memory, self._solve_kernels, self._spring_form, problem, guess, start
+        )
 
 
 _AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow]
@@ -240,8 +280,12 @@ class _SolveKernels(NamedTuple):
     read_positions: TypedKernel
 
 
-class _CompiledAccelerationState(AcceleratedState):
-    """State of a compiled solve; `free_states` receives its work arrays when it is deleted."""
+class CompiledAccelerationState(AcceleratedState):
+    """State of a compiled solve; `free_states` receives its work arrays when it is deleted.
+
+    Attributes:
+        guess_residual: residual at the initial guess [J^(1/2)], NaN if it is not measured.
+    """
 
     def __init__(
         self,
@@ -251,26 +295,49 @@ class _CompiledAccelerationState(AcceleratedState):
         parts: SpringForm,
         problem: StepProblem,
         guess: Positions,
+        start: int,
     ) -> None:
+        """Start a solve.
+
+        Args:
+            free_states: list that receives the work arrays.
+            state: work arrays.
+            solve_kernels: kernels of a solve.
+            parts: decomposition of the system's energies.
+            problem: step whose objective is minimised.
+            guess: initial guess (n, 3) [m].
+            start: where the solve starts, see `accelerated_step.start_solve`.
+        """
         self._free_states, self._memory, self._solve_kernels = free_states, state, solve_kernels
         step, window = state
         if parts.has_edges:
             step = step._replace(spring_packets=parts.update_edges(step.spring_packets, problem))
         self._state = step, window
-        given = problem.inertial_target, parts.compute_force(problem), problem.pin_targets, guess
-        if parts.form_builders:
-            step.objective_values[2] = parts.negative_energy(guess)
+        target, external, pins, at = map(
+            as_kernel_array, (problem.inertial_target, problem.external_force, problem.pin_targets, guess)
+        )
+        force = parts.compute_force(problem) if parts.form_builders else external
         self.positions = np.empty(guess.shape)
-        self.start_residual = solve_kernels.start_solve.call(step, window, *map(as_kernel_array, given))
-        if parts.has_edges:
-            step.objective_values[1] += parts.edge_energy_scale(guess)
+        self.guess_residual, self.start_residual = solve_kernels.start_solve.call(
+            step, window, target, force, pins, at, external, start, self.positions
+        )
+        if parts.form_builders or parts.has_edges:
+            p = guess if start == accelerated_step.START_AT_GUESS else self.positions
+            step.objective_values[2] = parts.negative_energy(p)
+            if parts.has_edges:
+                step.objective_values[1] += parts.edge_energy_scale(p)
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
         """Run iterations within the limits; return their number, the residual and the reason of the end."""
         return self._solve_kernels.run_solve.call(*self._state, limits, self.positions)
 
     def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
-        """Run rounds of iterations within the limits, compiled."""
+        """Run rounds of iterations within the limits, compiled.
+
+        Args:
+            rounds: state of the rounds (1,), updated.
+            limits: limits, in rounds.
+        """
         return self._solve_kernels.run_solve_rounds.call(*self._state, rounds, limits, self.positions)
 
     def step_state(self) -> bool:
