@@ -8,6 +8,10 @@ D_k is the decrease of the objective in the k-th group of rounds, and r_k the re
 rounds reach the limit of the residual within the cost of one Newton step. Costs are counted in groups, from the numbers
 of entries and operations, and not measured by a clock: equal solves then make equal decisions. Once a Newton step has
 been measured, its decrease per cost replaces the prediction.
+
+A round ends with a check, which costs c iterations. Rounds of s iterations cost c/s per iteration, and the last one
+makes s/2 iterations superfluous. With n iterations, n c/s + s/2 is minimal for s = sqrt(2 c n). Rounds have twice that
+length: this costs a quarter more than the minimum, and halves the number of rounds, which limits of iterations count.
 """
 
 from __future__ import annotations
@@ -50,22 +54,17 @@ ROUND_STATE_DTYPE = np.dtype(
         ("rival_gain", np.float64),  # decrease of the other methods per cost of a group [J]; 0: not measured
         ("trial_iteration", np.float64),  # iterations from which on a prediction counts
         ("newton_cost", np.float64),  # cost of a Newton step in groups
+        ("check_cost", np.float64),  # cost of the end of a round in iterations
     ]
 )
 """The state of the rounds of a solve."""
 
 
 @register_jitable(**jit_inner_options)
-def round_size(num_iterations):
-    """Return the number of iterations of the next round.
-
-    An easy step needs few iterations, of which the last round makes at most a third superfluous.
-    """
-    if num_iterations < 4:
-        return 2
-    if num_iterations < GROUP_ITERATIONS:
-        return 3
-    return 5 if num_iterations < 5 * GROUP_ITERATIONS else GROUP_ITERATIONS
+def round_size(now):
+    """Return the number of iterations of the next round, which ends at the next decision at the latest."""
+    left = (PROBE_ITERATIONS if now.num_iterations < PROBE_ITERATIONS else now.group_end) - now.num_iterations
+    return max(1, min(left, int(0.5 + 2.0 * np.sqrt(2.0 * now.check_cost * now.num_iterations))))
 
 
 @register_jitable(**jit_inner_options)
@@ -109,7 +108,7 @@ def build_rounds(
         if now.initial_residual < 0.0:
             now.initial_residual = now.group_residual = residual(state)
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
-            size = round_size(now.num_iterations)
+            size = round_size(now)
             done = run_unchecked(state, size)
             now.num_iterations += size
             count += 1
@@ -141,12 +140,18 @@ def build_compiled_rounds(
     return jit_closure(build_rounds(build_unchecked_steps(step_state), residual, decrease))
 
 
-def init_rounds(newton_cost: float) -> Any:
-    """Return the state of rounds at their start, (1,); the cost of a Newton step is in groups."""
-    return np.frombuffer(bytearray(_initial_content(newton_cost)), ROUND_STATE_DTYPE)  # NumPy copies field by field
+def init_rounds(newton_cost: float, check_cost: float) -> Any:
+    """Return the state of rounds at their start, (1,).
+
+    Args:
+        newton_cost: cost of a Newton step, in groups.
+        check_cost: cost of the end of a round, in iterations.
+    """
+    content = _initial_content(newton_cost, check_cost)  # NumPy copies field by field
+    return np.frombuffer(bytearray(content), ROUND_STATE_DTYPE)
 
 
 @cache
-def _initial_content(newton_cost: float) -> bytes:
-    initial = 0, GROUP_ITERATIONS, 0, -1.0, 0.0, 0.0, np.inf, 0.0, 0.0, newton_cost
+def _initial_content(newton_cost: float, check_cost: float) -> bytes:
+    initial = 0, GROUP_ITERATIONS, 0, -1.0, 0.0, 0.0, np.inf, 0.0, 0.0, newton_cost, check_cost
     return np.array([initial], ROUND_STATE_DTYPE).tobytes()

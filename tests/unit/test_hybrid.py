@@ -14,6 +14,7 @@ from springbench.harness.reference.exact_lengths import StationarityEvaluator
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric
+from springbench.solvers.kernels import descent_rounds
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.methods.newton import hybrid_newton
@@ -145,6 +146,24 @@ def test_a_solve_without_iterations_stays_at_the_guess():
     found = prepared.solve(given, StopRule(0))
     np.testing.assert_array_equal(found.positions, given.initial_guess)
     assert found.residual == pytest.approx(prepared.residual_at(given, given.initial_guess), rel=1e-9)
+
+
+@pytest.mark.parametrize("check_cost", [0.0, 0.1, 0.5, 20.0])
+def test_a_round_costs_a_quarter_more_than_the_least_and_ends_at_decisions(check_cost):
+    """n c/s + s/2 for the checks of n iterations, and for those that the last round makes in vain."""
+    (rounds,) = descent_rounds.init_rounds(1.0, check_cost).view(np.recarray)
+    ends = {0}
+    while rounds.num_iterations < 200:
+        size, n = descent_rounds.round_size(rounds), int(rounds.num_iterations)
+        most, left = 1.25 * (2.0 * check_cost * n) ** 0.5, (4 if n < 4 else rounds.group_end) - n
+        assert 1 <= size <= left
+        assert size in (1, left) or n * check_cost / (size - 1) + (size - 1) / 2.0 <= most
+        assert size == left or n * check_cost / (size + 1) + (size + 1) / 2.0 > most
+        rounds.num_iterations += size
+        ends.add(int(rounds.num_iterations))
+        if rounds.num_iterations == rounds.group_end:
+            rounds.group_end += descent_rounds.GROUP_ITERATIONS
+    assert {4, *range(10, 201, 10)} <= ends
 
 
 @pytest.mark.parametrize("guess", ["fall", "rest"])
