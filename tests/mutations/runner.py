@@ -12,7 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -28,6 +28,7 @@ TEST_SECONDS, SUITE_SECONDS = 900.0, 3600.0
 """Wall-clock limits [s] of an error's own tests and of the whole suite. A time-out decides nothing: a busy machine is
 slow too."""
 PYTEST = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "not long")
+"""Command of a file of tests or of the suite; a test that is named itself is run even if it is long."""
 TEST_FOLDERS = ("architecture", "unit", "oracles", "contracts", "stability", "bench")
 """All tests, the short ones first: the suite ends with the first that the error makes fail."""
 IGNORED_TESTS = "--ignore=tests/unit/test_mutations.py"
@@ -163,12 +164,18 @@ class SourceCopy:
         return process.returncode, output
 
 
+def select_named(tests: Sequence[str]) -> tuple[str, ...]:
+    """Return the options that select long tests too, if all are named themselves."""
+    return ("-m", "") if all("::" in test for test in tests) else ()
+
+
 def _run_tests(
-    copy: SourceCopy, mutation: Mutation, tests: Iterable[str], limit: float, max_failures: int = 1
+    copy: SourceCopy, mutation: Mutation, tests: Sequence[str], limit: float, max_failures: int = 1
 ) -> tuple[int, list[str]]:
     """Run tests with an error planted; returns the exit code and the tests that failed, or the last line of output."""
     with copy.plant_mutation(mutation):
-        code, output = copy.run_command(mutation, [*PYTEST, f"--maxfail={max_failures}", *tests], limit)
+        command = [*PYTEST, *select_named(tests), f"--maxfail={max_failures}", *tests]
+        code, output = copy.run_command(mutation, command, limit)
     lines = output.splitlines()
     failures = [line.removeprefix("FAILED ").split(" - ")[0] for line in lines if line.startswith("FAILED ")]
     return code, failures or lines[-1:] or [""]
@@ -177,7 +184,7 @@ def _run_tests(
 def _fails_by_error(copy: SourceCopy, mutation: Mutation, test: str) -> bool:
     """Whether a test fails with the error once more, and passes without it: otherwise it failed by chance."""
     with_error, _ = _run_tests(copy, mutation, [test], TEST_SECONDS)
-    without, _ = copy.run_command(mutation, [*PYTEST, test], TEST_SECONDS)
+    without, _ = copy.run_command(mutation, [*PYTEST, *select_named([test]), test], TEST_SECONDS)
     return with_error == 1 and without == 0
 
 

@@ -48,8 +48,8 @@ _TABLE = (
     (
         "filters-first",
         "harness/simulation/time_loop.py",
-        "filtered(v), scene.velocity_filters, motion",
-        "filtered(v), scene.velocity_filters[:1], motion",
+        "in scene.velocity_filters:",
+        "in scene.velocity_filters[:1]:",
         _STEPS,
     ),
     (
