@@ -2,8 +2,8 @@
 
     pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.3 --find-long 4     on an idle machine, all kernels compiled
 
-writes `slow.txt` anew and adds to `long.txt`. A line names a test, with or without its parameters, or a whole file. It
-names a file where its tests share an expensive fixture, for the next of them would set it up.
+rewrites `slow.txt` and adds to `long.txt`. A line names a test, with or without its parameters, or a whole file. It
+names a file where its tests share an expensive fixture, because the next of them would set it up.
 """
 
 from __future__ import annotations

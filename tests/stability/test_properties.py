@@ -65,6 +65,8 @@ def test_iterates_are_finite_and_descend(name: str, case: Case):
     iterates = ALL[name].prepare(problem.system).iterates(problem)
     found = [problem.initial_guess, *(p.copy() for p in islice(iterates, 8))]
     assert np.isfinite(found).all()
+    if not ALL[name].is_monotone:
+        return
     floor = rounding_scale(problem)
     slack = VALUE * max(map(problem.value_scale, found)) + 0.5 * (POSITION_ROUNDOFF * floor) ** 2
     assert all(problem.value(q) <= problem.value(p) + slack for p, q in pairwise(found))
