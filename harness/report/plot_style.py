@@ -190,14 +190,14 @@ def contrasting_text_colour(color: str) -> str:
 
     Contrast and relative luminance are those of WCAG 2.1.
     """
+    dark, light, behind = (_relative_luminance(one) + 0.05 for one in (TEXT_COLOUR, "#ffffff", color))
+    return TEXT_COLOUR if behind / dark > light / behind else "#ffffff"
+
+
+def _relative_luminance(color: str) -> float:
     channels = (int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))
     linear = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels)
-    luminance = sum(weight * c for weight, c in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
-    return TEXT_COLOUR if luminance > _EVEN_CONTRAST_LUMINANCE else "#ffffff"
-
-
-_EVEN_CONTRAST_LUMINANCE = 0.2195
-"""Luminance on which white and TEXT_COLOUR have the same contrast: sqrt(1.05 (L + 0.05)) - 0.05, L that of the text."""
+    return sum(weight * c for weight, c in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
 
 
 def shade_colour(color: str, amount: float) -> str:

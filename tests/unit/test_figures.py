@@ -70,7 +70,7 @@ def test_the_sheet_of_all_figures_looks_as_it_did(figures: dict[str, Figure], tm
     now = tile_figures(list(figures.values()), (2460, 1080))
     now.save(tmp_path / "figures.png")
     then = Image.open(EXPECTED_SHEET)
-    hint = f"look at {tmp_path / 'figures.png'} beside {EXPECTED_SHEET}, and where it is better, put it there"
+    hint = f"compare {tmp_path / 'figures.png'} with {EXPECTED_SHEET}; if it is better, replace the latter"
     assert now.size == then.size, hint
     assert least_similarity(now, then) > MIN_SIMILARITY, hint
 

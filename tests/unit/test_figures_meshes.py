@@ -60,7 +60,7 @@ def test_the_sheet_of_meshes_looks_as_it_did(tmp_path: Path) -> None:
     folder = made.write_recorded_runs(tmp_path / "results")
     now = tile_figures([compose_mesh_kind(kind, folder, 85.0)[0] for kind in MESH_FIGURE_KINDS], (1020, 360))
     now.save(tmp_path / "meshes.png")
-    hint = f"look at {tmp_path / 'meshes.png'} beside {EXPECTED_SHEET}, and where it is better, put it there"
+    hint = f"compare {tmp_path / 'meshes.png'} with {EXPECTED_SHEET}; if it is better, replace the latter"
     assert coarse(now, Image.open(EXPECTED_SHEET)) > MIN_SIMILARITY, hint
     turned = Image.fromarray(np.asarray(now)[:, ::-1])
     assert coarse(now, turned) < 0.5
