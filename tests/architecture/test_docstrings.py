@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import pytest
 from springbench.harness.cli.main import app
+from springbench.harness.cli.reference_pages.markdown_text import read_section_entries
 
 from tests.architecture.test_vocabulary import ROOT, parse_sources
 
 SECTIONS = ("Args", "Attributes", "Returns", "Yields", "Raises", "Example")
-_ENTRY = re.compile(r"(\*{0,2}\w+(?:(?:, | and )\*{0,2}\w+)*):(?: |$)")
 
 
 class DocumentedFunction(NamedTuple):
@@ -46,20 +46,9 @@ def list_parameters(arguments: ast.arguments) -> list[str]:
     return [one.arg for one in (*named, *others) if one.arg not in ("self", "cls")]
 
 
-def read_section(docstring: str, title: str) -> list[str] | None:
-    """Return the lines of a section without its indentation, None if there is no such section."""
-    found = re.search(rf"^{title}:\n((?:(?:    .*)?\n?)*)", docstring, re.MULTILINE)
-    return found and re.sub(r"^    ", "", found[1].rstrip(), flags=re.MULTILINE).split("\n")
-
-
-def list_entries(lines: list[str]) -> list[str]:
+def read_names(docstring: str, section: str) -> list[str]:
     """List the names that the entries of a section describe; an entry without a name is listed as it is."""
-    names: list[str] = []
-    for line in lines:
-        if line and not line.startswith(" "):
-            entry = _ENTRY.match(line)
-            names += [name.lstrip("*") for name in re.split(", | and ", entry[1])] if entry else [line]
-    return names
+    return [name.lstrip("*") for name in read_section_entries(docstring, section)]
 
 
 @pytest.fixture(scope="module")
@@ -73,12 +62,12 @@ def test_public_functions_with_several_parameters_describe_them(functions: list[
     commands = {getattr(command.callback, "__name__", "") for command in app.registered_commands}
     several = [one for one in functions if one.is_public and len(one.parameters) > 1 and one.name not in commands]
     assert len(several) > 1000
-    assert not [one[:2] for one in several if read_section(one.docstring, "Args") is None]
+    assert not [one[:2] for one in several if not read_names(one.docstring, "Args")]
 
 
 def test_the_described_arguments_are_the_parameters(functions: list[DocumentedFunction]) -> None:
-    described = ((one, read_section(one.docstring, "Args")) for one in functions)
-    named = ((one, list_entries(lines)) for one, lines in described if lines is not None)
+    described = (one for one in functions if re.search("^Args:", one.docstring, re.MULTILINE))
+    named = ((one, read_names(one.docstring, "Args")) for one in described)
     assert not [(*one[:2], names) for one, names in named if sorted(names) != sorted(one.parameters)]
 
 
@@ -102,10 +91,10 @@ def test_described_attributes_are_defined() -> None:
         node.name: node for one in parse_sources() for node in ast.walk(one.tree) if isinstance(node, ast.ClassDef)
     }
     for name, node in classes.items():
-        lines = read_section(ast.get_docstring(node) or "", "Attributes")
+        described = read_names(ast.get_docstring(node) or "", "Attributes")
         bases = [node, *(classes[base.id] for base in node.bases if isinstance(base, ast.Name) and base.id in classes)]
         names = {found for base in bases for found in list_attributes(base)}
-        missing += [f"{name}.{entry}" for entry in list_entries(lines or []) if entry not in names]
+        missing += [f"{name}.{entry}" for entry in described if entry not in names]
     assert not missing
 
 

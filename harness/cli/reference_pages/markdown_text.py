@@ -49,13 +49,19 @@ def format_docstring(docstring: str | None, *, with_arguments: bool = True) -> s
     return "\n\n".join(parts)
 
 
-def read_argument_texts(docstring: str | None) -> dict[str, str]:
-    """Read the texts of the section `Args` of a docstring, by name."""
+def read_section_entries(docstring: str | None, section: str) -> dict[str, str]:
+    """Read the texts of the entries of a section by name; an entry of several names gives each the same text.
+
+    Args:
+        docstring: text of the docstring.
+        section: title, such as `Args` or `Attributes`.
+    """
     return {
         name: text
         for title, body in _split_sections(docstring)
-        if title == "Args"
-        for name, text in _read_entries(body).items()
+        if title == section
+        for names, text in _read_entries(body).items()
+        for name in re.split(", | and ", names)
     }
 
 

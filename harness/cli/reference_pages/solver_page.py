@@ -8,7 +8,7 @@ from json import dumps
 from typing import Any
 
 from springbench.harness.cli.reference_pages.config_pages import SchemaWriter, format_default
-from springbench.harness.cli.reference_pages.markdown_text import format_docstring, format_table, read_argument_texts
+from springbench.harness.cli.reference_pages.markdown_text import format_docstring, format_table, read_section_entries
 from springbench.harness.config.json_schema import build_json_schema
 from springbench.harness.report.citations import format_citation
 from springbench.solvers.model.integrators import INTEGRATORS, SUBSTEPPING
@@ -65,7 +65,7 @@ def _describe_parameters(solvers: Mapping[str, Any]) -> list[str]:
     definitions = build_json_schema()["$defs"]
     writer = SchemaWriter(definitions, {}, "solvers.md")
     for name, solver in solvers.items():
-        texts = read_argument_texts(solver.__doc__)
+        texts = read_section_entries(solver.__doc__, "Args")
         rows = [
             (f"`{key}`", writer.format_type(one), format_default(one, False), texts.get(key, ""))
             for key, one in definitions[name]["properties"].items()
