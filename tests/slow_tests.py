@@ -3,7 +3,8 @@
     pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.3 --find-long 4     on an idle machine, all kernels compiled
 
 rewrites `slow.txt` and adds to `long.txt`. A line names a test, with or without its parameters, or a whole file. It
-names a file where its tests share an expensive fixture, because the next of them would set it up.
+names a file where its tests share an expensive fixture, because the next of them would set it up. `compiling.txt` names
+files of slow tests that are quick once their kernels, of rare methods and effects, are compiled: nothing rewrites it.
 """
 
 from __future__ import annotations
@@ -14,30 +15,16 @@ from pathlib import Path
 import pytest
 
 TESTS_FOLDER = Path(__file__).parent
-SLOW_LIST, LONG_LIST = (TESTS_FOLDER / name for name in ("slow.txt", "long.txt"))
+SLOW_LIST, LONG_LIST, COMPILING_LIST = (TESTS_FOLDER / f"{name}.txt" for name in ("slow", "long", "compiling"))
 
 COMPILING_NAME_PARTS = (
     *("float16", "float32", "eigen", "cholmod"),  # kernels of their own, and programs in C++
     "cuda/",  # in a simulator, which is Python
     *("newton, absolute", "newton, trust-region", "newton, progressive"),  # what `newton, clamp` does, but for a rule
-    *(
-        "bench/test_exact.py",
-        "unit/test_speed.py",
-        "oracles/test_planted_errors.py",
-        "oracles/test_obstacle_surfaces.py",
-    ),
-    *(
-        "unit/test_vbd_elements.py",
-        "refuse_by_name[vbd-",
-        "test_a_balloon_of_a_thousand",
-        "test_gas_is_minimised_where_its_sparse",
-        *("effects-dashpots-1e6-vbd", "effects-dashpots-1e12-vbd"),
-        *("effects-strain-limits-1e13-vbd", "effects-strain-limits-1e18-vbd", "effects-strain-limits-rigid-vbd"),
-    ),  # a kernel for each set of effects
-    *("test_a_factor_in_single_precision", "test_compiled.py::test_no_iter", "test_compiled.py::test_all_vertices_may"),
-    *("stability/test_hard_solutions.py", "stability/test_properties", "contracts/test_backends_agree.py"),
+    *("test_a_balloon_of_a_thousand", "test_gas_is_minimised_where_its_sparse", "test_a_factor_in_single_precision"),
+    "stability/test_properties",
 )
-"""Parts of names of slow tests that are quick once their kernels are compiled, which takes seconds."""
+"""Parts of names of slow tests in other files that are quick once their kernels are compiled."""
 
 
 def read_names(path: Path) -> frozenset[str]:
@@ -47,7 +34,7 @@ def read_names(path: Path) -> frozenset[str]:
 
 def mark_slow_tests(items: list[pytest.Item]) -> None:
     """Mark tests `long` or `slow` by the lists; what is marked `long` in its file remains so."""
-    slow, long = read_names(SLOW_LIST), read_names(LONG_LIST)
+    slow, long = read_names(SLOW_LIST) | read_names(COMPILING_LIST), read_names(LONG_LIST)
     find_compiling = re.compile("|".join(map(re.escape, COMPILING_NAME_PARTS))).search
     for item in items:
         if item.get_closest_marker("long"):
@@ -77,8 +64,9 @@ class SlowTestFinder:
     def pytest_sessionfinish(self) -> None:
         long = {name for name, seconds in self._tests.items() if seconds > self._long_limit}
         slow = {name for name, seconds in self._tests.items() if seconds > self._slow_limit}
-        alone = {name for name in slow if name.partition("::")[0] not in self._files}
-        write_names(SLOW_LIST, self._files | alone - long)
+        compiling = read_names(COMPILING_LIST)
+        alone = {name for name in slow if name.partition("::")[0] not in self._files | compiling}
+        write_names(SLOW_LIST, (self._files - compiling) | (alone - long))
         write_names(LONG_LIST, read_names(LONG_LIST) | long)
 
 

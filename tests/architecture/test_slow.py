@@ -8,8 +8,10 @@ import pytest
 
 from tests import slow_tests
 
+LISTS = slow_tests.SLOW_LIST, slow_tests.LONG_LIST, slow_tests.COMPILING_LIST
 
-@pytest.mark.parametrize("names", [slow_tests.SLOW_LIST, slow_tests.LONG_LIST], ids=lambda path: path.stem)
+
+@pytest.mark.parametrize("names", LISTS, ids=lambda path: path.stem)
 def test_each_line_names_a_file_or_a_test_in_it(names: Path) -> None:
     for line in slow_tests.read_names(names):
         path, _, name = line.partition("::")

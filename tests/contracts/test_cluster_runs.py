@@ -151,7 +151,7 @@ SOLVE = 0.03
 """Seconds that a solve takes at least: six of them make a run, so that all last through several kills."""
 
 RECORD_PROCESS = (
-    "import os, time; [open({told!r}, 'a').write(f'{{os.getpid()}} {{stop.iterations}}\\n')]; "
+    "import os, time; [open({log!r}, 'a').write(f'{{os.getpid()}} {{stop.iterations}}\\n')]; "
     f"until = time.perf_counter() + {SOLVE}; any(time.perf_counter() > until for _ in iter(int, 1))"
 )
 """A solver that shows which process does which run: each has its own number of iterations."""
@@ -166,7 +166,7 @@ def all_but_times(table: pa.Table) -> list[str]:
 def test_workers_that_are_killed_lose_nothing_and_repeat_the_runs_at_hand_alone(tmp_path: Path):
     log_path = tmp_path / "told"
     (tmp_path / "counted.py").write_text(
-        SOLVER_SOURCE.replace("pass  # while solving", RECORD_PROCESS.format(told=str(log_path)))
+        SOLVER_SOURCE.replace("pass  # while solving", RECORD_PROCESS.format(log=str(log_path)))
     )
     (tmp_path / "scene.yaml").write_text(SCENE_SOURCE)
     sweep = tmp_path / "sweep.yaml"

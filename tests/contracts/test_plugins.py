@@ -87,7 +87,7 @@ WHEEL = {
 NAMES = {"mesh": "Cord", "effect": "Hum", "solver": "Mine", "integrator": "EULER", "report": "tell"}
 ENTRY_POINTS = {"mesh": "cord", "effect": "hum", "solver": "mine", "integrator": "euler", "report": "tell"}
 NAMING_FORMS = {
-    "beside": {part: f"./mine.py:{name}" for part, name in NAMES.items()},
+    "adjacent": {part: f"./mine.py:{name}" for part, name in NAMES.items()},
     "below": {part: f"./own/mine.py:{name}" for part, name in NAMES.items()},
     "module": {part: f"somebodys:{name}" for part, name in NAMES.items()},
     "entry-point": ENTRY_POINTS,
@@ -147,7 +147,7 @@ def plugin_folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("way", mark_rare_cases(NAMING_FORMS, ["beside", "entry-point"]))
+@pytest.mark.parametrize("way", mark_rare_cases(NAMING_FORMS, ["adjacent", "entry-point"]))
 def test_a_sweep_runs_user_code_and_names_its_origin(way: str, plugin_folder: Path, installed_packages: Path):
     (plugin_folder / "installed").symlink_to(installed_packages)
     for mark in [*plugin_folder.rglob("*.was-run"), *installed_packages.rglob("*.was-run")]:
@@ -168,7 +168,7 @@ def test_a_sweep_runs_user_code_and_names_its_origin(way: str, plugin_folder: Pa
     own = {name: (module, version) for name, module, version in json.loads(row["plugins"])}
     assert set(own) == {name for part, name in NAMING_FORMS[way].items() if part != "report"}
     for module, version in own.values():
-        if way in ("beside", "below"):
+        if way in ("adjacent", "below"):
             assert module == NAMING_FORMS[way]["solver"].partition(":")[0]
             assert len(version) == 12
         else:
@@ -203,14 +203,14 @@ def test_a_fresh_environment_takes_both_packages_and_sweeps_with_them(tmp_path: 
 
 
 def test_a_changed_file_is_another_run(plugin_folder: Path):
-    sweep = configs(plugin_folder, NAMING_FORMS["beside"])
+    sweep = configs(plugin_folder, NAMING_FORMS["adjacent"])
     springbench(plugin_folder, "run", "sweep.yaml")
     (plugin_folder / "mine.py").write_text(CODE.replace("patience: int = 3", "patience: int = 4"))
     assert "missing" in springbench(plugin_folder, "list", sweep.name)
 
 
 def test_a_run_has_one_name_and_one_code_with_and_without_imported_plugins(plugin_folder: Path):
-    sweep = configs(plugin_folder, NAMING_FORMS["beside"])
+    sweep = configs(plugin_folder, NAMING_FORMS["adjacent"])
     closed, opened = (load_config(sweep, imports_code=opens).list_runs()[0] for opens in (False, True))
     assert closed.build_identity() == opened.build_identity()
     assert compute_source_fingerprint(collect_source_parts(closed)) == compute_source_fingerprint(
@@ -221,7 +221,7 @@ def test_a_run_has_one_name_and_one_code_with_and_without_imported_plugins(plugi
 
 
 def test_two_of_one_solver_are_distinguished_by_what_only_one_of_them_states(plugin_folder: Path):
-    sweep = configs(plugin_folder, NAMING_FORMS["beside"])
+    sweep = configs(plugin_folder, NAMING_FORMS["adjacent"])
     sweep.write_text(sweep.read_text().replace("patience: 5}", "patience: 5}, './mine.py:Mine'"))
     (group,) = group_by_scene(
         [PictureJob(run, plugin_folder, plugin_folder) for run in load_config(sweep).list_runs()], plugin_folder
@@ -232,7 +232,7 @@ def test_two_of_one_solver_are_distinguished_by_what_only_one_of_them_states(plu
 def test_a_file_next_to_the_config_travels_between_processes(plugin_folder: Path):
     import pickle
 
-    run = load_config(configs(plugin_folder, NAMING_FORMS["beside"])).list_runs()[0]
+    run = load_config(configs(plugin_folder, NAMING_FORMS["adjacent"])).list_runs()[0]
     (plugin_folder / "run.pickle").write_bytes(pickle.dumps(run))
     program = "import pickle; run = pickle.load(open('run.pickle', 'rb')); "
     program += "print(run.scene.load_plugins().effects[1], run.build_identity())"
@@ -254,7 +254,7 @@ RAISES = {
 def test_a_method_that_raises_is_named_with_its_line(method: str, plugin_folder: Path):
     (plugin_folder / "mine.py").write_text(CODE.replace(*RAISES[method]))
     with pytest.raises(InputError, match=rf"scene\.yaml:.*`{method}` raised KeyError: 3 \(mine\.py:\d+\)"):
-        load_config(configs(plugin_folder, NAMING_FORMS["beside"]))
+        load_config(configs(plugin_folder, NAMING_FORMS["adjacent"]))
 
 
 WEIGHTED_SOLVER = """
@@ -273,7 +273,7 @@ class Weighted(SparseLocalGlobal):
 @pytest.mark.slow
 def test_a_file_with_a_blank_in_its_name_and_a_field_that_is_an_array_are_verified(plugin_folder: Path):
     (plugin_folder / "my solver.py").write_text(WEIGHTED_SOLVER)
-    sweep = configs(plugin_folder, NAMING_FORMS["beside"] | {"solver": "./my solver.py:Weighted"})
+    sweep = configs(plugin_folder, NAMING_FORMS["adjacent"] | {"solver": "./my solver.py:Weighted"})
     sweep.write_text(sweep.read_text().replace(", patience: 5", "").replace("rounds: 1", "rounds: 1, verify: true"))
     springbench(plugin_folder, "run", "sweep.yaml")
     rows = [row for path in (plugin_folder / "results").rglob("*.parquet") for row in pq.read_table(path).to_pylist()]
@@ -319,7 +319,7 @@ WRONG = {
 
 @pytest.mark.parametrize(("part", "name"), WRONG)
 def test_the_target_of_a_name_is_checked_when_it_is_run(part: str, name: str, plugin_folder: Path):
-    sweep = configs(plugin_folder, NAMING_FORMS["beside"] | {part: name})
+    sweep = configs(plugin_folder, NAMING_FORMS["adjacent"] | {part: name})
     assert load_config(sweep, imports_code=False).list_runs()
     with pytest.raises(InputError) as caught:
         load_config(sweep)
@@ -327,7 +327,7 @@ def test_the_target_of_a_name_is_checked_when_it_is_run(part: str, name: str, pl
 
 
 def test_wrong_parameters_of_own_code_are_reported_with_their_line(plugin_folder: Path):
-    sweep = configs(plugin_folder, NAMING_FORMS["beside"])
+    sweep = configs(plugin_folder, NAMING_FORMS["adjacent"])
     sweep.write_text(sweep.read_text().replace("patience: 5", "patience: soon"))
     with pytest.raises(InputError, match=r"sweep\.yaml:2: solvers\[0\]\.patience: got \"soon\"; should be"):
         load_config(sweep)
