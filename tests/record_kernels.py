@@ -1,8 +1,8 @@
-"""Record which kernels the solvers of the quick start call, for the processes that compile them together.
+"""Record which kernels the solvers of the first runs call, for the processes that compile them together.
 
     python -m tests.record_kernels
 
-Each run is a process of its own, on a small mesh.
+Each solver runs in a process of its own, on two small meshes: some methods treat the smallest differently.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from tempfile import TemporaryDirectory
 
 from springbench.harness.experiments.kernel_precompilation import SIGNATURES_PATH
 
-SOLVERS = ("dense", "sparse", "numba")
+SOLVERS = ("dense", "sparse", "numba", "hybrid")
+"""Those of the quick start, and the one that runs a scene for which no solver is named."""
+
+SIZES = (8, 24)
 SCENE = Path(__file__).resolve().parents[1] / "configs" / "scenes" / "hanging-cloth.yaml"
 
 _RECORD_RUN = """
@@ -41,7 +44,12 @@ def record_kernels(solver: str) -> dict[str, int]:
     """
     with TemporaryDirectory() as folder:
         path, sweep = Path(folder) / "kernels.json", Path(folder) / "sweep.yaml"
-        keys = {"scenes": [str(SCENE)], "sizes": [8], "solvers": [solver], "options": {"frames": 10, "pictures": False}}
+        keys = {
+            "scenes": [str(SCENE)],
+            "sizes": SIZES,
+            "solvers": [solver],
+            "options": {"frames": 10, "pictures": False},
+        }
         sweep.write_text(json.dumps(keys))
         arguments = ["run", str(sweep), "--in-process", "--results", folder]
         subprocess.run([sys.executable, "-c", _RECORD_RUN, str(path), *arguments], check=True, capture_output=True)
