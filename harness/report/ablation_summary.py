@@ -80,7 +80,7 @@ def describe_effect(row: ResultRow, rows: Sequence[ResultRow]) -> str:
     """Describe the cost and the influence of one effect in a sentence.
 
     Args:
-        row: row of the effect, of kind `without`.
+        row: row of the effect, of kind `ablated`.
         rows: all rows of the ablation.
     """
     if row["status"] == "unsolvable":

@@ -109,7 +109,7 @@ class ConvergenceCurve:
         status, reason: values of the rows.
         is_preempted: whether other processes interrupted a round.
         recording_path: relative to the folder of the results, or "".
-        source_fingerprint: code that the curve was measured by.
+        source_fingerprint: fingerprint of the code that measured the curve.
     """
 
     problem: SnapshotProblem
@@ -139,15 +139,15 @@ class ConvergenceCurve:
 class WorkPoint:
     """One simulation up to `t_end` [s], with its error and its cost.
 
-    Times are wall seconds per simulated second; nan if the simulation failed.
+    Times are wall seconds per simulated second unless stated otherwise; nan if the simulation failed.
 
     Attributes:
         family, citation, is_minimiser, is_substepping: metadata of the solver.
-        cpu_seconds_per_simulated_second: CPU time of the best round.
+        cpu_seconds_per_simulated_second: smallest CPU time of a round, per simulated second.
         round_seconds: wall time of each round [s].
         is_preempted: whether other processes interrupted a round.
         stiffness: k/m [1/s^2] of the median spring and the mean free vertex.
-        source_fingerprint: code that the simulation was measured by.
+        source_fingerprint: fingerprint of the code that measured the simulation.
     """
 
     scene: str
@@ -195,7 +195,7 @@ def format_stop_rule(residual_rtol: float | None, max_iterations: int) -> str:
     """Format the stop rule of a step's iterations.
 
     Args:
-        residual_rtol: relative tolerance of the residual; 0 where it follows from the scene, None for none.
+        residual_rtol: relative tolerance of the residual; 0 if it is derived from the scene, None for no tolerance.
         max_iterations: number of iterations, which is stated only where there is no tolerance.
     """
     if residual_rtol is None:
@@ -232,7 +232,7 @@ def describe_stale_results(
 ) -> list[str]:
     """Describe which results were measured by other code, in at most one sentence.
 
-    For charts that have no marks of their own for stale results.
+    It is for charts that do not mark stale results at their points.
 
     Args:
         measured: curves or simulations.
@@ -256,13 +256,13 @@ def describe_self_converged(works: Iterable[WorkPoint]) -> list[str]:
 
 
 LONG_CURVE_ITERATIONS = 500
-"""Iterations from which on a curve of the reproduction gets a picture of its own: Figure 2 of the paper has 1000."""
+"""Minimum iterations of a curve of the reproduction that is drawn separately; figure 2 of the paper has 1000."""
 
 
 def without_short_curves(table: AccuracyData) -> AccuracyData:
     """Return the data without the short curves of the reproduction.
 
-    From these many curves only means for the paper's Figure 3 are taken.
+    Only the means of these curves are used, for figure 3 of the paper.
     """
     long = {
         c.problem.problem_digest

@@ -222,7 +222,7 @@ def _describe_scaling(table: AccuracyData) -> Iterator[str]:
 def _describe_liu2013(table: AccuracyData) -> Iterator[str]:
     """Yield a Markdown table with one row per curve of both figures.
 
-    Cells show own error / the paper's error, bold where they differ strongly.
+    Cells show own error / the paper's error = ratio; the ratio is bold beyond MAX_ERROR_RATIO.
     """
     by_curve: dict[str, dict[int, PaperComparison]] = {}
     for found in compare_with_paper(table):

@@ -62,7 +62,7 @@ def read_accuracy(
     table = read_rows(units, pa.schema([]), required_columns=("kind",), promote="permissive", on_invalid=on_invalid)
     for row in table.to_pylist():
         kinds[row["kind"]].append(missing | row)
-    for rows in kinds.values():  # files come by their names, 122 before 22
+    for rows in kinds.values():  # files are sorted by name, size 122 before size 22
         rows.sort(key=lambda row: (row["scene"], row["size"]))
     label = _build_row_labeller(kinds["curve"] + kinds["work"])
     problems = _build_snapshots(kinds, folder.name)
@@ -225,7 +225,7 @@ def _build_row_labeller(rows: Sequence[_ResultRow]) -> _RowLabeller:
         stated[row["solver"]] |= settings(row).keys()
     for row in rows:
         own = settings(row)
-        for key in stated[row["solver"]]:  # some state what others leave out, for they have it as usual
+        for key in stated[row["solver"]]:  # a parameter that a row does not state has its default value
             values[row["solver"], key].add(str(own.get(key)))
 
     def label(row: _ResultRow) -> str:

@@ -23,7 +23,7 @@ OWN_PROGRAM = "springbench"
 ERROR_TARGETS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
 """Relative errors of the positions at the end time."""
 MAX_MEANINGFUL_ERROR = 1.0
-"""Relative errors from here on do not represent a motion: nothing moved, or it exploded."""
+"""Relative errors of this value or more do not represent a motion: nothing moved, or it exploded."""
 
 
 class EngineComparison(NamedTuple):
@@ -62,7 +62,8 @@ def meshes_with_engines(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]
 def pareto_fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
     """Return the Pareto front of each program's settings in time and error.
 
-    The cheapest setting is first, and so are the own methods.
+    The front of the own methods is the first one. In each front, the cheapest setting is the first one. Settings with
+    errors of MAX_MEANINGFUL_ERROR or more are omitted.
     """
     by_program: dict[str, list[WorkPoint]] = {OWN_PROGRAM: []}
     for work in works:
@@ -133,7 +134,7 @@ def describe_best_settings(works: Iterable[WorkPoint]) -> Iterator[str]:
 
 
 def _find_unsupported(works: Iterable[WorkPoint]) -> set[str]:
-    """Find the programs that do not support the mesh's spring network, or are not installed."""
+    """Find the programs all of whose runs are unsupported, because of the spring network or the installation."""
     by_program: dict[str, set[str]] = {}
     for work in works:
         by_program.setdefault(program_name(work), set()).add(work.status)

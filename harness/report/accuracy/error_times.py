@@ -1,8 +1,9 @@
-"""Times of methods to errors, by round: what `springbench reproduce` compares between machines as ratios.
+"""Times of methods to errors, by round.
 
-Of a frozen step it is the time until the energy gap is at most the error, as in
-`springbench.harness.report.accuracy.time_to_accuracy`. Of simulations it is the time of the fastest setting of a solver
-whose error is at most the one that is requested, as in `springbench.harness.report.accuracy.engine_comparison`.
+`springbench reproduce` compares ratios of these times between machines. For a step snapshot, it is the time until the
+energy gap is at most the error (`springbench.harness.report.accuracy.time_to_accuracy`). For simulations, it is the
+time of the fastest setting of a solver whose error is at most the requested one
+(`springbench.harness.report.accuracy.engine_comparison`).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from springbench.harness.results.time_ratios import MethodTimes
 
 
 def list_curve_times(data: AccuracyData) -> list[MethodTimes]:
-    """List the times to each of `GAP_TARGETS` of the solvers of each frozen step."""
+    """List the times of the solvers to each of `GAP_TARGETS`, for each step snapshot."""
     found: list[MethodTimes] = []
     for curve in data.curves:
         step = curve.problem
@@ -39,10 +40,10 @@ def list_curve_times(data: AccuracyData) -> list[MethodTimes]:
 def list_simulation_times(
     published: AccuracyData, repeated: AccuracyData
 ) -> tuple[list[MethodTimes], list[MethodTimes]]:
-    """List the times to each of `ERROR_TARGETS` of the solvers of each simulation.
+    """List the times of the solvers to each of `ERROR_TARGETS`, for each simulation.
 
-    Both sides choose among the settings that both have. The published error of a setting decides what it reaches:
-    whether errors agree is compared separately.
+    Only settings that both studies measured are compared. The published error of a setting determines which targets it
+    reaches in both; whether the errors agree is compared separately.
 
     Args:
         published: data of the published study.

@@ -74,7 +74,7 @@ def curtain_stiffness(problem: SnapshotProblem) -> float:
 
 
 def compare_with_paper(table: AccuracyData) -> list[PaperComparison]:
-    """Return all points of the paper that the rows have a counterpart of."""
+    """Return all points of the paper for which the rows have a counterpart."""
     found: list[PaperComparison] = []
     for curve in select_long_curves(table)[:1]:
         for iterations, (theirs, _) in LIU2013_FIGURE_2.items():

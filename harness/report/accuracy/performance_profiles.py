@@ -84,7 +84,7 @@ def count_partial_coverage(table: AccuracyData) -> dict[str, int]:
 def baseline_solver(table: AccuracyData) -> str:
     """Return the backend of the plain local-global iteration that data profiles use as the unit.
 
-    Of the backends measured on most problems it is the last in alphabetical order; "" if none was measured.
+    Of the backends measured on the most problems, it is the last one in alphabetical order; "" if none was measured.
     """
     tried = Counter(curve.solver for curve in table.curves if curve.family == LOCAL_GLOBAL_FAMILY)
     return max(tried, key=lambda name: (tried[name], name), default="")
@@ -113,7 +113,7 @@ def cumulative_share(values: FloatArray, at: FloatArray) -> FloatArray:
 def solvable_races(table: AccuracyData, target: float) -> list[list[ConvergenceCurve]]:
     """Return the races for which an accuracy is meaningful.
 
-    In these, some solver reaches the accuracy, but no initial guess does.
+    In these, the minimum is certified, and some solver reaches the accuracy, but no initial guess does.
 
     Args:
         table: data of an accuracy measurement.

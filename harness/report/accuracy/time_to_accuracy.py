@@ -23,7 +23,7 @@ AMORTISATION_STEPS = (1, 10, 100, 1000)
 FATAL_STATUSES = ("unsupported", "diverged", "failed")
 """Statuses of curves that reach nothing; with others, such as time-limit, earlier results count."""
 
-_HALF_DECADES = tuple(10.0 ** (-k / 2) for k in range(1, 19))  # half decades, in which solvers overtake each other
+_HALF_DECADES = tuple(10.0 ** (-k / 2) for k in range(1, 19))  # gaps at which crossings are detected
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from springbench.harness.report.plot_style import SeriesStyle, indexed_style
 from springbench.solvers.model.integrators import INTEGRATORS
 
 FRAME_SECONDS = 1.0 / 30.0
-"""Seconds."""
+"""Length of a frame [s]."""
 ERROR_TARGETS = tuple(10.0**-k for k in range(1, 9))
 """Relative errors of the positions at the end time."""
 NO_WINNER = "none that was tried"

@@ -78,7 +78,7 @@ def is_same_method(work: WorkPoint, base: WorkPoint | None) -> bool:
 
     Args:
         work: simulation.
-        base: simulation with the default setting; None, where there is none, equals nothing.
+        base: simulation with the default setting; None equals no simulation.
     """
     return base is not None and (work.label, work.integrator, work.residual_rtol, work.max_iterations) == (
         base.label,
