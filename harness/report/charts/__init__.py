@@ -1,1 +1,1 @@
-"""Charts as plain data: one builder for each kind, which figures, sheets and the results page draw."""
+"""Charts as plain data, which figures, sheets and the results page draw."""

@@ -1,4 +1,4 @@
-"""Charts of ablations: cost and influence of each effect, and its overhead per iteration for every solver."""
+"""Charts of ablations: cost and influence of each effect, and its overhead per iteration."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ _ALL_EFFECTS = "all"
 def build_effect_chart(
     ablations: Mapping[str, Sequence[ResultRow]], newest_fingerprint: str | None = None
 ) -> ChartDescription:
-    """Build the chart of the cost of each effect and the displacement without it, with a frame for each ablation.
+    """Build the chart of the cost of each effect and the displacement without it.
+
+    It has a frame for each ablation.
 
     Args:
         ablations: rows of each ablation, by the name of its file.
@@ -129,7 +131,9 @@ def _build_effect_series(number: int, row: ResultRow, whole: ResultRow, *, is_st
 
 
 def build_overhead_chart(rows: Sequence[ResultRow], newest_fingerprint: str | None = None) -> ChartDescription:
-    """Build the chart of overheads per iteration: a map of all solvers, and a frame for each solver.
+    """Build the chart of overheads per iteration.
+
+    It has a map of all solvers for each scene and size, and a frame for each solver.
 
     Args:
         rows: rows of ablations.

@@ -1,7 +1,7 @@
 """Charts of `springbench accuracy`: convergence, time to accuracy, work-precision, profiles and scaling.
 
-A measurement is stale if other code made it: other than the current version, or than that of the newest rows if
-`newest_fingerprint` names it, as on the results page.
+A measurement is stale if it was made by other code than the current version. If `newest_fingerprint` is given, as on
+the results page, it is stale if it was made by other code than the newest rows.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ COST_LABEL = "wall time a simulated second"
 ERROR_LABEL = "error of the positions, relative to the distance from the start"
 
 _MIN_ERROR = 1e-16
-"""Smaller errors are drawn here: double precision resolves none below."""
+"""Smaller errors are drawn at this value, because double precision does not resolve them."""
 _MAX_DRAWN_ERROR = 1e3
-"""Relative errors from here on belong to motions that exploded; they would compress all others."""
+"""Relative errors of this value or more belong to motions that exploded; they would compress all others."""
 
 SourceLinks = Callable[[ConvergenceCurve], Mapping[str, Any]]
 """Returns what the page offers for the points of a curve."""
@@ -64,7 +64,9 @@ SourceLinks = Callable[[ConvergenceCurve], Mapping[str, Any]]
 def build_convergence_chart(
     table: AccuracyData, newest_fingerprint: str | None = None, link_source: SourceLinks = lambda curve: {}
 ) -> ChartDescription:
-    """Build the chart of errors against time and iterations, with a frame for each step and initial guess.
+    """Build the chart of errors against time and iterations.
+
+    It has a frame for each step and initial guess.
 
     Args:
         table: data of an accuracy measurement.
@@ -255,7 +257,9 @@ def _build_time_series(
 
 
 def build_work_precision_chart(table: AccuracyData, newest_fingerprint: str | None = None) -> ChartDescription:
-    """Build the chart of error against wall time of whole simulations, with a frame for each integrator.
+    """Build the chart of error against wall time of whole simulations.
+
+    It has a frame for each mesh and integrator.
 
     Args:
         table: data of an accuracy measurement.
@@ -329,7 +333,7 @@ def _build_step_size_series(
     tolerances: Sequence[float],
     newest_fingerprint: str | None,
 ) -> Iterator[ChartSeries]:
-    """Yield a series for each group of simulations that differ in the time step alone, or in the substeps alone."""
+    """Yield a series for each group of simulations that differ only in time step or substeps."""
     default, divided = find_default_setting(works), _find_substep_labels(works)
     chains: dict[tuple[Any, ...], list[WorkPoint]] = {}
     for one in works:
@@ -357,7 +361,7 @@ def _build_step_size_series(
 
 
 def _label_work(work: WorkPoint) -> str:
-    """Return the label of a simulation; a dagger marks methods that do not minimise the step's objective."""
+    """Return the label of a simulation; a dagger marks methods that do not minimise."""
     return work.label if work.is_minimiser else f"{work.label} †"
 
 
@@ -502,7 +506,7 @@ def is_by_other_code(one: ConvergenceCurve | WorkPoint, newest_fingerprint: str 
 def describe_hollow_marks(
     measured: Iterable[ConvergenceCurve | WorkPoint], newest_fingerprint: str | None
 ) -> list[str]:
-    """State what hollow marks mean; the page does that by itself.
+    """Explain hollow marks in a note; the results page has its own explanation.
 
     Args:
         measured: curves or simulations of a chart.

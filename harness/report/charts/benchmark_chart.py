@@ -31,7 +31,7 @@ _CHANGE_MARKER_SCALE = 1.6
 
 
 def build_benchmark_chart(name: str, histories: Sequence[BenchmarkHistory]) -> ChartDescription:
-    """Build the chart with a name, with a frame for each history of its kind.
+    """Build one of the two charts, with a frame for each history of its kind.
 
     Args:
         name: RATIO_CHART or TIME_CHART.

@@ -1,7 +1,7 @@
-"""The description of a chart: named columns of numbers, and the axes that they may be drawn along.
+"""The description of a chart: named columns of numbers, and the possible axes.
 
-A builder makes one description of its rows, of curves or of cell maps. Matplotlib draws its panels (`select_panels`) as
-figures and sheets; the results page draws its JSON (`springbench.harness.report.site.chart_json`), curves by Plotly.
+A builder makes one from rows; it contains curves or cell maps. Matplotlib draws its panels (`select_panels`) as figures
+and sheets. The results page draws its JSON (`springbench.harness.report.site.chart_json`), with Plotly for curves.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from springbench.harness.report.charts.figure_panels import (
 from springbench.harness.report.plot_style import SeriesStyle
 
 LOW_SUFFIX, HIGH_SUFFIX = "_low", "_high"
-"""Ends of the names of the columns with the interval of a column."""
+"""Suffixes of the names of the columns that contain the interval of a column."""
 
 
 class ChartAxis(NamedTuple):
@@ -146,7 +146,7 @@ def select_panels(chart: ChartDescription) -> Iterator[FigurePanel]:
 def select_curve_plots(
     chart: ChartDescription, frames: Sequence[ChartFrame] | None = None, y: Sequence[ChartAxis] | None = None
 ) -> Iterator[CurvePlot]:
-    """Yield a plot for each frame and each pair of quantities that some series of it has.
+    """Yield a plot for each frame and each pair of quantities in its series.
 
     Args:
         chart: the chart.
@@ -175,8 +175,9 @@ def _build_plot(
         across.scale._replace(label=frame.x_label or across.scale.label, place_names=names[0]),
         up.scale._replace(place_names=names[1]),
     )
+    # A single size makes no curve: its values are drawn along x, with a row for each label.
     if across.scale.division == "sizes" and len({float(x) for one in series for x in one.x}) == 1:
-        least = {label: float(curve.y[0]) for label, curve in curves}  # of one's own, which are last
+        least = {label: float(curve.y[0]) for label, curve in curves}  # published curves precede own ones
         labels = sorted(least, key=lambda label: least[label])
         scales = up.scale, AxisScale("", "names", place_names=tuple(labels))
         series = [_lay_down(one, k) for k, row in enumerate(labels) for label, one in curves if label == row]

@@ -1,4 +1,4 @@
-"""The charts of an accuracy measurement by name, as sheets, figures and the results page have them."""
+"""The charts of an accuracy measurement by name, for sheets, figures and the results page."""
 
 from __future__ import annotations
 
@@ -44,10 +44,12 @@ def build_accuracy_chart(
     newest_fingerprint: str | None = None,
     link_source: SourceLinks = lambda curve: {},
 ) -> ChartDescription:
-    """Build the chart with a name of CHART_NAMES; it has no frames if the rows have nothing of the kind.
+    """Build a chart of an accuracy measurement.
+
+    It has no frames and no maps if the rows contain nothing of its kind.
 
     Args:
-        name: name of the chart.
+        name: name of the chart, one of CHART_NAMES.
         everything: data of an accuracy measurement.
         newest_fingerprint: see `springbench.harness.report.charts.accuracy_charts`.
         link_source: returns the links of a curve.

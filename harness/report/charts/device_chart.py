@@ -1,6 +1,6 @@
-"""Chart of device speedups: step times of both sides against vertices, with a frame for each scene and residual.
+"""Chart of device speedups: step times of device and processor against vertices.
 
-Each side is represented by its fastest run to a residual.
+There is a frame for each scene and residual. Each side is represented by its fastest run to the residual.
 """
 
 from __future__ import annotations

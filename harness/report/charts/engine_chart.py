@@ -1,4 +1,4 @@
-"""Chart of external engines: the Pareto front of each program over all its settings, with a frame for each mesh."""
+"""Chart of external engines: the Pareto front of each program over all its settings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from springbench.harness.report.plot_style import SeriesStyle
 
 
 def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = None) -> ChartDescription:
-    """Build the chart; it has no frames if no engine was measured.
+    """Build the chart, with a frame for each mesh with runs of engines and own methods.
 
     Args:
         table: data of an accuracy measurement.

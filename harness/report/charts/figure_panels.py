@@ -213,10 +213,10 @@ class CellMap:
 
 
 def merge_cell_maps(maps: Sequence[CellMap]) -> list[CellMap]:
-    """Merge maps with the same columns into one, whose row names include the titles.
+    """Merge adjacent maps with the same columns into one, whose row names include the titles.
 
     Args:
-        maps: maps, in order.
+        maps: maps, in their order.
     """
     merged: list[CellMap] = []
     for _, same in groupby(maps, key=lambda one: one.column_names):

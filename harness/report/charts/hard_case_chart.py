@@ -1,4 +1,7 @@
-"""Chart of verified runs: each solver's share of correct runs, and a map of solvers x cases for each family."""
+"""Chart of verified runs: shares of correct runs by solver, and maps of solvers x cases.
+
+There is a map for each family of cases.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +68,7 @@ def build_hard_case_chart(
 
 
 def _build_share_series(scores: Sequence[SolverScore], stale_solvers: Collection[str]) -> Iterator[ChartSeries]:
-    """Yield for each solver the share of correct runs, and a mark at the share that stayed finite."""
+    """Yield, for each solver, the shares of correct and of finite runs."""
     styles = assign_solver_styles(score.worst_run.solver_name for score in scores)
     for place, score in enumerate(scores):
         style = styles[score.worst_run.solver_name]

@@ -1,4 +1,4 @@
-"""Chart of the reproduction of Liu et al. 2013: own errors and those of figures 2 and 3."""
+"""Chart of the reproduction of Liu et al. 2013: own and published errors."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def _build_pair(table: AccuracyData, mine: list[PaperComparison]) -> list[ChartS
 
 
 def _build_other_series(table: AccuracyData) -> list[ChartSeries]:
-    """Build the series of the paper's Newton's method and of our other solvers on the step of figure 2."""
+    """Build the series of the paper's Newton method and of other own solvers, for figure 2."""
     (reference, *_) = select_long_curves(table)
     seconds, errors = zip(*LIU2013_FIGURE_2_NEWTON, strict=True)
     series = [

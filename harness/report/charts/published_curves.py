@@ -1,7 +1,7 @@
 """Published curves behind one's own, in grey.
 
-They are drawn where the published set has the same solver, with its parameters, on the same scene and size. For
-convergence the step is the same too.
+A published curve is drawn if its solver, parameters, scene and size are those of an own curve. For convergence the step
+must be the same too.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def read_published_data(own: AccuracyData, published: Path = PUBLISHED_FOLDER) -
 
 @cache
 def _list_meshes(path: Path, modified_at: int) -> frozenset[tuple[str, int]]:
-    """List the scenes and sizes of a table, which are read once for each state of the file."""
+    """List the scenes and sizes of a table; `modified_at` makes the cache follow the file."""
     import duckdb
 
     meshes = duckdb.execute("SELECT DISTINCT scene, size FROM read_parquet(?)", [str(path)]).fetchall()
@@ -70,11 +70,14 @@ def _read_study(folder: Path, modified_at: int) -> AccuracyData:
 def read_published_runs(
     own: Sequence[RunTimes], published: Path = PUBLISHED_FOLDER
 ) -> list[tuple[list[RunTimes], str]]:
-    """Read the published runs on the scenes and sizes of one's own, with their provenance in words, by study.
+    """Read the published runs on the scenes and sizes of one's own.
 
     Args:
         own: runs of one's own sweep.
         published: folder of the published set; outside a checkout nothing is found.
+
+    Returns:
+        For each study, its runs and their provenance in words.
     """
     if not any(published.glob(f"*/{STUDY_FILE}")):
         return []

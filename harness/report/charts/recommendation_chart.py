@@ -113,7 +113,10 @@ def _build_series(
 
 
 def _describe_ranking(ranked: Sequence[CandidatePoint], *, is_cheapest: bool) -> list[str]:
-    """Describe the recommended candidate and the runners-up, with their times relative to it if it is the cheapest."""
+    """Describe the recommended candidate and the runners-up.
+
+    With `is_cheapest`, times of the runners-up relative to it are included.
+    """
     sentences: list[str] = []
     for k, point in enumerate(ranked):
         cost = point.seconds_per_simulated_second

@@ -20,11 +20,13 @@ _ERROR_COLOURS = (
 )
 _UNKNOWN = CellOutcome("no error", "#ececea")
 _REASON_LETTERS = 16
-"""Number of letters of a line of a reason."""
+"""Maximum number of characters in a line of a reason."""
 
 
 def build_setting_chart(study: ConvergenceStudy, title: str, facts: Sequence[str]) -> ChartDescription:
-    """Build the map of a study's errors, in which the given settings and the cheapest ones are marked.
+    """Build the map of a study's errors.
+
+    The given settings, and the cheapest one within each error, are marked.
 
     Args:
         study: settings with their errors.
@@ -48,7 +50,7 @@ def build_setting_chart(study: ConvergenceStudy, title: str, facts: Sequence[str
 
 
 def _list_marks(study: ConvergenceStudy) -> dict[StepSetting, list[str]]:
-    """Return the words at settings: those that were given, and the cheapest one of each error."""
+    """Return the marks of the given settings, and of the cheapest one within each error."""
     marks: dict[StepSetting, list[str]] = {setting: ["given"] for setting in study.given_settings}
     for level in sorted({*ERROR_LEVELS, study.error_requested}):
         if best := study.find_cheapest(level):

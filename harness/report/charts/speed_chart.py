@@ -1,4 +1,4 @@
-"""Chart of a speed report: times of phases, bandwidth, share of the binding limit and speedup, by size."""
+"""Chart of a speed report: times, bandwidth, share of the binding limit and speedup by size."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def build_speed_chart(
 
     Args:
         candidates: figures of all candidates.
-        newest_fingerprint: what other code measured is stale: other than the current version, or than this one.
+        newest_fingerprint: code that measurements are compared with to find stale ones; None for the current version.
         citations: citation of the method of each solver.
     """
     timed = sorted((one for one in candidates if one.status == "ok"), key=lambda one: one.vertices)

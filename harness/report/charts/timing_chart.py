@@ -35,7 +35,7 @@ _HOVER = (
     *(("num_iterations", "iterations"), ("residual", "last residual, J^½"), ("max_strain", "largest strain")),
 )
 _MAX_FAILURE_NOTES, _REASON_LETTERS = 4, 90
-"""Maximum number of sentences on failures in a frame, and of the letters of a reason."""
+"""Maximum number of sentences on failures in a frame, and of characters of a reason."""
 
 
 def build_timing_chart(
@@ -117,7 +117,7 @@ def build_run_accuracy_chart(
     citations: Mapping[str, str | None] | None = None,
     machine_words: str = "",
 ) -> ChartDescription:
-    """Build the chart of the time of a step against the last residual, with a frame for each scene.
+    """Build the chart of step time against last residual, with a frame for each scene.
 
     Args:
         timed_runs: runs of a sweep.
@@ -189,7 +189,7 @@ def _to_seconds(milliseconds: Iterable[float | None]) -> list[float | None]:
 
 
 def _describe_powers(timed: Sequence[RunTimes], names: Mapping[str, str]) -> list[str]:
-    """State the powers of the number of vertices that fit the times of a step; empty for too few sizes."""
+    """Describe the fitted powers of the number of vertices; empty for too few sizes."""
     times: dict[str, dict[int, float]] = {}
     for run in timed:
         if run.vertices and run.step:

@@ -1,4 +1,4 @@
-"""Chart of the cheapest family of methods for an error: a map of stiffness number and error for each mesh size."""
+"""Chart of the cheapest family of methods by stiffness number and error."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ _NO_WINNER_COLOUR = "#e9e7e2"
 
 
 def build_winner_chart(table: AccuracyData, newest_fingerprint: str | None = None) -> ChartDescription:
-    """Build the chart, with a map for each number of vertices; it has none if only one family was measured.
+    """Build the chart, with a map for each number of vertices.
+
+    It has no map if only one family was measured.
 
     Args:
         table: data of an accuracy measurement.
