@@ -2,7 +2,7 @@
 # Matplotlib's stubs do not type most keywords.
 """Axes of figures for print: limits, tick positions and tick labels.
 
-Tick labels do not overlap, and numbers contain no small type.
+Tick labels do not overlap. Exponents are superscript characters instead of math text, which has a smaller font size.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def set_axis_scales(ax: Axes, panel: CurvePlot, panels: Sequence[CurvePlot]) -> 
 
 def bar_base(scale: AxisScale) -> float:
     """Return where bars along an axis begin."""
-    return 1.0 if scale.division == "log" else 0.0  # a ratio of 1, from which both directions are equally long
+    return 1.0 if scale.division == "log" else 0.0  # from a ratio of 1, so that r and 1 / r are equally long
 
 
 def _data_extent(panel: CurvePlot) -> tuple[FloatArray, FloatArray]:
@@ -88,7 +88,7 @@ def _data_extent(panel: CurvePlot) -> tuple[FloatArray, FloatArray]:
 def _set_log_axis(axis: Axis, scale: AxisScale, values: FloatArray) -> None:
     values = values[values > 0.0]
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.1, 10.0)
-    if high < 8.0 * low:  # at least most of a decade, so that noise looks like noise
+    if high < 8.0 * low:  # at least a factor of 8, so that noise does not fill the frame
         low, high = (np.sqrt(low * high / 8.0), np.sqrt(low * high * 8.0))
     room = (high / low) ** _AXIS_MARGIN
     _set_limits(axis, "log", low / room, high * room)
@@ -116,6 +116,7 @@ def _set_linear_axis(axis: Axis, scale: AxisScale, values: FloatArray) -> None:
 
 def _set_iteration_axis(axis: Axis, scale: AxisScale, values: FloatArray) -> None:
     last = max(float(values.max(initial=10.0)), 10.0)
+    # Logarithmic from 1 on, with a linear part that shows iteration 0.
     axis.axes.set_xscale("symlog", linthresh=1.0, linscale=0.35)
     axis.axes.set_xlim(-0.08, 1.2 * last)
     axis.set_major_locator(FixedLocator([0.0, *(10.0**k for k in range(7) if 10.0**k <= last)]))
@@ -181,7 +182,7 @@ def _label_boxes(axis: Axis) -> list[Bbox]:
 
 
 def _labels_overlap(boxes: Sequence[Bbox]) -> bool:
-    """Return whether two neighbouring labels are closer than a space."""
+    """Return whether two neighbouring labels are closer than a gap of 2 pixels."""
     gap = 2.0
     return any(_boxes_overlap(a, b, gap) for a, b in pairwise(boxes))
 

@@ -1,4 +1,7 @@
-"""Sheets of charts: all frames of what was measured on one page, as the reports of `springbench accuracy` show them."""
+"""Sheets of charts: all frames with the same sheet name on one page.
+
+The reports of `springbench accuracy` consist of them.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ _MAX_LONE_COLUMNS = 4
 def draw_chart_sheets(chart: ChartDescription, stem: Path, sources: str = "") -> list[Path]:
     """Draw the sheets of a chart as PNG and SVG, and return the files.
 
-    Its maps are on its own sheet, one below the other. Of a chart without panels an earlier sheet is deleted.
+    Its maps are on its own sheet, one below the other. If the chart has no panels, its earlier sheet is deleted.
 
     Args:
         chart: the chart.
@@ -55,7 +58,7 @@ def draw_chart_sheets(chart: ChartDescription, stem: Path, sources: str = "") ->
 
 
 def _shorten_notes(panels: Sequence[FigurePanel]) -> list[FigurePanel]:
-    """Leave at most _MAX_NOTES different notes, the last of which states how many there are more."""
+    """Reduce the notes to _MAX_NOTES; the last one then states the number of omitted ones."""
     notes = list(dict.fromkeys(note for panel in panels for note in panel.notes))
     if len(notes) <= _MAX_NOTES:
         return [*panels]
@@ -68,7 +71,8 @@ def _shorten_notes(panels: Sequence[FigurePanel]) -> list[FigurePanel]:
 def _arrange_plots(chart: ChartDescription, frames: Sequence[ChartFrame]) -> tuple[list[CurvePlot], int | None]:
     """Return the plots by rows, and the number of columns; None if it is free.
 
-    Quantities of y are in rows if x has several too, otherwise in columns. Many frames show the first one only.
+    Quantities of y are in rows if x has several too, otherwise in columns. If there are many frames, only the first
+    quantity of y is shown.
     """
     shown = [axis for axis in chart.y if axis.is_on_sheets]
     if len(shown) == 1 or len(frames) > _MAX_WHOLE_FRAMES:

@@ -21,7 +21,7 @@ from springbench.harness.report.plot_style import TEXT_COLOUR
 _MAX_LABELS, _MAX_WIDTH_SHARE = 9, 0.3
 """Maximum number of labels of a frame, and maximum share of the width for them."""
 _CALLOUT_RADIUS = 5.0
-"""Distance of a callout from its point [points]; the ring is a little smaller."""
+"""Initial distance of a callout from its point [points]; the radius of the ring is 1.05 times that."""
 _RING_DISTANCE = 1.6
 """Distance of a callout relative to that of a label without a ring."""
 _LABEL_DISTANCE = 7.0
@@ -183,9 +183,9 @@ _LABEL_OFFSETS: tuple[tuple[float, float, Any], ...] = tuple(
 
 
 def _place_label(ax: Axes, name: Annotation, offsets: Sequence[tuple[float, float, Any]]) -> None:
-    """Place a label on the first side without overlap.
+    """Place a label at the first offset where it fits, otherwise at the last one.
 
-    There it is inside the frame and overlaps no earlier label or point.
+    It fits if it is inside the frame horizontally, and overlaps no earlier label and contains no point.
     """
     before = [other for other in ax.texts[: ax.texts.index(name)] if isinstance(other, Annotation)]
     taken = [other.get_window_extent() for other in before]

@@ -45,7 +45,10 @@ _PANEL_WIDTH, _PICTURE_WIDTH = 58.0, 36.0
 _MAX_HEIGHT_RATIO = 1.5
 """Maximum total height of the rows of frames, in units of the figure's width, so that a two-column page has space."""
 _MIN_FRAME_HEIGHT = 48.0 / MILLIMETRES_PER_INCH
-"""A frame wider than 85 mm becomes flatter: its height is 0.3 of its width plus this [inches]."""
+"""Constant part of the height of a wide frame [inches].
+
+A frame of aspect 1 that is wider than 85 mm is flatter: its height is 0.3 of its width plus this.
+"""
 _FIVE_TICK_WIDTH = 55.0
 """Width from which on a colour bar has five numbers [mm], at a font size of 8 points."""
 _COLOUR_BAR_HEIGHT = 18.0
@@ -186,7 +189,7 @@ def _draw_panel(
 def wrap_words(words: str, room: float, size: float) -> list[str]:
     """Wrap text into lines that fit into a width.
 
-    A letter is about 0.6 of the font size wide.
+    A letter is assumed to be 0.58 of the font size wide.
 
     Args:
         words: text; words longer than a line are broken.

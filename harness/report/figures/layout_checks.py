@@ -21,6 +21,7 @@ def find_layout_faults(figure: Figure) -> list[str]:
     seen = visible_texts(figure)
     small = [(text.get_text(), float(text.get_fontsize())) for text in seen]
     found = [f"{words!r} is of {size:.1f} points" for words, size in small if size < MIN_FONT_SIZE]
+    # The method of Text itself: that of annotations includes their arrows.
     boxes = [(text.get_text(), Text.get_window_extent(text)) for text in seen]
     page = figure.bbox
     for words, box in boxes:

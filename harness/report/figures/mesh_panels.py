@@ -86,7 +86,7 @@ def last_frame_panels(folder: Path) -> list[PanelEntry]:
 def solver_comparison_panels(folder: Path) -> list[PanelEntry]:
     """Build entries for the last frames of all solvers of a scene and size.
 
-    They share one camera and one scale.
+    `align_pictures` gives those of a scene and size one camera and one scale.
     """
     return [one.build_entry(one.mesh_key, one.label_parts) for one in _find_recorded_runs(folder)]
 
@@ -94,7 +94,7 @@ def solver_comparison_panels(folder: Path) -> list[PanelEntry]:
 def scene_panels(folder: Path) -> list[PanelEntry]:
     """Build an entry for the last frame of each scene.
 
-    It shows the largest size, and the run with the lowest residual.
+    It shows a successful run, if there is one: of the largest size, and of those the one with the lowest residual.
     """
     best = {one.run.scene: one for one in sorted(_find_recorded_runs(folder), key=_run_rank)}
     return [one.build_entry(("scenes",), (scene,)) for scene, one in sorted(best.items())]
@@ -170,13 +170,13 @@ def _subject_words(replay: RecordingReplay) -> str:
 
 
 class _FrameRenderer(MeshRenderer):
-    """Renders one frame with one camera (`panel.MeshRenderer`)."""
+    """Renders one frame with one camera (`figure_panels.MeshRenderer`)."""
 
     def __init__(self, replay: RecordingReplay, frame: int, view: FittedCamera) -> None:
         self.replay, self.frame, self.view, self.aspect = replay, frame, view, 1.0
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
-        """Render the frame, see `panel.MeshRenderer`."""
+        """Render the frame, see `figure_panels.MeshRenderer`."""
         with OffscreenRenderer(width, max(1, round(width / self.aspect)), background=background) as studio:
             return studio.render_frame(self.replay, self.frame, self.view)
 

@@ -39,7 +39,7 @@ _LINE_WIDTH, _MARKER_SIZE, _MAX_MARKERS = 1.1, 3.6, 12
 _MARKER_SCALES: dict[Any, float] = {"*": 1.8, "P": 1.35, "X": 1.35, "p": 1.2, "h": 1.15, "d": 1.2}
 """Factors that make all markers appear equally large."""
 _MAX_LEVEL_LETTERS = 3
-"""Number of letters up to which the names of a map's columns are not rotated."""
+"""Names of a map's columns with more letters than this are rotated."""
 _DOT_INSET = 2.2
 """Distance from a cell's corner to the dot in it [points]."""
 RASTER_DPI = 300
@@ -81,7 +81,10 @@ def draw_curve_plot(ax: Axes, panel: CurvePlot, options: FigureOptions, panels: 
 
 
 def _draw_marked_values(ax: Axes, panel: CurvePlot, options: FigureOptions) -> None:
-    """Draw dashed lines at marked values, with their labels at the right and at the top; above rows of names."""
+    """Draw dashed lines at marked values, with labels at the right or at the top.
+
+    The labels of x values are above the frame if rows have names, otherwise inside it and rotated.
+    """
     line: Any = {"color": MUTED_COLOUR, "linewidth": 0.6, "linestyle": (0, (4, 2.5)), "zorder": 1}
     words: Any = {"textcoords": "offset points", "fontsize": options.small_font_size, "color": MUTED_COLOUR}
     for marked in panel.lines:
@@ -221,9 +224,9 @@ def draw_cell_map(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
 
 
 def write_cell_values(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
-    """Write the values of all cells, as large as the longest one fits.
+    """Write the values of all cells in one font size, at which the longest one fits.
 
-    None is written if that is too small to read.
+    No value is written if that size is too small to read.
 
     Args:
         ax: axes of the map, whose frame must have its final size.

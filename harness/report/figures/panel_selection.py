@@ -19,7 +19,7 @@ class PanelEntry:
     """A panel that can be drawn.
 
     Attributes:
-        group, name: as in `panel.CurvePlot`.
+        group, name: as in `figure_panels.CurvePlot`.
         build_panel: returns the panel.
     """
 

@@ -1,6 +1,6 @@
 """Templates of the scripts that reproduce figures.
 
-These are a common head, and the code for curves, cells and meshes.
+A script consists of a common header and the code for curves, cell maps or meshes.
 """
 
 SCRIPT_HEADER = '''"""Draws {name} again from {name}.csv, for you to change; needs Python with matplotlib alone."""

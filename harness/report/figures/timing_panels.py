@@ -17,7 +17,7 @@ from springbench.harness.report.timing_table import read_run_times
 from springbench.harness.results import parquet_rows, row_store
 
 StaleFinder = Callable[[pa.Table], Collection[str]]
-"""Returns the ids of those runs in a table of rows that other code than the current version measured."""
+"""Returns the ids of the runs in a table of rows that were measured by other code than the current version."""
 
 _REQUIRED_COLUMNS = ("run_id", "scene", "size", "solver", "phase", "status")
 
@@ -38,7 +38,7 @@ def read_sweep_rows(folder: Path) -> pa.Table:
 
 
 def timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
-    """Build panels of the times of a sweep, for each scene.
+    """Build the panels of a sweep's times, for each scene.
 
     Args:
         folder: folder of a sweep's results.
