@@ -24,10 +24,10 @@ from springbench.harness.report.plot_style import SeriesStyle
 ChartForm = Literal["bars", "lines", "heatmap"]
 
 _ACCENTS = ("#0072b2", "#d55e00", "#00a878", "#cc79a7", "#e69f00", "#7a5fd0")
-"""Colours of the series that a chart is about."""
+"""Colours of highlighted series."""
 _GREY = SeriesStyle("#c4c7cc", "None")
 _OTHERS = "others"
-"""Label of the series that a chart is not about."""
+"""Label of the series that are not highlighted."""
 _MAX_NAMED_PLACES = 7
 """Largest number of places of a logarithmic x axis that are all written out."""
 _SHARE_CLASSES = (
@@ -46,7 +46,7 @@ class ChartPoint(NamedTuple):
     Attributes:
         series: curve, bar, or column of a heat map.
         x: abscissa, or row of a heat map.
-        y: value; None is a gap.
+        y: value; a point without one is omitted, and is an empty cell of a heat map.
         low, high: interval of the value.
     """
 
@@ -65,7 +65,7 @@ class PageChartOptions(NamedTuple):
         x_scale, y_scale: "log" or "linear"; bars on a logarithmic axis are ratios and start at 1.
         highlights: series in colour; the others are grey. Empty: all of them.
         limit: a value that a line marks, and its meaning.
-        is_percentage: whether bars are shares.
+        is_percentage: whether values are shares, shown in percent; those of heat maps always are.
         notes: sentences below the chart.
     """
 
@@ -120,7 +120,10 @@ def _build_bars(name: str, points: Sequence[ChartPoint], options: PageChartOptio
 
 
 def _build_lines(name: str, points: Sequence[ChartPoint], options: PageChartOptions) -> CurvePlot:
-    """Build one line per series; those that the chart is not about share a label and are behind the others."""
+    """Build one line per series.
+
+    Series that are not highlighted share a label, and are drawn behind the others.
+    """
     names = list(dict.fromkeys(point.series for point in points))
     coloured = [one for one in options.highlights or names if one in names]
     series: list[CurveSeries] = []

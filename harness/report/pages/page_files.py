@@ -35,7 +35,11 @@ MAX_PIXEL_DIFFERENCE = 0.02
 
 
 def render_pages(root: Path) -> list[RenderedPage]:
-    """Render all templates of a checkout. Raises InputError for a mistake in one, or without a published set."""
+    """Render all templates of a checkout.
+
+    Raises:
+        InputError: if there are no templates or no published set, or if a template has a mistake.
+    """
     templates = find_templates(root)
     if not templates:
         raise InputError(InputMistake("contains no templates of pages; expected the root of a checkout", root))
@@ -44,7 +48,10 @@ def render_pages(root: Path) -> list[RenderedPage]:
 
 
 def write_pages(root: Path) -> list[Path]:
-    """Write all pages, and the pictures that changed; return the files that were written."""
+    """Write the pages and pictures that changed, and return the files that were written.
+
+    Pictures that no page shows are deleted.
+    """
     pages = render_pages(root)
     pictures, digests = index_pictures(pages, root), _read_digests(root)
     written: list[Path] = []
@@ -111,7 +118,7 @@ def _looks_equal(picture: PagePicture) -> bool:
 
 
 def _find_orphans(pages: list[RenderedPage]) -> list[Path]:
-    """Find files in the pages' folders of pictures that no page shows."""
+    """Find the picture files that no page shows, in the folders of the pages' pictures."""
     shown = {picture.path for page in pages for picture in page.pictures}
     folders = {picture.path.parent for page in pages for picture in page.pictures}
     return sorted(

@@ -13,7 +13,8 @@ A template is a Jinja2 file next to its page: `hard-cases.md.j2` makes `hard-cas
     figure(name, title, kind, study, alt, panels)
                        a link to a picture of a kind that `springbench figure` draws
     provenance(study)  command, machine, load, date and commit of a study, in one line; with a remark if `study.json`
-                       has the key `record`: its rows were copied, for the measured ones were not stored
+                       has the key `record`: its rows were copied, because the measured ones were not stored
+    has_study(study)   whether the published set has a study
 
 and the filters `percent`, `sig(digits)` and `count`.
 """
@@ -48,7 +49,12 @@ PICTURE_FOLDER = "pictures"
 
 @dataclass(frozen=True, slots=True)
 class PagePicture:
-    """Picture of a page: its path, the digest of all that it shows, and the function that draws it as PNG."""
+    """Picture of a page.
+
+    Attributes:
+        digest: digest of the data, texts and width of the picture.
+        draw_png: draws the picture, and returns the content of the PNG file.
+    """
 
     path: Path
     digest: str
@@ -66,7 +72,7 @@ class RenderedPage:
 
 @dataclass(slots=True)
 class _PageFields:
-    """Functions that a template calls; it collects the page's pictures."""
+    """Functions that a template calls; they collect the page's pictures."""
 
     page: Path
     queries: PublishedQueries
@@ -116,7 +122,7 @@ class _PageFields:
         date = started[-1][:10] if started else "undated"
         commits = ", ".join(commit[:9] for commit in about["commits"]) or "unknown"
         machines = [f"{one['cpu']}, {one['cores']} core{'s' * (one['cores'] != 1)}" for one in about["machines"]]
-        where = " and ".join(dict.fromkeys(machines))  # several may differ in their system alone
+        where = " and ".join(dict.fromkeys(machines))  # machines may differ only in their operating system
         requested = about.get("requested_runs")
         count = f"{about['runs']:,}" + (f" of {requested:,}" if requested else "")
         loads = [f"{load:.0f}" for load in about.get("load_average", ())]
@@ -142,7 +148,7 @@ def render_page(template: Path, queries: PublishedQueries) -> RenderedPage:
         queries: the published set.
 
     Raises:
-        InputError: a mistake in the template; the message names it and the line.
+        InputError: if the template has a mistake; the message names the template, and the line of a syntax error.
     """
     page = template.with_name(template.name.removesuffix(TEMPLATE_SUFFIX) + ".md")
     fields = _PageFields(page, queries)
@@ -181,7 +187,7 @@ def _bind_form(fields: _PageFields, form: Any) -> Callable[..., str]:
 
 
 def _build_point(row: Mapping[str, Any]) -> ChartPoint:
-    """Build a point from a row of a query; numbers of SQL, such as decimals, become float."""
+    """Build a point from a row of a query; SQL numbers, such as decimals, become float."""
     x, *numbers = (row.get(name) for name in ("x", "y", "low", "high"))
     place = x if isinstance(x, str) else float(x or 0.0)
     return ChartPoint(str(row["series"]), place, *(None if value is None else float(value) for value in numbers))

@@ -1,8 +1,8 @@
 """SQL over the published set, for templates of pages.
 
 Each study is a view: `hard` has its runs, `winners` its units of work and precision. Tables with names of their own are
-`<study>_blocks` and `<study>_rates`. Hyphens in names of studies become underscores. Views that reports compute are
-made when a query names them:
+`<study>_blocks` and `<study>_rates`. Hyphens in names of studies become underscores. Views that are computed from the
+rows are created when a query names them:
 
     <study>_outcomes   verified runs, one row each, classified by `springbench.harness.report.robustness`
     <study>_times      time and iteration of each curve to each gap of GAP_TARGETS, on steps with a certified minimum
@@ -48,7 +48,11 @@ class PublishedQueries:
             self._create_views(study)
 
     def query_records(self, sql: str) -> list[dict[str, Any]]:
-        """Return the rows of a query as dictionaries. Raises InputError if the query fails."""
+        """Return the rows of a query as dictionaries.
+
+        Raises:
+            InputError: if the query fails.
+        """
         for name, study, build in _COMPUTED_VIEW.findall(sql):
             if name not in self._computed and study in self._names:
                 self._computed.add(name)
@@ -72,7 +76,7 @@ class PublishedQueries:
 
 
 def list_outcomes(study: PublishedStudy) -> Sequence[dict[str, Any]]:
-    """List the outcomes of the verified runs of a study: case, family of cases, solver, outcome and worst error."""
+    """List the outcomes of the verified runs of a study."""
     with open_study_folder(study) as folder:
         cells = read_verified_runs(folder)
     return [
@@ -95,7 +99,10 @@ def list_outcomes(study: PublishedStudy) -> Sequence[dict[str, Any]]:
 
 
 def list_times(study: PublishedStudy) -> Sequence[dict[str, Any]]:
-    """List the times to GAP_TARGETS of all curves of a study [s]; None where a curve does not reach the gap."""
+    """List the times to GAP_TARGETS of all curves of a study [s].
+
+    The time is None if a curve does not reach the gap. Steps without a certified minimum are omitted.
+    """
     with open_study_folder(study) as folder:
         curves = read_accuracy(folder).curves
     return [
@@ -119,9 +126,9 @@ def list_times(study: PublishedStudy) -> Sequence[dict[str, Any]]:
 
 
 def list_costs(study: PublishedStudy) -> Sequence[dict[str, Any]]:
-    """List the processor seconds per simulated second of the cheapest simulation of each family for each error.
+    """List the cost of the cheapest simulation of each family, by mesh and error.
 
-    The rank of the cheapest family of a mesh and an error is 1.
+    Costs are processor seconds per simulated second. The cheapest family of a mesh and an error has rank 1.
     """
     with open_study_folder(study) as folder:
         cells = build_winner_cells(read_accuracy(folder).work_points)
@@ -144,7 +151,10 @@ def list_costs(study: PublishedStudy) -> Sequence[dict[str, Any]]:
 
 
 def list_engine_ratios(study: PublishedStudy) -> Sequence[dict[str, Any]]:
-    """List the least time of each engine over that of the own methods, where both reach the error."""
+    """List the ratios of each engine's least time to that of the own methods.
+
+    Errors that either does not reach are omitted.
+    """
     with open_study_folder(study) as folder:
         works = read_accuracy(folder).work_points
     return [
