@@ -1,6 +1,6 @@
 """Charts of an accuracy measurement for the results page.
 
-The page marks what other code than that of the newest rows measured.
+The page marks results that were measured by other code than the newest rows.
 """
 
 from __future__ import annotations

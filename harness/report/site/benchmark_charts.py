@@ -43,7 +43,7 @@ def read_benchmark_files(files: Iterable[Path], print_message: PrintMessage) -> 
 def build_benchmark_charts(stored: Sequence[StoredBenchmarks]) -> tuple[dict[str, ChartItem], list[ChartItem]]:
     """Build the charts by their ids, and the findings.
 
-    Charts are of ratios and of times; findings are the changes, the largest first.
+    The charts show ratios and times. The findings are the changes, the largest first.
     """
     found = build_histories(stored)
     made = {name: serialise_chart(build_benchmark_chart(name, found)) for name in (RATIO_CHART, TIME_CHART)}

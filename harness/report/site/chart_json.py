@@ -1,7 +1,7 @@
 """Charts for the results page: a chart description as JSON, which `static/chart.js` draws by Plotly.
 
-An item is a series with the columns of its points; it refers to its frame by number, as bands, lines and notes belong
-to frames. Axes and styles are in Plotly's terms. Cell maps are tables, which `static/map.js` shows.
+An item is a series with the columns of its points. It refers to its frame by number, because bands, lines and notes
+belong to frames. Axes and styles are in Plotly's terms. Cell maps are tables, which `static/map.js` shows.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _describe_map(cell_map: CellMap) -> dict[str, Any]:
 
 
 def _describe_axis(axis: ChartAxis, names_layout: Mapping[str, Any] = MappingProxyType({})) -> dict[str, Any]:
-    """Describe a choice of an axis; `names_layout` is added to the layout of an axis of names."""
+    """Describe an axis; `names_layout` is added to the layout of an axis of names."""
     layout = _plotly_axis(axis.scale)
     if axis.scale.division == "names":
         layout |= names_layout
@@ -69,7 +69,10 @@ def _describe_axis(axis: ChartAxis, names_layout: Mapping[str, Any] = MappingPro
 
 
 _TIME_TICKS = {"tickformat": "$~s"}
-"""Ticks of a time with SI prefixes, such as 5ms; the page's currency is the second."""
+"""Ticks of a time with SI prefixes, such as 5ms.
+
+The format `$` appends the currency, which the page defines as "s".
+"""
 
 
 def _plotly_axis(scale: AxisScale) -> dict[str, Any]:

@@ -81,7 +81,8 @@ def round_numbers(values: Iterable[Any]) -> list[float | int | None]:
 def encode_column(values: Sequence[Any]) -> Any:
     """Encode a column for the page.
 
-    Numbers stay as they are; strings become a list of distinct ones, `values`, and `indices`.
+    Numbers are rounded (`round_number`). Strings become a list of distinct ones, `values`, and `indices`; the index of
+    a missing string is -1.
     """
     if str not in set(map(type, values)):
         return round_numbers(values)

@@ -1,6 +1,6 @@
 """Per-frame data of each run, in a script per run.
 
-A script is loaded when its run is opened or compared.
+A script is loaded when its run is compared.
 """
 
 from __future__ import annotations

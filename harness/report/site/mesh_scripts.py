@@ -138,10 +138,10 @@ def _write_snapshot_solves(
 
 
 def _select_iterates(replay: RecordingReplay, reference: NDArray[np.float32]) -> dict[str, Any]:
-    """Select some of a solve's iterates, with the limits of a scale of their distances [m].
+    """Select iterates of a solve, with the limits of a scale of their distances [m].
 
-    Distances are from the reference. One in a hundred lies beyond the scale, and so does what is not finite: iterates
-    that diverge do not hide how the others converge.
+    Distances are from the reference. One distance in a hundred is beyond the scale, and so are non-finite ones. The
+    scale thus resolves the convergence even if some iterates diverge.
     """
     selected = np.unique(
         np.linspace(0, len(replay.frames) - 1, min(MAX_ITERATES, len(replay.frames))).round().astype(int)
@@ -180,7 +180,7 @@ def _is_up_to_date(target: Path, *sources: Path) -> bool:
 def _read_recording(recording: Path, frames: list[int] | None, print_message: PrintMessage) -> RecordingReplay | None:
     """Read a recording; return None, after a remark, if it is damaged."""
     from springbench.harness.recording.recording_reader import (
-        read_replay,  # brings Rerun along, which a page of what is there already needs not
+        read_replay,  # imports Rerun, which is not needed if all scripts are up to date
     )
 
     try:

@@ -60,7 +60,7 @@ def update_page(
         state = _sweep_state(folder, code, with_recordings)
         if _read_summary(home).get("fingerprint") != state:
             from springbench.harness.report.site.sweep_overview import (
-                build_overview,  # half of a second, with all charts
+                build_overview,  # takes half a second to load, with all charts
             )
 
             _write_sweep(

@@ -1,4 +1,4 @@
-"""Colours, markers and line styles of `springbench.harness.report.plot_style`, and axes, in Plotly's terms."""
+"""Colours, markers and line styles of `springbench.harness.report.plot_style` in Plotly's terms."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ def _fetch_viewer_files() -> tuple[str, bytes]:
     """
     with _run_viewer_server() as address:
         script, wasm = (_fetch_with_retries(f"{address}/{name}") for name in (_RERUN_SCRIPT, _RERUN_WASM))
-    return script.decode().replace("arg0.fetch(", "fetch("), wasm  # that of the window, else
+    return script.decode().replace("arg0.fetch(", "fetch("), wasm  # the wrapper's, not the window's
 
 
 @contextmanager

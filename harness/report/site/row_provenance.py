@@ -52,7 +52,7 @@ def find_config(folder: Path) -> str:
     if not config_path or "\0" in config_path or not path.is_file():
         return ""
     there = path.resolve()
-    for above in (Path.cwd(), *there.parents):  # as it is called from the folder that contains `configs/`
+    for above in (Path.cwd(), *there.parents):  # else relative to the folder that contains `configs/`
         if there.is_relative_to(above) and (above == Path.cwd() or (above / "configs").is_dir()):
             return there.relative_to(above).as_posix()
     return there.name

@@ -93,7 +93,7 @@ def build_run_table(folder: SweepFolder, table: pa.Table) -> list[RunRecord]:
 
 
 def restore_run_times(record: RunRecord) -> RunTimes:
-    """Return the times in the record of a run."""
+    """Convert the record of a run to `RunTimes`."""
     return RunTimes(*(record["global" if name == "global_" else name] for name in RunTimes._fields))
 
 
@@ -135,7 +135,7 @@ def format_references(pairs: Any) -> dict[str, dict[str, str]]:
 
 
 _EXACT_COLUMNS = ("time_step", "residual_rtol", "error_requested")
-"""Columns that commands need to the last digit."""
+"""Columns that are not rounded, because commands contain their values."""
 
 _PAGE_COLUMNS = (
     *(

@@ -21,7 +21,7 @@ springbench.chart = (() => {
   // Plotly omits a tick suffix between powers of ten; so times are formatted with seconds as the currency, such as 5ms.
   const SECONDS = { en: { format: { currency: ["", "s"] } } };
 
-  // Next to the point and inside the window, never wider than a tooltip.
+  // Show the tooltip next to the point and inside the window.
   function show(x, y, content) {
     tip.replaceChildren(...content);
     if (!tip.isConnected) document.body.append(tip);

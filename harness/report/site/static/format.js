@@ -27,8 +27,8 @@ Object.assign(springbench, (() => {
     return Math.abs(whole * dt - 1) < 1e-4 ? `1/${whole} s` : `${number(1e3 * dt)} ms`;
   };
 
-  // List the code versions and machines of figures: each pair once, the newest first.
   const commit = text => (text || "unknown").slice(0, 10) + (/dirty/.test(text) ? "-dirty" : "");
+  // List the machines and code versions of results: each pair once, in the order of the results.
   function madeBy(some, most = 2) {
     const origins = [...new Set(some.map(one => `${one.cpu || "unknown processor"}${one.machine_id ? ` (machine ${one.machine_id.slice(0, 6)})` : ""}, code ${commit(one.commit)}`))];
     const machines = new Set(some.map(one => one.machine_id || one.cpu)).size;
