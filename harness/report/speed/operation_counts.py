@@ -15,7 +15,10 @@ _ENTRY_BYTES = {"float64": 8, "float32": 4, "float16": 2}
 """Bytes of an entry of the factor, by the solver's `precision`."""
 
 _SPRING_BYTES, _SPRING_FLOPS = 16, 19
-"""Per spring: k r and two indices; a difference, its length, a division, and a sum at each end."""
+"""Bytes and flops per spring.
+
+Bytes: k r and two indices. Flops: a difference, its length, a division, and a sum at each end.
+"""
 
 _LOCAL_BYTES, _GLOBAL_BYTES = 72, 176
 """Bytes of the vectors that are moved per vertex.
@@ -43,7 +46,7 @@ def count_operations(
     An iteration is both steps. Unknown counts are omitted.
 
     Args:
-        stats: `nnz_factor`, `panel_bytes` and `flops_per_solve` of a prepared solver, as far as known.
+        stats: `nnz_factor`, `factor_bytes` and `flops_per_solve` of a prepared solver, as far as known.
         vertices: number of vertices.
         springs: number of springs.
         precision: number format of the factor.

@@ -44,16 +44,17 @@ class SpeedFigures(NamedTuple):
     Attributes:
         step: time of STEP_ITERATIONS iterations.
         factor_entries: number of entries of the factor L.
-        achieved_bandwidth: bytes per second of an iteration, by the size of the factor's panels.
+        achieved_bandwidth: bytes per second of an iteration, from `count_operations`.
         binding_limit: resource that binds.
         roofline_fraction: share of the binding limit that an iteration reaches, by those bytes and flops.
-        two_pass_fraction: share of the time that two passes over the entries of L would take, both from the location of
-            the working set; a program that uses entries twice while they are in the cache exceeds it.
+        two_pass_fraction: time of two passes over the entries of L, all loaded from the location of the working set,
+            over the measured time; above 1 if entries are used twice while they are in the cache.
         speedup: of a step, over the C++ baseline.
+        speedup_over_cheap: of a step, over the C++ baseline with cheap temporaries.
         speedup_over_cholmod: of a step, over carefully written C++.
         solve_speedup_over_cholespy: of a global step.
         precision_error: distance from the converged positions in float64, relative to the scene's size.
-        source_fingerprint, commit: code that the candidate was measured by.
+        source_fingerprint, commit: code that measured the candidate.
         cpu, cores: machine of the measurement.
     """
 
