@@ -179,8 +179,9 @@ def partition_series(y: FloatArray, penalty: float) -> tuple[int, ...]:
 
 
 def estimate_noise(y: FloatArray) -> float:
-    """Estimate the noise of results around their segment's mean from the median difference of neighbours."""
+    """Estimate the standard deviation of the noise from the median difference of neighbours."""
     differences = np.abs(np.diff(y))
+    # The median of |x| is 0.6745 sigma for normal x; the difference of two results has sqrt(2) sigma.
     return max(float(np.median(differences)) / (0.6745 * math.sqrt(2)), NOISE_FLOOR)
 
 

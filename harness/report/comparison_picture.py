@@ -245,7 +245,7 @@ def _has_finite_end(replay: RecordingReplay) -> bool:
 def _compute_distance(replay: RecordingReplay, reference: RecordingReplay) -> float:
     """Return the largest vertex distance [mean rest lengths].
 
-    The result is NaN if the runs end in different frames or non-finite.
+    The result is NaN if the runs end in different frames, have different meshes, or have non-finite positions.
     """
     comparable = (
         _has_finite_end(replay)

@@ -30,7 +30,7 @@ class DeviceRun(NamedTuple):
         device_requested: whether the run requested a device.
         vertices: number of vertices; None if the run failed before its scene was built.
         seconds: median wall time of a step [s]; None without timed steps.
-        has_converged: whether all steps ended at their tolerance.
+        has_converged: whether all steps ended at their tolerance or at round-off.
     """
 
     computer: str

@@ -1,4 +1,4 @@
-"""Selection of the drawable frames and the framed vertices of a recording, and their strain scale."""
+"""Selection of drawable frames and framed vertices of recordings, and their strain scale."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from springbench.harness.recording.strain_scale import round_scale_end
 from springbench.harness.report.recorded_strain import compute_spring_strain, compute_vertex_strain, mean_rest_length
 from springbench.harness.results import quantities
 
-_MAX_DRAWABLE_EXTENT = 1e4  # coordinates this many times larger than the start's are drawn as if not finite
+_MAX_DRAWABLE_EXTENT = 1e4  # coordinates this many times larger than the start's count as non-finite
 
 
 def find_drawable_frames(replay: RecordingReplay) -> NDArray[np.int64]:
@@ -24,7 +24,7 @@ def find_drawable_frames(replay: RecordingReplay) -> NDArray[np.int64]:
     start = replay.positions[0]
     limit = _MAX_DRAWABLE_EXTENT * (max(float(np.abs(start).max(initial=0.0)), mean_rest_length(replay)) or 1.0)
     with np.errstate(invalid="ignore"):
-        good = np.abs(replay.positions).max(axis=(1, 2), initial=0.0) <= limit  # not so for a NaN
+        good = np.abs(replay.positions).max(axis=(1, 2), initial=0.0) <= limit  # False for a NaN
     return np.arange(len(good) if good.all() else int(np.argmin(good)))
 
 

@@ -31,7 +31,7 @@ class AccuracyComparison(NamedTuple):
         error_label: name of the error.
         lowest_error: smallest error of these runs.
         equal_runs: runs within a factor EQUAL_ERROR_FACTOR of the lowest error or of round-off, the fastest first.
-        worse_runs: runs beyond that, each with its error divided by the lowest.
+        worse_runs: runs beyond that, each with its error over the lowest error or round-off, whichever is larger.
         unknown_runs: runs whose error is unknown.
     """
 

@@ -1,8 +1,8 @@
 # pyright: reportUnknownMemberType=false
 # Matplotlib's stubs do not type most keywords, and PyVista is only partly typed.
-"""Gallery of scenes: a title, one tile per scene with its name, and the scale of strains.
+"""Gallery of scenes: a title, one tile per scene, and the scale of strains.
 
-All text can be read where the sheet is as wide as a column of print.
+All text is readable if the sheet is printed at the width of a column.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _TILE_ASPECT, _MAX_TILE_HEIGHT = 1.28, 480
 _TEXT_SIZE, _TITLE_SIZE = 27.0, 32.0
 """Font sizes [points]; on a sheet of 1600 pixels that is printed 85 mm wide, they are 5.6 and 6.7 points."""
 _LINE_HEIGHT = 48
-"""Pixels between the baselines of two lines of _TEXT_SIZE; a line of the title is as much higher as it is larger."""
+"""Pixels between the baselines of two lines of _TEXT_SIZE; that of the title is in proportion to its font size."""
 _SCALE_WIDTH, _SCALE_HEIGHT = 300, 22
 """Size of the scale of strains [pixels]."""
 _FACT_SEPARATOR = "  ·  "
@@ -83,7 +83,7 @@ class _PlacedText(NamedTuple):
 
     Attributes:
         words: text of the line.
-        x: pixel from the left that `options` align with.
+        x: distance from the left [pixels], to which `options` align the text.
         baseline: distance of the baseline from the top [pixels].
         options: keywords of `Figure.text`.
     """
@@ -194,7 +194,7 @@ def _line_height(size: float) -> int:
 
 
 def _add_caption(sheet: _Sheet, tile: SceneTile, left: int, top: int, width: int) -> int:
-    """Add name and notes below a tile, in as many lines as they need; return where they end [pixels from the top]."""
+    """Add the name and notes below a tile, and return their lower end [pixels from the top]."""
     notes = [
         *describe_outside(framed_vertex_mask(tile.replay, [-1])),
         *describe_self_intersection(tile.replay, [-1]),
@@ -207,14 +207,14 @@ def _add_caption(sheet: _Sheet, tile: SceneTile, left: int, top: int, width: int
 
 
 def _add_strain_scale(sheet: _Sheet, replays: Sequence[RecordingReplay]) -> None:
-    """Add the scale of strains with words at its ends, and what the points of pinned vertices are.
+    """Add the scale of strains, and the legend entry of pinned vertices.
 
-    Scenes of different scales have no common number at the ends.
+    The ends of the scale have numbers only if all scenes have the same scale.
     """
     limits = {replay.strain_range for replay in replays}
     end = f" {100 * limits.pop():.3g} %" if len(limits) == 1 else ""
     x = float(_MARGIN)
-    for words in (f"compressed{end}", "", f"stretched{end}"):
+    for words in (f"compressed{end}", "", f"stretched{end}"):  # the empty text stands for the bar
         if words:
             sheet.add_text(words, x, sheet.y)
             x += measure_text(words, _TEXT_SIZE) + 16

@@ -27,7 +27,7 @@ from rows_of group by run_id, scene, size, solver, parameters order by scene, si
 
 
 def find_certificates(rows: pa.Table) -> list[dict[str, Any]]:
-    """Return a mapping for each run of a sweep's rows: its frames, and how many of them are free of intersections."""
+    """Return the certificate of each run as a mapping, with the columns of the CSV file."""
     return query_records(_CERTIFICATE_QUERY, rows)
 
 
@@ -35,8 +35,7 @@ def write_certificates(rows: pa.Table, folder: Path) -> list[Path]:
     """Write certificates.csv and return its path.
 
     The columns are: the run, its status, its frames, the number of intersection-free frames, the number of steps that
-    ended at the tolerance or at round-off, the mean number of their iterations, and the reason where a run has no
-    frames.
+    ended at the tolerance or at round-off, the mean number of iterations of a step, and the reason of a failed run.
 
     Args:
         rows: rows of a sweep.

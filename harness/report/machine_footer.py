@@ -14,7 +14,7 @@ from springbench.harness.report.table_queries import query_table
 COMPARISON_NOTE = (
     "compare times only on one machine; across machines compare ratios of such times, iterations, residuals and errors"
 )
-"""Rule that all rows satisfy."""
+"""Statement on all rows, the last line of a footer."""
 
 _MAX_LISTED = 8
 """Maximum number of machines with a line of their own."""

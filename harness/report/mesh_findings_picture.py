@@ -1,4 +1,4 @@
-"""Picture of a mesh file with what is suspicious in it marked."""
+"""Picture of a mesh file, with the findings of its checks marked."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _EDGE_SHARES = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 
 
 def draw_mesh_findings(report: MeshReport, path: Path) -> None:
-    """Draw the mesh of a report as a PNG file, with the places of its findings in one colour each.
+    """Draw the mesh of a report as a PNG file, with each finding in one colour.
 
     Args:
         report: the report.
@@ -58,7 +58,10 @@ def draw_mesh_findings(report: MeshReport, path: Path) -> None:
 
 
 def _mark_places(finding: MeshFinding, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the points that mark a finding, (q, 3): along edges, else in triangles, else at vertices."""
+    """Return the points (q, 3) that mark a finding.
+
+    They are on its edges; without edges in its triangles, and without triangles at its vertices.
+    """
     if len(finding.edges):
         a, b = (points[finding.edges[:, k]][:, None] for k in range(2))
         places = (a + _EDGE_SHARES[:, None] * (b - a)).reshape(-1, 3)

@@ -28,7 +28,7 @@ from springbench.harness.report.recorded_strain import compute_spring_strain, co
 
 PointArray = NDArray[np.floating]
 ColouredPoints = tuple[PointArray, str]
-_HALF_FIELD_OF_VIEW = np.radians(12.0)  # of the camera's view, vertically: long enough a lens for calm perspective
+_HALF_FIELD_OF_VIEW = np.radians(12.0)  # vertical; narrow, so that perspective distortion is small
 _VIEW_MARGIN = 0.06  # of the view, left free at each side
 _MAX_TUBES = 20_000  # springs; beyond that they are drawn as lines
 _PIXELS_PER_VERTEX = 350  # pixels of the view for each vertex; with fewer, lines would hide the colours

@@ -13,7 +13,10 @@ def format_count(number: int) -> str:
 
 
 def format_quantity(value: float) -> str:
-    """Format a number to three significant digits, with an exponent only from 1e7 on."""
+    """Format a number to three significant digits, or to an integer from 1000 on.
+
+    It has an exponent below 1e-4 and from 1e7 on.
+    """
     if value >= 1e7:
         return f"{value:.1e}"
     return f"{value:.3g}" if value < 1000 else format_count(round(value))

@@ -72,13 +72,13 @@ def build_obstacle_mesh(
     """Build the mesh of an obstacle at a time.
 
     Args:
-        obstacle: shape of the scene.
+        obstacle: obstacle of the scene.
         time: time [s].
         framed_points: points (q, 3) [m] relative to `origin`; of a plane only the part below them is built.
         origin: point that `framed_points` and the returned points are relative to (3,) [m].
 
     Returns:
-        The mesh, or None for the level ground.
+        The mesh, or None for level ground at rest.
     """
     made = _MESH_MAKERS[obstacle.kind](obstacle, framed_points + origin)
     if made is None:

@@ -1,7 +1,7 @@
 """Check whether this process can draw with OpenGL.
 
-VTK crashes with a segmentation fault where the system has no OpenGL libraries, so a child process tries first. That
-it succeeded without a display is stored for the user until packages of the system or VTK change.
+VTK crashes with a segmentation fault if the system has no OpenGL libraries, so a child process tries first. On Linux
+without a display, a success is stored for the user until system packages, VTK or environment variables change.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ window.Render()
 raise SystemExit(not window.SupportsOpenGL())
 """
 _PROBE_TIMEOUT = 60
+"""Timeout of the probe [s]."""
 
 _SYSTEM_FILES = ("/etc/ld.so.cache", "/var/lib/dpkg/status", "/var/lib/rpm")
 """Files that change with the installed libraries."""
@@ -80,7 +81,10 @@ def find_opengl_problem() -> str | None:
 
 
 def _find_marker() -> Path | None:
-    """Return the file that exists if drawing has succeeded with these libraries; None where a display takes part."""
+    """Return the file that exists if a probe has succeeded with these libraries.
+
+    It is None with a display, and on other systems than Linux.
+    """
     if sys.platform != "linux" or os.environ.get("DISPLAY"):
         return None
     found = [os.stat(name) for name in _SYSTEM_FILES if os.path.exists(name)]

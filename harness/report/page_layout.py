@@ -43,7 +43,7 @@ STRAIN_MAP = LinearSegmentedColormap.from_list("strain", STRAIN_COLOURS, N=512)
 
 
 def new_page() -> Figure:
-    """Create an empty page, to be drawn on within `matplotlib.rc_context(RC)`."""
+    """Create an empty page, to be drawn on within `matplotlib.rc_context(PAGE_RC)`."""
     page = Figure(figsize=(PAGE_WIDTH / PAGE_DPI, PAGE_HEIGHT / PAGE_DPI), dpi=PAGE_DPI, facecolor=BACKGROUND_COLOUR)
     FigureCanvasAgg(page)
     return page
@@ -70,7 +70,7 @@ def measure_text(words: str, size: float, *, weight: str = "normal") -> float:
     """Return the width of a line of text [pixels].
 
     Args:
-        words: text, in the font family of the present `matplotlib.rc_context`.
+        words: text, in the font family of the current `matplotlib.rc_context`.
         size: font size [points].
         weight: weight of the font.
     """
@@ -183,7 +183,7 @@ def draw_header(page: Figure, headline: str, facts: Sequence[str], *, max_letter
 
 
 _MAX_CAPTION_LENGTH = 22
-"""Number of characters of a caption of the strain scale that leaves room for the one in the middle."""
+"""Maximum length of the captions at the ends of the strain scale that leaves space for the middle one [characters]."""
 
 
 def draw_strain_scale(page: Figure, limit: float, ends: tuple[float, float], *, pins: bool) -> None:
@@ -234,7 +234,7 @@ def scene_headline(replay: RecordingReplay) -> str:
 
 
 _TIME_UNITS = (("s", 1.0, 1e-2), ("ms", 1e-3, 1e-3), ("µs", 1e-6, 1e-6), ("ns", 1e-9, 1e-9), ("ps", 1e-12, 1e-12))
-"""Units of time [s], each with the last time from which on it is used [s]."""
+"""Units of time: name, length [s], and the smallest time of the last frame [s] for which the unit is used."""
 
 
 def format_frame_time(replay: RecordingReplay, frame: int) -> str:

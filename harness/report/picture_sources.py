@@ -1,4 +1,7 @@
-"""Digest of the data of a picture, stored in the PNG file: a picture is drawn again only if they change."""
+"""Digest of the data of a picture, stored in the PNG file.
+
+A picture is drawn again only if the digest changes.
+"""
 
 from __future__ import annotations
 

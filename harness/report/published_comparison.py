@@ -1,7 +1,7 @@
-"""Comparison of one's own runs with the published ones: ratios to a reference solver, and iterations.
+"""Comparison of own runs with published ones: ratios to a reference solver, and iterations.
 
 A row is a method of one's own results on a scene and size that a published study has too. Both ratios refer to the same
-reference method, measured where the times were measured. Milliseconds of two machines are not compared.
+reference method, measured on the same machine as the method. Milliseconds of two machines are not compared.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ComparedMethod(NamedTuple):
     Attributes:
         study: published study that has the scene and size.
         scene, size, solver: the run.
-        reference: solver that the ratios refer to; empty if nothing was timed.
+        reference: solver that the ratios refer to; empty if nothing was timed, or if the references differ.
         own_ratio, published_ratio: time over that of the reference; None if it is unknown.
         published_interval: interval in which a repetition should lie.
         own_iterations, published_iterations: mean per step; None if it is unknown.

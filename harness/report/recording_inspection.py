@@ -156,7 +156,7 @@ def _print_summary(recording_summary: RecordingSummary, console: Console) -> Non
 def _print_difference(paths: list[Path], console: Console) -> None:
     """Print the distance between the final positions of two runs, and their times."""
     for path in paths:
-        read_replay(path, [-1])  # refuses what is not one run's recording
+        read_replay(path, [-1])  # raises InputError unless it is the recording of one run
     first, second = (summarise_recording(path) for path in paths)
     common = np.intersect1d(first.frames, second.frames)
     if not len(common):

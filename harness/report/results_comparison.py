@@ -2,9 +2,9 @@
 
 It finds regressions in time, and other changes. Runs are paired by their inputs, and compared step by step
 (`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). The load of the machine may have differed
-between the two results, and statistics cannot detect that: hence a margin beyond the interval, and
-`springbench regress --baseline REVISION` for smaller changes. Times of two machines are not comparable; with a
-reference solver that both ran, the ratios to it are.
+between the two results, and statistics cannot detect that. Therefore the interval is extended by a margin; smaller
+changes need `springbench regress --baseline REVISION`. Times of two machines are not comparable; their ratios to a
+reference solver that both machines ran are.
 """
 
 from __future__ import annotations

@@ -3,12 +3,12 @@
 Outcomes follow from the rows only. A run of a minimising solver is correct if, in every step, the result is stationary
 to the requested tolerance, up to round-off at each vertex, and a certified minimum. Both are checked by the reference
 evaluator, never by the solver's own report. That report is compared: if a step ended because its residual met the
-tolerance, but the evaluator finds it not stationary, the run is falsely converged instead of merely unconverged. A
-method that does not minimise is scored by its motion only.
+tolerance, but the evaluator finds it not stationary, the run is silently wrong instead of merely unconverged. A method
+that does not minimise is scored by its motion only.
 
-A step may have several minima. Which of them a run takes is stated, and is no part of its outcome: whether its motion
-is that of the reference, and by how much the objective after its first step, which all runs of a case share, exceeds
-the lowest one that any run found.
+A step may have several minima. Which of them a run reaches does not affect its outcome. It is stated separately:
+whether the motion is that of the reference, and by how much the objective after the first step, which has the same
+start in all runs of a case, exceeds the lowest one of these runs.
 """
 
 from __future__ import annotations
@@ -134,8 +134,8 @@ class VerifiedRun:
             distance from the reference; None if unknown.
         error_kind: "stationarity" or "distance".
         reason: why the run is not correct, or how its motion differs from the reference.
-        same_motion: whether the motion is that of the reference; None without a reference, and of methods that do not
-            minimise, whose outcome is the motion itself.
+        same_motion: whether the motion is that of the reference; None without a reference, and for methods that do
+            not minimise, which are scored by their motion.
         energy_excess: objective after the first step less the lowest of all runs of the case, over the largest
             magnitude of these; None if unknown or if the solver does not minimise.
         citation: reference of the solver as in the rows.
@@ -166,7 +166,7 @@ class VerifiedRun:
 
     @property
     def has_lowest_energy(self) -> bool:
-        """Whether the run is correct, and no run of the case has a lower objective after the first step."""
+        """Whether the run is correct, and its objective after the first step is the lowest."""
         return self.outcome is CORRECT and self.energy_excess is not None and self.energy_excess <= SAME_ENERGY_RTOL
 
     @property
@@ -188,7 +188,7 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
     results page lists them.
 
     Raises:
-        InputError: if no run was verified.
+        InputError: if no run was verified, or if some runs were verified by an incompatible version.
     """
     files = row_store.list_units(folder / "rows")
     needed = "run_id", "scene", "size", "solver", "phase", "status", "started_at"
@@ -245,7 +245,7 @@ def has_verification(table: pa.Table) -> bool:
 
 
 class RunVerdict(NamedTuple):
-    """Outcome of a run, with its worst error and the kind of that error; see `VerifiedRun` for the others."""
+    """Outcome of a run, and its reasons; see `VerifiedRun` for the fields."""
 
     outcome: RunOutcome
     worst_error: float | None
@@ -312,7 +312,7 @@ def _solver_label(row: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> 
     """Return the solver's name with the parameters in which its runs differ."""
     stated = {run["parameters"] or "{}" for run in runs}
     others = [json.loads(text) for text in stated]
-    own = json.loads(row["parameters"] or "{}")  # what a solver from outside was not given is not among them
+    own = json.loads(row["parameters"] or "{}")  # a parameter that was not given is missing
     varied = [str(v) for key, v in own.items() if any(other.get(key) != v for other in others)]
     return " ".join([row["solver"], *varied])
 
@@ -324,7 +324,7 @@ class SolverScore:
     Attributes:
         outcome_counts: number of runs with each outcome, in the order of RUN_OUTCOMES.
         correct_share: share of correct runs among supported cases; None if no case is supported.
-        finite_share: share of runs that stayed finite, likewise.
+        finite_share: share of runs that neither diverged nor failed, likewise.
         other_motion_count: number of correct runs with another motion than the reference.
         lowest_energy_count: number of correct runs whose first step has the lowest objective of all solvers.
         worst_run: run with the largest error.

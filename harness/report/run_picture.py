@@ -61,7 +61,7 @@ from springbench.harness.report.self_intersection_notes import describe_self_int
 _FRAMES_LEFT, _FRAMES_TOP, _FRAMES_RIGHT, _FRAMES_HEIGHT = 36, 114, PAGE_WIDTH - 36, 750
 _MAX_FINAL_WIDTH, _MIN_FINAL_WIDTH = 1180, 420  # of the final frame; the earlier ones have the rest
 _RULE_GAP, _TILE_GAP, _CAPTION_HEIGHT = 44, 12, 24
-_EARLIER_FRAMES = 4  # any grid that they are put in is full
+_EARLIER_FRAMES = 4  # fills a grid of 1, 2 or 4 columns
 
 
 class PixelBox(NamedTuple):

@@ -50,7 +50,7 @@ _PIXELS_PER_VERTEX = 120
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkedPoints:
-    """Points (q, 3) [m] that a preview marks in one colour, with a label and a description."""
+    """Points (q, 3) [m] that a preview marks in one colour."""
 
     label: str
     description: str

@@ -23,7 +23,9 @@ _MIN_MARKER, _MAX_MARKER = 0.4, 11.0
 
 
 def draw_sparsity(matrices: Mapping[str, csr_array], path: Path, title: str, facts: Sequence[str]) -> Path:
-    """Draw the patterns at one scale as a PNG file: dark entries are positive, orange ones negative.
+    """Draw the patterns at one scale as a PNG file.
+
+    Positive entries are dark, negative ones orange.
 
     Args:
         matrices: matrices by name, in drawing order.

@@ -1,9 +1,8 @@
 """SQL over the rows of all sweeps, accuracy configs and ablations.
 
-DuckDB reads the Parquet files. A query runs in the child process of `springbench.harness.execution.sandbox`, because
-it may exceed
-the allowed time or memory. Read-only queries are answered from the files; for other statements (PIVOT, CREATE) all rows
-are loaded into memory first.
+DuckDB reads the Parquet files. A query runs in the child process of `springbench.harness.execution.sandbox`, because it
+may exceed the allowed time or memory. Read-only queries are answered from the files; for other statements (PIVOT,
+CREATE) all rows are loaded into memory first.
 """
 
 from __future__ import annotations
@@ -120,9 +119,9 @@ def _run_with_retries(sql: str, folders: dict[str, list[Path]], max_rows: int) -
         table: [unit for folder in folders[table] for unit in row_store.list_units(folder)] for table in _TABLE_SCHEMAS
     }
     for _ in range(_MAX_ATTEMPTS):
-        with suppress(row_union.SchemaMismatch):  # units were packed since they were looked for
+        with suppress(row_union.SchemaMismatch):  # units were packed after they were listed
             return _execute_query(sql, units, max_rows)
-    try:  # else units are damaged, or their paths are patterns to DuckDB
+    try:  # units are damaged, or DuckDB interprets their paths as patterns
         return _execute_query(sql, units, max_rows, in_memory=True)
     except row_union.SchemaMismatch as error:
         raise InputError(f"query: {str(error)[:2000]}") from error
@@ -142,9 +141,9 @@ def _execute_query(sql: str, units: dict[str, list[Path]], max_rows: int, *, in_
                 characters += sum(len(value) for value in values[-1] if isinstance(value, str))
         except duckdb.Error as error:
             if isinstance(error, _FILE_ERRORS) or type(error) is duckdb.Error:
-                raise
+                raise  # `open_connection` converts it to SchemaMismatch
             raise InputError(f"query: {str(error)[:2000]}") from error
-        except (ValueError, OverflowError) as error:  # dates and numbers that Python does not have
+        except (ValueError, OverflowError) as error:  # dates and numbers that Python cannot represent
             raise InputError(f"query: {str(error)[:2000]}") from error
         names = [column[0] for column in found.description]
         return QueryResult(names, values[:max_rows], len(values) > max_rows or characters >= _MAX_CHARACTERS)

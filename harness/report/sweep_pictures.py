@@ -1,6 +1,6 @@
 """Pictures of a sweep: runs, solver comparisons, and run times.
 
-Side-by-side recordings are made too.
+The side-by-side recordings of the comparisons are also written.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ def draw_sweep_pictures(
     stale_ids: Collection[str] = (),
 ) -> None:
     """Draw the pictures and comparisons that are missing or older than one of their recordings.
+
+    `references.bib` is written too.
 
     Args:
         name: name of the sweep.
@@ -177,7 +179,10 @@ def _is_outdated(target: Path, sources: Iterable[Path]) -> bool:
 class SolverGroup:
     """Runs that differ only in their solver or its settings.
 
-    `jobs_by_label` has them by these differences; the paths are those of the files that compare them.
+    Attributes:
+        group_label: scene and size.
+        jobs_by_label: the runs, by solver and differing settings.
+        recording_path, picture_path: files that compare the runs.
     """
 
     group_label: str

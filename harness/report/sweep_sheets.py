@@ -47,7 +47,8 @@ def draw_hard_case_sheets(
 
     Args:
         results: folder of results, or the folder of one sweep.
-        find_stale: returns the ids of those runs in a sweep's folder that other code than the current version executed.
+        find_stale: returns the ids of the runs in a sweep's folder that were executed by other code than the current
+            version.
 
     Yields:
         Each PNG file and its runs.

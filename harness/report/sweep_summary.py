@@ -16,14 +16,17 @@ from springbench.harness.report.equal_accuracy import compare_runs
 from springbench.harness.report.timing_table import TABLE_WIDTH, RunTimes, label_runs, read_run_times
 
 SOLVED_RESIDUAL = 1e-2
-"""Share of a step's initial residual above which a remainder of a method that does not minimise is reported."""
+"""Share of a step's initial residual above which the final residual of a method that does not minimise is reported."""
 
 STRAIN_GROWTH_FACTOR = 1.5
-"""Factor by which the largest strain has to grow to be reported, and to exceed the growth of the 99th percentile."""
+"""Growth factor of the largest strain above which it is reported.
+
+If the growth also exceeds that of the 99th percentile by this factor, it is attributed to a point load.
+"""
 
 
 NOTABLE_SHARE, MAX_DISSIPATION_SENTENCES = 0.01, 3
-"""Share of the provided energy above which dissipation is reported, and the largest number of scenes that are."""
+"""Share of the provided energy above which dissipation is reported, and the maximum number of sentences on it."""
 
 
 def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Path) -> list[str]:
@@ -45,7 +48,7 @@ def build_closing_lines(table: pa.Table, config: Path, results: Path, folder: Pa
 
 
 def summarise_sweep(timed_runs: Sequence[RunTimes]) -> list[str]:
-    """Summarise the fastest solvers, the termination reasons, the strains and the dissipation of runs, in lines."""
+    """Summarise speed, termination reasons, strains and dissipation of runs, in lines."""
     fine, names = [run for run in timed_runs if run.status == "ok"], label_runs(timed_runs)
     sentences = [
         *_describe_fastest(fine, names),
@@ -161,10 +164,10 @@ def _compare_strains(coarse_run: RunTimes, ok_runs: RunTimes) -> str:
 
 
 def _describe_dissipation(ok_runs: Sequence[RunTimes], names: Mapping[str, str]) -> Iterator[str]:
-    """Describe the energy that integrators and unconverged solves took, for the scenes where they took most.
+    """Describe the energy dissipated by integrators and unconverged solves, where it is largest.
 
-    Of each scene and integrator it is the run of the largest mesh whose solves changed the energy least. A solver that
-    integrates frames itself counts as an integrator.
+    Each scene, integrator and time step is represented by a run of the largest mesh: the one whose solves changed the
+    energy least. A solver that integrates frames itself counts as an integrator.
     """
     chosen: dict[tuple[str, str, float], RunTimes] = {}
     for run in sorted(ok_runs, key=lambda run: (run.size, -abs(run.solve_share or 0.0))):
@@ -235,7 +238,7 @@ def _has_steps_of_integrator(run: RunTimes) -> bool:
 
 
 def _integration_share(run: RunTimes) -> float:
-    """Return the share that the integrator dissipated, in an engine with its solves."""
+    """Return the share that the integrator dissipated; in an engine, that of its solves is included."""
     return (run.integrator_share if run.engine_share is None else run.engine_share) or 0.0
 
 

@@ -32,14 +32,16 @@ def write_timing_plot(rows: pa.Table, folder: Path) -> list[Path]:
 def draw_timing_plot(
     table: pa.Table, path: Path, title: str, stale_ids: Collection[str] = (), sources: str = ""
 ) -> list[Path]:
-    """Draw the times of a sweep's runs as PNG and SVG, and return the files; none if no run succeeded.
+    """Draw the times of a sweep's runs as PNG and SVG, and return the files.
+
+    If no run succeeded, nothing is drawn, and an earlier picture is deleted.
 
     Args:
         table: rows (schema: `springbench.harness.results.run_schema.RUN_SCHEMA`).
         path: file of the PNG; that of the SVG is next to it.
         title: name of the sweep.
         stale_ids: ids of runs that were executed by other code than the current version; their marks are hollow.
-        sources: digest of all these, stored in the file (`springbench.harness.report.picture_sources`).
+        sources: digest of the runs and the title, stored in the file (`springbench.harness.report.picture_sources`).
     """
     words = describe_provenance(table.select(PROVENANCE_COLUMNS).to_pylist())
     chart = build_timing_chart(read_run_times(table), stale_ids, machine_words=words)

@@ -42,7 +42,7 @@ class RunTimes(NamedTuple):
         phases_consistent: whether the phases add up to an iteration.
         roundoff_residual: residuals below it are round-off (`ROUNDOFF_RATIO`) [J^(1/2)].
         reference_distance: the largest over all frames, if every frame was verified.
-        modulus_exponent: value of the rows.
+        modulus_exponent: exponent of the mesh spacing to which the material's modulus is proportional.
         max_stationarity_audit: largest stationarity that the reference evaluator measured, for a solver that does not
             minimise.
         provided_energy: energy provided in all frames [J].
@@ -174,7 +174,7 @@ def label_runs(timed_runs: Sequence[RunTimes]) -> dict[str, str]:
         stated[run.scene, run.solver] |= parameters[run.run_id].keys()
         for key, value in settings[run.run_id].items():
             values[run.scene, run.solver, key].add(str(value))
-    for run in timed_runs:  # what some state and others leave out, for they have it as usual
+    for run in timed_runs:  # a parameter that only some runs state has its default value in the others
         own = parameters[run.run_id]
         for key in stated[run.scene, run.solver] - own.keys() if own else ():
             values[run.scene, run.solver, key].add("")
@@ -321,7 +321,7 @@ def _describe_methods(table: pa.Table) -> list[str]:
 
 
 def _format_dissipation(run: RunTimes) -> str:
-    """Format the shares of the causes in whole percent, separated by slashes; those of an engine are three."""
+    """Format the shares of the causes in percent, separated by slashes; an engine has three."""
     if (shares := run.dissipation_shares) is None:
         return "–"
     damping, friction, integrator, solve, engine = (

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false
 # Jinja2's and Matplotlib's stubs do not type most members.
-"""Page of a validation: tables in Markdown, and pictures of errors by refinement and of textile tests."""
+"""Page of a validation: tables in Markdown, and pictures of errors and of textile tests."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def write_validation_page(rows: Sequence[dict[str, Any]], solver: str, folder: P
 
 
 def _select_drawn_rows(rows: Sequence[dict[str, Any]], name: str) -> list[dict[str, Any]]:
-    """Return the rows of a picture: what was simulated of the closed forms, or of the textile tests."""
+    """Return the rows of a picture: simulated closed forms, or simulated textile tests."""
     return [row for row in rows if ("errors" if name == CLOSED_FORMS_PICTURE else "bending_length") in row]
 
 
@@ -142,7 +142,7 @@ def draw_closed_forms(forms: Sequence[dict[str, Any]], solver: str, path: Path) 
 
 
 def draw_fabrics(tests: Sequence[dict[str, Any]], solver: str, path: Path) -> None:
-    """Draw textile tests in their bands to a PNG, a column of 85 mm wide.
+    """Draw textile tests in their bands to a PNG, 5.2 inches wide at 200 dpi.
 
     Args:
         tests: rows of textile tests, one for each fabric.

@@ -1,1 +1,4 @@
-"""Figures for print, with their data and a script that reproduces them."""
+"""Figures for print, with their data and a script that reproduces them.
+
+Any panel or picture can be drawn at a given width.
+"""

@@ -185,7 +185,7 @@ _LABEL_OFFSETS: tuple[tuple[float, float, Any], ...] = tuple(
 def _place_label(ax: Axes, name: Annotation, offsets: Sequence[tuple[float, float, Any]]) -> None:
     """Place a label at the first offset where it fits, otherwise at the last one.
 
-    It fits if it is inside the frame horizontally, and overlaps no earlier label and contains no point.
+    It fits if it is inside the frame, overlaps no earlier label, and contains no point.
     """
     before = [other for other in ax.texts[: ax.texts.index(name)] if isinstance(other, Annotation)]
     taken = [other.get_window_extent() for other in before]
