@@ -31,6 +31,7 @@ class SnapshotProblem:
 
     Attributes:
         time_step: [s].
+        stiffness_ratio: k dt^2/m of the median spring and the mean free vertex.
         mean_rest_length: [m].
         objective_magnitude: magnitude of the objective's terms [J].
         objective_initial: g0 [J].

@@ -134,7 +134,10 @@ def describe_best_settings(works: Iterable[WorkPoint]) -> Iterator[str]:
 
 
 def _find_unsupported(works: Iterable[WorkPoint]) -> set[str]:
-    """Find the programs all of whose runs are unsupported, because of the spring network or the installation."""
+    """Find the programs all of whose runs are unsupported.
+
+    They do not support the mesh's spring network, or are not installed.
+    """
     by_program: dict[str, set[str]] = {}
     for work in works:
         by_program.setdefault(program_name(work), set()).add(work.status)

@@ -19,7 +19,7 @@ _MIN_FIT_SIZES = 3
 
 
 class SizeScaling(NamedTuple):
-    """A solver's times to GAP_TARGET, on the sizes of a scene where it reached the gap.
+    """A solver's times to GAP_TARGET by size, where it reached the gap.
 
     Attributes:
         vertices: numbers of vertices (k,).

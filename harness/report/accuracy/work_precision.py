@@ -1,4 +1,4 @@
-"""Error of simulations against their wall time: the Pareto front, the default, and the cheapest settings."""
+"""Error of simulations against wall time: Pareto front, default and cheapest settings."""
 
 from __future__ import annotations
 
