@@ -194,7 +194,7 @@ def _line_height(size: float) -> int:
 
 
 def _add_caption(sheet: _Sheet, tile: SceneTile, left: int, top: int, width: int) -> int:
-    """Add the name and notes below a tile, and return their lower end [pixels from the top]."""
+    """Add name and notes below a tile; return their lower end [pixels from the top]."""
     notes = [
         *describe_outside(framed_vertex_mask(tile.replay, [-1])),
         *describe_self_intersection(tile.replay, [-1]),

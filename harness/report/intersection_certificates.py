@@ -27,7 +27,7 @@ from rows_of group by run_id, scene, size, solver, parameters order by scene, si
 
 
 def find_certificates(rows: pa.Table) -> list[dict[str, Any]]:
-    """Return the certificate of each run as a mapping, with the columns of the CSV file."""
+    """Return the certificate of each run by the columns of the CSV file."""
     return query_records(_CERTIFICATE_QUERY, rows)
 
 

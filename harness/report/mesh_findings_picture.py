@@ -21,7 +21,7 @@ _EDGE_SHARES = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
 
 
 def draw_mesh_findings(report: MeshReport, path: Path) -> None:
-    """Draw the mesh of a report as a PNG file, with each finding in one colour.
+    """Draw the mesh of a report as PNG, with each finding in one colour.
 
     Args:
         report: the report.

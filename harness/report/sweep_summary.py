@@ -238,7 +238,7 @@ def _has_steps_of_integrator(run: RunTimes) -> bool:
 
 
 def _integration_share(run: RunTimes) -> float:
-    """Return the share that the integrator dissipated; in an engine, that of its solves is included."""
+    """Return the share that the integrator dissipated, including the solves of an engine."""
     return (run.integrator_share if run.engine_share is None else run.engine_share) or 0.0
 
 

@@ -1,4 +1,4 @@
-"""Sheet of step and preparation times of a sweep by number of vertices, for each scene."""
+"""Sheet of step and preparation times by number of vertices, for each scene of a sweep."""
 
 from __future__ import annotations
 

@@ -333,7 +333,7 @@ def _build_step_size_series(
     tolerances: Sequence[float],
     newest_fingerprint: str | None,
 ) -> Iterator[ChartSeries]:
-    """Yield a series for each group of simulations that differ only in time step or substeps."""
+    """Yield a series per group of simulations that differ only in time step or substeps."""
     default, divided = find_default_setting(works), _find_substep_labels(works)
     chains: dict[tuple[Any, ...], list[WorkPoint]] = {}
     for one in works:

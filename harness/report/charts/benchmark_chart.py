@@ -1,4 +1,4 @@
-"""Charts of stored benchmark results by commit, with the level of each segment and its changes."""
+"""Charts of stored benchmark results by commit, with levels and changes."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _build_frame(gate: BenchmarkHistory, title: str) -> ChartFrame:
 
 
 def _build_series(gate: BenchmarkHistory) -> Iterator[ChartSeries]:
-    """Yield the results, the level of each segment with a gap between segments, and the changes."""
+    """Yield the results, the levels of the segments with gaps between them, and the changes."""
 
     def link_commits(places: Sequence[float]) -> dict[str, object]:
         commits = [None if np.isnan(at) else gate.points[round(at)].commit for at in places]
@@ -128,5 +128,5 @@ def _distinguish_commits(points: Sequence[BenchmarkPoint]) -> tuple[str, ...]:
 
 
 def format_level_change(ratio: float) -> str:
-    """Format the ratio of a new level to the one before as a change in percent."""
+    """Format the ratio of a level to the previous one as a change in percent."""
     return f"{100 * (ratio - 1):+.1f} %"

@@ -25,7 +25,7 @@ _SIDE_STYLES = {
 
 
 def build_device_chart(device_runs: Sequence[DeviceRun]) -> ChartDescription:
-    """Build the chart; it has no frames if no run on a device reached its residual.
+    """Build the chart, without frames if no run on a device reached its residual.
 
     Args:
         device_runs: runs of a sweep.

@@ -29,7 +29,7 @@ from springbench.harness.report.plot_style import SeriesStyle
 
 
 def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = None) -> ChartDescription:
-    """Build the chart, with a frame for each mesh with runs of engines and own methods.
+    """Build the chart, with a frame for each mesh on which engines were measured.
 
     Args:
         table: data of an accuracy measurement.

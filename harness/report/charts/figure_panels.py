@@ -244,6 +244,9 @@ class MeshPicture:
         strain_limit: end of the strain scale.
         aspect: width / height of the picture.
         render: returns the pixels, given width [pixels] and background.
+        facts: lines below the title.
+        style: style of the solver.
+        mesh: path of the recording.
     """
 
     group: tuple[str, ...]

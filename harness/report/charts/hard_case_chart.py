@@ -1,4 +1,4 @@
-"""Chart of verified runs: shares of correct runs by solver, and maps of solvers x cases.
+"""Chart of verified runs: shares of correct runs, and maps of solvers x cases.
 
 There is a map for each family of cases.
 """

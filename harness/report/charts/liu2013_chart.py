@@ -86,7 +86,7 @@ def _build_pair(table: AccuracyData, mine: list[PaperComparison]) -> list[ChartS
 
 
 def _build_other_series(table: AccuracyData) -> list[ChartSeries]:
-    """Build the series of the paper's Newton method and of other own solvers, for figure 2."""
+    """Build the series of the paper's Newton method and of other own solvers."""
     (reference, *_) = select_long_curves(table)
     seconds, errors = zip(*LIU2013_FIGURE_2_NEWTON, strict=True)
     series = [

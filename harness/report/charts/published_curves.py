@@ -35,7 +35,7 @@ _PUBLISHED_NOTE = "Published curves are grey: the same solver, on the machine of
 
 
 def read_published_data(own: AccuracyData, published: Path = PUBLISHED_FOLDER) -> list[AccuracyData]:
-    """Read the published data on the scenes and sizes of one's own; none outside a checkout.
+    """Read the published data on own scenes and sizes; none outside a checkout.
 
     Args:
         own: data of one's own accuracy measurement.

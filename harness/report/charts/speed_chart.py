@@ -1,4 +1,4 @@
-"""Chart of a speed report: times, bandwidth, share of the binding limit and speedup by size."""
+"""Chart of a speed report: times, bandwidth, roofline fraction and speedup by size."""
 
 from __future__ import annotations
 

@@ -153,7 +153,10 @@ def _build_series(
     *,
     is_connected: bool = True,
 ) -> Iterator[ChartSeries]:
-    """Yield a series for each label; a cross marks its end if a run of a larger size failed."""
+    """Yield a series for each label.
+
+    A cross marks its end if a run of a larger size failed.
+    """
     for label in dict.fromkeys(names[run.run_id] for run in timed):
         own = [run for run in timed if names[run.run_id] == label]
         later = [run.status for run in here if names[run.run_id] == label and run.size > own[-1].size]

@@ -116,6 +116,7 @@ def spread_positions(targets: Sequence[float], gap: float, top: float) -> list[f
         top: upper limit, exceeded only if the space from 0 is too small.
     """
     at = list(targets)
+    # Relaxation: two neighbours that are too close both move by half of the missing distance.
     for _ in range(60):
         for k in range(1, len(at)):
             short = gap - (at[k] - at[k - 1])

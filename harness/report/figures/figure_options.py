@@ -40,7 +40,7 @@ class FigureOptions:
 
     @property
     def mark_scale(self) -> float:
-        """Size of markers and lines, relative to that at a font size of 8 points or less."""
+        """Size of markers and lines, 1 at a font size of 8 points or less."""
         return max(1.0, self.font_size / 8.0)
 
     @property

@@ -122,7 +122,7 @@ def _draw_curve(ax: Axes, series: CurveSeries, options: FigureOptions) -> None:
             if series.is_stepped:
                 marks.set_markevery((0.1, 0.3))  # a step is no measurement: its marks only distinguish the curves
             elif many:
-                marks.set_markevery(0.14)
+                marks.set_markevery(0.14)  # distance of markers, relative to the diagonal of the frame
 
 
 def _draw_bars(ax: Axes, series: CurveSeries, scale: AxisScale, options: FigureOptions) -> None:
@@ -224,7 +224,7 @@ def draw_cell_map(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
 
 
 def write_cell_values(ax: Axes, panel: CellMap, options: FigureOptions) -> None:
-    """Write the values of all cells in one font size, at which the longest one fits.
+    """Write the values of all cells in a font size at which the longest fits.
 
     No value is written if that size is too small to read.
 

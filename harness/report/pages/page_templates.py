@@ -187,7 +187,7 @@ def _bind_form(fields: _PageFields, form: Any) -> Callable[..., str]:
 
 
 def _build_point(row: Mapping[str, Any]) -> ChartPoint:
-    """Build a point from a row of a query; SQL numbers, such as decimals, become float."""
+    """Build a point from a row of a query; decimals of SQL become float."""
     x, *numbers = (row.get(name) for name in ("x", "y", "low", "high"))
     place = x if isinstance(x, str) else float(x or 0.0)
     return ChartPoint(str(row["series"]), place, *(None if value is None else float(value) for value in numbers))

@@ -36,7 +36,7 @@ def collect_provenance(table: pa.Table, unit: str) -> list[dict[str, Any]]:
 
 
 def find_newest_fingerprint(table: pa.Table) -> str:
-    """Return the fingerprint of the code that wrote the newest row; "" if it is unknown."""
+    """Return the fingerprint of the newest row's code; "" if it is unknown."""
     dated = zip(*(table[name].to_pylist() for name in ("started_at", "source_fingerprint")), strict=True)
     return max(((started or "", code or "") for started, code in dated), default=("", ""))[1]
 
