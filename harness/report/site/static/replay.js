@@ -43,7 +43,7 @@ window.springbench ??= {};
       element("button", head, { type: "button", textContent: "Close" }).addEventListener("click", () => dialog.close());
       element("div", dialog, { className: "stage" });
       dialog.setAttribute("aria-labelledby", "replay-title");
-      dialog.addEventListener("close", () => dialog.open || stop()); // the event is asynchronous: another recording may be open by then
+      dialog.addEventListener("close", () => dialog.open || stop()); // asynchronous: another may be open
     }
     dialog.querySelector("h2").textContent = title;
     dialog.querySelector(".stage").replaceChildren();
@@ -113,7 +113,7 @@ window.springbench ??= {};
     ready ??= (async () => {
       const brought = await taken(new URL("viewer.js", here).href, "The viewer is not part of this report: it was left out.");
       const wasm = await unpacked(brought.wasm);
-      delete WebAssembly.instantiateStreaming; // it requires a server's response with a MIME type, which a script does not have
+      delete WebAssembly.instantiateStreaming; // it requires a server's response with a MIME type
       await brought.start({ module_or_path: wasm });
       return brought.start;
     })();
