@@ -2,8 +2,9 @@
 
     t <- t + .9 (d(t) - min_distance)/l,     l = upper bound of the speed at which the distance d of the pair shrinks
 
-Source: Li, Kaufman and Jiang 2021, "Codimensional incremental potential contact", section 5. The common translation of
-a pair is removed first, which gives a tighter bound l. Pairs that are farther apart than they can move are discarded in
+Source: Li, Kaufman and Jiang 2021, "Codimensional incremental potential contact", section 5. The first advance also
+subtracts a tenth, and each later one a twentieth, of the initial gap from the distance. The common translation of a
+pair is removed first, which gives a tighter bound l. Pairs that are farther apart than they can move are discarded in
 8-lane packets. Each pair retains at least a twentieth of its initial gap, which is far more than round-off.
 """
 
@@ -93,7 +94,7 @@ def collision_free_step_size(candidates, p, displacement, max_step, local_indice
 
 @jit_inner
 def _needs_ccd(candidates, p, displacement, max_step, first, last, edges):
-    """Return as bits which of eight pairs can reach each other, by distances and displacement lengths alone."""
+    """Return as bits which of eight pairs can reach each other, by distances and displacement lengths."""
     x = candidates.vertices
     a, b, c, d = (
         gather_rows(p, x, first, last, 0),
@@ -166,6 +167,7 @@ def pair_time_of_impact(candidates, e, p, displacement, max_step, edges, local_i
 
 @jit_inner
 def _additive_ccd(corners, relative_displacement, local_indices, edges, gap, min_distance, speed, max_step):
+    """Return the collision-free step size of one pair; `corners` are moved along."""
     least, t = MIN_GAP_FRACTION * gap, 0.9 * (1.0 - MIN_GAP_FRACTION) * gap / speed
     done = 0.0
     for _ in range(_MAX_CCD_ITERATIONS):
@@ -184,7 +186,10 @@ def _additive_ccd(corners, relative_displacement, local_indices, edges, gap, min
 
 @jit_inner
 def _centre_motion(p, displacement, x, edges, corners, relative_displacement):
-    """Write corners (4, 3) relative to the first one and displacements without their mean; return the closing speed."""
+    """Write centred corners and displacements (4, 3); return the closing speed.
+
+    Corners are relative to the first one, displacements to their mean.
+    """
     for a in range(3):
         mean = 0.25 * (displacement[x[0], a] + displacement[x[1], a] + displacement[x[2], a] + displacement[x[3], a])
         for k in range(4):
@@ -231,6 +236,7 @@ def _displacement_diagonal(p, q, tile):
             load_packet(q, 8) - load_packet(p, 8),
             load_packet(q, 16) - load_packet(p, 16),
         )
+        # 0 x is NaN unless x is finite; sums of it detect coordinates that comparisons would ignore.
         low, high, nothing = (x, y, z), (x, y, z), (0.0 * x, 0.0 * y, 0.0 * z)
         for k in range(24, 24 * whole, 24):
             x, y, z = (

@@ -40,8 +40,8 @@ _EMPTY_ARRAY = np.empty(0)
 class CollisionMesh:
     """Points, edges and triangles of a mesh, in contact with each other.
 
-    Pairs that share a vertex are excluded. Pairs that are closer at rest than the activation distance have both
-    distances scaled in proportion. They exert no force at rest, and still cannot interpenetrate.
+    Pairs that share a vertex are excluded. For pairs that are closer at rest than the activation distance, the minimum
+    and the activation distance are scaled in proportion. They exert no force at rest, and still cannot interpenetrate.
 
     Attributes:
         rest_positions: rest shape (n, 3) [m].
@@ -102,7 +102,10 @@ class CollisionMesh:
         return cls(rest, *trees, lengths, np.array(stiffness), min_distance, dhat, near)
 
     def _find_close_pairs(self, x: FloatArray, inflation_radius: float) -> tuple[IndexArray, int]:
-        """Return index pairs (k, 2) that may be closer than a radius at x (n, 4), and how many are point-triangle."""
+        """Return index pairs (k, 2) that may be closer than a radius at x (n, 4).
+
+        The second result is the number of point-triangle pairs, which come first.
+        """
         limits = CollisionQuery(inflation_radius, inflation_radius, 0.0, 0.0)
         one = find_candidate_pairs(self.points, self.triangles, x, x, limits)
         return np.concatenate([one, find_candidate_pairs(self.edges, self.edges, x, x, limits)]), len(one)
@@ -250,7 +253,7 @@ def write_candidate_vertices(pair_indices, first, parts, vertices):
 
 @jit_kernel
 def filter_candidates(candidates, pair_indices, parts, lengths, stiffness, x, inflation_radius):
-    """Remove the pairs that are not closer than a radius, and write the others to `candidates`.
+    """Remove the pairs that are not closer than a radius; write the others to `candidates`.
 
     Args:
         candidates: vertices, stiffness and mollifier threshold are overwritten.

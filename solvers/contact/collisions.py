@@ -24,7 +24,7 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 POINT_POINT, POINT_EDGE, POINT_TRIANGLE, EDGE_EDGE = 2, 3, 4, 5
-"""Kinds of collisions."""
+"""Kinds of collisions, in this order: equal collisions up to POINT_EDGE are merged."""
 
 
 class Candidates(NamedTuple):

@@ -1,11 +1,11 @@
-"""Barrier contact of primitive pairs: an energy of positions (`springbench.solvers.contact.potentials.barrier`) with
-a step limit.
+"""Barrier contact of primitive pairs: an energy of positions that limits the step size.
 
-`springbench.solvers.contact.broad_phase.candidate_cache` finds the candidates and the collision-free step size.
+`springbench.solvers.contact.potentials.barrier` defines the energy. The candidates and the collision-free step size are
+those of `springbench.solvers.contact.broad_phase.candidate_cache`.
 
-`SelfContact` is contact of a mesh with itself, `ObstacleContact` that of a mesh with the surfaces of obstacles. Their
-vertices follow those of the mesh in all arrays. In a step they are at their end positions; they move there linearly
-from their start positions.
+`SelfContact` is contact of a mesh with itself, `ObstacleContact` that of a mesh with the surfaces of obstacles. The
+vertices of obstacles follow those of the mesh in all arrays. The energy of a step has the obstacles at their end
+positions, to which they move linearly from their start positions.
 """
 
 from __future__ import annotations
@@ -41,11 +41,17 @@ _CANDIDATE_INFLATION = 1.25
 
 
 ObstacleMotion = Callable[[float], Positions]
+"""Function of a time [s] that returns the obstacle vertices (o, 3) [m]."""
+
 ComovingMap = Callable[[float, float, Positions], list[Positions]]
+"""Function of two times [s] and positions (n, 3) [m] that returns these moved with each moving obstacle."""
 
 
 class _CollisionState(NamedTuple):
-    """Active collisions at p (n, 3), with energy [J] and gradient (n, 3) [N]; buffer: memory of the collisions."""
+    """Active collisions at p (n, 3), with energy [J] and gradient (n, 3) [N].
+
+    buffer: memory of the collisions.
+    """
 
     p: Positions
     collisions: Collisions
@@ -120,7 +126,7 @@ class BarrierContact:
         return candidate_cache.find_candidates(self.collision_mesh, self.candidate_caches, p)
 
     def value(self, p: Positions) -> float:
-        """Return the energy [J] at p (n, 3); infinite if a pair is closer than the minimum distance."""
+        """Return the energy [J] at p (n, 3); infinite if a gap is closed."""
         p = self.append_obstacle_positions(p)
         if not candidate_cache.has_no_active_collisions(self.collision_mesh, self.candidate_caches, p):
             if not np.isfinite(p).all():
@@ -278,7 +284,7 @@ class BarrierContact:
         return self
 
     def comoving_positions(self, p: Positions) -> list[Positions]:
-        """Return the end positions that p (n, 3) would have if it moved with each of the moving obstacles."""
+        """Return the end positions of p (n, 3) if it moved with each moving obstacle."""
         return []
 
     def find_violated_pairs(self, p: Positions) -> list[tuple[NDArray[np.int64], bool, float]]:
@@ -407,7 +413,7 @@ class ObstacleContact(BarrierContact):
         )
 
     def comoving_positions(self, p: Positions) -> list[Positions]:
-        """Return the end positions that p (n, 3) would have if it moved with each of the moving obstacles."""
+        """Return the end positions of p (n, 3) if it moved with each moving obstacle."""
         return self.comoving_map(*self.step_times, p)
 
     def obstacle_work(self, p: Positions, start: Positions) -> ObstacleWork:

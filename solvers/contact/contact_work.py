@@ -1,7 +1,7 @@
 """Work of contact in a step, separated into that of obstacles and what friction dissipates.
 
 The energy of contact depends on the positions x of the mesh and q of the obstacles. While these move by dx and dq,
-the obstacles do the work dE/dq . dq, and friction dissipates df/dx . dx + df/dq . dq, with f its part of E.
+the obstacles do the work dE/dq . dq, and friction dissipates df/dx . dx + df/dq . dq, with f the friction part of E.
 """
 
 from __future__ import annotations

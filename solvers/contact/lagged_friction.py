@@ -1,6 +1,6 @@
-"""Lagged friction: a fixed-point iteration over the solves of a step, which updates the normal forces.
+"""Lagged friction: a fixed-point iteration over the solves of a step that updates normal forces.
 
-    x_0 = argmin E(x; N at the step's start),     x_{k+1} = argmin E(x; N(x_k)),     k + 1 < max_iterations
+    x_0 = argmin E(x; N at the step's start),     x_{k+1} = argmin E(x; N(x_k)),     k + 1 < friction_iterations
 
 Normal forces N, contact points and directions are constant in a solve, so that friction has a potential (Li et al.
 2020, "Incremental potential contact", section 5). With f(x; N) the gradient of friction, f(x_k; N(x_k)) - f(x_k;
@@ -64,7 +64,7 @@ class FrictionSolver(PreparedSolver, Protocol):
 
 
 class FrictionConvergence(NamedTuple):
-    """Number of iterations of a step, and the last change of friction relative to its largest component."""
+    """Iterations of a step, and the last change of friction relative to its largest component."""
 
     num_iterations: int
     relative_change: float
@@ -104,13 +104,13 @@ def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: St
     earlier = deque[_Round](maxlen=PERIOD)
     while True:
         x = solution.positions
-        # Later solves move little: all have the pattern, and so the analysis, of the first solution's neighbourhood.
+        # Later solves move little, so that all reuse the sparsity pattern at the first solution, and its analysis.
         first = x if len(counts) == 1 else problem.step_start.pattern_positions
         start = replace(problem.step_start, pattern_positions=first, normal_force_positions=x)
         following = replace(problem, initial_guess=x, step_start=start)
         change, acting = _relative_friction_change(problem, following, x)
         ended = len(counts) >= rounds or _is_cycle_at_largest(earlier, x, acting)
-        if not change > FRICTION_RTOL or ended:  # not a number where the solve diverged
+        if not change > FRICTION_RTOL or ended:  # `change` is NaN if the solve diverged
             problem = problem if len(counts) == 1 else replace(problem, initial_guess=guess)
             return FrictionSolve(problem, solution, tuple(counts), FrictionConvergence(len(counts), change))
         earlier.append(_Round(x, acting))
@@ -142,14 +142,14 @@ def _max_friction_iterations(system: System) -> int:
 
 
 class _Round(NamedTuple):
-    """Final positions (n, 3) [m] of an iteration, and the largest component of its friction [N]."""
+    """Final positions (n, 3) [m] of an iteration, and its largest friction component [N]."""
 
     positions: Positions
     acting: float
 
 
 def _is_cycle_at_largest(earlier: deque[_Round], x: Positions, acting: float) -> bool:
-    """Return whether x (n, 3) [m] returns to an iterate before the last, and none since then had more friction."""
+    """Return whether x closes a cycle in which no iterate had more friction."""
     if len(earlier) < 2:
         return False
     moved = _largest_component(x - earlier[-1].positions)
@@ -160,7 +160,10 @@ def _is_cycle_at_largest(earlier: deque[_Round], x: Positions, acting: float) ->
 
 
 def _relative_friction_change(problem: StepProblem, following: StepProblem, x: Positions) -> tuple[float, float]:
-    """Return the relative change of friction at x (n, 3) between two problems, and its largest component [N] before."""
+    """Return the relative change of friction at x (n, 3) between two problems.
+
+    The second result is the largest component [N] before.
+    """
     before, after = (
         [energy.friction_gradient(x) for energy in each.energies if has_friction(energy)]
         for each in (problem, following)

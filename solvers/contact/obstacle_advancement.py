@@ -63,7 +63,7 @@ def intersection_free_guess(problem: StepProblem) -> StepProblem:
 
 
 def _find_clear_positions(problem: StepProblem, energies: Sequence[BarrierEnergy]) -> Positions:
-    """Return positions (n, 3) [m] without intersections at the end of the step, by a path without collisions.
+    """Return intersection-free positions (n, 3) [m] at the step's end, by a collision-free path.
 
     Raises NoClearance if none is found.
     """
@@ -101,6 +101,7 @@ def _push_out(problem: StepProblem, energies: Sequence[BarrierEnergy], p: Positi
         places = np.full((len(blocks.vertices), k * k), -1)
         places[:, :: k + 1] = blocks.vertices
         blocks.add_blocks(places, curvature)
+    # A vertex without inertia gets a small one, so that no block is singular.
     diagonal = np.maximum(system.inertia_diagonal, 1e-9 * float(curvature.max(initial=0.0)) or 1.0)
     curvature += diagonal[:, None, None] * np.eye(3)
     shift = np.asarray(-0.5 * np.linalg.solve(curvature, gradient[:, :, None])[:, :, 0], np.float64)

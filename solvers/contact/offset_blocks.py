@@ -6,10 +6,11 @@ no neighbouring feature is closer. A point x is in the block of
     vertex i    if (x - x_i) . (x_i - x_j) >= 0 for all its neighbours j
     edge ij     if (x - q) . (q - x_k) >= 0 for the third vertex k of all its triangles, q = foot of x_k on the line
 
-and its closest point on the feature is no end of it. A candidate pair is in contact if its closest features are in each
-other's blocks, as far as they are vertices, or edges of a pair of a point and a triangle. Forces are then perpendicular
-to the faces in contact. Source: Chen et al. 2025, "Offset geometric contact", ACM TOG 44(4); the conditions are those
-of `ipctk.ogc`.
+and its closest point on an edge is not one of its ends. A candidate pair is in contact if its closest features are in
+these blocks of each other: those of both vertices if a point is closest to a corner of a triangle, that of the edge if
+it is closest to an edge, and that of each end that is closest in a pair of edges. Forces are then perpendicular to the
+faces in contact. Source: Chen et al. 2025, "Offset geometric contact", ACM TOG 44(4); the conditions are those of
+`ipctk.ogc`.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ def _is_in_vertex_block(adjacency, x, i, p):
 
 @jit_inner
 def _is_in_edge_block(adjacency, x, i, j, p):
-    """Return whether a point p, with its closest point inside edge ij, is in the block of that edge."""
+    """Return whether p is in the block of edge ij, given a closest point inside it."""
     begin = load_point(x, i)
     u = subtract3(load_point(x, j), begin)
     length = dot3(u, u)
@@ -100,7 +101,7 @@ def _is_in_edge_block(adjacency, x, i, j, p):
 
 @jit_inner
 def _is_point_triangle_contact(adjacency, x, v, c1, c2, c3):
-    """Return whether vertex v[0] and the closest feature of a triangle are in each other's blocks."""
+    """Return whether vertex v[0] and a triangle's closest feature are in each other's blocks."""
     p = load_point(x, v[0])
     if c1 != 0.0 and c2 != 0.0 and c3 != 0.0:
         return True
@@ -118,7 +119,7 @@ def _is_point_triangle_contact(adjacency, x, v, c1, c2, c3):
 
 @jit_inner
 def _is_edge_edge_contact(adjacency, x, v, s, t):
-    """Return whether the closest features of edges v[0] v[1] and v[2] v[3] are in each other's blocks."""
+    """Return whether the closest features of two edges v (4,) are in each other's blocks."""
     one_end = -1 if 0.0 < s < 1.0 else v[0] if s <= 0.0 else v[1]
     other_end = -1 if 0.0 < t < 1.0 else v[2] if t <= 0.0 else v[3]
     a, b, c, d = load_point(x, v[0]), load_point(x, v[1]), load_point(x, v[2]), load_point(x, v[3])
@@ -131,7 +132,7 @@ def _is_edge_edge_contact(adjacency, x, v, s, t):
 
 @jit_inner
 def _is_contact(adjacency, x, v, edges):
-    """Return whether the closest features of a pair with vertices v (4,) are in each other's blocks."""
+    """Return whether the closest features of a pair v (4,) are in each other's blocks."""
     a, b, c, d = load_point(x, v[0]), load_point(x, v[1]), load_point(x, v[2]), load_point(x, v[3])
     if edges:
         _, s, _, minus_t, _, _ = edge_edge_distance_vector(a, b, c, d)

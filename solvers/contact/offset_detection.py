@@ -1,10 +1,10 @@
-"""Contact detection of offset geometric contact (OGC): contacts, and how far each vertex may move before the next one.
+"""Contact detection of offset geometric contact (OGC): contacts, and displacement bounds of vertices.
 
     b_v = gamma min(reach, gaps of all pairs of a point and a triangle or of two edges that v belongs to)
 
-With gamma < 1/2 no two vertices of a pair close its gap, in whichever direction they move by up to b_v: the points of a
-triangle or an edge move by no more than one of its vertices. Source: Chen et al. 2025, "Offset geometric contact", ACM
-TOG 44(4). There a contact counts once, whatever the number of primitives around its features; barriers count all.
+With gamma < 1/2 no pair closes its gap, in whichever direction its vertices move by up to b_v: the points of a triangle
+or an edge move by no more than one of its vertices. Source: Chen et al. 2025, "Offset geometric contact", ACM TOG
+44(4). There a contact counts once, whatever the number of primitives around its features; barriers count all.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class OffsetSurface(NamedTuple):
         )
 
     def _find_candidates(self, contact: BarrierContact, p: Positions, reach: float) -> Any:
-        """Find all pairs with gaps up to `reach` [m] at p (N, 3) [m], and possibly more."""
+        """Find all pairs with gaps up to `reach` [m] at p, and possibly more."""
         limit = contact.collision_mesh.min_distance + reach
         if not (self.cached_candidates and self.cached_candidates[0].covers_positions(p, limit)):
             inflated = CACHE_INFLATION * limit + compute_roundoff_margin(p)
@@ -123,7 +123,7 @@ class OffsetSurface(NamedTuple):
         return self.cached_candidates[0].candidates
 
     def _average_stiffness(self, vertices: IndexArray, coefficients: FloatArray) -> FloatArray:
-        """Return the stiffness [N/m] of contacts (k,): that of their vertices in the mesh, weighted by coefficients."""
+        """Return the mean stiffness [N/m] of each contact's mesh vertices, weighted by coefficients (k, 4)."""
         own = vertices < len(self.vertex_stiffness)
         weight = np.where(own, np.abs(coefficients), 0.0)
         total = np.einsum("ki,ki->k", weight, self.vertex_stiffness[np.where(own, vertices, 0)])

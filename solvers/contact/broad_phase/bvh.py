@@ -1,11 +1,11 @@
-"""Broad phase: bounding volume hierarchies (BVH) over points, edges or triangles, built once and refitted per query.
+"""Broad phase: bounding volume hierarchies (BVH) over points, edges or triangles.
 
-A node has eight boxes, tested at once in vector registers (`springbench.solvers.simd.float64x8`). Primitives are
-numbered along a
-Morton curve through the rest shape, so that eight consecutive ones form a patch of the surface however it folds. The
-tree is implicit: the child of box b of node k is node 8 k + 1 + b. Eight primitives traverse the other tree together
-and are separated at its leaves. Candidates are ordered by these packets, by the leaves, and by primitives. The order
-depends on nothing else, so that sums over a superset of the active pairs are bitwise identical.
+A tree is built once and refitted in each query. A node has eight boxes, tested at once in vector registers
+(`springbench.solvers.simd.float64x8`). Primitives are numbered along a Morton curve through the rest shape, so that
+eight consecutive ones form a patch of the surface however it folds. The tree is implicit: the child of box b of node k
+is node 8 k + 1 + b. Eight primitives traverse the other tree together and are separated at its leaves. Candidates are
+ordered by these packets, by the leaves, and by primitives. The order depends on nothing else, so that sums over a
+superset of the active pairs are bitwise identical.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ from springbench.solvers.simd.float64x8 import lowest_set_bit
 
 _MORTON_BITS = 10
 _STACK_SIZE = 8 * 22
-"""Stack entries: eight times the number of levels of any tree that fits in memory."""
+"""Stack entries: eight per level, for more levels than any tree in memory has."""
 _CANDIDATES_PER_PRIMITIVE = 24
-"""Initial capacity for pairs of each primitive; beyond it the query is repeated. Four touching layers have some 14."""
+"""Initial capacity per primitive for candidate pairs; if it is exceeded, the query is repeated. Four touching layers
+need about 14."""
 
 
 class BVH(NamedTuple):
@@ -133,7 +134,7 @@ def allocate_traversal_stack() -> IndexArray:
 
 
 def _build_node_aabbs(one: BVH, other: BVH, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Build the boxes of both trees around the linear motion from x to y, (n, 4) each."""
+    """Build the boxes of both trees around the linear motion from x to y."""
     boxes = [np.empty((tree.num_nodes, 6, 8)) for tree in ((one,) if one is other else (one, other))]
     for tree, around in zip((one, other), boxes, strict=False):
         refit_aabbs(tree, x, y, around)
@@ -208,7 +209,7 @@ def traverse_trees(one, other, begin, end, query, is_same_tree, stack, out):
             if each > 1:
                 left = overlap_mask(boxes, there, node, low, high, lower, upper, query)
                 if is_same_tree:
-                    left &= -1 << max(0, (first_of_eight - first) // each)  # nothing before these eight
+                    left &= -1 << max(0, (first_of_eight - first) // each)  # skip boxes before these eight primitives
                 for slot in range(7, -1, -1):  # the first one is popped first
                     if left >> slot & 1:
                         stack[top, 0], stack[top, 1], stack[top, 2] = (
@@ -219,7 +220,7 @@ def traverse_trees(one, other, begin, end, query, is_same_tree, stack, out):
                         top += 1
                 continue
             above, slot, own = max(0, node - 1) // 8, (node - 1) % 8, 255
-            if node > 0:  # which of the eight come near the box around this node
+            if node > 0:  # select those of the eight that come near the box around this node
                 own = overlap_mask(
                     mine, yours, leaf + first_of_eight // 8,
                     *extract_aabb(boxes[above], slot), *extract_aabb(there[above], slot), query,
@@ -233,9 +234,8 @@ def traverse_trees(one, other, begin, end, query, is_same_tree, stack, out):
                 while left != 0:
                     f = first + lowest_set_bit(left)
                     left &= left - 1
-                    if count < len(
-                        out
-                    ):  # pairs with a common vertex are overwritten, as a branch here would be mispredicted
+                    # Pairs with a common vertex are overwritten by the next pair: a branch would be mispredicted.
+                    if count < len(out):
                         out[count, 0], out[count, 1] = first_of_eight + k, f
                     count += not has_common_vertex(one.primitives, first_of_eight + k, other.primitives, f)
     return count

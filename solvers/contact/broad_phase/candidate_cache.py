@@ -1,12 +1,12 @@
 """Cache of candidate pairs and of clearances, as in a neighbour list with a skin.
 
 Candidates are found at one position and reused while the vertices stay close to it, apart from a common translation.
-The cache changes no bit of the results: pairs beyond the activation distance contribute nothing, and all others come in
-one order. Step sizes are limited by the pairs that may collide along the displacement
-(`springbench.solvers.contact.ccd`). Where
-the previous query found none, clusters of primitives are tested first (`contact.broad_phase.cluster_culling`). The
-cache then stores the clearance at the end of the displacement, separately for pairs close to each other at rest and for
-all others. A later displacement is collision-free if no two vertices move relative to each other by more than that.
+The cache changes no bit of the results: pairs beyond the activation distance contribute nothing, and all others always
+have the same order. Step sizes are limited by the pairs that may collide along the displacement
+(`springbench.solvers.contact.ccd`). Where the previous query found none, clusters of primitives are tested first
+(`springbench.solvers.contact.broad_phase.cluster_culling`). The cache then stores the clearance at the end of the
+displacement, separately for pairs close to each other at rest and for all others. A later displacement is
+collision-free if no two vertices move relative to each other by more than that.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class CandidateSource(Protocol):
         ...
 
     def max_relative_displacement(self, p: Positions, q: Positions) -> float:
-        """Return the largest relative displacement of two vertices that are close to each other at rest.
+        """Return the largest relative displacement of two vertices close to each other at rest.
 
         Args:
             p: start positions, contiguous (n, 3) [m].
@@ -87,7 +87,7 @@ class CandidateSource(Protocol):
         ...
 
     def find_ccd_candidates(self, x: FloatArray, y: FloatArray, query: CollisionQuery, edges: bool) -> Candidates:
-        """Return the pairs that may violate a limit on the linear displacement from x to y.
+        """Return the pairs that may violate a limit between x and y.
 
         Args:
             x: start positions (n, 4) [m]; column 3 is padding.
@@ -175,9 +175,10 @@ class CachedCandidates(NamedTuple):
 
 
 def _stays_inactive(source: CandidateSource, gap: float, displacements: tuple[float, float]) -> bool:
-    """Return whether gaps of at least `gap` [m] stay open and remain inactive at the end of a displacement.
+    """Return whether gaps stay open on a displacement and are inactive at its end.
 
-    displacements: maximum relative displacements [m] of its start and of its end with respect to the cached position.
+    gap: lower bound of the distances at the cached position [m]; displacements: maximum relative displacements [m] of
+    the start and of the end with respect to the cached position.
     """
     return displacements[1] <= gap - source.min_distance - source.dhat and _keeps_gaps_open(
         gap - source.min_distance, displacements
@@ -279,7 +280,7 @@ def find_collision_free_step_size(
             and 2.0 * (_max_displacement_from_mean(one.positions, p) + fast) <= one.radius - closed
         ):
             return ccd.collision_free_step_size(one.candidates, x, along, most, *scratch)
-    for edges in (False, True):  # edges are queried along the part of the path that points leave
+    for edges in (False, True):  # edge pairs are queried only up to the step size that points allow
         limits = CollisionQuery(closed + rounded, closed, MIN_GAP_FRACTION, 2.0 * most * fast)
         near = source.find_ccd_candidates(x, x + most * along, limits, edges)
         most = ccd.collision_free_step_size(near, x, along, most, *scratch)
@@ -297,7 +298,7 @@ def _roundoff_margin(p: Positions) -> float:
 
 
 def _max_displacement_from_mean(p: Positions, q: Positions) -> float:
-    """Return the largest displacement [m] of a vertex from p to q, (n, 3) each, relative to the mean displacement."""
+    """Return the largest displacement [m] of a vertex relative to the mean displacement from p to q."""
     shift = q - p
     shift -= shift.mean(axis=0)
     return float(np.sqrt(np.einsum("ij,ij->i", shift, shift)).max(initial=0.0))

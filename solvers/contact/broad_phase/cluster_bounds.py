@@ -1,18 +1,17 @@
-"""Distance bounds of clusters that are affine images of their rest shape, by projection onto a plane.
+"""Distance bounds of clusters that are affine images of their rest shape.
 
-Let a and b be points of primitives of two clusters P and Q, and A and B the same points at rest. x_P, F_P and y_i are
-those of `springbench.solvers.contact.broad_phase.cluster_fit`. Let e_1, e_2 span P's plane, projected on which
-bending is a
-second-order effect, and E = (e_1, e_2)'. Then
+The bounds are those of projections onto a plane. Let a and b be points of primitives of two clusters P and Q, and A and
+B the same points at rest. x_P, F_P and y_i are those of `springbench.solvers.contact.broad_phase.cluster_fit`. Let
+e_1, e_2 span P's plane, projected on which bending is a second-order effect, and E = (e_1, e_2)'. Then
 
     |a - b| >= |E (a - b)| >= l |A - B| - z,     l = least eigenvalue of the symmetric part of E F_P (t_1, t_2)
     z = |E (x_Q - x_P - F_P (X_Q - X_P))| + |E (F_Q - F_P)| rho_Q + |E y_i| + |E y_j|
 
-at most, with |A - B| reduced by its part out of the plane. On a linear motion E is constant, l concave and z convex. A
-bound that is satisfied at both ends is therefore satisfied between them.
+z is an upper bound, and |A - B| is reduced by its part out of the plane. On a linear motion E is constant, l concave
+and z convex. A bound that is satisfied at both ends is therefore satisfied between them.
 
-The initial distance is at most |F_P| |A - B| + z without E. The required fraction of it remains where it is less than
-the bound, which is linear in |A - B|.
+The initial distance is at most |F_P| |A - B| + z', with z' the value of z without E. A fraction s of it remains if
+l |A - B| - z >= s (|F_P| |A - B| + z'). For l > s |F_P| a test at the smallest |A - B| covers all larger ones.
 """
 
 from __future__ import annotations
@@ -195,7 +194,7 @@ def _separated_mask(begin, end, pairs, basis, first, last, query, min_end_distan
 
 @jit_inner
 def _deviation_bounds(poses, pairs, first, last, e1, e2):
-    """Return z without the first clusters' own part, of eight pairs, and the same without E."""
+    """Return z of eight pairs with and without E; both exclude the residual of the first clusters."""
     room, x = len(pairs.rest_distance), pairs.clusters
     f1, f2 = gather_rows(poses.f1, x, first, last, 0), gather_rows(poses.f2, x, first, last, 0)
     c = subtract3(gather_rows(poses.centre, x, first, last, 1), gather_rows(poses.centre, x, first, last, 0))

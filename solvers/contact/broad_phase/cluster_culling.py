@@ -1,11 +1,10 @@
-"""Cluster culling: prove that no primitives of a surface come close, without testing each of them.
+"""Cluster culling: prove that no primitives of a surface come close, without testing each.
 
 The surface is divided into clusters of a few vertices each. A cluster owns the points, edges and triangles whose first
 vertex along the Morton curve belongs to it. Cluster pairs that are close at rest are tested by their affine poses
 (`springbench.solvers.contact.broad_phase.cluster_bounds`), all others by bounding boxes. Primitives are tested only
-where both
-fail. The result is a lower bound of all distances at the end of the motion. Boxes are tested again only after vertices
-have moved relative to each other by as much.
+where both fail. The result is a lower bound of all distances at the end of the motion. Boxes are tested again only
+after vertices have moved relative to each other by that bound.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ from springbench.solvers.model.step_problem import Positions
 FloatArray = NDArray[np.float64]
 
 _CLUSTER_SIZE = 16
-"""Vertices of a cluster, in addition to those of its neighbours that its primitives have."""
+"""Number of vertices assigned to a cluster; its primitives add vertices of neighbouring clusters."""
 
 _QUERY_INFLATION = 1.5
 """Query distance relative to the required one: a larger clearance stays valid for longer."""
 
 _REMOTE_INFLATION = 4.0
-"""Factor on that distance for clusters not close at rest, tried first."""
+"""Further factor on the query distance for clusters not close at rest; if pairs remain, it is queried without it."""
 
 _POSITION_TOLERANCE = 1e-12
 """Tolerance, relative to the query distance, within which two positions count as the same."""
@@ -149,7 +148,9 @@ class ClusterCulling:
         return made._with_rest_pairs(rest)
 
     def compute_clearance_bounds(self, p: Positions, q: Positions, query: CollisionQuery) -> ClearanceBounds | None:
-        """Return clearance bounds at q of primitives without common vertices, if the motion violates no limit.
+        """Return clearance bounds at q, if the motion violates no limit.
+
+        Pairs with a common vertex are excluded.
 
         Args:
             p: start positions (n, 3) [m].
@@ -235,7 +236,7 @@ class ClusterCulling:
     def _fit_clusters(self, p: Positions, query: CollisionQuery) -> _ClusterSnapshot:
         for k, one in enumerate(self.recent_poses):
             if ccd.is_rigid_translation(one.positions, p, _POSITION_TOLERANCE * query.inflation_radius):
-                self.recent_poses.append(self.recent_poses.pop(k))  # the other one is the first to be overwritten
+                self.recent_poses.append(self.recent_poses.pop(k))  # the first entry is the next to be overwritten
                 return one
         one = (
             self.recent_poses.pop(0)
@@ -249,7 +250,10 @@ class ClusterCulling:
         return one
 
     def _find_cluster_pairs(self, begin: _ClusterSnapshot, end: _ClusterSnapshot, query: CollisionQuery) -> int:
-        """Find cluster pairs to test in addition to those close at rest; return their number, -1 if out of memory."""
+        """Find cluster pairs to test in addition to those close at rest.
+
+        The result is their number, or -1 if the capacity does not suffice.
+        """
         known, pairs = self.num_rest_pairs, self.cluster_pairs
         here, there = begin.aabbs, end.aabbs
         for around in (here, there):
@@ -267,7 +271,10 @@ class ClusterCulling:
     def _find_primitive_pairs(
         self, patches: IndexArray, x: FloatArray, y: FloatArray, query: CollisionQuery
     ) -> Candidates | None:
-        """Return the primitive pairs of cluster pairs (k, 2) whose boxes may violate the limits; None if too many."""
+        """Return the primitive pairs whose boxes may violate the limits; None if there are too many.
+
+        patches: cluster pairs (k, 2).
+        """
         memory = self.scratch
         owned = self.points, self.edges, self.triangles
         first, many = cluster_candidates(
@@ -325,7 +332,7 @@ class _ClusterSnapshot(NamedTuple):
 
 @jit_kernel
 def keep_new_pairs(pairs, starts, num_new_pairs):
-    """Remove the last pairs that are close at rest, which are stored already, and compact the others.
+    """Remove new pairs that are close at rest, which are stored already, and compact the others.
 
     Args:
         pairs: cluster pairs (k, 2), those close at rest first; updated.

@@ -3,7 +3,7 @@
     x_i = x_P + F_P (X_i - X_P) + y_i,     F_P = f_1 t_1' + f_2 t_2'
 
 X: rest shape; t_1, t_2: axes of the plane of a cluster P at rest; F_P: least squares fit; y_i: its residual.
-All of these are sums over vertices, which are invariant to rotations of a cluster.
+x_P and F_P are linear in the positions, so that a rotation of the cluster leaves the lengths of all y_i unchanged.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class ClusterPrimitives(NamedTuple):
 
 @jit_kernel
 def cluster_candidates(cluster_primitives, patches, x, y, query, start_aabbs, end_aabbs, out):
-    """Write the primitive pairs of cluster pairs whose boxes may violate the limits on a linear motion.
+    """Write the primitive pairs whose boxes may violate the limits on a linear motion.
 
     Args:
         cluster_primitives: points, edges and triangles of the clusters.
@@ -84,7 +84,7 @@ def cluster_candidates(cluster_primitives, patches, x, y, query, start_aabbs, en
 
 @jit_inner
 def _add_cluster_pair(one, a, other, b, x, y, query, start_aabbs, end_aabbs, out, count):
-    """Add pairs of primitives of clusters a and b, in 8-lane packets; return the new count."""
+    """Add pairs of primitives of clusters a and b; return the new count."""
     begin, end, last = other.cluster_starts[b], other.cluster_starts[b + 1], one.cluster_starts[a + 1]
     for first in range(begin, end, 8):
         _store_primitive_aabbs(other.primitives, first, end, x, start_aabbs, (first - begin) // 8)
@@ -97,7 +97,7 @@ def _add_cluster_pair(one, a, other, b, x, y, query, start_aabbs, end_aabbs, out
         mine = overlap_mask(start_aabbs, end_aabbs, len(start_aabbs) - 1, low, high, lower, upper, query) & (
             (1 << min(8, last - first)) - 1
         )
-        while mine != 0:  # primitives near any other there
+        while mine != 0:  # primitives near the box of the other cluster
             slot = lowest_set_bit(mine)
             mine &= mine - 1
             count = _add_primitive_candidates(
@@ -108,7 +108,10 @@ def _add_cluster_pair(one, a, other, b, x, y, query, start_aabbs, end_aabbs, out
 
 @jit_inner
 def _add_primitive_candidates(one, e, slot, other, begin, end, same, query, start_aabbs, end_aabbs, out, count):
-    """Add pairs of primitive e with a range of others; within one cluster each edge pair is added once."""
+    """Add pairs of primitive e with a range of others.
+
+    Within one cluster each edge pair is added once.
+    """
     eights, wide, own = (end - begin + 7) // 8, one.primitives.shape[1], len(start_aabbs) - 1
     low, high = extract_aabb(start_aabbs[own], slot)
     lower, upper = extract_aabb(end_aabbs[own], slot)
@@ -137,13 +140,13 @@ def _add_primitive_candidates(one, e, slot, other, begin, end, same, query, star
 
 @jit_inner
 def _store_primitive_aabbs(corners, first, end, x, boxes, node):
-    """Store the boxes at x of eight primitives in a node; lanes beyond the end repeat the last one."""
+    """Store the boxes of eight primitives at x; lanes beyond the end repeat the last."""
     store_aabbs(*primitive_aabbs(corners, first, end - 1, x), boxes, node)
 
 
 @jit_inner
 def _store_parent_aabbs(boxes, eights):
-    """Store the boxes of the first nodes, eight per node, after them; return the box of all."""
+    """Store the boxes of the first nodes behind them, eight per node; return their union."""
     l0, l1, l2, h0, h1, h2 = np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf
     for node in range(eights):
         low, high = merge_aabbs(boxes[node], 8)

@@ -1,8 +1,8 @@
-"""Axis-aligned bounding boxes (AABB) of primitives, and tests of which may violate distance limits during a motion.
+"""Axis-aligned bounding boxes (AABB) of primitives, and tests of distance limits during a motion.
 
 Let a pair have the distance d at the start of a linear motion in which no two vertices move relative to each other by
-more than M. Its distance stays at least d - M. If it comes closer than t + s d, then d < (t + M)/(1 - s), so that it
-comes closer than
+more than M. Its distance stays at least d - M. Let t be the minimum distance, and s the one relative to d. If the pair
+comes closer than t + s d, then d < (t + M)/(1 - s), so that it comes closer than
 
     t + s d < (t + s M)/(1 - s)
 
@@ -50,7 +50,7 @@ class ClearanceBounds(NamedTuple):
 
 @jit_inner
 def primitive_aabbs(corners, first, last, x):
-    """Return the lower and upper corners of the boxes of eight primitives at x (n, 4).
+    """Return the lower and upper corners of the boxes of eight primitives.
 
     Args:
         corners: vertices of each primitive (m, k).
@@ -83,11 +83,13 @@ def store_aabbs(low, high, boxes, node):
 def compute_aabb_clearance(
     one: tuple[int, int], other: tuple[int, int], p: Positions, q: Positions, query: CollisionQuery
 ) -> float:
-    """Return the distance [m] of the boxes of two vertex ranges at q, if they prove that no limit is violated.
+    """Return the distance [m] at q of the boxes of two vertex ranges.
+
+    It is 0 unless the boxes prove that no limit is violated.
 
     Args:
-        one: first and last vertex of one range.
-        other: first and last vertex of the other range.
+        one: first vertex of one range, and the vertex after its last one.
+        other: first vertex of the other range, and the vertex after its last one.
         p: start positions (n, 3) [m] of the linear motion.
         q: end positions (n, 3) [m].
         query: limits of the distances.
@@ -103,7 +105,7 @@ def compute_aabb_clearance(
     clearance = float(np.linalg.norm(np.maximum(apart, 0.0)))
     begin, end = low.min(axis=0), high.max(axis=0)
     if max(float((begin[0] - end[1]).max()), float((begin[1] - end[0]).max())) > query.inflation_radius:
-        return clearance  # no path leads so near, and what no path leads to bounds no step
+        return clearance  # the boxes around the whole motion are separated, so that no pair limits the step size
     wide = float(np.linalg.norm(high[0].max(axis=0) - low[0].min(axis=0)))
     wide = min(
         max(query.inflation_radius, query.min_distance + query.relative_min_distance * wide), max_inflation(query)
@@ -145,6 +147,7 @@ def merge_aabbs(boxes, num_boxes):
 @jit_kernel
 def max_inflation(query):
     """Return the distance [m] beyond which no limit can be violated."""
+    # The test avoids 0 times an infinite displacement, which would be NaN.
     relative_offset = query.relative_min_distance * query.max_displacement if query.relative_min_distance > 0.0 else 0.0
     return max(query.inflation_radius, (query.min_distance + relative_offset) / (1.0 - query.relative_min_distance))
 
@@ -167,7 +170,7 @@ def overlap_mask(boxes, end_boxes, node, low, high, lower, upper, query):
     at, most = _NODE_STRIDE * node, max_inflation(query)
     x0, x1, x2 = load_packet(boxes, at), load_packet(boxes, at + 8), load_packet(boxes, at + 16)
     y0, y1, y2 = load_packet(boxes, at + 24), load_packet(boxes, at + 32), load_packet(boxes, at + 40)
-    if end_boxes is boxes:  # half the tests say the other half
+    if end_boxes is boxes:  # the tests of the end boxes are those of the start boxes
         return mask_to_bits(
             (x0 <= high[0] + most)
             & (y0 >= low[0] - most)

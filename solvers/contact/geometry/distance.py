@@ -2,7 +2,7 @@
 
 The functions are inlined kernels, for floats or 8-lane packets.
 
-    z = sum_i c_i x_i        from the closest point of one to that of the other, over four vertices x_0 .. x_3
+    z = sum_i c_i x_i        from the closest point of the second to that of the first, over four vertices x_0 .. x_3
 
 A point x_0 and a triangle x_1 x_2 x_3 have c_0 = 1; edges x_0 x_1 and x_2 x_3 have c = (1 - s, s, t - 1, -t). |z|^2 is
 a convex quadratic function of the local coordinates. If its minimum lies inside, it gives the closest points; else they
@@ -62,7 +62,10 @@ def cross3(a, b):
 
 @jit_inner
 def _project_onto_edge(w, u):
-    """Return the closest place of w on an edge u, in [0, 1], and the squared distance; both start at one end."""
+    """Return the parameter of the closest point on an edge u to w, and the squared distance.
+
+    The parameter is in [0, 1]. The vectors w and u start at the same end of the edge.
+    """
     length, t = dot3(u, u), dot3(u, w)
     t = where(t <= 0.0, 0.0, where(t >= length, 1.0, divide_packet(t, length)))
     d = w[0] - t * u[0], w[1] - t * u[1], w[2] - t * u[2]
@@ -99,7 +102,7 @@ def point_triangle_closest_point(x, a, b, c):
 
 @jit_inner
 def edge_edge_closest_point(a, b, c, d):
-    """Return the places of the closest points on two edges.
+    """Return the parameters of the closest points on two edges.
 
     Args:
         a, b: ends of one edge [m], three floats or packets each.

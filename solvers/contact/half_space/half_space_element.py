@@ -67,7 +67,7 @@ def _hessian(parameters, e, z0, z1, z2):
     xx, xy, xz, yy, yz, zz = axial_hessian(pressed, weight, n0, n1, n2)
     if length <= parameters[e, 9]:
         return xx, xy, xz, yy, yz, zz
-    u0, u1, u2 = u0 / length, u1 / length, u2 / length  # what slips has no stiffness along its path
+    u0, u1, u2 = u0 / length, u1 / length, u2 / length  # sliding friction has no stiffness along its direction
     return (
         xx - weight * u0 * u0, xy - weight * u0 * u1, xz - weight * u0 * u2,
         yy - weight * u1 * u1, yz - weight * u1 * u2, zz - weight * u2 * u2,

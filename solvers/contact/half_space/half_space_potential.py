@@ -1,4 +1,4 @@
-"""Penalty contact of vertices with convex obstacles, and Coulomb friction, as one convex energy per step.
+"""Penalty contact of vertices with convex obstacles and Coulomb friction: one convex energy per step.
 
     E(x) = sum_i k_i/2 min(0, n_i.x_i - d_i)^2 + F_i h(|u_i|),   u_i = (I - n_i n_i')(x_i - a_i)
 
@@ -11,8 +11,8 @@ moves by less than the smoothing length s = eps_v (t_x - t), with t_x the time o
 (`springbench.solvers.contact.potentials.friction_law`).
 
 A sticking vertex moves at most at the speed `eps_v`. Half-spaces, depth and friction refer to the end of the step. If
-the stage is the position at another time (`springbench.solvers.model.integrators`), both are moved towards the start
-in proportion.
+the stage is the position at another time (`springbench.solvers.model.integrators`), all of these are moved towards the
+start in proportion.
 """
 
 from __future__ import annotations

@@ -26,6 +26,8 @@ from springbench.solvers.kernels.spring_law import unit_direction
 from springbench.solvers.simd.spring_packets import LANES, RHS_STRIDE
 
 _MAX_ACTIVE_SET_PASSES = 4
+"""Maximum number of searches for the active half-spaces of a step with one block."""
+
 EXACT_BLOCK, _FRICTION_MAJORANT, SPRING_MAJORANT, _FULL_MAJORANT = range(4)
 """The blocks: exact except for compressed springs; majorant of friction; also of springs; also of inactive contact."""
 
@@ -135,8 +137,8 @@ def _add_outer_product(block, weight, n0, n1, n2):
 def add_half_spaces(s, i, x, d, level, gradient, block):
     """Add the half-spaces of a row to its gradient and block.
 
-    Included are those active at x or after a step d, or all if they are two-sided or with the full majorant, and all
-    friction.
+    Half-spaces that are active at x or after a step d are included; all are if they are two-sided or if `level` is the
+    full majorant. Friction is always included.
 
     Args:
         s: half-spaces.
@@ -201,7 +203,10 @@ def solve_block(block, g):
 
 @jit_inner
 def _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load):
-    """Return the change of a vertex's energy [J] of springs, inertia and pins by a step d, without cancellation."""
+    """Return the change of a vertex's energy [J] by a step d, without cancellation.
+
+    The energy is that of springs, inertia and pins.
+    """
     total = 0.0
     for c in range(3):
         total += d[c] * (0.5 * anchor_stiffness * d[c] - load[c])
@@ -251,9 +256,9 @@ def add_half_space_change(s, i, x, d, total):
 
 
 def build_block_step(energy_change: Any) -> Any:
-    """Build a function that finds a step of row i from x that does not increase its energy.
+    """Build a function that finds a step of row i that does not increase its energy.
 
-    It tries increasingly large blocks; if none succeeds, the step is zero. A device compiles it separately.
+    The function tries increasingly large blocks; if none succeeds, the step is zero. A device compiles it separately.
 
     Args:
         energy_change: function (d, where) that returns the change by a step of the other energies of the row; `where`
@@ -281,9 +286,9 @@ def build_block_step(energy_change: Any) -> Any:
 
 
 def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
-    """Build a function that moves the vertices of a packet to lower energies one after another.
+    """Build a function that moves the vertices of a packet to lower energies in turn.
 
-    No two of them are coupled.
+    No two of these vertices are coupled.
 
     Args:
         add_gradient_block: function (others, i, p, gradient, block) that adds the other energies of row i.

@@ -1,5 +1,7 @@
-"""Half-spaces of contact in the order of vertex-block packets (see
-`springbench.solvers.contact.half_space.half_space_steps`)."""
+"""Half-spaces of contact in the order of vertex-block packets.
+
+`springbench.solvers.contact.half_space.half_space_steps` uses them.
+"""
 
 from __future__ import annotations
 

@@ -5,8 +5,8 @@ extent, a capsule a box along one axis, and a plane the top of a box that is unb
 vertex moves linearly from a to b, where it would end by its velocity alone. The distance f to the box along this line
 is convex. Newton's method for f = R, started at a, therefore never passes the time of impact. At each iterate, the
 plane through the closest point, displaced outwards by R, separates the obstacle from a. The last one touches the first
-point of contact, or does not intersect the line at all. A vertex that ends on its outer side has not been inside the
-obstacle on the path, wherever it ends.
+point of contact, or does not intersect the line at all. A vertex that ends on the outer side of this plane has not been
+inside the obstacle on its path.
 """
 
 from __future__ import annotations
@@ -72,9 +72,8 @@ def find_nearby_obstacles(p, v, dt, frames, low, high, out):
         out[k] = True
         for c in range(3):
             begin, end = _project_box(frames[k, 0], c, x0, x1, x2, y0, y1, y2)
-            other, last = _project_box(
-                frames[k, 1], c, x0, x1, x2, y0, y1, y2
-            )  # less than `travel` from where they end
+            # Vertices end less than `travel` from p, whose box is therefore extended by that in the end frame.
+            other, last = _project_box(frames[k, 1], c, x0, x1, x2, y0, y1, y2)
             out[k] &= (
                 min(begin, other - travel) <= high[k, c] + travel and max(end, last + travel) >= low[k, c] - travel
             )
@@ -84,7 +83,7 @@ def find_nearby_obstacles(p, v, dt, frames, low, high, out):
 
 @jit_inner
 def _project_box(frame, c, x0, x1, x2, y0, y1, y2):
-    """Return the smallest and largest coordinate c, in a frame, of the box from x to y."""
+    """Return the range of coordinate c, in a frame, of the box from x to y."""
     e0, e1, e2, o = frame[1 + c, 0], frame[1 + c, 1], frame[1 + c, 2], frame[0]
     middle = e0 * (0.5 * (x0 + y0) - o[0]) + e1 * (0.5 * (x1 + y1) - o[1]) + e2 * (0.5 * (x2 + y2) - o[2])
     half = 0.5 * (abs(e0) * (y0 - x0) + abs(e1) * (y1 - x1) + abs(e2) * (y2 - x2))
@@ -93,7 +92,9 @@ def _project_box(frame, c, x0, x1, x2, y0, y1, y2):
 
 @jit_kernel
 def build_separating_planes(p, v, dt, frames, obstacle, margin, out, work):
-    """Write the half-spaces of the vertices that may reach one obstacle to the first k rows of `out`.
+    """Write the half-spaces of the vertices that may reach one obstacle.
+
+    They are written to the first k rows of `out`.
 
     Args:
         p: positions (n, 3) [m].
@@ -195,7 +196,10 @@ def _directional_derivative(a, b, n):
 
 @jit_inner
 def _closest_box_point(x, obstacle, c, n):
-    """Return the signed distance of x from the box; write the closest surface point to c, and the normal to n."""
+    """Return the signed distance of x from the box.
+
+    c and n are overwritten with the closest surface point and the normal there.
+    """
     low, high, _ = obstacle
     square, least, axis, side = 0.0, np.inf, 0, 1.0
     for k in range(3):

@@ -1,7 +1,7 @@
 """Interface of vertex contact to prefactored methods.
 
 Contact acts on single vertices with forces that appear and vanish, and is far stiffer than anything in Q. No constant Q
-contains it, so that it is no projective energy. It provides its stiffness as rows instead, which
+contains it, so it is not a projective energy. It provides its stiffness as rows instead, which
 `springbench.solvers.methods.local_global.half_space_contact` adds to Q in each iteration.
 """
 
@@ -62,7 +62,10 @@ def _is_vertex_contact_type(kind: type) -> bool:
 
 
 def begin_active_contacts(problem: StepProblem) -> list[VertexContactEnergy]:
-    """Return the active contacts of a step, begun separately from energies that may not be needed."""
+    """Begin the vertex contacts of a step, and return those that are active.
+
+    Other energies are not begun, because they may not be needed.
+    """
     begun = [energy.begin_step(problem.step_start) for energy in problem.system.energies if is_vertex_contact(energy)]
     return [energy for energy in begun if is_vertex_contact(energy) and not energy.has_no_active_collisions()]
 

@@ -75,7 +75,7 @@ def energy_and_gradient(collisions, p, out):
     Args:
         collisions: active collisions.
         p: positions (n, 3) [m].
-        out: gradient (n, 3) [N], updated; closed gaps exert the force of a millionth of the activation distance.
+        out: gradient (n, 3) [N], updated; closed gaps exert the force of a gap of 1e-6 activation distances.
 
     Returns:
         Energy [J]; infinite where a gap is closed.

@@ -320,7 +320,7 @@ def _write_hessian_block(collisions, k, p, negative_fraction, scratch, H):
 
 @jit_inner
 def _orthogonalise_columns(p, x, kind, c, z0, z1, z2, first, second):
-    """Write the columns of B, orthogonalised by G, and return the weights of their squares in B G^-1 B'."""
+    """Write the columns of B, orthogonalised by G; return their weights in B G^-1 B'."""
     around = kind in (POINT_EDGE, POINT_TRIANGLE)
     if around:
         one, two = (1, 2), (1, 3)
@@ -346,7 +346,10 @@ def _orthogonalise_columns(p, x, kind, c, z0, z1, z2, first, second):
 
 @jit_inner
 def _write_sliding_column(p, x, ends, c, z0, z1, z2, out):
-    """Write the column of B (12,) where c moves from the second of two ends to the first; return z_a."""
+    """Write a column of B (12,), and return z_a.
+
+    The column is that of c moving from the second of two ends to the first.
+    """
     i, j = ends
     a0, a1, a2 = p[x[i], 0] - p[x[j], 0], p[x[i], 1] - p[x[j], 1], p[x[i], 2] - p[x[j], 2]
     for k in range(4):

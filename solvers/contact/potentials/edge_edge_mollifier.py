@@ -17,7 +17,7 @@ MOLLIFIER_THRESHOLD_SCALE = 1e-3
 """Threshold of |u x v|^2 relative to |u|^2 |v|^2 at rest, below which edges are nearly parallel (Li et al. 2020)."""
 
 _MIN_MOLLIFIER_VALUE = 1e-200
-"""Values of m below this exert no force."""
+"""Values of m up to this are not divided by."""
 
 
 class EdgeCrossProduct(NamedTuple):
@@ -64,7 +64,7 @@ def edge_edge_mollifier(c, e):
 def compute_mollifier_hessian_weights(edges, factor, energy, negative_fraction, dc):
     """Return the mollifier's Hessian weights, and write c' to dc (12,).
 
-    The rotation of its own edges is excluded; see `add_edge_rotation_hessian`.
+    The rotation of the edges is excluded; see `add_edge_rotation_hessian`.
 
     Args:
         edges: cross product data of both edges.

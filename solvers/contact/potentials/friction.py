@@ -1,4 +1,4 @@
-"""Lagged Coulomb friction of collisions with given normal forces: a convex function of positions within the step.
+"""Lagged Coulomb friction of collisions with given normal forces: a convex function of positions.
 
     E(p) = sum over pairs of mu F h(|u|),     u = (I - nn') sum_i c_i (x_i - x_i^t)
 

@@ -1,9 +1,10 @@
-"""Regularised Coulomb friction: the potential F h(|u|) of a tangential displacement u, with the friction limit F.
+"""Regularised Coulomb friction: the potential F h(|u|) of a tangential displacement u.
 
     h(u) = u^2/(2 s)  for u <= s,   u - s/2  beyond;     h'(u)/u = 1/max(s, u)
 
-h is the length, with its kink smoothed at displacements up to the smoothing length s: Huber's function (Huber 1964,
-"Robust estimation of a location parameter"), whose force grows linearly up to the limit. All contact has this law.
+F is the friction limit. h is the length, with its kink smoothed at displacements up to the smoothing length s: Huber's
+function (Huber 1964, "Robust estimation of a location parameter"), whose force grows linearly up to the limit. All
+contact has this law.
 
 These functions are for single contacts in kernels, also on devices; `evaluate_friction` is for arrays.
 """

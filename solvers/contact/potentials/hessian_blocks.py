@@ -25,7 +25,7 @@ BLOCK_ENTRIES = 90
 class ReusableBuffer:
     """Array memory that is reused once the last array is no longer referenced.
 
-    The system clears each page of new memory, which takes as long as to compute the entries.
+    The operating system clears each page of new memory, which takes as long as computing the entries.
     """
 
     def __init__(self) -> None:
@@ -125,7 +125,7 @@ def row_offset(i, a):
 
 @jit_inner
 def count_block_vertices(numbers):
-    """Return the number of vertices of a block with n entries."""
+    """Return the number of vertices of a block with this number of entries."""
     return 4 if numbers == BLOCK_ENTRIES else 3 if numbers == 54 else 2
 
 

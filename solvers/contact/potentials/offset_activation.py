@@ -3,9 +3,9 @@
     g(d) = (r - d)^2/2                          for r/2 <= d < r,        0 beyond r
            (r/2)^2 (1/2 - ln(2 d/r))            for 0 < d < r/2
 
-per stiffness [N/m], with the contact radius r. Equal values, slopes and curvatures of both parts determine the factor
-and that they meet at r/2. Source: Chen et al. 2025, "Offset geometric contact", ACM TOG 44(4); ipctk has the same
-function as `TwoStageBarrier`.
+per stiffness [N/m], with the contact radius r. Both parts meet with equal values, slopes and curvatures, which
+determines the factor and the point r/2. Source: Chen et al. 2025, "Offset geometric contact", ACM TOG 44(4); ipctk has
+the same function as `TwoStageBarrier`.
 """
 
 from __future__ import annotations
