@@ -21,7 +21,7 @@ SUBDOMAIN_SIZE = 32
 
 
 class SubdomainHierarchy:
-    """Positions of the blocks of a matrix in subdomains; subdomain_order (f,): its rows, grouped by subdomain."""
+    """Positions of a matrix's blocks in subdomains; subdomain_order (f,): its rows, grouped by subdomain."""
 
     def __init__(self, graph: csr_array, order: NDArray[np.int64]) -> None:
         """Build the hierarchy.
@@ -106,7 +106,7 @@ def order_into_subdomains(Q: csr_array) -> NDArray[np.int64]:
 
 
 def _build_aggregation_matrix(of: NDArray[np.int64]) -> csr_array:
-    """Return the matrix P (n, N) that maps each node to the values of its aggregate `of` (n,)."""
+    """Return the matrix P (n, N) that prolongs values of aggregates `of` (n,) to nodes."""
     return csr_array((np.ones(len(of)), (np.arange(len(of)), of)))
 
 

@@ -24,7 +24,7 @@ _ROWS_PER_BLOCK = 4
 
 
 class DenseInverse:
-    """Dense inverse of a symmetric positive definite Q, with n^2 entries and therefore for small n.
+    """Dense inverse of a symmetric positive definite Q, for small n: it has n^2 entries.
 
     Attributes:
         nonzeros: entries of one triangle.

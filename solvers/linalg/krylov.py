@@ -82,7 +82,7 @@ class ConjugateGradientIteration(ABC):
         """
 
     def is_convex(self, curvature: Any) -> bool:
-        """Return whether the iteration may continue along p; always if A is known to be positive definite."""
+        """Return whether the iteration may continue along p; always for a positive definite A."""
         return True
 
     @abstractmethod

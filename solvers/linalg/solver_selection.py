@@ -76,7 +76,7 @@ class CostEstimate:
 
 
 class SolverChoice(NamedTuple):
-    """A solver's name, the reason for its selection, and its symbolic factor if that was computed."""
+    """A solver's name, the reason for its selection, and its symbolic factor if computed."""
 
     solver_name: str
     reason: str
@@ -119,10 +119,11 @@ def build_linear_solver(
 
 
 def _error_reduction(Q: csr_array, factor: LinearSolver) -> float:
-    """Estimate the largest |e - R^-1 Q e|_Q / |e|_Q of corrections of an error e by a rounded factor R.
+    """Estimate the largest error reduction of corrections by a rounded factor R.
 
-    Below 1 each correction is a descent step. A few power iterations from a random vector detect larger values. They
-    occur if soft modes hide stiff ones in the rounded numbers, or if rounding of stiff modes perturbs soft ones.
+    It is |e - R^-1 Q e|_Q / |e|_Q for an error e. Below 1 each correction is a descent step. A few power iterations from
+    a random vector detect larger values. They occur if soft modes hide stiff ones in the rounded numbers, or if rounding
+    of stiff modes perturbs soft ones.
     """
     e = np.random.default_rng(0).standard_normal((len(Q.indptr) - 1, 3))
     most, corrected, before = 0.0, np.empty_like(e), energy_norm(Q, e)
@@ -257,9 +258,9 @@ def _raise_out_of_memory(memory_limit: float, needs: dict[str, CostEstimate]) ->
 
 @cached_njit()
 def _count_factorisation_work(parent, first, row_start, sequence):
-    """Return the peak number of entries in panels of L and updates, and the flops, of the factorisation."""
+    """Return the peak number of entries in panels and updates, and the flops."""
     nodes = len(parent)
-    waiting = np.zeros(nodes + 1, np.int64)  # of each supernode's children; the last is the roots'
+    waiting = np.zeros(nodes + 1, np.int64)  # entries of children's updates; the last is for the roots
     most, now, panels, flops = 0, 0, 0, 0.0
     for s in sequence:
         own, below = first[s + 1] - first[s], (row_start[s + 1] - row_start[s] + 7) // 8 * 8

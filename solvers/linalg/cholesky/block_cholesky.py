@@ -1,9 +1,9 @@
-"""Sparse Cholesky factorisation of a matrix of d x d blocks, analysed once and factorised repeatedly.
+"""Sparse Cholesky factorisation of a block matrix, analysed once and factorised repeatedly.
 
     H x = b,   H symmetric, dn x dn, with a block for each entry of a graph of n vertices
 
-d is 3 for Hessians, and 1 for numbers. The elimination order and the supernodes are those of the graph. A failed
-factorisation is a regular result and no error: H is not positive definite.
+d is 3 for Hessians, and 1 for numbers. The elimination order and the supernodes are those of the graph. A factorisation
+that fails is a regular result, not an error: H is then not positive definite.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MIN_FACTORISATION = 0.2
 
 
 class _Workspace(NamedTuple):
-    """What a number of threads needs: schedules, scratch memory and shared state, their number or None, the kernel."""
+    """Schedules, scratch memory, shared state and kernel for a number of threads, None for one."""
 
     schedule: FactorisationSchedule
     solve_schedule: FactorisationSchedule
@@ -86,7 +86,7 @@ class BlockCholesky:
             graph: pattern (n, n), symmetric, with an entry for each block including the diagonal.
             block_size: rows of a block, d.
             symbolic_factor: the symbolic factor, if it is known.
-            count: the count to which factorisations are added; by default one of its own.
+            count: the count to which factorisations are added; by default a new one.
 
         Raises:
             Unsupported: if the factor does not fit in memory.
@@ -143,7 +143,7 @@ class BlockCholesky:
         return _Workspace(schedule, select_solve(schedule), scratch, team, threads if threads > 1 else None, kernel)
 
     def _current_workspace(self) -> _Workspace:
-        """Return the workspace for Numba's number of threads, one if a second does not pay off."""
+        """Return the workspace for Numba's number of threads, or for one if that is faster."""
         threads = numba.get_num_threads() if self.flops >= _MIN_THREADED_FLOPS else 1
         if threads not in self._workspaces:
             self._workspaces[threads] = self._allocate(*self._plan(threads), threads)

@@ -29,7 +29,7 @@ _MIN_PART_HEIGHT = 32
 """Least height of the row blocks of parts that threads share: four vectors."""
 
 ZERO, ONE = np.int64(0), np.int64(1)
-"""Numbers 0 and 1 as arguments: kernels are compiled once more for the literals."""
+"""0 and 1 as int64 arguments: for literals, kernels would be compiled once more."""
 
 _PIVOT_ROUNDOFF = 4.0 * np.finfo(np.float64).eps
 """Pivots below this fraction of the matrix entry are round-off."""
@@ -144,7 +144,10 @@ def factorise_diagonal_block(fronts, supernode, values, to, first, min_pivots, t
 
 @jit_inner
 def _failed_column(triangle, min_pivots, columns):
-    """Return the first column of a tile with a pivot, the inverse square on the diagonal, that is too small."""
+    """Return the first column of a tile whose pivot is too small.
+
+    The diagonal of `triangle` contains the inverse square roots of the pivots.
+    """
     for j in range(columns):
         if not min_pivots[j] * triangle[j, j] * triangle[j, j] < 1.0:
             return j
@@ -259,7 +262,7 @@ def _solve_tile(to, at, triangle, strips, columns):
 
 @jit_inner
 def _subtract_lower_product(panels, left, stride, depth, head, target, to, size, first, end, part, parts):
-    """Subtract the lower triangle of the product of panel columns with themselves from columns of a matrix.
+    """Subtract the lower triangle of L L' of panel columns L from columns of a matrix.
 
     head: offset of the rows that are multiplied; first, end: range of the matrix columns.
     """

@@ -1,6 +1,6 @@
-"""Multifrontal Cholesky factorisation of a matrix of d x d blocks (Duff and Reid 1983), by threads.
+"""Multifrontal Cholesky factorisation of a matrix of d x d blocks (Duff and Reid 1983).
 
-A front is the dense matrix of a supernode's columns and of the rows below, with a right-hand side as one column more.
+A front is the dense matrix of a supernode's columns and of the rows below, with a right-hand side as one more column.
 Its columns become a panel of L; the remainder is an update of its parent
 (`springbench.solvers.linalg.cholesky.block_front`). Threads process groups of whole subtrees, and then the supernodes
 above them one after the other, each divided into parts. Every entry is the same sum in the same order, whatever the
@@ -10,8 +10,8 @@ Updates within a group are stored on two stacks that alternate between the level
 computed in its place, while those of its children are read. All others have their own memory.
 
 Two ranges of rows are aligned to whole vectors: those of a panel's columns, and those below. The columns of either are
-padded to tiles of three and six, a panel's with those of the identity. There is no other padding.
-Entries above the diagonal are never read; the diagonal contains the inverses of L's entries.
+padded to tiles of three and six, a panel's with those of the identity. There is no other padding. Entries above the
+diagonal are never read; the diagonal contains the inverses of L's entries.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class FactorisationScratch(NamedTuple):
 
 @jit_kernel
 def run_stages(fronts, schedule, values, panels, x, scratch, team, threads):
-    """Run the stages of a schedule: factorise a matrix of blocks, solve with its factor, or both.
+    """Run the stages of a schedule: factorise, solve with the factor, or both.
 
     One kernel does all three, because each takes seconds to compile.
 
@@ -190,7 +190,7 @@ def _process_part(fronts, schedule, stage, values, panels, x, scratch, thread, p
 
 @jit_inner
 def _begin_stage(fronts, schedule, stage, values, panels, x, scratch, thread):
-    """Do what precedes a stage in one thread; return whether the stage takes place.
+    """Prepare a stage in one thread; return whether the stage takes place.
 
     A supernode is processed unless one before it has failed, so that the first failure does not depend on threads.
     """
@@ -274,9 +274,10 @@ def _assemble_columns(fronts, schedule, supernode, values, to, scratch, thread, 
 
 @jit_inner
 def _find_runs(fronts, child, num_columns, below_offset, begin, runs):
-    """List the runs of consecutive members in a child's update, from member `begin` on; return their number.
+    """List the runs of consecutive members in a child's update; return their number.
 
-    Each run begins at a row of the update, runs[0], and at a row of the parent's front, runs[1].
+    The first run begins with member `begin`. Each run begins at a row of the update, runs[0], and at a row of the
+    parent's front, runs[1].
     """
     first, size = fronts.member_start[child] + fronts.num_columns[child], fronts.block_size
     rows = fronts.member_start[child + 1] - first
@@ -293,7 +294,10 @@ def _find_runs(fronts, child, num_columns, below_offset, begin, runs):
 
 @jit_inner
 def _extend_add(fronts, child, source, at, to, runs, begin, end):
-    """Add the columns of a child's update between two members of the parent to the parent's front."""
+    """Add columns of a child's update to the parent's front.
+
+    begin, end: range of the parent's members.
+    """
     own, first = to.num_columns, fronts.member_start[child] + fronts.num_columns[child]
     size = fronts.block_size
     rows = fronts.member_start[child + 1] - first
@@ -384,7 +388,10 @@ def _solve_backward(fronts, schedule, group, panels, x, scratch, thread):
 
 @jit_inner
 def _front_sizes(fronts, supernode):
-    """Return first member, columns and rows below in vertices, and begin and end of those rows in the panel."""
+    """Return the sizes of a front.
+
+    These are the first member, the columns and rows below in vertices, and begin and end of those rows in the panel.
+    """
     first, own, size = fronts.member_start[supernode], fronts.num_columns[supernode], fronts.block_size
     below, head = (
         fronts.member_start[supernode + 1] - first - own,

@@ -1,6 +1,7 @@
-"""Division of a multifrontal factorisation among threads: groups of subtrees, then the supernodes above them in parts.
+"""Division of a multifrontal factorisation among threads.
 
-Where a thread stores updates is fixed in advance, too. Neither changes any result.
+Threads process groups of subtrees, and then parts of each supernode above them. Where a thread stores updates is fixed
+in advance, too. Neither changes any result.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from springbench.solvers.jit.kernel_compilation import cached_njit
 from springbench.solvers.linalg.cholesky.supernode_amalgamation import group_subtrees
 
 SUBTREES, ASSEMBLY, ELIMINATION, PRODUCT, UPDATE, FORWARD, BACKWARD = range(7)
-"""Kinds of stages: all groups; of one front its assembly, of a panel block the rows below and the columns to the right,
-and the update; of a solve alone the forward substitution of all groups; at the end their backward substitution."""
+"""Kinds of stages. SUBTREES: all groups. ASSEMBLY and UPDATE: assembly and update of a front. ELIMINATION and PRODUCT:
+rows below a panel block, and columns to its right. FORWARD: forward substitution of all groups, in a solve without
+factorisation. BACKWARD: backward substitution of all groups, at the end."""
 
 _TASKS_PER_THREAD = 4
-"""Groups, and parts of a front, for each thread: threads that are interrupted leave theirs to others."""
+"""Groups, and parts of a front, for each thread: others process the tasks of a thread that is interrupted."""
 
 _UPDATE_COST = 16.0
 """Cost of an entry of an update, which is stored, read and added, in flops."""
@@ -100,9 +102,10 @@ def select_solve(schedule: FactorisationSchedule) -> FactorisationSchedule:
 
 @cached_njit()
 def _place_updates(parent, group, groups, sizes):
-    """Return the place of each update, whether it is shared, and the sizes of a stack and of all shared updates.
+    """Return where each update is stored.
 
-    An update whose parent is in the same group is on one of two stacks, whichever its children are not on.
+    The results are its first entry, whether it is shared, and the sizes of a stack and of all shared updates. An update
+    whose parent is in the same group is on that of two stacks on which its children are not.
     """
     nodes = len(parent)
     start, shared = np.zeros(nodes, np.int64), np.zeros(nodes, np.bool_)

@@ -1,4 +1,4 @@
-"""The fronts of a multifrontal factorisation of a matrix of d x d blocks, from its symbolic factor."""
+"""Fronts of a multifrontal factorisation of a block matrix, from its symbolic factor."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FrontalStructure(NamedTuple):
     def from_symbolic(
         cls, pointers: NDArray[np.int64], neighbours: NDArray[np.int32], symbolic: SymbolicFactor, block_size: int
     ) -> FrontalStructure:
-        """Build the fronts of a symbolic factor, with supernodes renumbered in the order of their elimination.
+        """Build the fronts of a symbolic factor, with supernodes renumbered in elimination order.
 
         Args:
             pointers: row pointers (n + 1,) of the matrix's graph in CSR form.

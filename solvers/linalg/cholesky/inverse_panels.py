@@ -82,7 +82,7 @@ def _write_inverse_block(inverse, real, width, squares, begin):
 
 @jit_inner
 def _write_rows(factor, at, stride, count, inverse, real, width, panels, begin, done, row):
-    """Compute rows of W = -L21 L11^-1, which follow `done` others, four rows at a time."""
+    """Compute rows of W = -L21 L11^-1, four at a time; `done` rows precede them."""
     for first in range(0, count, 4):
         for k in range(real):
             for r in range(4):

@@ -74,7 +74,7 @@ def order_subgraph(pointers, neighbours, piece, local):
                 lowest = word & (~word + np.uint64(1))
                 word ^= lowest
                 i = w * 64 + _popcount(lowest - np.uint64(1))
-                if i >= size:
+                if i >= size:  # the remaining bits are those of the halo
                     break
                 rows[i, best >> 6] &= ~(np.uint64(1) << np.uint64(best & 63))
                 degree[i] = 0

@@ -120,7 +120,7 @@ def _run_refinement_pass(cut):
 
 @jit_inner
 def _select_move(cut, listed):
-    """Return the listed vertex whose move shrinks the separator most, -1 for none, and its target side."""
+    """Return the move that shrinks the separator most: list position, -1 for none, and side."""
     counts, pull, limit = cut.side_counts, cut.pulled_neighbours, (1.0 - MIN_SIDE_FRACTION) * len(cut.piece)
     choice, best, to = -1, -(1 << 60), 0
     for k in range(listed):
@@ -135,7 +135,10 @@ def _select_move(cut, listed):
 
 @jit_inner
 def _apply_move(cut, i, to, at, listed):
-    """Move i out of the separator, and its neighbours on the other side in; return the ends of log and list."""
+    """Move i out of the separator, and its neighbours on the other side in.
+
+    The results are the new ends of the log and of the list.
+    """
     side, pull, local = cut.side, cut.pulled_neighbours, cut.local_index
     at = _assign_side(cut, i, to, at)
     v = cut.piece[i]

@@ -98,7 +98,7 @@ class PanelLayout(NamedTuple):
             part = places[begin:stop]
             part[part >= top] += (g + 1) * (end - top)
         filled = spans[:-1, 0] < spans[:-1, 1]
-        filled[0] = True  # one group at least, though everything be in the top
+        filled[0] = True  # at least one group, even if all supernodes are in the top
         spans = spans[np.append(filled, True)]
         rows_of_work = int(end + (len(spans) - 1) * (end - top))
         return cls(
@@ -187,14 +187,14 @@ class SupernodalCholesky:
         write_inverse_panels(
             cholesky.fronts, cholesky.panels, s.postorder, layout.first_chunk, layout.chunks, squares, panels
         )
-        del cholesky  # before the panels are copied
+        del cholesky  # free its memory before the panels are copied
         self.nonzeros: int | None = s.nonzeros
         work = allocate_aligned(4 * layout.num_work_rows, np.float64 if precision == "float64" else np.float32)
         if precision == "float16":
             preserve_column_sums(panels, panels - panels.astype(np.float16), layout.chunks)
         squares, panels = _cast_entries(squares, work.dtype), _cast_entries(panels, np.dtype(precision))
         if precision == "float16":
-            panels = panels.view(np.uint16)  # which Numba has arrays of
+            panels = panels.view(np.uint16)  # Numba has arrays of uint16, but not of float16
         self.factor_bytes = squares.nbytes + panels.nbytes
         below, quads = layout.chunks[:, 4:6].T
         entries = COLUMN_LANES * quads * (COLUMN_LANES * quads + 2 * below)

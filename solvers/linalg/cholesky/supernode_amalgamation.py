@@ -78,7 +78,10 @@ def amalgamate_supernodes(parent, count):
 
 @jit_inner_allocating
 def _find_fundamental_supernodes(parent, count):
-    """Find columns of one structure; return the tree of these nodes, each column's node, and node widths and rows."""
+    """Find columns of one structure.
+
+    The results are the tree of these nodes, the node of each column, and the widths and rows of the nodes.
+    """
     n = len(parent)
     of_column = np.empty(n, np.int32)
     nodes = 0
@@ -101,7 +104,10 @@ def _find_fundamental_supernodes(parent, count):
 
 @jit_inner_allocating
 def _merge_children(tree, width, rows):
-    """Return the node that each node is merged into, itself if it remains; `width` is updated."""
+    """Return the node that each node is merged into, itself if it remains.
+
+    `width` is updated.
+    """
     nodes = len(tree)
     child = np.full(nodes, -1, np.int32)
     sibling = np.full(nodes, -1, np.int32)
@@ -110,19 +116,19 @@ def _merge_children(tree, width, rows):
             sibling[s] = child[tree[s]]
             child[tree[s]] = s
     into = np.arange(nodes)
-    for s in range(nodes):  # children come first, so theirs are settled
+    for s in range(nodes):  # children come first, so their merges are complete
         while True:
             best, before = _find_best_merge(s, child, sibling, width, rows)
             if best < 0:
                 break
             into[best] = s
             width[s] += width[best]
-            if before >= 0:  # out of the list of children,
+            if before >= 0:  # remove it from the list of children
                 sibling[before] = sibling[best]
             else:
                 child[s] = sibling[best]
             c = child[best]
-            while c >= 0:  # and its children into it
+            while c >= 0:  # and add its children to the list
                 following = sibling[c]
                 sibling[c] = child[s]
                 child[s] = c
@@ -132,7 +138,7 @@ def _merge_children(tree, width, rows):
 
 @jit_inner
 def _find_best_merge(s, child, sibling, width, rows):
-    """Return the child whose merge gains most, -1 for none, and the child before it in the list."""
+    """Return the child whose merge gains most, -1 for none, and its predecessor."""
     best, best_gain, before_best, before = -1, 0.0, -1, -1
     c = child[s]
     while c >= 0:
@@ -146,7 +152,7 @@ def _find_best_merge(s, child, sibling, width, rows):
 
 
 def group_subtrees(parent: NDArray[Any], cost: NDArray[np.float64], num_groups: int) -> NDArray[np.int32]:
-    """Assign each node of a forest to a group of whole subtrees, `num_groups` for the top.
+    """Assign each node of a forest to a group of subtrees, `num_groups` for the top.
 
     The heaviest subtree is split, with its root assigned to the top, until none exceeds a group's share. The lightest
     group then repeatedly gets the heaviest remaining subtree. The result depends on the tree alone, never on threads.

@@ -1,4 +1,4 @@
-"""Symbolic Cholesky factorisation: the structure of the factor of a sparse symmetric matrix, from its graph alone.
+"""Symbolic Cholesky factorisation: the structure of the factor, from the graph of the matrix alone.
 
 Elimination tree and column counts (Liu 1990; Davis 2006, chapter 4), and the rows of each supernode.
 """
@@ -189,7 +189,10 @@ def _compute_postorder(parent):
 
 @cached_njit()
 def _count_column_entries(pointers, neighbours, order, place, parent):
-    """Return the entries of each column of L with its diagonal: row i has those on the paths from its entries to i."""
+    """Return the number of entries of each column of L, with its diagonal.
+
+    Row i has an entry in each column on the paths in the tree from its entries in the matrix to i.
+    """
     n = len(order)
     count = np.ones(n, np.int64)
     mark = np.full(n, -1, np.int32)
@@ -207,7 +210,10 @@ def _count_column_entries(pointers, neighbours, order, place, parent):
 
 @cached_njit()
 def _find_supernode_rows(pointers, neighbours, slot, vertex, parent, node_of_slot, nodes):
-    """Return the rows below each supernode, by slot: row i belongs to those on the paths from its entries to i."""
+    """Return the rows below each supernode, by slot.
+
+    Row i belongs to the supernodes on the paths in the tree from its entries in the matrix to its own supernode.
+    """
     start = np.zeros(nodes + 1, np.int64)
     rows = np.empty(0, np.int32)
     for fill in range(2):
@@ -225,7 +231,7 @@ def _find_supernode_rows(pointers, neighbours, slot, vertex, parent, node_of_slo
                         rows[start[s]] = i
                     start[s] += 1
                     s = parent[s]
-        for s in range(nodes, 0, -1):  # counts, or ends, to beginnings
+        for s in range(nodes, 0, -1):  # from counts, or from ends, to starts
             start[s] = start[s - 1]
         start[0] = 0
         if fill == 0:

@@ -102,7 +102,10 @@ def _store_release_code(typingctx: Any, signals: Any, place: Any, value: Any) ->
 
 
 def _call_storing_error_code(typingctx: Any, signals: Any, function: Any, arguments: Any) -> Any:
-    """Call a kernel; store the address of the exception that it raises in signals, and return whether it raised one."""
+    """Call a kernel, and return whether it raised an exception.
+
+    The address of the exception is stored in `signals`.
+    """
     call = function.get_call_type(typingctx, arguments.types, {})
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -233,7 +236,10 @@ def call_in_thread(team, function, arguments):
 
 @jit_inner
 def raise_thread_error(team):
-    """Raise the exception that a thread has raised, if there is one; call it after the threads have ended."""
+    """Raise the exception that a thread has raised, if there is one.
+
+    This must be called after the threads have ended.
+    """
     _raise_stored_error(team.signals)
 
 

@@ -194,7 +194,7 @@ def _run_thread(factor, b, out, first):
 
 @jit_inner_parallel
 def _run_threads(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team, b, out, threads):
-    for thread in prange(threads):  # which takes no tuple with another in it
+    for thread in prange(threads):  # a parallel loop does not support nested tuples
         whole = SupernodalFactor(squares, panels, places, chunks, spans, by_slot, by_vertex, work, team)
         call_in_thread(team, _run_thread, (whole, b, out, thread * (len(spans) - 1) // threads))
 

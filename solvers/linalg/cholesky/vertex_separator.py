@@ -13,7 +13,7 @@ from springbench.solvers.jit.kernel_compilation import jit_inner_allocating
 
 NUM_LANDMARKS = 8
 _NUM_FLAT_LANDMARKS = 4
-"""The distances from four landmarks, its corners, resolve the directions of a sheet; a solid needs all eight."""
+"""Distances from four landmarks, the corners of a sheet, resolve its directions; a solid needs all eight landmarks."""
 
 FIELDS_PER_BLOCK = 8
 """Fields that are processed at a time, as a vector."""
@@ -44,7 +44,10 @@ MIN_SIDE_FRACTION = 0.25
 
 @jit_inner_allocating
 def _breadth_first_search(pointers, neighbours, owner, number, root, dist, queue):
-    """Write graph distances from `root` within its piece to `dist`, initially -1; return the number of vertices."""
+    """Write graph distances from `root` within its piece to `dist`, initially -1.
+
+    The result is the number of vertices reached.
+    """
     queue[0] = root
     dist[root] = 0
     head, tail = 0, 1
@@ -62,9 +65,12 @@ def _breadth_first_search(pointers, neighbours, owner, number, root, dist, queue
 
 @jit_inner_allocating
 def _landmark_distances(pointers, neighbours, owner, number, piece, begin, end, dist, queue):
-    """Write distances from landmarks `begin` to `end`, which are chosen as far apart as possible, to `dist`."""
+    """Write distances from landmarks `begin` to `end` to `dist`.
+
+    The landmarks are chosen as far apart as possible.
+    """
     far = piece[0]
-    if begin == 0:  # the first is where a search from anywhere ends
+    if begin == 0:  # the first landmark is the last vertex of a search from any vertex
         for v in piece:
             dist[v, 0] = -1
         far = queue[_breadth_first_search(pointers, neighbours, owner, number, far, dist[:, 0], queue) - 1]
@@ -114,7 +120,7 @@ def find_separator(pointers, neighbours, owner, number, piece, dist, field, queu
         reach = 0
         for k in range(FIELDS_PER_BLOCK):
             reach = max(reach, high[k] - low[k])
-        count = np.zeros((reach + 2, FIELDS_PER_BLOCK), np.int32)  # how many have this value
+        count = np.zeros((reach + 2, FIELDS_PER_BLOCK), np.int32)  # number of vertices with a value
         enter = np.zeros((reach + 2, FIELDS_PER_BLOCK), np.int32)  # differences of the size of the boundary
         for v in piece:
             for k in range(FIELDS_PER_BLOCK):
@@ -161,7 +167,7 @@ def _assign_sides(pointers, neighbours, owner, number, piece, field, cut):
 
 @jit_inner_allocating
 def _combine_distances(dist, weights, piece, field, low, high):
-    """Write weighted sums of distances to `field`, and their minima and maxima to `low` and `high`."""
+    """Write weighted sums of distances to `field`; `low` and `high`: their minima and maxima."""
     low[:] = 2**31 - 1
     high[:] = -(2**31)
     total = np.empty(FIELDS_PER_BLOCK, np.int32)

@@ -1,4 +1,4 @@
-"""Kernels of multigrid and conjugate gradients, for sparse rows and vectors of four numbers per vertex.
+"""Kernels of multigrid and conjugate gradients, for vectors of four numbers per vertex.
 
 Each row is summed separately. Sums over all rows are taken in blocks of a fixed size, whose partial sums are added in
 order, so that the result is bitwise independent of the number of threads. Vectors are (n, 4), three coordinates and a
@@ -224,7 +224,7 @@ def build_aggregates(pointers, columns, values, strength, dominance):
                 largest[i] = max(largest[i], size)
         free[i] = own <= dominance * total
     count = 0
-    for i in range(n):  # a vertex with all its strong neighbours, where none of them is taken
+    for i in range(n):  # first pass: a vertex and its strong neighbours, if none of them is aggregated
         if not free[i]:
             continue
         alone = of[i] < 0
@@ -244,14 +244,14 @@ def build_aggregates(pointers, columns, values, strength, dominance):
                 of[j] = count
         count += 1
     first = of.copy()
-    for i in range(n):  # what is left joins its strongest neighbour's,
+    for i in range(n):  # second pass: a remaining vertex joins the aggregate of its strongest neighbour
         if free[i] and of[i] < 0:
             best = 0.0
             for e in range(pointers[i], pointers[i + 1]):
                 j = columns[e]
                 if j != i and first[j] >= 0 and abs(values[e]) > best and abs(values[e]) >= strength * largest[i]:
                     best, of[i] = abs(values[e]), first[j]
-    for i in range(n):  # or gathers what is left around it
+    for i in range(n):  # third pass: the others form aggregates with their remaining strong neighbours
         if free[i] and of[i] < 0:
             of[i] = count
             for e in range(pointers[i], pointers[i + 1]):

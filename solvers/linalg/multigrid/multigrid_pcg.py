@@ -1,10 +1,10 @@
-"""Conjugate gradients (Hestenes and Stiefel 1952) preconditioned by multigrid, for systems whose factor does not fit.
+"""Conjugate gradients preconditioned by multigrid, for systems whose factor does not fit in memory.
 
     z = V-cycle(r),  p = z + beta p,  x += alpha p,  r -= alpha Q p
 
-Three right-hand sides are solved in lockstep and share each pass over the matrices. z approximates the error of x
-itself, whatever the stiffness of a row. The iteration ends when no entry of z exceeds CG_RTOL times the largest one of
-x.
+Source: Hestenes and Stiefel 1952. Three right-hand sides are solved in lockstep and share each pass over the matrices.
+z approximates the error of x itself, whatever the stiffness of a row. The iteration ends when no entry of z exceeds
+CG_RTOL times the largest one of x.
 """
 
 from __future__ import annotations
@@ -20,12 +20,15 @@ from springbench.solvers.linalg.multigrid.smoothed_aggregation import Multigrid
 from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, Unsupported
 
 CG_RTOL = 1e-12
-"""Positions distinct at 1e-9 of a scene's size remain so at a distance of a hundred sizes from the origin, and after
+"""Largest correction, relative to the largest entry of x, at which the iteration ends.
+
+Positions distinct at 1e-9 of a scene's size remain so at a distance of a hundred sizes from the origin, and after
 some iterations. Each iteration gains a constant number of digits, so that two more digits cost two iterations in
 ten."""
 
 _MAX_ITERATIONS = 200
-"""Sheets and solids take about ten iterations at any size, springs over six decades of stiffness thirty."""
+"""Maximum number of iterations. Sheets and solids take about ten at any size, springs over six decades of stiffness
+thirty."""
 
 
 class ConjugateGradients:
@@ -156,5 +159,5 @@ class _ColumnIteration(ConjugateGradientIteration):
 
 
 def _safe_divide(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a / b, and 0 where b is 0: a converged or zero right-hand side remains constant."""
+    """Return a / b, and 0 where b is not positive: a solved column remains constant."""
     return np.divide(a, b, out=np.zeros(3), where=b > 0.0)

@@ -4,7 +4,7 @@
     P  B over each aggregate, orthonormalised: B = P B_coarse (Vanek, Mandel and Brezina 1996)
     A_coarse = P'AP            z = V-cycle(r), a fixed symmetric operator near A^-1
 
-P is not smoothed, so that coarse matrices stay sparse. It depends on the pattern of A and on its slow-to-converge
+P is not smoothed by default, so that coarse matrices stay sparse. It depends on the pattern of A and on its slow
 modes, which change little as A does. One `ProlongationHierarchy` therefore serves many matrices of one pattern, each
 with its own `VCycle`. The method helps if few modes converge slowly. Sums are taken in one order, whatever the number
 of threads.
@@ -52,7 +52,7 @@ def compute_near_nullspace(A: csr_array, num_components: int, num_sweeps: int) -
     Returns:
         Vectors (n, q), each scaled to a largest entry of 1.
     """
-    B = np.random.default_rng(0).uniform(size=(A.shape[0], num_components))  # always the same
+    B = np.random.default_rng(0).uniform(size=(A.shape[0], num_components))  # the same vectors in each call
     sweep_gauss_seidel(A.indptr, A.indices, A.data, B, num_sweeps)
     return normalise_columns(B)
 
@@ -77,6 +77,13 @@ class ProlongationHierarchy:
     """
 
     def __init__(self, A: csr_array, B: NDArray[np.float64], smooth_prolongators: bool = False) -> None:
+        """Build the prolongation matrices.
+
+        Args:
+            A: matrix (n, n).
+            B: near-null-space vectors (n, q).
+            smooth_prolongators: whether each P is smoothed by a damped Jacobi step.
+        """
         self.prolongators: list[csr_array] = []
         nodes = np.arange(A.shape[0])
         while not is_coarsest_level(A):
@@ -94,7 +101,10 @@ class ProlongationHierarchy:
 def _build_prolongator(
     A: csr_array, B: NDArray[np.float64], nodes: NDArray[np.int64]
 ) -> tuple[csr_array, NDArray[np.float64], NDArray[np.int64]]:
-    """Return P, B_coarse and the coarse nodes; unknowns are grouped by nodes (n,), which are aggregated as a whole."""
+    """Return P, B_coarse and the coarse nodes.
+
+    Unknowns are grouped by nodes (n,), which are aggregated as a whole.
+    """
     owner = _aggregate_unknowns(A, nodes, _MAX_UNKNOWN_FRACTION * len(nodes) / max(1, B.shape[1]))
     count = int(owner.max(initial=-1)) + 1
     inside = np.flatnonzero(owner >= 0)
@@ -123,7 +133,10 @@ def _build_prolongator(
 
 
 def _aggregate_unknowns(A: csr_array, nodes: NDArray[np.int64], max_aggregates: float) -> NDArray[np.int64]:
-    """Return the aggregate of each unknown (n,), -1 for none; they are aggregated again while there are too many."""
+    """Return the aggregate of each unknown (n,), -1 for none.
+
+    Aggregates are aggregated again while there are too many.
+    """
     owner, before = nodes, -1
     while True:
         condensed = _condense_blocks(A, owner)
@@ -137,7 +150,10 @@ def _aggregate_unknowns(A: csr_array, nodes: NDArray[np.int64], max_aggregates: 
 
 
 def _condense_blocks(A: csr_array, nodes: NDArray[np.int64]) -> csr_array:
-    """Return the Frobenius norms of A's blocks by nodes, -1 for none; A itself if each unknown is a node."""
+    """Return the Frobenius norms of A's blocks by nodes (n,), -1 for none.
+
+    The result is A itself if each unknown is a node.
+    """
     n, count = len(nodes), int(nodes.max(initial=-1)) + 1
     if count == n:
         return A
@@ -186,6 +202,12 @@ class VCycle:
     """
 
     def __init__(self, A: csr_array, prolongation: ProlongationHierarchy) -> None:
+        """Build the levels.
+
+        Args:
+            A: matrix (n, n).
+            prolongation: prolongation matrices of all levels, for the pattern of A.
+        """
         self._levels: list[_NearNullspaceLevel] = []
         for P in prolongation.prolongators:
             self._levels.append(_NearNullspaceLevel.from_matrices(A, P))
@@ -197,7 +219,7 @@ class VCycle:
             dense = A.toarray()
             self._factor = cho_factor(dense + _COARSE_DIAGONAL_SHIFT * np.diag(np.diag(dense)), lower=True)
             self.matrix_bytes += 8 * A.shape[0] ** 2
-        else:  # nothing there can be gathered: each unknown is its own diagonal's, nearly
+        else:  # A cannot be coarsened further
             self._coarsest_smoother = _NearNullspaceLevel.from_matrices(A, A)
             self.matrix_bytes += 12 * A.nnz
 
@@ -221,6 +243,14 @@ class PreconditionedSolve(ConjugateGradientIteration):
     """
 
     def __init__(self, A: csr_array, cycle: VCycle, b: FloatVector, rtol: float) -> None:
+        """Prepare the solve.
+
+        Args:
+            A: symmetric positive definite matrix (n, n).
+            cycle: V-cycle for A.
+            b: right-hand side (n,).
+            rtol: tolerance of the residual relative to |b|.
+        """
         self._A, self._cycle, self._atol = A, cycle, rtol * ordered_norm(b)
         self.x, self._r = np.zeros_like(b), b.copy()
         self._p = np.zeros_like(b)

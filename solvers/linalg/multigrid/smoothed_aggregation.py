@@ -61,7 +61,7 @@ class MultigridLevel:
 
 
 class Multigrid:
-    """A V-cycle for Q; z is linear, symmetric and positive definite in r up to rounding.
+    """A V-cycle for Q: z is linear in r, symmetric and positive definite up to rounding.
 
     Attributes:
         nonzeros: entries of all levels' matrices, including the coarsest level's factor.
@@ -174,7 +174,7 @@ def estimate_largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> 
     if not len(diagonal):
         return 0.0
     bound = float(((abs(A) @ np.ones(len(diagonal))) / diagonal).max())
-    v = np.random.default_rng(0).normal(size=len(diagonal))  # a bit of everything, and always the same
+    v = np.random.default_rng(0).normal(size=len(diagonal))  # contains all modes, and is the same in each call
     for _ in range(20):
         v = (A @ v) / diagonal
         v /= np.linalg.norm(v)
