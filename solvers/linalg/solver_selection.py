@@ -121,9 +121,9 @@ def build_linear_solver(
 def _error_reduction(Q: csr_array, factor: LinearSolver) -> float:
     """Estimate the largest error reduction of corrections by a rounded factor R.
 
-    It is |e - R^-1 Q e|_Q / |e|_Q for an error e. Below 1 each correction is a descent step. A few power iterations from
-    a random vector detect larger values. They occur if soft modes hide stiff ones in the rounded numbers, or if rounding
-    of stiff modes perturbs soft ones.
+    It is |e - R^-1 Q e|_Q / |e|_Q for an error e. Below 1 each correction is a descent step. A few power iterations
+    from a random vector detect larger values. They occur if soft modes hide stiff ones in the rounded numbers, or if
+    rounding of stiff modes perturbs soft ones.
     """
     e = np.random.default_rng(0).standard_normal((len(Q.indptr) - 1, 3))
     most, corrected, before = 0.0, np.empty_like(e), energy_norm(Q, e)
