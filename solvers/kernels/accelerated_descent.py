@@ -7,9 +7,8 @@
 A method is defined by its coefficients (see `acceleration_coefficients`), which it computes from inner products of the
 window's vectors. An iteration tries p + d, then shorter steps, then the plain correction with decreasing lengths, until
 one descends enough (`springbench.solvers.kernels.line_search_conditions`). For projective energies Q majorises the
-Hessian, so that
-the plain correction is accepted at full length. Vectors are flat and independent of the meaning of their entries;
-entries of vertices that do not move are zero.
+Hessian, so that the plain correction is accepted at full length. Vectors are flat and independent of the meaning of
+their entries; entries of vertices that do not move are zero.
 """
 
 from __future__ import annotations
@@ -37,27 +36,27 @@ WINDOW_STATE_DTYPE = np.dtype(
         ("coefficient_rule", np.int64),  # see `acceleration_coefficients`
         ("max_retries", np.int64),  # shorter steps along d before the plain correction
         ("num_pairs", np.int64),  # pairs in the window
-        ("newest_pair", np.int64),  # the latest of them
+        ("newest_pair", np.int64),  # index of the latest one
         ("num_rejected_trials", np.int64),  # trials rejected in this iteration
         ("is_plain", np.int64),  # whether the trial is along c
         ("objective_change", np.float64),  # g(trial) - g(p) [J]
-        ("roundoff", np.float64),  # what of it may be round-off
-        ("objective_decrease", np.float64),  # by how much g fell since the start, where round-off does not hide it [J]
+        ("roundoff", np.float64),  # bound of the round-off of this change [J]
+        ("objective_decrease", np.float64),  # decrease of g since the start, without changes below round-off [J]
         ("step_size", np.float64),  # t
         ("slope", np.float64),  # grad g(p) d [J]
         ("correction_squarednorm", np.float64),  # |c|_Q^2 [J]
-        ("correction_scale", np.float64),
-        ("spectral_radius", np.float64),  # Chebyshev's: of convergence of the plain iteration
+        ("correction_scale", np.float64),  # factor of c in d
+        ("spectral_radius", np.float64),  # estimated convergence factor of the plain iteration, for Chebyshev
         ("chebyshev_weight", np.float64),  # omega
-        ("polynomial_degree", np.int64),  # of the polynomial
-        ("reference_squarednorm", np.float64),  # |c|_Q^2 where it began [J]
+        ("polynomial_degree", np.int64),  # degree of the Chebyshev polynomial
+        ("reference_squarednorm", np.float64),  # |c|_Q^2 at the start of this polynomial [J]
     ]
 )
 """The state of an iteration."""
 
 
 class AccelerationWindow(NamedTuple):
-    """The state of a solve with m pairs in the history and N entries per vector.
+    """The state of a solve with m history pairs and N entries per vector.
 
     Attributes:
         step_history, image_history: s and w (m N,).
@@ -130,7 +129,11 @@ def shorten_trial(window, fraction):
 
 @jit_kernel
 def judge_trial(window):
-    """Decide about a trial whose change, noise and gradient are known."""
+    """Accept, replace or reject a trial whose change, round-off and gradient are known.
+
+    Returns:
+        TRIAL_ACCEPTED, TRIAL_AGAIN for the next trial, or TRIAL_STALLED.
+    """
     now = window.window_state[0]
     even = abs(now.objective_change) <= now.roundoff < np.inf
     if even:

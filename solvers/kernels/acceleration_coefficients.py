@@ -1,4 +1,4 @@
-"""The coefficients of accelerated directions d = scale c - sum over j of (a_j s_j + b_j w_j), for each method.
+"""Coefficients of accelerated directions d = scale c - sum over j of (a_j s_j + b_j w_j), by method.
 
 See `springbench.solvers.kernels.accelerated_descent` for the notation, and each method's own module for its source.
 """
@@ -19,7 +19,7 @@ _MIN_CURVATURE_RATIO = 1e-2
 """Smallest ratio of s y to w y of a pair that L-BFGS stores; for a positive Hessian s y is not below w y."""
 
 _DEPENDENCE_TOLERANCE = 1e-12
-"""Fraction of its square below which the independent part of a difference is ignored by Anderson."""
+"""Anderson's method ignores the independent part of a difference below this fraction of its square."""
 
 _RESTART_EXPONENT = 0.75
 """Chebyshev's estimate is updated if the residual ratio exceeds this power of the predicted one."""
@@ -43,7 +43,7 @@ def compute_coefficients(window):
 
 @jit_inner_numpy
 def _lbfgs_coefficients(window, now):
-    """Run the two-loop recursion over the pairs (Nocedal 1980) on inner products (Byrd, Nocedal, Schnabel 1994).
+    """Run the two-loop recursion (Nocedal 1980) on inner products (Byrd, Nocedal, Schnabel 1994).
 
     H0 = scale Q^-1 has the curvature of the newest pair along Q^-1 y. Q itself is too stiff, with steps half as long.
     """
@@ -79,7 +79,10 @@ def _lbfgs_coefficients(window, now):
 
 @jit_inner_numpy
 def _anderson_coefficients(window, now):
-    """Set a = -b = argmin |c - W a|_Q by the normal equations; of dependent differences the newest are used."""
+    """Set a = -b = argmin |c - W a|_Q by the normal equations.
+
+    Of dependent differences the newest ones are used.
+    """
     a, m, L = window.a, len(window.a), window.sy
     for nth in range(now.num_pairs):
         i = (now.newest_pair - nth + m) % m
@@ -146,7 +149,7 @@ def _estimate_radius(now):
 
 
 MAX_HISTORY_SIZE = 100
-"""Each pair costs two vectors and an inner product with all others, and old pairs are no longer representative."""
+"""Largest size: each pair costs two vectors and inner products with all others, and old pairs represent g badly."""
 
 
 def require_history_size(pairs: int) -> None:

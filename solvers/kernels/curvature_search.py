@@ -1,4 +1,4 @@
-"""Kernels that rule out negative curvature of the objective's Hessian H, or search for a direction of it.
+"""Kernels that rule out negative curvature of the Hessian H, or search for it.
 
     x'Hx >= sum_v (h_v - 2 sum_{e at v} c_e) |x_v|^2,   c_e = k_e max(0, r_e/l_e - 1),   h_v: inertia and pins
 
@@ -30,7 +30,7 @@ EXHAUSTED_RATIO = 1e-20
 """Decrease of r'z at which the Krylov space is exhausted: a solution to ten digits."""
 
 _BLOCK_SHIFT = 1e-6
-"""Fraction of a block's diagonal that is added to it: springs may resist in one direction only."""
+"""Shift of a block relative to the sum of its absolute entries: springs may resist in one direction only."""
 
 
 class CurvatureScratch(NamedTuple):
@@ -60,7 +60,7 @@ class CurvatureScratch(NamedTuple):
 
 @jit_kernel
 def bound_by_springs(terms, p, anchor_stiffness, linear, negative):
-    """Return whether the bound shows that springs, constant forms, inertia and pins have no negative curvature.
+    """Return whether the bound shows that springs, forms, inertia and pins have no negative curvature.
 
     Args:
         terms: objective terms.
@@ -227,7 +227,7 @@ def _add_elements(joined, curvature, blocks, size):
 
 @jit_inner
 def _invert_block(blocks, v):
-    """Invert a packed symmetric block, with the smallest of a few shifts that makes it positive definite."""
+    """Invert a packed symmetric block, with the first shift that makes it positive definite."""
     xx, xy, xz, yy, yz, zz = blocks[v, 0], blocks[v, 1], blocks[v, 2], blocks[v, 3], blocks[v, 4], blocks[v, 5]
     size = abs(xx) + abs(yy) + abs(zz) + abs(xy) + abs(xz) + abs(yz)
     shift = _BLOCK_SHIFT * size
@@ -272,7 +272,7 @@ def _start_search(scratch):
 
 @jit_inner
 def _precondition_residual(scratch):
-    """Write z to the product, which is of no more use, and return r'z."""
+    """Overwrite the product with z, and return r'z."""
     r, z, total = scratch.residual, scratch.product, 0.0
     for v in range(len(r)):
         z0, z1, z2 = _apply_block(scratch.inverse_blocks, v, r)

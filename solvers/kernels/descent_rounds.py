@@ -1,4 +1,4 @@
-"""Rounds of a first-order method, and the rule that ends them when Newton's method is predicted to gain more.
+"""Rounds of a first-order method, ended when Newton's method is predicted to gain more.
 
     q = D_k / D_(k-1),   remaining decrease = q D_k + q^2 D_k + ... = D_k q / (1 - q)
     switch if that per cost of a Newton step exceeds q D_k per round, i.e. if  1 / (1 - q) > cost of a Newton step
@@ -62,14 +62,14 @@ ROUND_STATE_DTYPE = np.dtype(
 
 @register_jitable(**jit_inner_options)
 def round_size(now):
-    """Return the number of iterations of the next round, which ends at the next decision at the latest."""
+    """Return the number of iterations of the next round, up to the next decision."""
     left = (PROBE_ITERATIONS if now.num_iterations < PROBE_ITERATIONS else now.group_end) - now.num_iterations
     return max(1, min(left, int(0.5 + 2.0 * np.sqrt(2.0 * now.check_cost * now.num_iterations))))
 
 
 @register_jitable(**jit_inner_options)
 def _judge_round(now, decrease, residual, residual_limit):
-    """Return SWITCH if another method is predicted to gain more, else ITERATIONS."""
+    """Return REASON_SWITCH if another method is predicted to gain more, else REASON_ITERATIONS."""
     if now.num_iterations == PROBE_ITERATIONS and residual > _FAST_RESIDUAL_RATIO * now.initial_residual:
         now.is_unsuited = 1
         return REASON_SWITCH

@@ -1,9 +1,11 @@
-"""Strain limits and dashpots in the packets of springs, each in the entry of the spring between the same vertices.
+"""Strain limits and dashpots in the packets of springs.
+
+Each is in the entry of the spring between the same vertices.
 
     E = sum_e k_e/2 (l_e - clip(l_e, low_e, high_e))^2      strain limits, l = |v|
       + sum_e (m_e.v_e - q_e)^2 / 2                         dashpots, m = sqrt(k) n, q = sqrt(k) o
 
-The vector v and the length l of an entry's spring are there already, so that an edge adds its arithmetic, but no memory
+The vector v and the length l of an entry's spring are available, so that an edge adds its arithmetic, but no memory
 access to vertices. An edge without a spring gets one of zero stiffness. Both energies are projective: the gradient is
 A'K b, the projection d = v - b, with b = (l - clip(l)) v/l of a limit and (n.v - o) n of a dashpot. Dashpots between
 the same vertices have the same n and o in a step, and are added to one.
@@ -136,7 +138,7 @@ class AttachedEdges(NamedTuple):
         first_dashpot = proper[first]
         damping = np.zeros(len(first_dashpot))
         np.add.at(damping, kind, np.concatenate([np.empty(0), *(e.stiffness for e in dashpots)])[proper])
-        # Which spring has each edge: an existing one, the first of its pair, or a new one behind the springs.
+        # The spring of each edge is the first one of its vertex pair, or a new one behind the springs.
         keys = np.concatenate(
             [vertex_pair_keys(ends, size) for ends in (springs.edges, limit_ends, dashpot_ends[first_dashpot])]
         )
@@ -232,7 +234,10 @@ def _rank_repeated(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @jit_kernel
 def _write_dashpots(edges, axis, offset, data, blocks):
-    """Write m and q of all entries, and the sums of m m' of the packets; axis: m (d, 3); offset: q (d,)."""
+    """Write m and q of all entries, and the sums of m m' of the packets.
+
+    axis: m (d, 3); offset: q (d,).
+    """
     for b in range(len(edges.packet_start) - 1):
         for k in range(6 * LANES):
             blocks[6 * LANES * b + k] = 0.0
@@ -255,7 +260,7 @@ def _write_dashpots(edges, axis, offset, data, blocks):
 
 @jit_inner
 def _limit_excess(edges, at, length):
-    """Return the length beyond the limits at a position in their data, negative below the minimum."""
+    """Return the length beyond the limits at a data position, negative below the minimum."""
     return length - min(max(length, edges.limit_data[at + LANES]), edges.limit_data[at + 2 * LANES])
 
 

@@ -1,4 +1,4 @@
-"""The iteration loop and the stop rule, as Python for the driver and compiled into kernels.
+"""The iteration loop and the stop rule, for the Python driver and for kernels.
 
     iterate until  residual <= limit  or  residual <= floor  or no step descends  or all iterations are done
 
@@ -20,7 +20,7 @@ REASON_ITERATIONS, REASON_TOLERANCE, REASON_FLOOR, REASON_STALLED = range(4)
 """The termination reason of a loop: maximum iterations, residual limit, round-off floor, or no descent."""
 
 RESIDUAL_NEVER, RESIDUAL_LAST, RESIDUAL_EACH = range(3)
-"""When residuals are computed."""
+"""When residuals are computed: never, after the last iteration, or in each one."""
 
 
 class LoopLimits(NamedTuple):

@@ -12,7 +12,7 @@ in one iteration and, after all subtrees below it, up from it in the next, while
 all sums is independent of the number of threads. The threads are started once per step, not once per iteration, because
 waking a thread takes longer than an iteration.
 
-A vector has rows of four numbers: the slots of `Supernodal`, the groups' copies of the top, the vertices that do not
+A vector has rows of four numbers: the slots of the factor, the groups' copies of the top, the vertices that do not
 move, and two padding rows of the packets. With `p` None it contains positions, and a solve gives the next ones.
 Otherwise it contains corrections of the positions p (n rows in float64), which may have a lower precision.
 """
@@ -96,7 +96,10 @@ def _add_slice(a, b):
 
 @jit_inner
 def _forward_block(plan, bundles, block, x, right, p, out):
-    """Do the local step of a block at x (at p, if that is given) and its forward substitution."""
+    """Do the local step of a block and its forward substitution.
+
+    The positions are x, or p if that is given.
+    """
     _, _, bundle, bundle_end, chunk, chunk_end, _ = plan.block_table[block]
     if p is None:
         add_projection(bundles, bundle, bundle_end, x, right, out, plan.row_shift)
@@ -122,7 +125,10 @@ def _clear_block(plan, block, out):
 
 @jit_inner
 def _process_group(plan, bundles, group, x, right, p, out, down, up):
-    """Process a group in the order of its visits: down with the vector x, and up with `out`."""
+    """Process a group in the order of its visits.
+
+    Back substitution changes x; the local step and forward substitution change `out`.
+    """
     top = 4 * plan.top_range[0]
     size = 4 * plan.top_range[1] - top
     copy = top + (group + 1) * size
@@ -169,7 +175,7 @@ def _compute_displacement(plan, part, x, before, p, e):
 
 @jit_inner
 def _squared_norm(plan, form, part, e):
-    """Return |e|_Q^2 [J] of a group or the top, with half of each spring at either end."""
+    """Return |e|_Q^2 [J] of a group or the top, with half of each spring."""
     begin, end = plan.group_blocks[part], plan.group_blocks[part + 1]
     if begin == end:
         return 0.0
@@ -219,7 +225,7 @@ def run_blocked_local_step(plan, bundles, x, right, p, out):
 
 @jit_inner
 def _run_thread(plan, bundles, form, vectors, right, p, limits, team, first):
-    """Do a thread's part of the iterations: the groups from `first` on that no other thread has claimed.
+    """Do the iterations of the groups, from `first` on, that no other thread has claimed.
 
     Phase 2 k is iteration k, phase 2 k + 1 computes its residual if it is requested.
     """
@@ -272,7 +278,9 @@ def _run_threads(plan, bundles, form, vectors, right, p, limits, team, threads):
 
 @jit_kernel
 def run_iterations(plan, bundles, form, vectors, right, p, limits, threads, team):
-    """Iterate from the positions in the first vector, or from p if that is given, which is then overwritten.
+    """Iterate from the positions in the first vector, or from p if that is given.
+
+    p is overwritten.
 
     Args:
         plan: the plan.

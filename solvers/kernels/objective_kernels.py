@@ -1,4 +1,6 @@
-"""The gradient of the objective and its change between two points, in one pass over springs and one over vertices.
+"""The gradient of the objective, and its change between two points.
+
+Each is computed in one pass over springs and one over vertices.
 
     grad g = sum_e k_e (1 - r_e/l_e) v_e + h (p - target) - f + w (p - pin)              h = c m/dt^2
     g(q) - g(p) = sum_e k_e/2 (l'_e - l_e) (l'_e + l_e - 2 r_e) + ...,   l' - l = (v' - v)(v' + v) / (l' + l)
@@ -77,7 +79,7 @@ class StepData(NamedTuple):
 
 @jit_kernel
 def compute_max_magnitude(p):
-    """Return the largest absolute coordinate of p (n, 3), 0 for none; NaN if there is one."""
+    """Return the largest absolute coordinate of p (n, 3), 0 without rows, NaN if one is."""
     largest = 0.0
     for v in range(len(p)):
         for c in range(3):
@@ -251,7 +253,7 @@ class ExactPins(NamedTuple):
 
 @jit_kernel
 def try_step(terms, form, step_data, exact_pins, p, direction, step_size, slope, curvature, q, out):
-    """Evaluate a trial of a line search, and the gradient there if the objective decreases enough.
+    """Evaluate a line-search trial, and the gradient there if the objective decreases enough.
 
     Args:
         terms: objective terms.

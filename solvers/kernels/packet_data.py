@@ -20,6 +20,6 @@ def deduplicate_packets(*numbers: NDArray[np.float64]) -> tuple[NDArray[np.int32
     rows = np.concatenate([array.reshape(-1, LANES) for array in numbers], axis=1)
     mixing = np.random.default_rng(0).integers(2**63, size=rows.shape[1], dtype=np.uint64)
     _, first, kind = np.unique(rows.view(np.uint64) @ mixing, return_index=True, return_inverse=True)
-    if not np.array_equal(rows[first[kind]], rows):  # two kinds were mixed to one number
+    if not np.array_equal(rows[first[kind]], rows):  # different entries have equal hashes: all are stored
         first = kind = np.arange(len(rows))
     return (rows.shape[1] * kind).astype(np.int32), copy_aligned(rows[first])

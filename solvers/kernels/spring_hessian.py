@@ -1,4 +1,4 @@
-"""The Hessian of springs, assembled directly into a matrix of 3 x 3 blocks, and its products.
+"""The Hessian of springs, assembled into 3 x 3 blocks, and its products with vectors.
 
     H_e = k nn' + t/l (I - nn'),   t = k (l - r),   n the direction of a spring, l its length, t its tension
 
@@ -96,7 +96,7 @@ def locate_blocks(number, starts, columns, transposed, vertices, out):
 
 @jit_kernel
 def list_vertex_pairs(number, vertices, starts, higher, last_lower, pairs):
-    """Write the different pairs of free vertices within rows of vertices (m, k), in ascending order.
+    """Write the distinct pairs of free vertices within rows of vertices, in ascending order.
 
     Pairs are grouped by their lower index, so that only the few different ones of a group are sorted.
 
@@ -199,7 +199,7 @@ def _write_constant_blocks(terms, places, values):
 
 @jit_kernel
 def assemble_hessian(terms, places, constant, p, tension, negative_fraction, values):
-    """Write the Hessian [N/m] of springs, inertia and penalty pins at p (n, 3) to the blocks `values`, (b, 3, 3).
+    """Write the Hessian [N/m] of springs, inertia and penalty pins to matrix blocks.
 
     Args:
         terms: objective terms.

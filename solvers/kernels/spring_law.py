@@ -1,15 +1,17 @@
-"""The law of one spring: its direction, its transverse stiffness and its change of energy, for processors and devices.
+"""The law of one spring: its direction, its transverse stiffness and its change of energy.
 
     E = k/2 (l - r)^2,   grad E = k (l - r) n,   H = k nn' + t/l (I - nn'),   t = k (l - r)
 
 `springbench.solvers.model.energies.spring_energy` is the interpreted form. This is the form of compiled edges and of
 devices in float64, with `springbench.solvers.model.energies.element_energies.axial_hessian` for H.
 
-Packets of eight springs (`springbench.solvers.simd`) and their scalar fallbacks compute k r/l - k in place of t/l, with
-1/l by an estimate and its correction, and devices in float32 the difference from a reference, which has no rounding
-error of float64 positions. Last bits differ between these forms. The two packet codes of k r/l - k, for the local step
-and for the objective, round differently too: one code for both takes as long (13.0 and 13.4 ms of processor time for
-100 local-global iterations of a cloth of 48 x 48), but changes positions by 4e-16 m, so they stay apart.
+Packets of eight springs (`springbench.solvers.simd`) and their scalar fallbacks compute k r/l - k in place of t/l.
+Packets get 1/l from an estimate and its correction. Devices in float32 compute the difference from a reference, which
+has no rounding error of float64 positions. Last bits differ between these forms.
+
+The packet codes of k r/l - k for the local step and for the objective round differently, too. One code for both takes
+as long (13.0 and 13.4 ms of processor time for 100 local-global iterations of a cloth of 48 x 48), but changes
+positions by 4e-16 m. They therefore remain separate.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""The compiled local step of springs: packets of eight vertices, each vertex with its incident springs.
+"""The compiled local step of springs, in packets of eight vertices.
 
     out_i += y_i + sum over springs (i, j) of k r (p_i - p_j) / |p_i - p_j|                         `add_projection`
     out_i += y_i - h_i p_i + sum of (k r / |p_i - p_j| - k) (p_i - p_j),   minus the gradient       `add_descent`
 
-It is one pass, without A or d. Each spring is computed at both of its ends, so that no vertex adds to the sum of
-another one. The result is therefore bitwise independent of the number of threads.
+Each vertex has its incident springs. The step is one pass, without A or d. Each spring is computed at both of its ends,
+so that no vertex adds to the sum of another one. The result is therefore bitwise independent of the number of threads.
 """
 
 from __future__ import annotations
@@ -64,7 +64,9 @@ class SpringPackets(NamedTuple):
         far: int,
         attached: AttachedEdges | None = None,
     ) -> tuple[SpringPackets, NDArray[np.int64]]:
-        """Build the packets of springs, and the first packet of each part of the rows (parts + 1,).
+        """Build the packets of springs.
+
+        The second result is the first packet of each part of the rows (parts + 1,).
 
         Self-loops, which have no extension, are omitted.
 
@@ -140,9 +142,10 @@ class SpringPackets(NamedTuple):
     def build_right_hand_side(
         self, anchor_stiffness: NDArray[np.float64], y: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Build the constant right-hand side y of the packets, with the anchor stiffness of each row [N/m].
+        """Build the constant right-hand side y of the packets, with anchor stiffnesses.
 
-        A packet has RHS_STRIDE numbers: eight x, y and z each, and eight stiffnesses. Rows in no packet follow it all.
+        A packet has RHS_STRIDE numbers: eight x, y and z each, and eight stiffnesses. Rows that are in no packet share
+        one more packet at the end.
 
         Args:
             anchor_stiffness: anchor stiffness of each row [N/m].
@@ -258,7 +261,7 @@ def add_scalar_springs(bundles, b, p, out, correct):
 
 @jit_inner
 def _add_edges(bundles, edges, i, entry, lane, p, correct, force):
-    """Add the edges of an entry to the force on the vertex at offset i; do nothing without edges."""
+    """Add an entry's edges to the force on the vertex at offset i, if there are any."""
     if edges is None:
         return force
     e = LANES * entry + lane

@@ -1,4 +1,6 @@
-"""The objective and minus its gradient in one pass over a factor's rows, in packets of eight vertices.
+"""The objective and minus its gradient, in packets of eight vertices.
+
+Both are computed in one pass over a factor's rows:
 
     b_i = y_i - h_i p_i + sum of s v over the springs (i, j),   s = k r / |v| - k,   v = p_i - p_j    minus the gradient
     g   = sum of s^2 |v|^2 / (2 k) + sum of |y_i - h_i p_i|^2 / (2 h_i)                          up to a constant

@@ -1,4 +1,4 @@
-"""Start and end of a step: conversion of the problem's arrays to the rows of the kernels and back."""
+"""Conversion of a step's arrays to the rows of the kernels and back."""
 
 from __future__ import annotations
 
