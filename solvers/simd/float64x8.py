@@ -1,4 +1,4 @@
-"""SIMD packets of eight float64 for kernels: the same source computes with scalars and with vector registers.
+"""SIMD packets of eight float64 in kernels; the same source also computes with scalars.
 
 `+`, `-`, `*` and comparisons act lane by lane on two packets, or on a packet and a float. Comparisons of packets give
 masks, which `&` and `|` combine. `where` replaces branches. No product is fused with a sum, so that each lane is
@@ -153,7 +153,7 @@ def _store_packet_code(typingctx: Any, value: Any, array: Any, place: Any) -> An
 
 
 def _mask_to_bits_code(typingctx: Any, flags: Any) -> Any:
-    """Return a mask as the bits of an integer, with the first lane as the lowest bit."""
+    """Return a mask as the bits of an integer, the first lane lowest."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.zext(builder.bitcast(args[0], I8), I64)

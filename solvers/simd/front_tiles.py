@@ -23,7 +23,8 @@ from springbench.solvers.simd.llvm_vectors import (
 )
 
 TILE_ROWS, TILE_COLUMNS = 8, 6
-"""Rows and columns (two vertices) of a tile: its sums and a factor fit the registers of AVX2, two tiles' AVX-512's."""
+"""Rows and columns (two vertices) of a tile. The sums of one tile and a factor fit the registers of AVX2, those of two
+tiles the registers of AVX-512."""
 
 _PACKET_TYPE = ir.VectorType(F64, TILE_ROWS)
 
@@ -40,7 +41,7 @@ class _StripBuilder(VectorBuilder):
         return self.broadcast_scalar(self.builder.load(pointer), TILE_ROWS)
 
     def masked_load_or_store(self, pointer: Any, mask: Any, value: Any = None) -> Any:
-        """Load the lanes of a mask, with zero in the others; or store those lanes of a value."""
+        """Load the lanes of a mask, with zero in the others, or store them."""
         builder = self.builder
         place = builder.bitcast(pointer, _PACKET_TYPE.as_pointer())
         kinds = [_PACKET_TYPE.as_pointer(), I32, mask.type]

@@ -1,4 +1,4 @@
-"""Shared tools of kernels written with an LLVM builder, and a prefetch for all other kernels.
+"""Shared tools of kernels written with an LLVM builder, and a prefetch for all kernels.
 
 `contract` permits the target to fuse a product with a sum.
 """
@@ -178,6 +178,5 @@ def _prefetch_entry_code(typingctx: Any, array: Any, place: Any) -> Any:
     return types.void(array, types.int64), generate
 
 
-prefetch_entry: Any = intrinsic(
-    _prefetch_entry_code
-)  # Numba passes the first argument itself, which no type checker sees
+# Numba passes the first argument itself, which type checkers cannot see.
+prefetch_entry: Any = intrinsic(_prefetch_entry_code)

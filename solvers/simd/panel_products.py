@@ -34,11 +34,12 @@ class _TileBuilder(VectorBuilder):
         super().__init__(context, builder)
         self.element_type = context.get_value_type(element)
         self.element_bytes = element.bitwidth // 8
-        self.lanes_per_vector = 16 // self.element_bytes  # of a vector
-        self.vectors_per_tile = 4 * m // self.lanes_per_vector  # of a tile
-        self.entries_per_tile = 16 * m  # of a tile
+        self.lanes_per_vector = 16 // self.element_bytes  # lanes of four numbers in 64 bytes
+        self.vectors_per_tile = 4 * m // self.lanes_per_vector
+        self.entries_per_tile = 16 * m
 
     def zero_vector(self, lanes: int) -> ir.Constant:
+        """Return a vector of zeros with a number of lanes."""
         return ir.Constant(ir.VectorType(self.element_type, 4 * lanes), [0.0] * (4 * lanes))
 
     def load_lanes(self, pointer: Any, lanes: int = 1) -> Any:
@@ -74,10 +75,11 @@ class _TileBuilder(VectorBuilder):
         return self.shuffle(vector, vector, [i // 4 * 4 + c for i in range(vector.type.count)])
 
     def add_vectors(self, a: Any, b: Any) -> Any:
+        """Return a + b."""
         return self.builder.fadd(a, b)
 
     def reduce_to_rows(self, totals: list[Any]) -> list[Any]:
-        """Sum the lanes of three or four vectors; return them as four rows, padded with zero."""
+        """Sum the lanes of three or four vectors; return four rows, padded with zero."""
         vectors, even = (
             [*totals, self.zero_vector(self.lanes_per_vector)][:4],
             list(range(0, 2 * self.lanes_per_vector, 2)),

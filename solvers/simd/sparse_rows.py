@@ -35,6 +35,5 @@ def _sparse_row_product_code(typingctx: Any, values: Any, columns: Any, begin: A
     return declared, generate
 
 
-sparse_row_product: Any = intrinsic(
-    _sparse_row_product_code
-)  # Numba passes the first argument itself, which no type checker sees
+# Numba passes the first argument itself, which type checkers cannot see.
+sparse_row_product: Any = intrinsic(_sparse_row_product_code)

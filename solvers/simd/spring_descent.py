@@ -78,6 +78,5 @@ def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any
     return types.float64(bundles, shares, number, x, right, out), generate
 
 
-spring_energy_and_descent: Any = intrinsic(
-    _spring_gradient_code
-)  # Numba passes the first argument itself, which no type checker sees
+# Numba passes the first argument itself, which type checkers cannot see.
+spring_energy_and_descent: Any = intrinsic(_spring_gradient_code)

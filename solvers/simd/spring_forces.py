@@ -1,5 +1,7 @@
-"""Forces of the springs of eight vertices, and their norm, in LLVM vectors (see
-`springbench.solvers.simd.spring_packets`)."""
+"""Forces of the springs of eight vertices, and their norm, in explicit LLVM vectors.
+
+See `springbench.solvers.simd.spring_packets` for the lanes.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,10 @@ from springbench.solvers.simd.spring_packets import (
 
 
 def _spring_force_code(subtract_position: bool) -> Callable[..., Any]:
-    """Return the code that adds a packet's forces to rows of `out`, or none if a spring is too short, which it returns.
+    """Return the code that adds a packet's forces to rows of `out`.
 
-    subtract_position: whether to add the negative gradient; else the constant right-hand side and the spring
-    projections.
+    The code returns whether a spring is too short; if one is, it adds nothing. subtract_position: whether to add the
+    negative gradient; if not, the constant right-hand side and the spring projections are added.
     """
 
     def declare(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
@@ -114,7 +116,10 @@ def _add_springs_with_edges(
 
 
 def _spring_norm_code(typingctx: Any, bundles: Any, number: Any, x: Any, measure: Any) -> Any:
-    """Return a packet's share of the squared norm of x: half of its springs', and `measure` times squared positions."""
+    """Return a packet's share of the squared norm of x.
+
+    This is half the sum of its springs' terms, plus `measure` times squared positions.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, number, x, measure = unpack_arguments(context, builder, signature, args)

@@ -286,7 +286,10 @@ class PacketBuilder(VectorBuilder):
             prefetch_line(b, b.gep(springs.neighbour_offset, [b.add(first, I64(2 * LANES * k))]))
 
     def estimate_inverse_sqrt(self, s: Any) -> tuple[Any, Any]:
-        """Return y, an estimate of 1/sqrt(s), and 1 - s y^2, for clamped s; `inverse_sqrt_correction` completes it."""
+        """Return y, an estimate of 1/sqrt(s), and 1 - s y^2, for clamped s.
+
+        `inverse_sqrt_correction` completes the estimate.
+        """
         b = self.builder
         if self.has_avx512:
             kind = ir.FunctionType(PACKET_TYPE, [PACKET_TYPE, PACKET_TYPE, I8])
