@@ -2,7 +2,7 @@
 
 Numba optimises a called function and generates its machine code, then repeats this in each caller, level by level. A
 function that only kernels call needs neither: an inner kernel, and what Numba implements in Python, such as `np.empty`.
-Here it stays as lowered, and the kernel that Python calls is optimised once as a whole.
+Here it remains lowered LLVM code, and the kernel that Python calls is optimised once as a whole.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class LinkedLibrary(_LIBRARY_CLASS):
 
     @property
     def codegen(self) -> _NullCodegen:
-        """A null object for environments of functions; the libraries that link this code set their own."""
+        """Object that ignores environments of functions; the libraries that link this code set their own."""
         return _NullCodegen()
 
 
@@ -63,7 +63,10 @@ class _NullCodegen:
 
 @contextmanager
 def _use_library_class(codegen: Any, library_class: type) -> Generator[None]:
-    """Create libraries of a class inside the block. Numba compiles under a lock of its own, in one thread at a time."""
+    """Create libraries of a class inside the block.
+
+    Numba compiles under a global lock, in one thread at a time.
+    """
     before = codegen._library_class
     codegen._library_class = library_class
     try:

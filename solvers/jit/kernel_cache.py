@@ -3,10 +3,9 @@
 Numba's own cache considers the kernel's file only. It ignores kernels in other files that the kernel calls, constants
 from there, and the compile options. Two processes that compile for one index may also leave the code of one under the
 signature of the other. So a kernel is cached here by the digest of all sources that its module imports
-(`springbench.solvers.jit.source_digest`). The key also has the options, the signature, the processor and the
-versions; each
-signature has its own file. A cache entry is therefore what a compilation would produce, whichever module imports the
-kernel and in whatever order.
+(`springbench.solvers.jit.source_digest`). The key also has the options, the signature, the processor and the versions;
+each signature has its own file. A cache entry is therefore what a compilation would produce, whichever module imports
+the kernel and in whatever order.
 
     <folder>/<module>-<digest>/<kernel>-<digest of the key>.nbc
 
@@ -165,10 +164,10 @@ class KernelCache(_NUMBA_CACHE):
         """
 
     def _store_code(self, sig: Any, data: CompileResult) -> None:
-        """Store the code compiled for a signature, if it is cacheable and the disk has space."""
+        """Store the code of a signature, if it is cacheable and the disk has space."""
         if data.library.has_dynamic_globals or not all(lifted.can_cache for lifted in data.lifted):
             return
-        for env in data._find_referenced_environments():  # of what it links in
+        for env in data._find_referenced_environments():  # those of the functions it links, too
             data.library.codegen.set_env(env.env_name, env)
         key = self._entry_key(sig, data.target_context)
         with suppress(OSError):
@@ -193,7 +192,10 @@ class KernelCache(_NUMBA_CACHE):
 
 
 def _closure_key(value: Any) -> Any:
-    """Return the cache key of a closed-over value: for a kernel its names, its sources and its own closure."""
+    """Return the cache key of a closed-over value.
+
+    That of a kernel consists of its names, its sources and its closure.
+    """
     function = getattr(value, "py_func", None)
     if function is None:
         return value
@@ -224,7 +226,7 @@ def _writable_root(source: str) -> Path:
 
 
 def _remove_stale(made: Path, module: str) -> None:
-    """Remove the code compiled from other sources of a module unless a process has used it recently."""
+    """Remove the code of other sources of a module unless it was used recently."""
     for other in made.parent.glob(f"{module}-*"):
         with suppress(OSError):
             if made.stat().st_mtime - other.stat().st_mtime > _STALE_SECONDS:
@@ -233,7 +235,7 @@ def _remove_stale(made: Path, module: str) -> None:
 
 @contextmanager
 def _lock_entry(path: Path) -> Generator[None]:
-    """Wait until no other process compiles for this file, at most a minute, and lock out others inside the block.
+    """Lock an entry inside the block, after waiting at most a minute for other processes.
 
     A kernel is locked while those that it calls are compiled. Kernels do not call each other in a circle, so no two
     processes wait for each other.

@@ -1,8 +1,9 @@
-"""Numba options of the kernels: compiled code is cached on disk, and arrays are not reference-counted.
+"""Numba options of the kernels: a disk cache, and arrays without reference counting.
 
-Kernels neither create nor store arrays, so there is nothing to count. Counting took half of a step of a hundred
-vertices. Kernels release the GIL. Inner functions are called by kernels only: they need no Python wrapper and no
-machine code of their own (`springbench.solvers.jit.inline_linking`). Neither does a kernel where another one calls it.
+Compiled code is cached on disk. Kernels neither create nor store arrays, so that there are no references to count:
+counting took half of a step of a hundred vertices. Kernels release the GIL. Inner functions are called by kernels only:
+they need no Python wrapper and no machine code of their own (`springbench.solvers.jit.inline_linking`). Neither does a
+kernel where another one calls it.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ def _default_flags(flags_class: Any) -> dict[str, Any]:
 
 
 def _read_flags(flags: Any) -> dict[str, Any]:
-    """Return the values of all flags of a compilation, as the method of Numba that this replaces does.
+    """Return the values of all flags of a compilation, as the Numba method it replaces.
 
-    That one reads them one by one, where type inference compares them for each call in a kernel: a quarter of the time
-    of a compilation.
+    Numba's method reads the flags one by one. Type inference compares them for each call in a kernel, which takes a
+    quarter of the time of a compilation.
     """
     return {**_default_flags(type(flags)), **flags._values}
 
@@ -57,7 +58,7 @@ class KernelDispatcher(_DISPATCHER_CLASS):
 
 
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator like Numba's `njit` whose disk cache depends on all that the function depends on."""
+    """Return a decorator like Numba's `njit`, with a disk cache that considers all dependencies."""
 
     def compiling(function: Callable[..., Any]) -> Any:
         if "pipeline_class" in options:
@@ -73,7 +74,7 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _cache_kernel(function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Return Numba's dispatcher of a function, with our cache."""
+    """Return Numba's dispatcher of a function, with the cache of this package."""
     dispatcher: Any = njit(**options)(function)
     dispatcher._cache = kernel_cache = KernelCache(function, options)
     compile_code = dispatcher._compiler.compile
@@ -89,7 +90,10 @@ def _cache_kernel(function: Callable[..., Any], options: dict[str, Any]) -> Any:
 
 @contextmanager
 def _pause_garbage_collection() -> Generator[None]:
-    """Collect no garbage inside the block: a compilation creates millions of objects that live until its end."""
+    """Collect no garbage inside the block.
+
+    A compilation creates millions of objects that live until its end.
+    """
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -104,9 +108,10 @@ jit_inner_options: Any = {**_bare_options, **_linked_options}
 
 jit_kernel: Any = cached_njit(**_bare_options)
 jit_inner: Any = cached_njit(**jit_inner_options)
-jit_inner_allocating: Any = cached_njit(**_linked_options)  # an inner one that makes arrays
+jit_inner_allocating: Any = cached_njit(**_linked_options)  # inner functions that allocate arrays
 jit_closure: Any = njit(**jit_inner_options)  # not cached by itself, but within its caller
-jit_inlined_closure: Any = njit(**jit_inner_options, forceinline=True)  # for what takes more arrays than it has work
+# For functions that take many arrays and do little work.
+jit_inlined_closure: Any = njit(**jit_inner_options, forceinline=True)
 jit_inner_parallel: Any = cached_njit(
     **_bare_options, **_no_wrapper_options, parallel=True, pipeline_class=ParallelCompiler
 )

@@ -1,4 +1,4 @@
-"""Kernels and the types of their arguments as plain data, so that another process can compile them.
+"""Kernels and their argument types as plain data, so that another process can compile them.
 
 A type is the name of one in `numba.types`, or a sequence:
 
@@ -70,7 +70,10 @@ def _load(name: str) -> Any:
 
 
 def measure_called_kernels() -> dict[KernelSignature, int]:
-    """Return the size of the machine code [bytes] of each kernel that Python code of this process has called."""
+    """Return the size of the cached code [bytes] of each kernel that Python code has called.
+
+    Only calls in this process count.
+    """
     return {
         KernelSignature(name, described): kernel._cache.measure_code(arguments, kernel.targetctx)
         for name, kernel in _find_kernels()
@@ -80,7 +83,7 @@ def measure_called_kernels() -> dict[KernelSignature, int]:
 
 
 def _find_kernels() -> Iterator[tuple[str, Any]]:
-    """Yield name and dispatcher of each kernel that Python code can call, in the imported modules."""
+    """Yield name and dispatcher of each kernel that Python can call, in the imported modules."""
     for module in [module for name, module in sys.modules.items() if name.startswith("springbench.")]:
         for name, value in vars(module).items():
             is_kernel = isinstance(getattr(value, "_cache", None), KernelCache)
@@ -96,7 +99,7 @@ def _describe_arguments(arguments: tuple[Any, ...]) -> tuple[Any, ...] | None:
 
 
 def is_missing(signature: KernelSignature) -> bool:
-    """Return whether the code of a kernel can be compiled for the cache, and is not in it."""
+    """Return whether a kernel's code can be cached, but is not in the cache."""
     try:
         kernel, arguments = _load(signature.kernel), tuple(map(build_type, signature.arguments))
     except (ImportError, AttributeError):  # of another version of the sources

@@ -1,4 +1,4 @@
-"""The sources that code depends on, and their digest, which identifies the code of kernels and measurements.
+"""Dependencies of source files, and their digest, which identifies compiled kernels and measurements.
 
 A source depends on itself and on the sources that its imports lead to, wherever in the file the imports stand. Imports
 are followed within this project, and within its own folder or package if the source lies elsewhere. A source also
@@ -9,8 +9,8 @@ A process continues to run the code that it has imported, even if the files chan
 state when this module was imported, or when its digest was first needed. A source that has changed since then gets a
 digest that no other process has.
 
-What was read from the sources is stored for the user, for one state: time, time of change, size and number of every
-file. No edit leaves all of these.
+Digests and imports are stored in the user's cache folder, under one state of all files: time of modification, time of
+change, size and inode number of each. Every edit changes at least one of these.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _SETTLING_NS = 2 * 10**9
 
 
 class SourceFacts(NamedTuple):
-    """Content digest of a source, in hexadecimal digits, and the paths of the sources that it imports or compiles."""
+    """Content digest of a source (hexadecimal), and the paths that it imports or compiles."""
 
     digest: str
     imports: list[str]
 
 
 def read_facts(states: Mapping[str, os.stat_result]) -> dict[str, SourceFacts]:
-    """Return the stored facts by path, for this state of all sources; empty if there are none."""
+    """Return the stored facts by path for this state of the sources; empty if none."""
     with suppress(OSError, ValueError, TypeError, IndexError):
         paths, facts = json.loads(_find_file(states).read_text(encoding="utf-8"))
         return {
@@ -153,14 +153,17 @@ def digest_sources(sources: Iterable[str | Path]) -> str:
 
 @cache
 def _sorted_dependencies(sources: frozenset[str]) -> list[tuple[str, str]]:
-    """Return the dependencies of sources at absolute paths, sorted by name; cached for the runs of a sweep."""
+    """Return the dependencies of sources at absolute paths, sorted by name.
+
+    The result is cached for the runs of a sweep.
+    """
     paths = {path for source in sources for path in find_dependencies(str(Path(source).resolve()))}
     return sorted((_portable_name(path), path) for path in paths)
 
 
 @cache
 def find_dependencies(source: str) -> frozenset[str]:
-    """Return the paths of all sources that the one at an absolute path depends on, including itself."""
+    """Return the paths of all dependencies of a source at an absolute path, including itself."""
     found, todo = {source}, [source]
     while todo:
         new = _find_imports(todo.pop()) - found
@@ -187,7 +190,7 @@ def stamp_sources() -> str:
 
 @cache
 def find_class_sources(made: type) -> frozenset[Path]:
-    """Return the source files of a class and of its base classes, without those of libraries."""
+    """Return the source files of a class and its bases, without those of libraries."""
     own = {getattr(sys.modules.get(made.__module__), "__file__", None)}
     for base in made.__mro__:
         # A module that was loaded manually may be identifiable by its functions only.
@@ -199,7 +202,10 @@ def find_class_sources(made: type) -> frozenset[Path]:
 
 
 def is_known_source(path: str) -> bool:
-    """Return whether a file is part of this project or of an installed library, not third-party code."""
+    """Return whether a file is part of this project or of an installed library.
+
+    A name such as `<string>` is known, too.
+    """
     return _is_project_file(path) or _is_library_file(path) or path.startswith("<")
 
 
@@ -221,7 +227,10 @@ def _is_project_file(path: str) -> bool:
 
 
 def _content_digest(path: str) -> bytes:
-    """Return the digest of a source; it is unique to this process if the file has changed since the first read."""
+    """Return the digest of a source.
+
+    It is unique to this process if the file has changed since it was first read.
+    """
     try:
         first = _FIRST_STAMPS.get(path) or _FIRST_STAMPS.setdefault(path, _stamp_file(path))
         file_digest = _file_digest(path)
@@ -240,7 +249,7 @@ def _file_digest(path: str) -> bytes:
 
 @cache
 def _read_facts() -> dict[str, SourceFacts]:
-    """Return digest and imports of all sources of this project, from the store if they are there."""
+    """Return digest and imports of all sources of this project, from the store if possible."""
     facts = read_facts(_FIRST_STATES)
     if not facts:
         with suppress(OSError):  # one was removed
@@ -255,7 +264,7 @@ def _read_facts() -> dict[str, SourceFacts]:
 
 @cache
 def _find_imports(source: str) -> set[str]:
-    """Return the sources that a source imports or compiles, and the `__init__` files of their packages."""
+    """Return the sources that a source imports or compiles, and their packages' `__init__` files."""
     known = _read_facts().get(source)
     return set(known.imports) if known else _parse_imports(source)
 
@@ -268,7 +277,7 @@ def _parse_imports(source: str) -> set[str]:
     }
     try:
         text = Path(source).read_text(encoding="utf-8", errors="replace")
-    except OSError:  # it was removed, which `digest` notes
+    except OSError:  # it was removed, which `_content_digest` detects
         return compiled
     run = _TYPE_CHECKING_BLOCK.sub("", text)
     return compiled | {path for base, name in _imported_names(run) for path in _resolve_import(source, base, name)}
@@ -304,13 +313,13 @@ def _resolve_import(source: str, base: str, name: str) -> Iterator[str]:
 
 
 def _is_source(path: str) -> bool:
-    """Return whether there is a source, or was one of ours when this module was imported."""
+    """Return whether a source exists, or was in this project when this module was imported."""
     return path in _FIRST_STAMPS or (not _is_project_file(path) and os.path.isfile(path))
 
 
 @cache
 def _import_root(source: str) -> tuple[str, list[str]]:
-    """Return the folder from which imports of a source are resolved, and the packages between it and the source."""
+    """Return the folder from which imports are resolved, and the packages down to the source."""
     folder, packages = os.path.dirname(source), list[str]()
     while os.path.isfile(os.path.join(folder, "__init__.py")):
         folder, package = os.path.split(folder)

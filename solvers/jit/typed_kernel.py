@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 
 def as_kernel_array(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return x, or a copy of it unless it is contiguous and writable, for which kernels are compiled."""
+    """Return x if it is contiguous and writable, else a copy; kernels are compiled for such arrays."""
     return x if x.flags.carray else np.array(x, np.float64, order="C")
 
 
