@@ -1,8 +1,8 @@
 """System calls that not every platform has, each with a portable path.
 
 Linux has all of them. Elsewhere runs are executed in the process of the command, without limits of time and memory; see
-`can_isolate_processes`. macOS has locks of files; without these (Windows) nothing prevents two commands from disturbing
-each other's times, so one should run at a time.
+`can_isolate_processes`. macOS has file locks. Without these (Windows) nothing prevents two commands from disturbing
+each other's times, so only one should run at a time.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ except ImportError:
 
 
 class LockMode(Enum):
-    """Mode of a lock of a file: shared by several processes, or exclusive."""
+    """Mode of a file lock: shared by several processes, or exclusive."""
 
     SHARED = "LOCK_SH"
     EXCLUSIVE = "LOCK_EX"
@@ -64,7 +64,7 @@ def wait_for_lock(handle: int, mode: LockMode) -> None:
 
 
 def unlock_file(handle: int) -> None:
-    """Release the lock of an open file, also for copies of this process that have it open."""
+    """Release the lock of an open file, also for forks of this process that share it."""
     if fcntl is not None:
         fcntl.flock(handle, fcntl.LOCK_UN)
 
@@ -106,7 +106,7 @@ def pin_threads(cores: set[int]) -> None:
     if not hasattr(os, "sched_setaffinity"):
         return
     for thread in os.listdir("/proc/self/task"):
-        with suppress(OSError):  # it has ended
+        with suppress(OSError):  # the thread has ended
             os.sched_setaffinity(int(thread), cores)
 
 
@@ -114,13 +114,13 @@ def measure_memory() -> float:
     """Return the memory of this machine [bytes]."""
     if hasattr(os, "sysconf"):
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    import psutil  # only where the system does not state it by itself
+    import psutil  # only on systems without `sysconf`
 
     return psutil.virtual_memory().total
 
 
 def read_load_average() -> float:
-    """Return the mean number of busy processes in the last minute; NaN if the system does not state it."""
+    """Return the mean number of busy processes in the last minute; NaN where it is unavailable."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
 
 
@@ -147,9 +147,10 @@ def get_soft_limit(name: str) -> float:
 
 
 def set_soft_limit(name: str, value: float) -> None:
-    """Set the soft limit of a resource, and leave the hard limit unchanged: the next call can use another value.
+    """Set the soft limit of a resource.
 
-    Nothing is limited where worker processes cannot be isolated.
+    The hard limit stays unchanged, so that the next call can use another value. Nothing is limited where worker
+    processes cannot be isolated.
 
     Args:
         name: name of the resource, such as `RLIMIT_DATA`.

@@ -1,5 +1,7 @@
-"""The solvers by name. A built-in solver has a line here; a third-party one needs none, see
-`springbench.solvers.plugins.plugin_discovery`."""
+"""The solvers by name.
+
+A built-in solver has a line here; a third-party one needs none, see `springbench.solvers.plugins.plugin_discovery`.
+"""
 
 from __future__ import annotations
 
@@ -66,12 +68,15 @@ SOLVER_TABLE = PluginTable("springbench.solvers", SOLVERS, OPTIONAL_SOLVERS)
 
 
 def is_minimiser(solver: Any) -> bool:
-    """Return whether the iterates converge to a minimum; a solver without `is_minimiser` is scored as if they do."""
+    """Return whether the iterates converge to a minimum.
+
+    A solver without the attribute `is_minimiser` is scored as if they do.
+    """
     return getattr(solver, "is_minimiser", True)
 
 
 def is_engine(solver: Any) -> bool:
-    """Return whether a solver, or its class, is an outside engine, whose iterations are its substeps."""
+    """Return whether a solver, or its class, is an external engine, whose iterations are its substeps."""
     return hasattr(solver, "write_script")
 
 
@@ -83,10 +88,10 @@ def find_solver_name(solver: Any) -> str:
 
 
 def find_solver_info(solver: Any, name: str) -> SolverInfo:
-    """Return the metadata of a solver, or those of a family of its own.
+    """Return the metadata of a solver, or default metadata that contain only a family name.
 
     Args:
         solver: the solver or its class.
-        name: name of the family if the solver states no metadata.
+        name: name of the family if the solver has no metadata.
     """
     return getattr(solver, "solver_info", SolverInfo(name))
