@@ -1,12 +1,11 @@
-"""Barrier energies, which are infinite beyond a surface in the space of positions and therefore limit the step size.
+"""Barrier energies, which are infinite beyond a surface and therefore limit the step size.
 
-A method that moves from p along a search direction limits the step size to `max_step_size` at each iterate, so that it
-stays on the side on which it started. The line search of the descent methods does this
-(`springbench.solvers.iteration.descent_method.backtracking_line_search`); the accelerated methods shorten their
-trial steps
-(`springbench.solvers.methods.local_global.accelerated_local_global`). Positions from another
-source, such as the inertial
-prediction or an initial guess, are accepted if the straight path to them is free of collisions.
+The surface is in the space of positions. A method that moves from p along a search direction limits the step size to
+`max_step_size` at each iterate, so that it stays on the side on which it started. The line search of the descent
+methods does this (`springbench.solvers.iteration.descent_method.backtracking_line_search`); the accelerated methods
+shorten their trial steps (`springbench.solvers.methods.local_global.accelerated_local_global`). Positions from another
+source, such as the inertial prediction or an initial guess, are accepted if the straight path to them is free of
+collisions.
 """
 
 from __future__ import annotations
@@ -70,7 +69,9 @@ class BarrierEnergy(Energy, Protocol):
         ...
 
     def collision_free_step_size_moving(self, p: Positions, direction: Positions, start_fraction: float) -> float:
-        """Return the largest collision-free step size up to 1 while obstacles move through the remaining step.
+        """Return the largest collision-free step size up to 1 while obstacles move.
+
+        The obstacles move through the remaining part of the step.
 
         Args:
             p: positions (n, 3) [m].

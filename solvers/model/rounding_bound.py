@@ -26,9 +26,10 @@ from springbench.solvers.model.step_problem import Energy, Positions, StepProble
 EPS = float(np.finfo(np.float64).eps)
 
 ROUNDOFF_FACTOR = StopRule().roundoff_floor
-"""Multiple of the bound up to which a gradient counts as round-off, 8. Solvers that iterate without a limit end at 0.1
-to 0.9 of the bound at the worst vertex of most hard scenes, and at 2 in the worst scene; iterates that have not
-converged are at a hundred or more."""
+"""Multiple of the bound up to which a gradient counts as round-off.
+
+It is 8. Solvers that iterate without a limit end at 0.1 to 0.9 of the bound at the worst vertex of most hard scenes,
+and at 2 in the worst scene; iterates that have not converged are at a hundred or more."""
 
 FloatArray = NDArray[np.float64]
 

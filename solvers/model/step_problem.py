@@ -6,8 +6,7 @@ A step of implicit Euler minimises the incremental potential (Liu et al. 2013, e
 
 over the positions p that satisfy all length constraints, with c = 1 and target = 2 p^t - p^(t-dt). Other integrators
 have other values of c and target (see `springbench.solvers.model.integrators`). `StepProblem` evaluates g in plain
-NumPy; every
-accuracy figure is computed from it.
+NumPy; every accuracy figure is computed from it.
 """
 
 from __future__ import annotations
@@ -127,7 +126,9 @@ class Energy(Protocol):
 
 @runtime_checkable
 class ProjectiveEnergy(Energy, Protocol):
-    """A projective energy min over d of sum_e w_e/2 |(A p)_e - d_e|^2, each d_e on a manifold (Bouaziz et al. 2014).
+    """A projective energy (Bouaziz et al. 2014).
+
+    It is min over d of sum_e w_e/2 |(A p)_e - d_e|^2, with each d_e on a manifold.
 
     Example:
         >>> import numpy as np
@@ -284,7 +285,7 @@ class StepStart:
 class LaggedEnergy(Energy, Protocol):
     """An energy that depends on the start of the step, such as damping, friction or moving obstacles.
 
-    The stiffness of a projective energy may depend on nothing of that start but its rate, because Q is built once.
+    The stiffness of a projective energy may depend on the `velocity_rate` of the start only, because Q is built once.
     """
 
     def begin_step(self, start: StepStart) -> Energy:
@@ -293,7 +294,10 @@ class LaggedEnergy(Energy, Protocol):
 
 
 def is_lagged(energy: Energy) -> TypeGuard[LaggedEnergy]:
-    """Return whether an energy is lagged; isinstance on the protocol would cost a hundredth of a small step."""
+    """Return whether an energy is lagged.
+
+    `isinstance` on the protocol would take a hundredth of the time of a small step.
+    """
     return hasattr(energy, "begin_step")
 
 
@@ -341,7 +345,7 @@ class StepProblem:
         """Return the terms [J] of the objective at p by name: inertia, force, pins, and energies by their class."""
         s, values, away = self.system, dict[str, float](), p - self.inertial_target
         for energy in self.energies:
-            name = type(energy).__name__.lower()  # which may be that of one of the three
+            name = type(energy).__name__.lower()  # a class may have the name of one of the terms below
             name = f"energy {name}" if name in ("inertia", "force", "pins") else name
             values[name] = values.get(name, 0.0) + energy.value(p)
         values["inertia"] = 0.5 * float(s.inertia_diagonal @ np.einsum("ij,ij->i", away, away))
@@ -405,8 +409,8 @@ class Solution:
     Attributes:
         positions: (n, 3) [m].
         num_iterations: number of iterations.
-        residual: |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices that the stop rule tested, at the iterate that
-            `residual_iterate` names; nan for a method that does not minimise.
+        residual: residual that the stop rule tested, |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices, at the
+            iterate that `residual_iterate` names; nan for a method that does not minimise.
         initial_residual: residual at the current positions; nan without a tolerance.
         termination_reason: "max-iter", "converged", "roundoff", "stalled" if no step decreases the objective, or
             "saddle" at a saddle point that the solve cannot leave.

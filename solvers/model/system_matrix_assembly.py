@@ -209,7 +209,7 @@ def require_determined_positions(system: System, Q: scipy.sparse.csr_array) -> N
     Raises:
         NotPositiveDefinite: some positions are not determined; the error names the first vertices concerned.
     """
-    from scipy.sparse.csgraph import connected_components  # brings scipy.linalg along
+    from scipy.sparse.csgraph import connected_components  # also imports scipy.linalg, so only where needed
 
     _, component = connected_components(Q, directed=False)
     anchor = system.mass.copy()
@@ -233,7 +233,8 @@ def energy_norm(Q: FloatArray | scipy.sparse.csr_array, e: FloatArray) -> float:
         e: displacement (n, 3) [m].
     """
     # If stiffness exceeds inertia by all digits of float64, round-off can make a sum of zero negative.
-    return sqrt(max(float(np.einsum("ij,ij->", e, Q @ e)), 0.0))  # in this order, so that NaN remains
+    # max(NaN, 0.0) is NaN, while max(0.0, NaN) would be 0.
+    return sqrt(max(float(np.einsum("ij,ij->", e, Q @ e)), 0.0))
 
 
 def diagonal_matrix(values: FloatArray) -> scipy.sparse.csr_array:

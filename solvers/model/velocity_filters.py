@@ -28,7 +28,12 @@ class ExponentialDecay:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuadraticDrag:
-    """Quadratic drag. mass: m (n,) [kg]; drag_coefficient: c dt (n,) [kg s/m]."""
+    """Quadratic drag.
+
+    Attributes:
+        mass: m (n,) [kg].
+        drag_coefficient: c dt (n,) [kg s/m].
+    """
 
     mass: NDArray[np.float64]
     drag_coefficient: NDArray[np.float64]

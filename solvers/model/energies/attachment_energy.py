@@ -17,7 +17,11 @@ from springbench.solvers.model.system_matrix_assembly import selection_matrix_sp
 
 @dataclass(frozen=True, eq=False)
 class Attachments(Quadratic):
-    """Attachments of vertices; anchor_positions_at: anchor points (m, 3) [m] as a function of time [s]."""
+    """Attachments of vertices.
+
+    Attributes:
+        anchor_positions_at: anchor points (m, 3) [m] as a function of time [s].
+    """
 
     anchor_positions_at: Callable[[float], Positions]
 

@@ -43,7 +43,7 @@ def _hessian(numbers, e, z0, z1, z2):
 
 @dataclass(frozen=True, eq=False)
 class AugmentedLagrangian(StrainLimits):
-    """Edges of an augmented Lagrangian, whose limits are shifted by tensions that may change from step to step."""
+    """Edges of an augmented Lagrangian, whose limits are shifted by the tensions."""
 
     element_law: ClassVar[ElementLaw] = ElementLaw.from_functions(
         _LIMIT_FUNCTIONS.value, _LIMIT_FUNCTIONS.gradient, _hessian, _LIMIT_FUNCTIONS.energy_change

@@ -1,14 +1,16 @@
-"""Quadratic bending of nearly inextensible surfaces that are flat at rest (Bergou et al. 2006; Wardetzky et al. 2007).
+"""Quadratic bending of nearly inextensible surfaces that are flat at rest.
+
+The energy is that of Bergou et al. 2006 and Wardetzky et al. 2007, with two differences (see below):
 
     E(x) = B/2 sum over inner edges of |K x|^2 / (A0 + A1),   K = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04)
 
 over the flap of an inner edge x0 x1 and the two opposite corners x2, x3, with the cotangents c of the flap's angles at
 the edge and the areas A0, A1 of its triangles, all at rest. 3 K x / (A0 + A1) is the mean Laplacian over the flap, and
-the matrix is constant. There are two differences from the paper:
+the matrix is constant. The two differences are:
 
-* It has the factor 3/(A0 + A1). On lattices of right or of equilateral triangles the sum is then the integral of the
-  squared curvature for a sphere, and three times that for a cylinder, which is the usual shape of bent cloth. Here a
-  cylinder has the energy B/2 k^2 per unit area, like a beam of flexural rigidity B per unit width.
+* The papers have the factor 3/(A0 + A1). On lattices of right or of equilateral triangles the sum is then the integral
+  of the squared curvature for a sphere, and three times that for a cylinder, which is the usual shape of bent cloth.
+  Here a cylinder has the energy B/2 k^2 per unit area, like a beam of flexural rigidity B per unit width.
 * A rectangle cut by one diagonal couples bending with twist, so that a strip under its weight would curl sideways and
   sag by a quarter more. Here rectangles count as cut by either diagonal, half each. A lattice of squares then resists
   twice as much along its diagonals as along its lines.

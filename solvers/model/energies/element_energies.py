@@ -202,7 +202,7 @@ def add_blocks(elements, block_indices, hessians, values):
         xx, xy, xz = hessians[e, 0], hessians[e, 1], hessians[e, 2]
         yy, yz, zz = hessians[e, 3], hessians[e, 4], hessians[e, 5]
         if xx == 0.0 and yy == 0.0 and zz == 0.0:
-            continue  # a limit that is not reached, an obstacle that is not touched
+            continue  # an inactive limit, or an obstacle without contact
         for a in range(width):
             for b in range(width):
                 block, c = block_indices[e, a * width + b], elements.coefficients[e, a] * elements.coefficients[e, b]

@@ -44,7 +44,7 @@ class Gas:
         return float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
 
     def _corner_positions(self, p: Positions) -> list[Positions]:
-        x = p - p.mean(axis=0)  # a closed surface may be moved; far from zero its volume would cancel
+        x = p - p.mean(axis=0)  # the volume does not depend on the origin; far from it the terms would cancel
         return [x[corner] for corner in self.triangles.T]
 
     def value(self, p: Positions) -> float:
@@ -115,7 +115,7 @@ class Gas:
         return drop_zeros(scipy.sparse.csr_array(-self._pressure_at(p)[0] * self._volume_hessian(p)))
 
     def low_rank_columns(self, p: Positions) -> NDArray[np.float64]:
-        """Return V = (p/V)^(1/2) grad V [(N/m)^(1/2)], shape (n, 3, 1); V V' is the rest of the Hessian."""
+        """Return u = (p/V)^(1/2) grad V [(N/m)^(1/2)], shape (n, 3, 1); u u' is the rest of the Hessian."""
         pressure, volume = self._pressure_at(p)
         return (np.sqrt(pressure / volume) * self._volume_gradient(p))[:, :, None]
 

@@ -20,7 +20,11 @@ from springbench.solvers.model.step_problem import Positions, StepStart
 
 @dataclass(frozen=True, eq=False)
 class Sewing(StrainLimits):
-    """Threads; max_length_at: their maximum lengths (m,) [m] as a function of time [s]."""
+    """Threads between pairs of vertices.
+
+    Attributes:
+        max_length_at: maximum lengths (m,) [m] as a function of time [s].
+    """
 
     max_length_at: Callable[[float], NDArray[np.float64]]
 

@@ -1,4 +1,4 @@
-"""Time integrators by name: `single_stage` has those with one stage per step, the others have tableaux of stages."""
+"""Time integrators by name: single-stage, generalised-alpha and implicit Runge-Kutta methods."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 StagedIntegrator = RungeKutta | GeneralisedAlpha
-"""The one-step integrators with one or more stages that evaluate all forces at the stage.
+"""The one-step integrators that evaluate all forces at their stages.
 
 Common attributes are order (of the error), num_stages (per step), inertia_factor (c), velocity_factor (velocity_rate
 times dt), needs_start_acceleration (whether the acceleration at the start of the step is needed), embedded_order (order

@@ -57,7 +57,7 @@ class GeneralisedAlpha:
 
     @property
     def velocity_factor(self) -> float:
-        """Ratio gamma/beta of the change of v' to that of the stage, in units of 1/dt."""
+        """Ratio gamma/beta of the changes of the stage's velocity and positions, in units of 1/dt."""
         return self.gamma / self.beta
 
     def iterate_stages(self, motion: Motion, acceleration: Positions | None, dt: float) -> StageGenerator:

@@ -1,4 +1,6 @@
-"""Diagonally implicit Runge-Kutta methods with one diagonal element gamma, whose last stage is the end of the step.
+"""Diagonally implicit Runge-Kutta methods with one diagonal element gamma.
+
+The last stage is the end of the step:
 
     P_i = x^ + gamma dt V_i,    x^ = p + dt sum_(j<i) a_ij V_j
     V_i = v^ + gamma dt A_i,    v^ = v + dt sum_(j<i) a_ij A_j,     M A_i = f(P_i, V_i, t + c_i dt)

@@ -1,4 +1,4 @@
-"""The interface of integrators with several stages per step, which they yield one after the other.
+"""The interface of integrators that yield the stages of a step one after the other.
 
 A stage x minimises energies(x) + c/(2 dt^2) |x - target|_M^2 - tr(x' f), like the step of implicit Euler, with the same
 c for all stages. So Q is factorised once, and every minimiser can be used. At the minimum M c/dt^2 (x - target) is the
@@ -53,7 +53,7 @@ class StepEnd(NamedTuple):
     Attributes:
         motion: motion at the end of the step.
         acceleration: (n, 3) [m/s^2] at the end of the step.
-        error: error estimate of the motion by an embedded method of lower order; None without one.
+        error: error estimate of the motion by an embedded method of another order; None without one.
     """
 
     motion: Motion

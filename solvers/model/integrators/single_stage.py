@@ -1,4 +1,6 @@
-"""Time integrators with one stage per step, each a step problem of the same form: minimise over the stage x
+"""Time integrators with one stage per step.
+
+The step problems of all of them have the same form: minimise over the stage x
 
     energies(x) + c/(2 dt^2) |x - target|_M^2 - tr(x' f),       Q = A'KA + c M/dt^2
 
@@ -34,7 +36,7 @@ class SingleStageIntegrator:
         inertia_factor: c.
         stage_fraction: time of the stage as a fraction of the step, 1 at its end.
         extrapolation_fraction: time of the external forces, as such a fraction.
-        needs_history: whether the motion of the previous step is needed; implicit Euler then makes the first step.
+        needs_history: whether the motion of the previous step is needed; implicit Euler then takes the first step.
         predict_target: function of the motions now and one step earlier, and of dt [s], that returns target and
             velocity_origin, each (n, 3) [m].
         order: order of the error.
@@ -86,7 +88,7 @@ def _predict_midpoint(motion: Motion, previous_motion: Motion, dt: float) -> tup
 class SubsteppingIntegrator(SingleStageIntegrator):
     """The integrator for solvers that integrate a step themselves and return the velocity.
 
-    Drag is then a force.
+    No velocity filters act: drag is a force.
     """
 
     has_split_filters: ClassVar[bool] = False
