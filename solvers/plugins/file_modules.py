@@ -1,6 +1,7 @@
-"""Import hook for Python files next to a config: `<this module>.m<path in hexadecimal>` is the file at that path.
+"""Import hook for Python files next to a config.
 
-Definitions in such a file have a module that every process can import, so they can be pickled between processes.
+The module `<this module>.m<path in hexadecimal>` is the file at that path. Definitions in such a file have a
+module that every process can import, so they can be pickled between processes.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Resolution of names in a config to code: built-in, of an installed package, or named by the config.
 
-    hybrid                        built-in: an entry of one of our tables
+    hybrid                        built-in: an entry of a built-in table
     my-method                     installed: an entry point of the table's group, such as `springbench.solvers`
     my_package.module:MyMethod    named: in a module that Python finds
     ./mine.py:MyMethod            named: in a file in the config's folder, or in a folder below it
@@ -74,8 +74,8 @@ class PluginTable(Mapping[str, Any]):
 
         Args:
             entry_point_group: group of installed entry points, such as `springbench.solvers`.
-            *builtin_tables: mappings from names to "module:name", or to the objects themselves; the first with a name
-                applies.
+            *builtin_tables: mappings from names to "module:name", or to the objects themselves; the first table that
+                contains a name is used.
         """
         self._entry_point_group, self.builtin_tables = entry_point_group, builtin_tables
 
@@ -101,9 +101,9 @@ class PluginTable(Mapping[str, Any]):
         return sum(1 for _ in self)
 
     def resolve_name(self, name: str, folder: Path) -> str:
-        """Return the name, as a PluginName if it is not built-in; an unknown name is returned unchanged.
+        """Return the name, as a PluginName if it is not built-in.
 
-        Imports nothing.
+        An unknown name is returned unchanged. Nothing is imported.
 
         Args:
             name: the name in the config.
@@ -143,14 +143,17 @@ def list_entry_points() -> list[tuple[str, str, str]]:
 
 
 def load_target(target: str) -> Any:
-    """Import the module, or run the file, of "module:name" or "path.py:name" and return the named object."""
+    """Import the object that "module:name" or "path.py:name" names; a file is executed."""
     place, _, name = target.rpartition(":")
     module = file_modules.load_file_module(Path(place)) if place.endswith(".py") else import_module(place)
     return getattr(module, name)
 
 
 def identify_code(name: str) -> str | list[str]:
-    """Return what distinguishes the code of a name from other code; a built-in is identified by its name."""
+    """Return what distinguishes the code of a name from other code.
+
+    A built-in is identified by its name.
+    """
     return name.identify_code() if isinstance(name, PluginName) else name
 
 
@@ -207,7 +210,7 @@ def find_module_source(module: str) -> str | None:
     first, *rest = module.split(".")
     try:
         spec = find_spec(first)
-    except ValueError:  # a module that was started as a script has none
+    except ValueError:  # a module that was started as a script has no spec
         return None
     for k in range(len(rest)):
         inside = spec.submodule_search_locations if spec else None
