@@ -1,11 +1,11 @@
 """External engines: third-party programs that step the same network through their own public interface.
 
-    positions, velocities, masses, springs (k, r), pins, load -> substeps of the engine's own -> positions, velocities
+    positions, velocities, masses, springs (k, r), pins, load -> the engine's substeps -> positions, velocities
 
-None minimises the objective of the step: they are evaluated by their motion. As with other substepping methods, the
-iterations are substeps: the k-th iterate is the whole step in k of them. Loads are constant within a step, and pins
-move at constant velocity. A feature that an engine does not support raises an error with its name; if the engine is not
-installed, the error has the installation command.
+No engine minimises the objective of the step: engines are evaluated by their motion. As with other substepping methods,
+the iterations are substeps: the k-th iterate is the whole step in k substeps. Loads are constant within a step, and
+pins move at constant velocity. A feature that an engine does not support raises an error with its name; if the engine
+is not installed, the error contains the installation command.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ACCELERATION_RTOL = 1e-12
 
 
 class EnginePackage(NamedTuple):
-    """The package of an engine: imported module, distribution, and our extra that installs it."""
+    """The package of an engine: imported module, distribution, and the extra of springbench that installs it."""
 
     module_name: str
     distribution_name: str
@@ -48,7 +48,7 @@ class EnginePackage(NamedTuple):
 
     @property
     def name_and_version(self) -> str:
-        """Return the name and version."""
+        """The distribution's name and version; only the name if it is not installed."""
         try:
             return f"{self.distribution_name} {version(self.distribution_name)}"
         except PackageNotFoundError:
@@ -159,7 +159,7 @@ class EngineNetwork:
 
 
 def _concatenate_edges(parts: list[SpringDashpots], unpinned: NDArray[np.bool_]) -> SpringDashpots:
-    """Concatenate edges with two distinct ends, at least one of them free."""
+    """Concatenate edges that act: distinct ends, at least one of them free, and a stiffness or a damping."""
     none = SpringDashpots(np.empty((0, 2), np.int64), np.empty(0), np.empty(0), np.empty(0))
     ends, *rest = (np.concatenate(arrays) for arrays in zip(none, *parts, strict=True))
     acts = (ends[:, 0] != ends[:, 1]) & unpinned[ends].any(axis=1) & ((rest[0] > 0.0) | (rest[2] > 0.0))
@@ -190,7 +190,7 @@ class ScriptFrames(NamedTuple):
         """Format the loop of a script: plain, or with changes between frames.
 
         Args:
-            plain: template of a loop with `steps`.
+            plain: template of a loop with `steps` or `frames`.
             driven: template with `frames`, `substeps` and `factor`.
         """
         if not self.is_driven:
@@ -275,7 +275,7 @@ class ExternalEngine(ABC):
 
 @dataclass(frozen=True, eq=False)
 class PreparedEngine(IterativeSolver):
-    """An engine, prepared for a system; `engine_stepper` has the network."""
+    """An engine, prepared for a system; `engine_stepper` contains the network."""
 
     residual_iterate: ClassVar[ResidualIterate] = "none"
     has_inner_solves: ClassVar[bool] = True

@@ -1,6 +1,6 @@
 """MuJoCo: vertices are bodies on three slide joints, springs and dashpots are spatial tendons.
 
-    M a = f - sum of k (l - r) + c dl/dt along the tendons - drag v
+    M a = f - sum of (k (l - r) + c dl/dt) along the tendons - drag v
 
 `Euler`, `implicitfast` and `implicit` are explicit in the positions, and implicit in the damping within the sparsity
 pattern of M: v <- v + h M^^-1 M a, p <- p + h v, M^ = M - h D. In `Euler`, D contains only drag; in the others it also
@@ -137,7 +137,7 @@ class _MujocoStepper:
 
     def __init__(self, library: Any, model: Any, network: EngineNetwork) -> None:
         self._library, self._model, self._data, self._network = library, model, library.MjData(model), network
-        library.set_mju_user_warning(_ignore_warning)  # it would write a file here
+        library.set_mju_user_warning(_ignore_warning)  # otherwise MuJoCo writes a log file into the current folder
 
     def step(self, problem: StepProblem, substeps: int) -> tuple[Positions, Positions]:
         """Integrate a step in `substeps` substeps; return positions [m] and velocities [m/s] at its end."""

@@ -1,4 +1,6 @@
-"""Newton (Warp): particle springs, stepped by three of its solvers in float32, on the CPU or a CUDA device.
+"""Newton (Warp): particle springs, stepped by three of its solvers in float32.
+
+It runs on the CPU or on a CUDA device.
 
 - `vbd`, vertex block descent (Chen et al. 2024), and `xpbd`: implicit Euler in substeps with several iterations each.
   Newton's `ModelBuilder.color` considers triangles, tetrahedra and bending edges, but no springs: a spring network has
@@ -9,10 +11,10 @@
   per substep therefore corresponds to XPBD.
 - `semi-implicit`: v <- v + h M^-1 f(p), p <- p + h v.
 
-Its documentation handles stiff springs by more substeps ("Tuning VBD"). Its example of a hanging cloth uses 10 substeps
-of a frame of 1/60 s, with 10 iterations each, for VBD and XPBD, and 32 explicit substeps. Kernels are compiled during
-preparation, which takes a minute the first time, and cached by Warp. Style3D, its fourth cloth solver, supports
-triangles but no springs.
+Its documentation recommends more substeps for stiff springs ("Tuning VBD"). Its example of a hanging cloth uses 10
+substeps of a frame of 1/60 s, with 10 iterations each, for VBD and XPBD, and 32 explicit substeps. Kernels are
+compiled during preparation, which takes a minute the first time, and cached by Warp. Style3D, its fourth cloth solver,
+supports triangles but no springs.
 """
 
 from __future__ import annotations
@@ -89,8 +91,8 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
     Args:
         newton_solver: one of Newton's solvers.
         iterations_per_substep: number of iterations; unused by the explicit solver.
-        colouring_source: vertices that `vbd` moves simultaneously: by springs, or Newton's colouring.
-        device: as for the other solvers.
+        colouring_source: colours of the vertices, which `vbd` moves simultaneously: of the springs, or Newton's own.
+        device: `cpu` or `cuda`.
     """
 
     solver_name: ClassVar[str] = "newton-physics"
@@ -110,7 +112,7 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
 
     def prepare(self, system: System) -> PreparedEngine:
         """Prepare the engine for a system; raise Unsupported for unsupported features."""
-        with suppress(ImportError):  # reported where Newton is prepared
+        with suppress(ImportError):  # `super().prepare` reports it
             warp = import_module("warp")
             warp.config.log_level = warp.LOG_ERROR  # otherwise it logs devices and each compiled module
         return super().prepare(system)
@@ -227,11 +229,11 @@ class _NewtonPhysicsStepper:
         for state in (self._current_state, self._next_state):
             _write_array(
                 state.particle_qd, 0.0, net.pinned_vertices
-            )  # a particle without mass would go on with what it has
+            )  # otherwise a massless particle would move at its velocity
         _write_array(self._external_force, problem.external_force)
         begin, end = start.positions[net.pinned_vertices], problem.pin_targets
         places = interpolate_pins(begin, end, substeps)
-        ahead = 0.0 if self._explicit else (end - begin) / substeps  # implicit steps have pins where they will be
+        ahead = 0.0 if self._explicit else (end - begin) / substeps  # implicit: pins at the end of the substep
         for k in range(substeps):
             if places is not None:
                 _write_array(self._current_state.particle_q, places[k] + ahead, net.pinned_vertices)
@@ -253,7 +255,7 @@ def _write_array(array: Any, values: NDArray[np.float64] | float, rows: NDArray[
     if rows is None and array.device.is_cuda:
         array.assign(np.asarray(values, np.float32))
         return
-    host = array.numpy()  # on the CPU the array itself
+    host = array.numpy()  # on the CPU this is a view of the array, on a device a copy
     host[slice(None) if rows is None else rows] = values
     if array.device.is_cuda:
         array.assign(host)

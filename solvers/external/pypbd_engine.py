@@ -3,7 +3,7 @@
     lambda' = -(C + lambda / (k h^2)) / (1/m_i + 1/m_j + 1/(k h^2)),    C = |p_i - p_j| - r
 
 (Macklin, Mueller and Chentanez 2016), in the substeps h of its `TimeStepController`, each with several iterations over
-all constraints. Its documentation and examples handle stiff cloth by substeps rather than by iterations, after Macklin
+all constraints. Its documentation and examples use substeps rather than iterations for stiff cloth, after Macklin
 et al. 2019: by default a time step of 5 ms has 5 substeps of one iteration each. Gravity is its only force.
 """
 
@@ -125,7 +125,7 @@ class PyPbdEngine(ExternalEngine):
             Unsupported: for loads other than `PYPBD_GRAVITY`.
         """
         _require_gravity(network, problem)
-        pieces = frames.num_substeps if frames.is_driven else 1  # of a frame, in steps of their own
+        pieces = frames.num_substeps if frames.is_driven else 1  # engine steps per frame; pins move only between steps
         given = {
             "time_step": network.time_step / pieces,
             "substeps": frames.num_substeps // pieces,
@@ -162,7 +162,7 @@ class _PyPbdStepper:
     def __init__(self, library: Any, network: EngineNetwork, iterations: int) -> None:
         self._library, self._network = library, network
         _limit_openmp_threads()
-        library.Simulation.getCurrent()  # has gravity
+        library.Simulation.getCurrent()  # creates the simulation, which contains gravity
         self._model, self._control = library.SimulationModel(), library.TimeStepController()
         self._model.init()
         self._control.init()
@@ -179,7 +179,7 @@ class _PyPbdStepper:
         for e, r in enumerate(network.spring_dashpots.rest_length.tolist()):
             constraints[e].restLength = r
         self._set_if_changed(iterations, "MAX_ITERATIONS")
-        self._set_if_changed(0, "MAX_ITERATIONS_V")  # there is nothing to project velocities to
+        self._set_if_changed(0, "MAX_ITERATIONS_V")  # the network has no velocity constraints
         control = library.TimeStepController
         self._control.setValueInt(control.VELOCITY_UPDATE_METHOD, control.ENUM_VUPDATE_FIRST_ORDER)
         self._velocity = np.zeros((len(network.mass), 3))

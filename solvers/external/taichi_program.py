@@ -2,9 +2,9 @@
 
     g(x) = |x - y|^2_M / 2h^2 + sum of k (|x_i - x_j| - r)^2 / 2,    y = x + h v + h^2 M^-1 f
 
-As in Taichi's own implicit cloth example (`implicit_mass_spring`): blocks per spring, no matrix. In addition the
-eigenvalues of the blocks are clamped, block Jacobi preconditions, and steps are halved until g does not increase. The
-program does not depend on springbench.
+As in Taichi's own implicit cloth example (`implicit_mass_spring`), the Hessian is stored as one block per spring, not
+as a matrix. In addition, the eigenvalues of the blocks are clamped, the preconditioner is block Jacobi, and steps are
+halved until g does not increase. The program does not depend on springbench.
 """
 
 from types import SimpleNamespace
@@ -116,7 +116,7 @@ def build_taichi_program(
 
     @ti.kernel
     def step():
-        ti.loop_config(serialize=True)  # one core: all within runs in order
+        ti.loop_config(serialize=True)  # one core: all statements inside run in order
         for _ in range(1):
             for i in range(n):
                 last[i] = x[i]
