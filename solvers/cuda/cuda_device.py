@@ -56,7 +56,7 @@ def require_device(solver: str) -> Any:
         cuda.current_context()
     except (
         Exception
-    ) as error:  # without a driver, without a device, with one that another process locks: each has its own
+    ) as error:  # a missing driver, a missing device and a locked device raise different exceptions
         why = " ".join(str(error).split()).rstrip(":. ")
         raise Unsupported(f"{solver}: there is no CUDA device ({why}); {INSTALL_HINT}") from error
     return cuda
@@ -149,7 +149,10 @@ def _open_nvml() -> Generator[Any]:
 
 
 def _nvml_handle(nvml: Any, device: Any) -> Any:
-    """Return the library's handle of the device, by its UUID, because the two may number devices differently."""
+    """Return the handle of the device in NVML, by its UUID.
+
+    NVML and CUDA may number devices differently.
+    """
     uuid = str(getattr(device, "uuid", ""))
     if uuid:
         return nvml.nvmlDeviceGetHandleByUUID(uuid if uuid.startswith("GPU-") else f"GPU-{uuid}")

@@ -1,6 +1,7 @@
 """Numba's CUDA target or its simulator, streams, and graphs of kernels.
 
-Numba has no types for device arrays and kernels. Grids are of Python's integers: Numba takes no others.
+Device arrays and kernels have the type `Any`, because Numba has no stubs for them. Grid sizes are Python integers:
+Numba accepts no NumPy integers.
 """
 
 from __future__ import annotations
@@ -163,7 +164,7 @@ class LaunchGraph:
     def _record(self, driver: Any, launch_kernels: Callable[[], None]) -> Any:
         """Record the kernels; return the executable graph."""
         stream = int(self._stream.cuda_stream)
-        mode = driver.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_RELAXED  # Numba may free arrays of others meanwhile
+        mode = driver.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_RELAXED  # Numba may free other arrays then
         _require_success(driver.cuStreamBeginCapture(stream, mode))
         try:
             launch_kernels()

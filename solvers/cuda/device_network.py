@@ -1,16 +1,16 @@
-"""Springs, quadratic forms and dashpots of a step on a device: each thread gathers the terms of its vertex.
+"""Springs, quadratic forms and dashpots of a step on a device.
+
+Each thread gathers the terms of its vertex:
 
     E = sum_e k_e/2 (|v_e| - r_e)^2 + sum_e k_e/2 (n_e.v_e - o_e)^2 + sum_i h_i/2 |p_i - c_i|^2 - tr(p'f)
 
 Edges of the second kind, marked by nan in `rest`, are dashpots. Each vertex has one anchor stiffness and one centre,
 h c = inertia target + penalty pin, so that distant targets round as positions do. A form is represented by zero-length
-springs and anchors (`springbench.solvers.objective.spring_form`). Energies that couple vertices nonlinearly, or more
-than two of
-them, are not supported; the error names them.
+springs and anchors (`springbench.solvers.objective.spring_form`). Other energies, such as contact and strain limits,
+are not supported; the error names them.
 
 Vertices are in rows: the free ones first, in patches of neighbours (`springbench.solvers.linalg.additive_schwarz`),
-then those with
-exact pins. The entries of 32 rows, a warp, that are read together are contiguous.
+then those with exact pins. The entries that the 32 rows of a warp read together are contiguous.
 """
 
 from __future__ import annotations
@@ -108,7 +108,19 @@ class DeviceStepData(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DeviceNetwork:
-    """Edges of a system; `row_vertices` (n,) are the vertices of the rows, the first `num_free` rows move."""
+    """Edges of a system between rows.
+
+    Attributes:
+        system: the system.
+        spring_form: its energies as springs, anchors and dashpots.
+        row_vertices: (n,), vertex of each row.
+        num_free: number of rows that move, the first ones.
+        ends: (m, 2), rows of both ends of each edge.
+        edge_entries: the edges, listed at both ends.
+        stiffness, rest_length: (m,) [N/m, m]; the rest length of a dashpot is nan.
+        edge_direction: (m, 3), initial axis of a dashpot, or direction of a spring of zero length.
+        anchor_stiffness: h of each row (n,) [N/m].
+    """
 
     system: System
     spring_form: SpringForm
@@ -131,7 +143,7 @@ class DeviceNetwork:
             free_order: (f,), order of the free vertices, as indices among them.
 
         Raises:
-            Unsupported: with the names of energies other than springs, constant forms and dashpots.
+            Unsupported: for energies other than springs, constant forms and dashpots; the message names them.
         """
         parts = decompose_energies(system)
         require_known_energies(solver, system)
@@ -167,7 +179,7 @@ class DeviceNetwork:
 
     @property
     def device_bytes(self) -> float:
-        """Return the bytes of the network on the device, without vectors."""
+        """The bytes of the network on the device, without vectors."""
         return 24.0 * len(self.edge_entries.neighbour_rows) + 64.0 * len(self.ends)
 
     def upload_edges(self, stream: DeviceStream) -> DeviceEdges:
@@ -196,7 +208,7 @@ def require_known_energies(solver: str, system: System) -> None:
         system: the system; its barriers and its contact of vertices are among the unsupported energies.
 
     Raises:
-        Unsupported: with the names of the unsupported energies.
+        Unsupported: for other energies; the message names them.
     """
     bare = without_barriers(without_vertex_contact(system))
     there = {type(e).__name__ for e in system.energies if e not in bare.energies}

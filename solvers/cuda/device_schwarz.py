@@ -27,7 +27,7 @@ from springbench.solvers.linalg import additive_schwarz
 from springbench.solvers.model.system_matrix_assembly import compute_row_starts
 
 THREADS_PER_SUBDOMAIN = 1 if cuda_device.is_simulated() else 96
-"""Threads per subdomain; see `sums` for the simulator's value."""
+"""Threads per subdomain; see `device_sums` for the simulator's value."""
 
 _MAX_GRID_BLOCKS = 65_535
 
@@ -55,7 +55,7 @@ class SchwarzLevel:
 
     @property
     def num_subdomains(self) -> int:
-        """Return the number of subdomains."""
+        """The number of subdomains."""
         return -(-self.num_nodes // additive_schwarz.SUBDOMAIN_SIZE)
 
 
@@ -74,7 +74,7 @@ def build_levels(network: DeviceNetwork, anchor_stiffness: NDArray[np.float64]) 
     ends = network.ends
     while (n := found[-1].num_nodes) > additive_schwarz.SUBDOMAIN_SIZE:
         nodes = found[-1].num_subdomains
-        ends = np.where(ends < n, ends // additive_schwarz.SUBDOMAIN_SIZE, nodes)  # what does not move is one node more
+        ends = np.where(ends < n, ends // additive_schwarz.SUBDOMAIN_SIZE, nodes)  # fixed rows are one more node
         across = np.flatnonzero(ends[:, 0] != ends[:, 1])
         low, high = np.sort(ends[across], axis=1).T
         keys, which = np.unique(low * (nodes + 1) + high, return_inverse=True)
@@ -133,7 +133,10 @@ class UploadedLevel(NamedTuple):
 
 
 class DeviceAdditiveSchwarz:
-    """Packed inverses of the subdomains of all levels for one solve; `apply_preconditioner` acts on r (f, 3)."""
+    """Packed inverses of the subdomains of all levels for one solve.
+
+    `apply_preconditioner` acts on the attribute `r` (f, 3).
+    """
 
     def __init__(
         self,

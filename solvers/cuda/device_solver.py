@@ -1,6 +1,6 @@
 """Base classes of device solvers: one stream, events, and copies to the host only on demand.
 
-    start: upload | launch, launch, ... | positions: download                       all in one stream, in their order
+    start: upload | launch, launch, ... | positions: download                       all in one stream, in this order
 
 Kernels are launched asynchronously. `positions` copies on access. The residual is evaluated after each
 ITERATIONS_PER_RESIDUAL iterations if it can end a solve. The iterates depend on neither.
@@ -48,7 +48,7 @@ class DeviceSolverState(SolverState):
         self._num_iterations = 0
 
     def mark_start(self) -> None:
-        """Mark the start of a solve, of no iterations yet: the following copies belong to it."""
+        """Mark the start of a solve, to which the following copies belong."""
         self._positions_copy, self._num_iterations, self.stalled, self.velocity = None, 0, False, None
         self.uploads.start_step()
         self._start_event = self.stream.record_event()
@@ -134,9 +134,9 @@ class DeviceSolverState(SolverState):
 
 
 class DeviceSolver(IterativeSolver):
-    """A method that is prepared on a device, with the device `columns` of its rows."""
+    """A method that is prepared on a device; `device_columns` describe the device in rows."""
 
-    can_leave_saddles: ClassVar[bool] = False  # a timed solve repeats the number of iterations alone
+    can_leave_saddles: ClassVar[bool] = False  # a timed solve repeats only the number of iterations
 
     device_columns: dict[str, Any]
 

@@ -7,10 +7,9 @@
 No difference of large numbers occurs: each term is accurate to the last digits of w, so the error of float32 is
 relative to the change since the reference. The force at the reference itself is computed in float64.
 
-A thread processes one lane of `springbench.solvers.kernels.spring_local_step`'s packets, with rows as indices: eight
-adjacent
-vertices read eight neighbours, eight spring vectors and one weight offset. Positions are in rows of four numbers, so
-that a neighbour is one memory sector.
+A thread processes one lane of `springbench.solvers.kernels.spring_local_step`'s packets, with rows as indices:
+eight adjacent vertices read eight neighbours, eight spring vectors and one weight offset. Positions are in rows of four
+numbers, so that a neighbour is one memory sector.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ class DeviceLanes(NamedTuple):
 
     @property
     def single_type_arguments(self) -> tuple[Any, ...]:
-        """Return the arguments of the kernels in the kernels' type."""
+        """The arguments of the kernels that compute in their own floating-point type."""
         return (
             self.lane_row,
             self.packet_start,
@@ -99,7 +98,7 @@ class DeviceLanes(NamedTuple):
 
     @property
     def float64_arguments(self) -> tuple[Any, ...]:
-        """Return the arguments of the float64 kernel that writes the spring vectors."""
+        """The arguments of the float64 kernel that writes the spring vectors."""
         return (
             self.lane_row,
             self.packet_start,
@@ -200,7 +199,10 @@ def build_spring_kernels(real: Any) -> SpringKernels:
 
     @cuda.jit
     def linearise(own, start, neighbour, kind, weights, spring, direction, arrows, padding_row, far, given, x, force):
-        """Write the spring vectors of the reference and the negative gradient there, in float64 (3, lanes) [N]."""
+        """Write the spring vectors of the reference, and the negative gradient there (3, lanes) [N].
+
+        Both are computed in float64.
+        """
         t = cuda.grid(1)
         if t >= len(own) or own[t] == padding_row:
             return

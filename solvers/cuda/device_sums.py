@@ -1,4 +1,4 @@
-"""Parallel sums in an order that depends only on the number of terms: they are bitwise reproducible.
+"""Bitwise reproducible parallel sums, in an order that depends only on the number of terms.
 
 Threads loop over the terms with a stride, the threads of a block are summed by a tree, and one block sums the blocks by
 the same tree. The two stages are two kernels, so no block waits for another and atomics are unnecessary.
@@ -16,8 +16,10 @@ from springbench.solvers.cuda.cuda_device import is_simulated
 from springbench.solvers.cuda.cuda_target import cuda
 
 THREADS_PER_BLOCK, MAX_BLOCKS = (1, 2) if is_simulated() else (256, 1024)
-"""Threads per block. The simulator starts a Python thread for each, which is slower than its work. Its device functions
-from other files than the kernel's also require a block of one thread."""
+"""Threads per block, and maximum number of blocks.
+
+The simulator starts a Python thread for each thread, which is slower than its work. Its device functions from other
+files than the kernel's also require a block of one thread."""
 
 
 def count_blocks(n: int) -> int:

@@ -36,7 +36,7 @@ def edge_direction_and_tension(edges, e, v0, v1, v2):
         Three components of the unit direction, which points to the entry's own end, then tension and length.
     """
     k, rest = edges.entry_stiffness[e], edges.entry_rest_length[e]
-    if rest == rest:
+    if rest == rest:  # a spring: the rest length of a dashpot is nan
         n0, n1, n2, length = _unit_direction(v0, v1, v2, edges.edge_direction, edges.edge_indices[e])
         return n0, n1, n2, k * (length - rest), length
     named, sign = edges.edge_indices[e], 1.0
@@ -158,7 +158,7 @@ def build_hessian_kernels(real: type[np.float32] | type[np.float64]) -> HessianK
     def multiply(edges, hold, linear, x, out, which, partials, now):
         """Write H x (f, 3) to `out` and store the first stage of x'H x.
 
-        Do nothing if now[STATUS] is not RUNNING.
+        Do nothing if now[0] is not 0.
         """
         if now[0] != 0.0:
             return

@@ -1,4 +1,6 @@
-"""Kernels of the additive Schwarz preconditioner: assembly and inversion of subdomains, multiplication by inverses.
+"""Kernels of the additive Schwarz preconditioner.
+
+They assemble and invert subdomains, and multiply by the inverses.
 
 A subdomain is inverted where it is assembled, in shared memory, in float64 and in place. It is symmetric, and only one
 half is stored, packed by rows. Sweeping each pivot of a positive definite A yields -A^-1 (Goodnight 1979, "A tutorial
@@ -239,7 +241,7 @@ def build_schwarz_kernels(real: RealType, patch: int) -> SchwarzKernels:
 
     @cuda.jit
     def dot(r, z, which, partials, now):
-        """First stage of the sum r'z."""
+        """Do the first stage of the sum r'z."""
         if now[0] != 0.0:
             return
         total, i = 0.0, cuda.grid(1)
