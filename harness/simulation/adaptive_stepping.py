@@ -5,9 +5,9 @@
 The next step size h' is the smaller one of the elementary and the predictive controller
 (`springbench.solvers.model.integrators.step_size_controller`), as in Hairer and Wanner's RADAU5. The step size of an
 implicit step is 2^-level of the end time, and the step starts at a multiple of its size. Few factors are therefore
-needed, the last ones used are cached (`MAX_FACTOR_BYTES`), and the end time is met exactly. The step size is doubled
-where h' is at least twice as large. The proportional-integral controller of the explicit methods would not reach that
-threshold.
+needed, the last ones used are cached (`MAX_FACTOR_BYTES`), and the last step ends exactly at the end time. The
+step size is doubled where h' is at least twice as large. The proportional-integral controller of the explicit methods
+would not reach that threshold.
 
 The algebraic error of a step's solve is limited to a share of the tolerance (`ALGEBRAIC_ERROR_SHARE`). Positions
 between steps are interpolated by cubic Hermite polynomials. Substepping solvers choose their step sizes within a frame
@@ -45,7 +45,7 @@ from springbench.solvers.model.step_problem import Positions, PreparedSolver, So
 MIN_STEP_FACTOR, MAX_REJECTION_FACTOR = 0.1, 0.5
 """Bounds of the change of the step size after a rejected step."""
 ALGEBRAIC_ERROR_SHARE = 0.1
-"""Share of the tolerance that the residuals of the stages may add to a step's error estimate."""
+"""Maximum part of a step's error estimate that the residuals of its stages cause, relative to the tolerance."""
 MAX_FACTOR_BYTES = 2**28
 """Memory limit [bytes] of cached factors; the two used last are always cached."""
 MIN_RELATIVE_STEP = 1e-9
@@ -80,8 +80,8 @@ class Trajectory:
         num_accepted_steps: number of accepted steps.
         num_rejected_steps: number of rejected steps.
         num_factorisations: number of factorisations.
-        num_iterations: number of iterations of the steps' solves.
-        step_size_range: smallest and largest step size [s].
+        num_iterations: number of iterations of the steps' solves; force evaluations of a solver with substeps.
+        step_size_range: smallest and largest step size [s]; twice the mean size of a solver with substeps.
         wall_seconds: wall time [s], without the preparation of the first steps.
         frame_seconds: wall time (k,) [s] in which each frame was computed; frames of one step share its time equally.
         cpu_seconds: processor time [s] of this thread, including preparation.
@@ -151,7 +151,7 @@ class Stepper(Protocol):
 
 
 class _StepSizeLevels:
-    """Scenes and prepared solvers by step size; the oldest beyond MAX_FACTOR_BYTES are discarded."""
+    """Scenes and prepared solvers by step size; beyond MAX_FACTOR_BYTES the least recently used are discarded."""
 
     def __init__(self, bound: Callable[[float], Scene], solver: Solver, horizon: float) -> None:
         self._bound, self._solver, self._horizon = bound, solver, horizon
@@ -222,7 +222,7 @@ class AdaptiveImplicitStepper(Stepper):
 
 
 class _AdaptiveIntegration:
-    """One motion with steps of the levels."""
+    """The integration of one motion, with step sizes of `_StepSizeLevels`."""
 
     def __init__(
         self, stepper: AdaptiveImplicitStepper, tolerance: float, limit: float, observe: StepObserver | None
@@ -365,7 +365,7 @@ def stack_motions(motions: Sequence[Motion]) -> tuple[Positions, Positions]:
 
 
 def interpolate_hermite(before: Motion, after: Motion, h: float, part: float) -> Motion:
-    """Interpolate a motion within a step by cubic Hermite polynomials of the motions at both ends.
+    """Interpolate a motion within a step by cubic Hermite polynomials.
 
     Args:
         before: motion at the start.

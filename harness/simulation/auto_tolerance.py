@@ -1,4 +1,4 @@
-"""Automatic tolerance of a step's solve: the residual may add little to the step's own local error.
+"""Automatic tolerance of a step's solve: the residual may add little to the step's local error.
 
     rate |dp|_M <= |residual|_Q,    |dp|_M + T rate |dp|_M <= PART (|e_p|_M + T |e_v|_M),    T the simulated time
 
@@ -10,7 +10,7 @@ estimate, though of the lower order. The smaller one is used:
     e_p = h |D^q v|_M / (q + 1)!,    e_v = |D^(q+1) v|_M / (q + 1)!
 
 The residuals themselves enter the differences with a factor of at most PART 2^(q+1)/(q + 1)! <= 0.2 per step. The noise
-of one step thus reduces the next tolerance and cannot sustain itself. The first steps have no history.
+of one step therefore decays in the following ones. The first steps have no history.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LOCAL_ERROR_SHARE = 0.1
 FIRST_STEP_RTOL = 1e-10
 """Relative tolerance of the steps without a history, with respect to the residual at their start."""
 _TINY = 1e-300
-"""Smallest tolerance [J^(1/2)]: a scene at rest is solved to round-off, which ends its solve at once."""
+"""Smallest tolerance [J^(1/2)]; a scene at rest is at round-off, which ends its solve at once."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,7 +77,7 @@ class ReplayingDeviceSolver(DelegatingSolver):
 
 
 def wrap_device_solver(prepared: PreparedSolver) -> DevicePreparedSolver | None:
-    """Wrap a prepared solver for replay on its device; None on the processor."""
+    """Wrap a prepared solver for replay on its device; None for a solver on the processor."""
     usual = prepared.usual if isinstance(prepared, AlternatingSolver) else prepared
     return DevicePreparedSolver(prepared, usual) if isinstance(usual, PreparedDeviceSolver) else None
 
@@ -85,8 +85,11 @@ def wrap_device_solver(prepared: PreparedSolver) -> DevicePreparedSolver | None:
 def compute_event_seconds(marks: SolveEvents | None) -> dict[str, float]:
     """Compute the times [s] of a step's kernels and transfers by events on the stream.
 
+    Args:
+        marks: events of the step's solve, None in the simulator.
+
     Returns:
-        columns; empty without events.
+        The columns by name; empty without events.
     """
     if marks is None:
         return {}

@@ -33,16 +33,16 @@ A step with stages x_i, velocities v_i and weights b_i balances the work of all 
 
 a_i = c/dt^2 (x_i - target) is the acceleration of a stage. Implicit Euler has one stage, its end, and dissipates
 1/2 |v' - v|_M^2 + U(p) - U(p') - grad U(p') . (p - p'), which is positive where U is convex. The residual acts like a
-force that the scene does not have: where a solve ends early, it may supply energy as well as dissipate it. Of length
-constraints, tensions are the part of the residual in the span of their gradients, and do no work in the exact motion.
-Sources are changing forces, moving pins and obstacles, and energies whose parameters change, at the mean of a step's
-two ends. Exactly pinned vertices have no kinetic energy.
+force that the scene does not have: where a solve ends early, it may supply energy as well as dissipate it. The
+tensions of length constraints are the part of the residual in the span of the constraints' gradients; they do no work
+in the exact motion. Sources are changing forces, moving pins and obstacles, and energies whose parameters change. The
+work of the latter is the mean of that at the two ends of a step. Exactly pinned vertices have no kinetic energy.
 
-A start may have pinned vertices away from their targets. The constraint projects them, which is no part of the motion:
-its energy at the start is that after the projection. Midpoint has its stage while the pins are still moving, and
-solvers of frames move them uniformly; the work of that motion is then a source. Penalty pins that reach their targets
-in this first step act as exact ones during the run: the kinetic energy of their vertices, which may ring, is work
-of the pins.
+A start may have pinned vertices away from their targets. The constraint projects them, which is not part of the
+motion: the energy of the start is that after the projection. Midpoint has its stage while the pins are still moving,
+and solvers of frames move them uniformly; the work of that motion is then a source. Penalty pins that reach their
+targets in this first step act as exact ones during the run: the kinetic energy of their vertices, which may ring, is
+work of the pins.
 
 The terms are evaluated separately, so their sum tests them: it differs from the change of the energy by round-off.
 
@@ -103,7 +103,7 @@ work, or at another time. Dormand and Prince's method of order 8 gains 2.3 times
 within frames."""
 
 BLOW_UP_FACTOR = 1e6
-"""Ratio of gain to available energy above which a motion has diverged: it is a thousand times as fast as possible."""
+"""Ratio of gain to available energy above which a motion has diverged, at a thousand times the possible speed."""
 
 _ACTIVE_LENGTH_RTOL = 1e-6
 """Distance from a bound, relative to it, within which a length is taken to be constrained: solves satisfy lengths to
@@ -113,8 +113,10 @@ _PLACED_RTOL = 1e-2
 """Distance from their targets after the first step, relative to that before it, within which pins have been placed."""
 
 _REGULARISATION, _NUM_REFINEMENTS = 1e-10, 4
-"""Shift of the matrix of the tensions, whose diagonal is 2, as redundant constraints make it singular; and the
-refinements that remove its effect, each by a factor of the shift over an eigenvalue."""
+"""Shift of the matrix of the tensions, and number of the refinements that remove its effect.
+
+The diagonal of the matrix is 2, and redundant constraints make it singular. Each refinement reduces the effect of the
+shift by the factor shift/eigenvalue."""
 
 
 class EnergyGain(NamedTuple):
@@ -170,10 +172,15 @@ class EnergyGrowth(NamedTuple):
 
 
 class _StepAccount:
-    """Data of both balances of a run: its scene, its motion so far, and the potentials after the last step."""
+    """Data of both balances of a run: scene, motion so far, and potentials after the last step."""
 
     def __init__(self, scene: Scene, mass: NDArray[np.float64]) -> None:
-        """Start at the scene's start; `mass` (n,) [kg] has kinetic energy where a vertex has no exact pin."""
+        """Start at the scene's start.
+
+        Args:
+            scene: scene that is stepped.
+            mass: masses (n,) [kg] for the kinetic energy; those of exactly pinned vertices do not count.
+        """
         system = scene.system
         self._scene, self._motion = scene, build_initial_state(scene).motion
         self._first = self._motion.positions
@@ -238,8 +245,8 @@ class EnergyBalance(_StepAccount):
     def _set_initial_energy(self, step_problem: StepProblem, x: Positions, moved: Positions) -> None:
         """Set the energy of the start.
 
-        An energy may be infinite there, since its obstacle is already where it is at the step's end. It then starts
-        with the value for which its work is zero.
+        An energy may be infinite there, because its obstacle is already at its place at the end of the step. Its
+        initial value is then the one for which its work is zero.
         """
         potentials = self._potential_energies(step_problem, self._first, self._first, 0.0)
         for k, energy in enumerate(step_problem.energies):
@@ -287,10 +294,10 @@ class EnergyBalance(_StepAccount):
             work.append(_dot(weight[:, None] * (stated.pin_targets[soft] - x[vertices]), led[soft]))
             work[-1] = max(
                 work[-1], _dot(self._conservative_gradient(stated, x)[vertices], led[soft])
-            )  # where they are taken as exact
+            )  # the work if penalty pins act as exact ones
         if moved[self._exact].any():
             work.append(_dot(self._conservative_gradient(stated, x)[self._exact], moved[self._exact]))
-            if len(self._penalties):  # tensions are what balances the gradient of all else
+            if len(self._penalties):  # tensions balance the gradient of all other terms
                 work.append(_dot(stated.gradient(x), moved))
         return float(sum(max(0.0, one) for one in work))
 
@@ -324,7 +331,7 @@ class EnergyBalance(_StepAccount):
 
 
 _NUM_STATES = 3
-"""Number of the first fields of StepDissipation, which are states; the others are sums over steps."""
+"""Number of the first fields of StepDissipation, which are states; the others are summed over steps."""
 
 _QUADRATURE_NODES = (0.0, 0.25, 0.5, 0.75, 1.0)
 _BOOLE_WEIGHTS = (7 / 90, 32 / 90, 12 / 90, 32 / 90, 7 / 90)
@@ -333,7 +340,9 @@ _SIMPSON_WEIGHTS = (1 / 6, 0.0, 4 / 6, 0.0, 1 / 6)
 
 
 class StepDissipation(NamedTuple):
-    """Energies after a step and its dissipation by cause, each [J]; None where the cause cannot be separated.
+    """Energies after a step and its dissipation by cause, each [J].
+
+    A value is None where its cause cannot be separated.
 
     Attributes:
         kinetic_energy: of all vertices without an exact pin.
@@ -429,7 +438,7 @@ class DissipationBudget(_StepAccount):
         return found
 
     def _place_start(self, step: SimulationStep, end: float) -> None:
-        """Place the pins of the start where the first step, which ends at a time [s], finds them."""
+        """Set the pin positions from which the first step, which ends at a time [s], moves the pins."""
         system, targets = self._scene.system, self._scene.pin_targets_at(0.0)
         pinned, (soft, vertices, _) = system.pins.vertices, system.penalty_pins
         away = targets - self._first[pinned]
@@ -692,7 +701,7 @@ class DissipationBudget(_StepAccount):
 
 
 class FrameDissipation:
-    """Dissipation of a motion by frames, from steps of other lengths, in order.
+    """Dissipation of a motion by frames, from steps whose lengths may differ from a frame.
 
     A step belongs to the frame in which it ends. A frame in which none ends has the energies of the one before it.
 
@@ -723,7 +732,10 @@ class FrameDissipation:
 
 
 def sum_dissipation(by_frame: Mapping[int, StepDissipation]) -> StepDissipation:
-    """Sum the dissipation of all frames, of which there is at least one; energies are those of the last."""
+    """Sum the dissipation of all frames; energies are those of the last frame.
+
+    There must be at least one frame.
+    """
     return reduce(StepDissipation.add_step, (by_frame[frame] for frame in sorted(by_frame)))
 
 

@@ -275,9 +275,12 @@ def find_termination_reason(step: SimulationStep) -> str:
 
 
 def describe_phases(step: SimulationStep) -> str | None:
-    """Describe the methods that a step's solves switched between; None for a solver of one method.
+    """Describe the methods that a step's solves switched between.
 
     Each has its iterations and its share of the counted cost, summed over the stages.
+
+    Returns:
+        The description; None for a solver of one method.
     """
     counts: dict[str, int] = {}
     costs: dict[str, float] = {}

@@ -1,4 +1,4 @@
-"""Transfer of motions between a mesh and a coarser one of the same body, exact for linear functions.
+"""Transfer of motions between two meshes of one body, exact for linear functions.
 
     f(x) = sum_j w_j f(x_j)   with   sum_j w_j = 1,   sum_j w_j x_j = x,   and sum_j w_j^2 |x_j - x|^4 minimal
 
@@ -78,8 +78,8 @@ def build_interpolation(sources: Positions, targets: Positions) -> csr_array:
     away = (sources[near] - targets[:, None, :]) / scale[:, :, None]
     linear = np.concatenate([np.ones((*near.shape, 1)), away], axis=2)
     normal = np.einsum("nki,nk,nkj->nij", linear, inverse, linear)
-    # Points on a line or in a plane leave directions undetermined, which need no weights.
-    pseudo_inverse: Any = np.linalg.pinv  # of stacks of matrices, which its types do not state
+    # Points on a line or in a plane leave directions undetermined; the pseudo-inverse gives these no weight.
+    pseudo_inverse: Any = np.linalg.pinv  # untyped, because its stubs do not accept stacks of matrices
     first = np.asarray(pseudo_inverse(normal, rcond=1e-13, hermitian=True), np.float64)[:, :, 0]
     weights = inverse * np.einsum("nki,ni->nk", linear, first)
     start = np.arange(0, near.size + 1, near.shape[1])

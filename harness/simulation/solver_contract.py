@@ -85,7 +85,14 @@ class SolverContract:
         self._before = {name: array.copy() for name, array in _collect_system_arrays(system).items()}
 
     def wrap_prepared(self, prepared: Any) -> ContractCheckedSolver:
-        """Wrap the prepared solver with checks; raises RunFailed if preparing modified the system."""
+        """Wrap the prepared solver with checks.
+
+        Args:
+            prepared: result of the solver's `prepare`.
+
+        Raises:
+            RunFailed: `prepare` modified the system, or its result lacks a method or property.
+        """
         line = _locate_method(type(self._solver), "prepare")
         self.require_unmodified(line)
         lacks = [name for name in _REQUIRED_METHODS if not callable(getattr(prepared, name, None))]
@@ -158,7 +165,7 @@ class ContractCheckedSolver(DelegatingSolver):
 
 def _locate_method(owner: type, method: str) -> str:
     function: Callable[..., Any] | None = getattr(owner, method, None)
-    if getattr(function, "__module__", "") == IterativeSolver.__module__:  # the loop is not the solver's own
+    if getattr(function, "__module__", "") == IterativeSolver.__module__:  # an inherited loop
         function = getattr(owner, "init_state", None)
     code = getattr(function, "__code__", None)
     return (

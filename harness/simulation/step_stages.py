@@ -1,9 +1,10 @@
-"""A step of several stages: the integrator defines them one after the other, a prepared solver solves each.
+"""A step in stages: the integrator defines them in turn, and a prepared solver solves each.
 
-All forces, pins and energies are evaluated at the time of the stage. Lagged quantities - forces that depend on the
-motion, directions of dashpots - are evaluated at the expected position of the stage first. The stage is then solved
-again `order - 2` times with the quantities at the last solution; each solve gains one order of accuracy. Exact pins
-have the exact velocity of their motion. Velocity filters and contact apply to the whole step and are of order 1.
+All forces, pins and energies are evaluated at the time of the stage. Lagged quantities, which are forces that
+depend on the motion and directions of dashpots, are evaluated at the expected position of the stage first. The stage is
+then solved again `order - 2` times with the quantities at the last solution; each solve gains one order of accuracy.
+Exact pins have the exact velocity of their motion. Velocity filters and contact apply to the whole step and are of
+order 1.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class StepResult(NamedTuple):
 
 
 class StageSequence:
-    """The stages of one step of a scene, from a filtered motion at a time."""
+    """The stages of one step of a scene, which starts from a filtered motion."""
 
     def __init__(self, scene: Scene, now: Motion, acceleration: Positions | None, time: float) -> None:
         """Start a step.
@@ -146,7 +147,7 @@ class StageSequence:
         return Motion(p, v)
 
     def build_start_problem(self) -> StepProblem:
-        """Build the problem whose gradient at the start of the step is that of all forces but inertia [N]."""
+        """Build the problem of the start, whose gradient there has no inertia term [N]."""
         (p, v), system = self.now, self.scene.system
         begun = StepStart(p, v, self.time, p - v / system.velocity_rate, system.velocity_rate, self.time)
         force = reduce(

@@ -1,17 +1,17 @@
 """Cross-check of times: wall time and CPU time by other clocks around the timed work.
 
-    pass_seconds = wall time of all work of a phase, by the kernel's raw clock
-    lost         = pass_seconds - CPU time             the process was preempted or stopped
-    |pass_seconds - sum of the phase's times| <= max(3 % of it, 1 ms)
+    wall_seconds      = wall time of all work of a phase, by the kernel's raw clock
+    preempted_seconds = wall_seconds - CPU time        the process was preempted or stopped
+    |wall_seconds - sum of the phase's times| <= max(3 % of wall_seconds, 1 ms, 15 us for each entry)
 
-The sum may be less than pass_seconds by another 1.5 times the lost time, since caches are cold after a preemption.
-However much is lost, half of the CPU time of the calling thread is in it (it includes the reading of the clocks, in
-which caches may be cold):
+The sum may be less than wall_seconds by another 1.5 times preempted_seconds, since caches are cold after a preemption.
+However long the preemption, the sum includes at least half of the CPU time of the calling thread (which includes the
+reading of the clocks, in which caches may be cold):
 
     CPU time of the thread / 2 - sum of the phase's times <= max(1 ms, 15 us for each entry)
 
 The times themselves are measured by `perf_counter`, call by call, elsewhere, so that an error in one place shows in the
-other. A delay between two calls is in pass_seconds alone. It is then in `lost` as well and is no error.
+other. A delay between two calls is in wall_seconds only. It is then in preempted_seconds as well and is no error.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ PREEMPTED_FACTOR = 1.5
 """Time that may be missing, relative to the lost time: caches are cold after a preemption."""
 
 PHASE_SUM_RTOL = 0.15
-"""Relative difference between an iteration's time and the sum of its phases from which on their rows are flagged."""
+"""Relative difference between an iteration's time and the sum of its phases above which their rows are flagged."""
 
 
 class ClockMismatch(RunFailed):

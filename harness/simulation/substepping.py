@@ -60,7 +60,7 @@ class _SubsteppingSolver(Protocol):
 
         Returns:
             Positions [m] and velocities [m/s] at the frame's end, and the number of accepted steps, the
-            number of rejected steps and the last step size [s].
+            number of rejected steps and the size of the last step [s].
         """
         ...
 

@@ -321,7 +321,7 @@ def _place_pins(system: System, p: Positions, targets: Positions) -> Positions:
 
 
 def _guess_assignment(step_problem: StepProblem) -> StepProblem:
-    """Guess the current positions unchanged, with pinned vertices where the penalty left them."""
+    """Guess the positions at the start of the step; pinned vertices are not moved to their targets."""
     return replace(step_problem, initial_guess=step_problem.step_start.positions)
 
 
@@ -384,7 +384,7 @@ _COARSE_LEVELS: WeakKeyDictionary[Scene, CoarseLevel] = WeakKeyDictionary()
 
 
 def _guess_coarse_to_fine(scene: Scene, state: MotionState, step_problem: StepProblem) -> StepProblem:
-    """Guess the displacement of this step on a mesh of half the size, interpolated.
+    """Guess the displacement of this step by interpolation from a mesh of half the size.
 
     The coarser solve itself starts from a still coarser one (nested iteration: Kronsjö and Dahlquist 1972). The shape
     of the finer mesh is preserved, since only the displacement is interpolated.

@@ -1,8 +1,8 @@
-"""Wall times of a run, and their rows: preparation, whole steps, and the local and global step separately.
+"""Wall times of a run and their rows: preparation, whole steps, and phases of an iteration.
 
-The timed passes record nothing. They follow an untimed pass in which the phases of each frame are timed separately,
-next to an iteration of its solve. This pass warms up all code that the steps use. The timed passes then repeat the
-whole simulation `rounds` times. All times are checked by a second clock (`PhaseWatch`). Where times do not matter
+The timed passes record nothing. They follow a warm-up pass, in which the phases of each frame and an iteration of its
+solve are timed separately, and which runs all code that the steps use. The timed passes then repeat the whole
+simulation `rounds` times. All times are checked by a second clock (`PhaseWatch`). Where times do not matter
 (`prepare_untimed`), only the instrumentation pass is run.
 
 Whether phases add up to an iteration is decided by medians over the frames: of the sum of the phases' own medians, and
@@ -38,11 +38,10 @@ from springbench.harness.simulation.time_loop import SimulationStep, build_initi
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solver
 
 PHASE_REPEATS = 3
-"""Number of timings of the local and the global step in each frame, after warm-up calls."""
+"""Number of timings of each phase in each frame, after the warm-up calls of `check_phases`."""
 
 ITERATION_PHASE = "iteration"
-"""Phase that the others should add up to: the time of a whole solve divided by its iterations, measured next to
-theirs."""
+"""Phase that the others should add up to: the time of a whole solve divided by its iterations."""
 
 NO_CLOCK: AbstractContextManager[None] = nullcontext()
 
@@ -143,7 +142,7 @@ def measure_run(
 
     prepared = None
     for round in range(settings.rounds + 1):
-        prepared = None  # its memory is free again before the next one takes as much
+        prepared = None  # releases its memory before the next one is allocated
         with watch("prepare"):
             began = perf_counter()
             prepared = prepare(scene, solver)
