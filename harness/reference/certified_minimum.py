@@ -1,12 +1,11 @@
 """Certified minima that solvers are compared with, by Newton's method to round-off.
 
 At a minimum grad g = 0 and the Hessian H is positive definite. Both are checked with
-`springbench.solvers.model.step_problem`,
-whatever method found the positions. Newton steps |H^-1 grad g| are repeated while each is shorter than half of the one
-before. The point where they end is stored. There the smallest eigenvalue must be positive beyond round-off
-(`springbench.harness.reference.hessian_curvature`) and one more step must be short. The energy is not convex, so
-there may be
-several minima. The basin of a minimum is defined by Newton's method with a line search, which only descends.
+`springbench.solvers.model.step_problem`, whatever method found the positions. Newton steps |H^-1 grad g| are repeated
+while each is shorter than half of the one before. The point where they end is stored. There the smallest eigenvalue
+must be positive beyond round-off (`springbench.harness.reference.hessian_curvature`) and one more step must be short.
+The energy is not convex, so there may be several minima. The basin of a minimum is defined by Newton's method with a
+line search, which only descends.
 
 Where the curvature along some direction is zero within round-off, and points in that direction have the same energy,
 the minima form a continuum: for example a circle, for a chain that may buckle to any side. The distance to one of its
@@ -37,7 +36,7 @@ from springbench.solvers.model.step_problem import Positions, Solver, StepProble
 UNLIMITED_STOP_RULE = StopRule(1000)
 """Iterate until round-off prevents any further descent: a tolerance would stop at saddles too."""
 CERTIFIED_RTOL = 1e-9
-"""Accuracy of a certified minimum relative to the mesh size; two within a hundred times this distance are one."""
+"""Accuracy of a certified minimum relative to the mesh size; two minima count as one within a hundred times it."""
 MAX_REFACTORISATIONS = 5
 
 

@@ -4,9 +4,8 @@
 
 Lengths l and directions n are those at p. Q is that of the step's projective energies and of the penalties of exact
 lengths (`springbench.solvers.model.energies.augmented_lagrangian`). The solution d is zero if and only if p is a
-stationary point.
-The tensions t are the multipliers of its constraints: of all tensions, those that minimise the remaining gradient in
-the norm of Q^-1 once the length errors are corrected. The active set is found by a semismooth Newton method
+stationary point. The tensions t are the multipliers of its constraints. They minimise the remaining gradient in the
+norm of Q^-1 once the length errors are corrected. The active set is found by a semismooth Newton method
 (Hintermueller, Ito and Kunisch 2002): a limit is active where l + t/k is beyond it. Linearly dependent lengths share
 their tension.
 

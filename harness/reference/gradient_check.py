@@ -1,4 +1,4 @@
-"""Check of energies from user code: each gradient is compared with the derivative of the energy's own value.
+"""Check of energies from user code: gradients are compared with derivatives of the values.
 
     f'(x).d = Im f(x + i h d) / h                           complex step (Squire and Trapp 1998): no cancellation
     f'(x).d = (4 D(h/2) - D(h)) / 3                         central differences D, Richardson-extrapolated
@@ -29,8 +29,9 @@ SPACING_FRACTIONS = (1e-3, 1e-2, 0.1, 0.5)
 ROUNDOFF_MULTIPLE = 200.0
 """Number of roundings in an element's energy, with a margin for sums of thousands of elements."""
 _COMPLEX_STEP = 1e-100
+"""h [m] of the complex step; its truncation error, of order h^2, is far below round-off."""
 _DIFFERENCE_STEP = 1e-4
-"""h, relative to the smallest length."""
+"""h of the central differences, relative to the smallest length."""
 
 
 class _SamplePoint(NamedTuple):
@@ -80,7 +81,7 @@ def _is_shipped(energy: Energy) -> bool:
 
 
 def _sample_points(scene: Scene, frames: int) -> Iterator[tuple[System, _SamplePoint]]:
-    """Sample points near the start and near the rest positions; every fifth is in the first frame."""
+    """Yield points near the start and near the rest positions; every fifth is in the first frame."""
     rng, rest = np.random.default_rng(0), scene.mesh.rest_positions
     begun = build_initial_state(scene).motion
     for k in range(NUM_POINTS):
@@ -99,7 +100,7 @@ def _sample_points(scene: Scene, frames: int) -> Iterator[tuple[System, _SampleP
 def measure_gradient_error(
     energy: Energy, x: Positions, direction: NDArray[np.float64], coordinate_scale: float, min_length: float
 ) -> float:
-    """Return the relative error of an energy's slope along a direction by its gradient.
+    """Return the relative error of the directional derivative that an energy's gradient gives.
 
     Args:
         energy: energy of a step.

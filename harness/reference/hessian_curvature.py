@@ -31,14 +31,16 @@ from springbench.solvers.model.system_matrix_assembly import diagonal_matrix
 from springbench.solvers.objective.woodbury import RankUpdateEnergy
 
 LARGE_SIZE = 30_000
-"""Number of unknowns from which on SuperLU would need gigabytes, so that the block Cholesky factor replaces it. The
-factor only guides the search, since the eigenvalue is a product with the Hessian."""
+"""Number of unknowns above which the block Cholesky factor replaces SuperLU, which would need gigabytes.
+
+The factor only guides the search, since the eigenvalue is a product with the Hessian."""
 NUM_ROUNDINGS = 3
 MAX_STEP_FRACTION = 1e-4
 """Step length relative to the mesh extent above which a step gives no information on a nearby stationary point."""
 SHIFTS = (0.0, *(10.0**k for k in range(-17, 2)))
-"""Shifts relative to the Hessian's largest row sum: the first that makes it positive definite is next to the smallest
-eigenvalue."""
+"""Shifts relative to the Hessian's largest row sum.
+
+The first one that makes it positive definite is close to the smallest eigenvalue."""
 
 
 SolveFunction = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -214,10 +216,10 @@ def _compute_softest_mode(H: SplitHessian) -> tuple[NDArray[np.float64], SolveFu
 
 
 def factorise_definite(H: SplitHessian) -> SolveFunction | None:
-    """Factorise a symmetric 3 x 3 block matrix; None where not positive definite.
+    """Factorise a symmetric 3 x 3 block matrix, and return the product with its inverse.
 
-    The result is the product with its inverse. Not positive definite means that in floating point some pivot of the
-    factor is not positive. For S + V V', the number of negative eigenvalues is that of S less that of I + V'S^-1 V
+    The result is None for a matrix that is not positive definite: in floating point some pivot of the factor is not
+    positive. For S + V V', the number of negative eigenvalues is that of S less that of I + V'S^-1 V
     (Sylvester's law of inertia).
     """
     S, V = H
@@ -235,7 +237,7 @@ def factorise_definite(H: SplitHessian) -> SolveFunction | None:
         except RuntimeError:  # a pivot is zero
             return None
         pivots = factor.U.diagonal()
-        if not np.array_equal(factor.perm_r, factor.perm_c):  # a pivot was not to be had on the diagonal
+        if not np.array_equal(factor.perm_r, factor.perm_c):  # SuperLU chose a pivot off the diagonal
             return None
         inner, negative = factor.solve, int(np.count_nonzero(~(pivots > 0.0)))
     if not V.size:

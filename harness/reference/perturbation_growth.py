@@ -45,8 +45,9 @@ _LINEAR_LIMIT = 1e3
 _HORIZON_SAFETY = 0.5
 """Fraction of the allowed growth at a recommended horizon, since the samples of that horizon differ."""
 _NUM_REFINEMENTS, _RTOL = 2, 1e-9
-"""Accuracy of the two methods: growth up to 1e-2 then equals that of the reference, and smaller steps do not change
-it."""
+"""Accuracy of the two methods, at which growth up to 1e-2 equals that of the reference.
+
+Smaller steps do not change it."""
 
 AdvanceFunction = Callable[[int, OdeState], OdeState]
 """Maps an interval index and the states of both motions at its start, concatenated, to those at its end."""
@@ -71,7 +72,7 @@ class PerturbationGrowth:
 
     @classmethod
     def from_reference(cls, reference: ReferenceTrajectory) -> PerturbationGrowth:
-        """Return the uncertainty of a reference in place of the growth, where no perturbation can be integrated."""
+        """Return the uncertainty of a reference as growth, for scenes without equations of motion."""
         coordinates = 3 * max(1, len(reference.free_vertices))
         scale = float(reference.displacement[-1]) / coordinates**0.5
         return cls(reference.times, reference.displacement, reference.disagreement, scale)

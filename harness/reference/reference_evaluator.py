@@ -5,9 +5,8 @@
 
 Q is the matrix of the system's projective energies. It is assembled here and factorised by SuperLU, independently of
 the solver. Round-off is bounded for each vertex (`springbench.solvers.model.rounding_bound`): a gradient of at most
-FACTOR delta_i
-at vertex i may be round-off only; a larger one is significant, however distant or stiff another part of the scene is.
-Hence
+FACTOR delta_i at vertex i may be round-off only; a larger one is significant, however distant or stiff another part of
+the scene is. Hence
 
     floor(p)  = sqrt(sum_i (FACTOR delta_i)^2 / Q_ii)          bound on the round-off of the residual
     beyond(p) = |Q^-1 (grad g less the part explained by round-off, for each vertex)|_Q / initial
@@ -16,7 +15,7 @@ A step is assessed by `stationarity_above_roundoff`: it is 0 where every vertex 
 
 Where Q has more than MAX_DIRECT_NNZ entries, conjugate gradients from zero replace the factor. |x_k|_Q grows towards
 |Q^-1 g|_Q (Hestenes and Stiefel 1952), so that the result is a close lower bound. The preconditioner is multigrid,
-which affects only the number of iterations, not the limit: ten iterations on meshes of any size.
+which affects only the number of iterations, not the limit; about ten are needed on meshes of any size.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ MAX_DIRECT_NNZ = 1_500_000
 """Entries of Q up to which its factor takes seconds at most: sheets of some 150,000 vertices, solids of 50,000."""
 
 MULTIGRID_RTOL = 1e-9
-"""Tolerance of conjugate gradients relative to the scaled gradient norm |D^-1/2 g|, D the diagonal of Q. It gives four
-digits of |Q^-1 g|_Q where a heavy pin contributes nearly all of g, and more elsewhere. The limit is
-MAX_CG_ITERATIONS."""
+"""Tolerance of conjugate gradients relative to the scaled gradient norm |D^-1/2 g|, D the diagonal of Q.
+
+It gives four digits of |Q^-1 g|_Q where a heavy pin contributes nearly all of g, and more elsewhere."""
 
 MAX_CG_ITERATIONS = 500
 

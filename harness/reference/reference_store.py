@@ -138,7 +138,10 @@ class ReferenceStore:
     def find_minima(self, frozen: StepSnapshot) -> KnownMinima:
         """Load the known minima of a problem, or find them.
 
-        `lowest` of the result raises UncertifiedError if there is none.
+        `lowest_minimum` of the result raises UncertifiedError if there is none.
+
+        Args:
+            frozen: snapshot whose step problem is minimised.
         """
         path = self.folder / f"minima-{frozen.digest}.npz"
         if stored := _read_arrays(path, _CERTIFICATE_FIELDS):
@@ -152,7 +155,7 @@ class ReferenceStore:
         """Find the minimum in whose basin p is.
 
         A new certified minimum is added to the known ones, and becomes the reference if it is the lowest. Its index is
-        `find_minima(snapshot).find_index(minimum)` where it is certified.
+        `find_minima(frozen).find_index(minimum)` where it is certified.
 
         Args:
             frozen: snapshot whose step problem is minimised, and under whose digest its minima are stored.
@@ -248,17 +251,18 @@ class ReferenceStore:
         refined_error: float | None = None,
         seconds: float | None = None,
     ) -> SelfConvergedTrajectory:
-        """Load the self-converged trajectory of a scene with contact, or compute it; it may be less accurate.
+        """Load or compute the self-converged trajectory of a scene with contact.
 
-        Its fingerprint is a first step, the same for every time step of the scene.
+        It may be less accurate than requested. Its fingerprint is a first step, the same for every time step of the
+        scene.
 
         Args:
             spec: specification of the scene.
             size: size of the scene.
             times: ascending times [s].
-            error: smallest relative error to be measured, if that takes no longer than a limit.
-            refined_error: the same where no motion for `error` is stored; `error` by default.
-            seconds: that limit, processor time [s]; MAX_SECONDS by default.
+            error: smallest relative error to be measured, if that takes no longer than `seconds`.
+            refined_error: error for which a motion is computed if none for `error` is stored; `error` by default.
+            seconds: limit on the processor time [s]; MAX_SECONDS by default.
 
         Raises:
             InputError: the scene cannot be built.
@@ -285,7 +289,7 @@ class ReferenceStore:
     def load_contact_horizon(
         self, spec: SceneSpec, size: int, t_end: float, *, error: float
     ) -> tuple[SelfConvergedTrajectory, str]:
-        """Load the motion of a scene with contact at the longest time at which an error can be measured.
+        """Load the motion with contact at the longest time at which an error can be measured.
 
         Eighths of t_end are tried, then those of a quarter of it, and so on, within MAX_SECONDS altogether.
 
@@ -369,7 +373,7 @@ class ReferenceStore:
         return found
 
     def _load_known_snapshots(self, request: _ReferenceRequest, frames: Iterable[int]) -> dict[int, StepSnapshot]:
-        """Load those of the snapshots that are on disk and match the present scene."""
+        """Load the snapshots that are on disk and match the present scene."""
         stored = [_read_arrays(self._snapshot_path(request, frame), SNAPSHOT_ARRAYS) for frame in frames]
         snapshots = [restore_snapshot(arrays, request.scene) for arrays in stored if arrays]
         return {snapshot.frame: snapshot for snapshot in snapshots if snapshot}
@@ -426,9 +430,9 @@ def _build_minima(arrays: Arrays) -> KnownMinima:
 
 
 def _read_arrays(path: Path, names: Collection[str]) -> dict[str, Any]:
-    """Read the arrays of a file; none if there is no file, or one of the names is missing in it.
+    """Read the arrays of a file; none if there is no file, or if it lacks one of the names.
 
-    Names are missing in files that were written by other code.
+    Files of another version of the code may lack names.
     """
     if not path.exists():
         return {}

@@ -1,10 +1,9 @@
 """Reference trajectory for time stepping: a high-order integration of the equations of motion.
 
-Dormand and Prince's method of order 8 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, section
-II.10) at rtol 1e-12, checked by Adams methods of orders up to 12 (VODE; ibid., section III.1). Where a perturbation of
-1e-12 at the start grows past the error to be measured (`springbench.harness.reference.perturbation_growth`), there
-is no reference
-trajectory, and the request is rejected.
+The motion is integrated by Dormand and Prince's method of order 8 (Hairer, Norsett and Wanner, Solving Ordinary
+Differential Equations I, section II.10) at rtol 1e-12, and checked by Adams methods of orders up to 12 (VODE; ibid.,
+section III.1). Where a perturbation of 1e-12 at the start grows past the error to be measured
+(`springbench.harness.reference.perturbation_growth`), there is no reference trajectory, and the request is rejected.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class UnpredictableMotion(RunFailed):
 
 
 def compute_position_error(p: Positions, reference: Positions, free_vertices: NDArray[np.int64]) -> float:
-    """Return |p - reference|_F [m] over the free vertices, the error by which methods are compared.
+    """Return |p - reference|_F [m] over the free vertices, by which methods are compared.
 
     Args:
         p: positions (n, 3) [m].

@@ -7,8 +7,7 @@ evaluations of the residual need not agree, and the claim is not compared.
 
 Where lengths are exact, g is the Lagrangian with the tensions that minimise its gradient at p
 (`springbench.harness.reference.exact_lengths`). With the tensions of the method itself the gradient may vanish where
-lengths are
-wrong.
+lengths are wrong.
 
 The audit runs in the instrumentation pass, which is not timed. It detects a method that does nothing and reports a zero
 residual. A method whose iterations do not end at the minimum of the step's objective (`is_minimiser = False`, and no
@@ -30,7 +29,7 @@ from springbench.solvers.model.step_problem import Positions, PreparedSolver, So
 from springbench.solvers.registry import find_solver_info, find_solver_name, is_minimiser
 
 RESIDUAL_SLACK = 10.0
-"""Factor between reported and measured residual: a factor of few digits, or a preconditioner close to Q, is allowed."""
+"""Factor allowed between reported and measured residual, for a factor of few digits or a preconditioner close to Q."""
 
 _SAME_POSITION_RTOL = 1e-9
 """Relative difference, in the largest coordinate, of two sums of the same terms after many iterations."""
@@ -69,7 +68,7 @@ class AuditedSolver(DelegatingSolver):
             RunFailed: the residual that the solver reports is wrong.
         """
         found = self._prepared.solve(problem, stop)
-        if problem.step_start.time > self._begun:  # the first unknown of the next frame
+        if problem.step_start.time > self._begun:  # the first stage of the next frame
             self._done, self._begun = self._done + 1, problem.step_start.time
         if self._done in self._frames and np.isfinite(found.positions).all():
             graded = self._audit_solution(problem, found, stop)

@@ -3,10 +3,10 @@
     |q_h(T) - q_(h/2)(T)| and |2 p_(h/2)(T) - p_h(T) - q_(h/2)(T)| <= CONTACT_MARGIN error |q(T) - p(0)|
 
 Here p is the motion by implicit Euler, of order 1, whose limit Richardson extrapolation estimates, and q the one by
-BDF2, which is the reference. Norms are Frobenius norms over the free vertices; steps
-are solved by Newton's method; a motion with a step that does not converge is not used. Contact has no equation of
-motion that could be integrated instead, and its limit may depend on the integrator, which determines the restitution of
-an impact and the velocity that lagged friction opposes. Where the limits differ, there is no reference. Half-spaces
+BDF2, which is the reference. Norms are Frobenius norms over the free vertices. Steps are solved by Newton's method; a
+motion with a step that does not converge is not used. Contact has no equation of motion that could be integrated
+instead. Its limit may depend on the integrator, which determines the restitution of an impact and the velocity that
+lagged friction opposes. Where the limits differ, there is no reference. Half-spaces
 stiffen with 1/h^2, so that their limit is a rigid contact; barriers retain the stiffness of the scene's own step.
 """
 
@@ -36,7 +36,7 @@ MAX_SECONDS = 60.0
 SHORTEST_REFINEMENT = 0.5
 """Processor time [s] below which no motion is refined."""
 TRIAL_SHARE = 0.6
-"""Share of the remaining time that a motion is given, before one of a quarter of its length is tried."""
+"""Share of the remaining processor time for a motion, before one of a quarter of its length is tried."""
 MAX_RELATIVE_ERROR = 0.05
 """Relative error for which a reference is always accurate enough, if MAX_SECONDS suffice."""
 CONTACT_MARGIN = 0.3
@@ -57,7 +57,7 @@ class NotConverged(UnpredictableMotion):
 
 
 def has_contact(system: System) -> bool:
-    """Return whether a system has contact: with half-spaces, or by barriers with itself and with obstacles."""
+    """Return whether a system has contact, by half-spaces or by barriers."""
     return without_barriers(without_vertex_contact(system)) is not system
 
 
@@ -85,11 +85,11 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
         return float(self.disagreement[-1]) > _DISAGREEMENT_FACTOR * self.last_change
 
     def count_known_times(self, max_disagreement: float) -> int:
-        """Return the number of times, from the first one on, at which the limits disagree by no more than this."""
+        """Return the number of times before the first one at which the limits disagree by more than this."""
         return int(np.argmin(np.append(self.disagreement <= max_disagreement, False)))
 
     def find_last_known_time(self, max_disagreement: float) -> int | None:
-        """Return the index of the last time at which the limits disagree by no more than this; None without one."""
+        """Return the index of the last time at which the limits disagree by at most this; None for none."""
         known = np.flatnonzero(self.disagreement <= max_disagreement)
         return int(known[-1]) if len(known) else None
 

@@ -1,7 +1,7 @@
 """Snapshots of single steps of a reference run, so that all solvers solve the same problem.
 
-The reference run takes converged steps (Newton's method), with all pins exact whatever the scene states. Accuracy is
-measured on three snapshots:
+The reference run takes converged steps by Newton's method, with all pins exact, also those that the scene declares as
+penalties. Accuracy is measured on three snapshots:
 
     early     a tenth of the run, and the second step at least, before which BDF2 has no history
     middle    half of the run

@@ -1,12 +1,10 @@
 """Verifier of steps: stationarity, whether the solution is a minimum, and distance from a reference run.
 
 Stationarity is measured by `springbench.harness.reference.reference_evaluator` with a matrix that it assembles and
-factorises
-itself, independently of the solver. A stationary point is a minimum where the smallest eigenvalue of its Hessian is
-positive beyond round-off (`springbench.harness.reference.hessian_curvature`). The motion is compared with a
-reference run, each
-step of which was solved to round-off. The comparison is by vertex: a distance is relative to the size of the vertex's
-connected component. A step with exact lengths is evaluated by its Lagrangian
+factorises itself, independently of the solver. A stationary point is a minimum where the smallest eigenvalue of its
+Hessian is positive beyond round-off (`springbench.harness.reference.hessian_curvature`). The motion is compared with a
+reference run, each step of which was solved to round-off. The comparison is by vertex: a distance is relative to the
+size of the vertex's connected component. A step with exact lengths is evaluated by its Lagrangian
 (`springbench.harness.reference.exact_lengths`).
 """
 
