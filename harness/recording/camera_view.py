@@ -25,7 +25,7 @@ _DEFAULT_AZIMUTH, _DEFAULT_ELEVATION = 38.5, 20.8
 """Default azimuth and elevation of the camera [degrees]: from the side and slightly from above; y is up."""
 _OTHER_ANGLES = [(around, up) for around in (40, 20, 60, 80, -20, -40, -60, -80) for up in (15, 30, 40)]
 _MIN_IMPROVEMENT = 1.15
-"""Factor by which another direction must improve the filled fraction, over all frames, to replace the default."""
+"""Factor by which another direction must improve the filled fraction to replace the default."""
 _EQUAL_FRACTION = 0.97
 """Fraction of the best filled fraction that counts as equally good; the first such direction is selected."""
 
@@ -98,10 +98,10 @@ class ViewExtent:
         if self._sight is None:
             near = find_framed_vertices(self._start, self._moved)
             seen = [p[near[which]] for which, p in self._seen if near[which].any()]
-            if not near.all() and len(np.unique(np.concatenate(seen), axis=0)) == 1:  # of a point nothing has a size
+            if not near.all() and len(np.unique(np.concatenate(seen), axis=0)) == 1:  # a single point has no extent
                 seen.append(self._start)
             around = np.ptp(np.concatenate([self._rest[near], *seen]), axis=0)
-            least = _MIN_DISTANCE_FRACTION * float(np.linalg.norm(around)) or 1.0  # of a single point
+            least = _MIN_DISTANCE_FRACTION * float(np.linalg.norm(around)) or 1.0  # a single point has no diagonal
             first, *others = (
                 _CameraView(angles, self._aspect, seen, least)
                 for angles in ((_DEFAULT_AZIMUTH, _DEFAULT_ELEVATION), *_OTHER_ANGLES)
@@ -214,7 +214,7 @@ def _select_support_points(
     if len(of) <= 2 * _NUM_SUPPORTS:
         return of, p[of]
     turn = np.arange(_NUM_SUPPORTS)
-    up = (turn + 0.5) / _NUM_SUPPORTS  # of half a ball, in a spiral by the golden angle
+    up = (turn + 0.5) / _NUM_SUPPORTS  # directions over half a ball, in a spiral by the golden angle
     out, around = np.sqrt(1 - up**2), turn * np.pi * (3 - np.sqrt(5))
     along = p[of] @ np.stack([out * np.cos(around), up, out * np.sin(around)])
     which = of[np.unique([along.argmax(axis=0), along.argmin(axis=0)])]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 _WIDTH, _HEIGHT = 150.0, 100.0
 _TEXT_COLOUR, _RULE_COLOUR = 0xFFFFFFFF, 0x464950FF
 _LINE_HEIGHT = 7.0
-"""Height of a label, the minimum spacing of the labels at the ends of curves."""
+"""Height of a label, and minimum spacing of the labels at the ends of curves."""
 _MIN_LABEL_HEIGHT = 4.5
 """Distance by which the viewer draws a label below its position."""
 

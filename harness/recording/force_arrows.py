@@ -33,7 +33,7 @@ class ForceArrows:
     def __init__(self, stream: rr.RecordingStream, size: float) -> None:
         self._stream, self._size = stream, size
         self._pending: dict[str, list[tuple[int, PointArray, PointArray]]] = {}
-        self._scale: dict[str, float] = {}  # metres a newton
+        self._scale: dict[str, float] = {}  # metres per newton
 
     def add_frame(self, frame: int, p: PointArray, forces: Mapping[str, Positions], times: TimeIndex) -> None:
         """Buffer the force arrows of one frame.

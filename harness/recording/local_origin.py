@@ -30,7 +30,7 @@ def compute_local_origin(rest: Positions) -> NDArray[np.float64]:
     """Return the origin (3,) [m] for a mesh with rest positions (n, 3) [m]."""
     low, high = rest.min(axis=0), rest.max(axis=0)
     with np.errstate(over="ignore"):
-        size = MIN_DIAGONALS_PER_CELL * math.hypot(*(high - low)) or 1.0  # a single point
+        size = MIN_DIAGONALS_PER_CELL * math.hypot(*(high - low)) or 1.0  # a single point has no diagonal
     if not size < _MAX_CELL:
         return np.zeros(3)
     cell = 2.0 ** math.ceil(math.log2(size))

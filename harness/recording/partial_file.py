@@ -46,9 +46,9 @@ class PartialFile:
         self._partial = partial_path(path)
         _first_pid = _first_pid or os.getpid()
         isolated_worker.FORK_BLOCKERS.add("Rerun's streams")
-        if not _broken_streams and os.getpid() == _first_pid:  # else this would wait for ever, or refuse
-            rerun_bindings.flush_and_cleanup_orphaned_recordings()  # the library has two threads for each until then
-        rr.set_strict_mode(True)  # without it a wrong shape is swallowed and logged as nothing
+        if not _broken_streams and os.getpid() == _first_pid:  # otherwise the call would wait forever or fail
+            rerun_bindings.flush_and_cleanup_orphaned_recordings()  # ends the two threads of each destroyed stream
+        rr.set_strict_mode(True)  # otherwise data of a wrong shape are dropped without an error
         self.stream = rr.RecordingStream(
             re.sub(r"[^\w .-]", "-", application),  # the viewer warns of other characters
             recording_id=recording_id,

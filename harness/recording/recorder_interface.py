@@ -26,7 +26,7 @@ INTERSECTION_FREE_PROPERTY = "prevents_self_intersection"
 """Property of a recording that states whether an effect prevents self-intersection of the mesh."""
 
 NUM_SAMPLES = 8
-"""Number of sampled frames before the last: a recording wrong in half of its frames passes once in 256 runs."""
+"""Number of sampled frames before the last: a recording with half of its frames wrong passes once in 256 runs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +41,8 @@ class RecordedFrame:
         residual: residual norm [J^(1/2)].
         num_iterations: number of solver iterations of the step.
         forces: forces (n, 3) [N] by name, drawn as arrows.
-        num_intersections: number of self-intersections of the mesh; None where they were not counted.
+        num_intersections: number of edge-triangle intersections of the mesh with itself and with obstacles; None where
+            they were not counted.
     """
 
     index: int

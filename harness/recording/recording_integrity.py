@@ -5,8 +5,8 @@ then that many bytes of payload. The library aborts the process on some damaged 
 written is therefore first read in the child process of `springbench.harness.execution.sandbox`.
 
 Files that can be read are noted in the user's cache folder, for all processes, since reading a whole recording takes
-far longer than what a report needs from it. A note identifies the state of a file by its inode, size and times; the
-change time is set by the system and cannot be forged. Notes are not stored with the results, which may come from
+far longer than what a report needs from it. A note identifies the state of a file by its device, inode, size and times;
+the change time is set by the system and cannot be forged. Notes are not stored with the results, which may come from
 any source.
 """
 
@@ -50,7 +50,7 @@ def mark_verified(path: Path, *, shared: bool = True) -> None:
     """
     _verified_states.add(state := _file_state(path))
     if shared:
-        with suppress(OSError):  # then it is found out again
+        with suppress(OSError):  # without a note, other processes check the file again
             notes = _notes_path()
             notes.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(notes, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)

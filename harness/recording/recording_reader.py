@@ -174,7 +174,7 @@ def _try_reading(path: Path) -> None:
         for chunk in source.iterate_chunks(content="/**"):
             chunk.to_record_batch().validate(full=True)
     summarise_recording(path)
-    with suppress(InputError):  # of a recording that is not of one run
+    with suppress(InputError):  # raised for a recording that is not of one run
         read_replay(path)
 
 
@@ -194,7 +194,7 @@ def open_recording_source(path: Path) -> Generator[RecordingSource]:
         raise InputError(InputMistake(f"{beginning}; it is not a Rerun recording (.rrd)", file=path))
     require_intact(path, _try_reading)
     with ExitStack() as stack, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # for files without a footer, which `complete` reports
+        warnings.simplefilter("ignore")  # about files without a footer, which `is_complete` reports
         complete, end = scan_messages(path)
         readable = path
         if not complete and end < path.stat().st_size:  # the library reads nothing of a file cut within a message
@@ -240,8 +240,8 @@ def iterate_positions(
         source: open recording.
         frames: indices of the frames; all if omitted.
 
-    Returns:
-        Tuples of frame, time [s] and positions, which are relative to the origin.
+    Yields:
+        Frame, time [s] and positions, which are relative to the origin.
     """
     for chunk in source.iterate_chunks(content="/scene/mesh", components=_POSITION_COMPONENTS):
         batch = chunk.to_record_batch()
@@ -271,7 +271,7 @@ def read_properties(source: RecordingSource) -> tuple[str, dict[str, Any]]:
             name: get_scalar(batch, name, 0).as_py()[0] for name in batch.schema.names if name != _ROW_ID
         }
         if chunk.entity_path == "/__properties/run":
-            facts |= values  # what changed at the end is last
+            facts |= values  # properties that changed at the end are last
         title = values.get(_NAME_COMPONENT, title)
     return title, facts
 
@@ -284,7 +284,7 @@ def _read_scalars(source: RecordingSource) -> pa.Table:
             name: read_timeline(batch, name) for name in chunk.timeline_names if name in SCALAR_SCHEMA.names
         }
         values = get_column(batch, _SCALAR_COMPONENT).flatten()
-        if chunk.entity_path.rpartition("/")[0].endswith("/convergence"):  # a value for each of the frames
+        if chunk.entity_path.rpartition("/")[0].endswith("/convergence"):  # each row has a value of every frame
             frames, times = read_convergence_frames(source, chunk.entity_path)
             known = {
                 "frame": np.tile(frames, batch.num_rows),
@@ -344,10 +344,6 @@ def _resolve_frame(path: Path, frame: int, known: NDArray[np.int64]) -> int:
         return frame
     have = f"frames {known[0]} to {known[-1]} are" if len(known) else "no frame is"
     raise InputError(InputMistake(f"there is no frame {frame}; {have} recorded", file=path, key="frame"))
-
-
-# pyright: reportUnknownMemberType=false, reportUnknownArgumentType=false
-# pyarrow's stubs do not state the column types of a schema.
 
 
 def read_cell(batch: pa.RecordBatch, name: str, row: int = 0) -> NDArray[Any]:

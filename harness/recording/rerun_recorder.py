@@ -65,11 +65,10 @@ _STRIP_TYPE: Any = rr.components.LineStrip3DBatch([]).as_arrow_array().type
 class RerunRecorder:
     """Recorder of one run to a Rerun file; implements `springbench.harness.recording.recorder_interface.RunRecorder`.
 
-    All work but opening the file is deferred to the first frame, so that it runs in the thread that delivers the
-    frames.
+    The scene is written with the first frame, so that this work runs in the thread that delivers the frames.
 
     Raises:
-        RunFailed: the file cannot be written or is incomplete at the end.
+        WriteError: the file cannot be written or is incomplete at the end.
     """
 
     def __init__(self, path: Path, info: RecordingInfo) -> None:
@@ -80,13 +79,13 @@ class RerunRecorder:
         self._scalars: dict[str, list[tuple[int, float]]] = {}
         self._styled: dict[str, list[str]] = {}
         self._frames = 0
-        self._clock: dict[int, float] = {}  # of each frame [s]
+        self._clock: dict[int, float] = {}  # time of each frame [s]
         self._buffered: list[tuple[int, NDArray[np.float32], NDArray[np.uint32]]] = []
         self._pins: NDArray[np.float32] | None = None
         self._unseen = 1e-6 * info.mesh.bounding_box_diagonal
         self._springs_shown = False
         self._ends = (0.0, 0.0)  # the smallest and the largest strain of a spring
-        self._ranges: dict[str, tuple[float, float]] = {}  # of what has a legend, by group
+        self._ranges: dict[str, tuple[float, float]] = {}  # values of plots with a legend, by group
         self._curves: dict[int, tuple[Sequence[float], Sequence[float]]] = {}  # residual and objective, by frame
         self._energies: dict[str, dict[int, float]] = {}
         self._file = PartialFile(path, viewer_blueprint.format_application_id(info), info.run_id, info.title)
@@ -244,7 +243,7 @@ class RerunRecorder:
         pins = p[self._info.pinned_vertices]
         with np.errstate(invalid="ignore"):
             moved = np.inf if self._pins is None else np.abs(pins - self._pins).max(initial=0.0)
-        if not moved <= self._unseen:  # a penalty lets its vertices move by less; what is not a number is recorded
+        if not moved <= self._unseen:  # penalty pins move by less; `not <=` also records NaN
             points = rr.Points3D(pins, radii=rr.Radius.ui_points(5), colors=int(PIN_COLOUR[1:] + "ff", 16))
             self._stream.log("/scene/pins", points)
             self._pins = pins
@@ -257,7 +256,7 @@ class RerunRecorder:
             self._stream.log(
                 "/scene/springs", rr.LineStrips3D(_build_line_strips(p[springs]), colors=colours, radii=radius)
             )
-        elif self._springs_shown:  # else they would stay where they were, over a mesh that moves on
+        elif self._springs_shown:  # otherwise the viewer would show the springs of an earlier frame
             self._stream.log("/scene/springs", rr.Clear(recursive=False))
         self._springs_shown = due
 
@@ -280,7 +279,7 @@ class RerunRecorder:
             viewer_blueprint.SERIES_COLOURS[k % len(viewer_blueprint.SERIES_COLOURS)] for k in range(len(frames))
         )
         self._stream.log("/convergence", rr.AnyValues(frames=frames, times=times), static=True)
-        self._file.flush_stream()  # before the values: a reader of a file that was cut has their owners
+        self._file.flush_stream()  # the frames precede the values, so that a truncated file states both
         for name, values in {"residual": table[0], "objective": table[1]}.items():
             self._stream.log(f"/convergence/{name}", rr.SeriesLines(names=names, colors=colours), static=True)
             columns = rr.Scalars.columns(scalars=values.ravel()).partition([len(frames)] * longest)

@@ -53,7 +53,7 @@ _COLOURED_COMPONENTS = (
     ("Points3D:positions", "Points3D:colors"),
     ("LineStrips3D:strips", "LineStrips3D:colors"),
 )
-"""Components with positions, and those with the strain colours at these positions."""
+"""Pairs of a component with positions and the one with the strain colours at these positions."""
 
 
 class LineStyle(NamedTuple):
@@ -76,14 +76,14 @@ def write_side_by_side(out: Path, recordings: Mapping[str, Path], title: str, st
 
     Raises:
         InputError: a file is not the recording of a run.
-        RunFailed: `out` cannot be written.
+        WriteError: `out` cannot be written.
     """
     file = PartialFile(out, f"springbench side by side {title}", title, title)
     try:
         with ExitStack() as opened:
             sources = {name: opened.enter_context(open_recording_source(path)) for name, path in recordings.items()}
             longest = max(float(read_network(source)["strain_range"][0]) for source in sources.values())
-            box: ViewExtent | None = None  # of all of them, so that all are seen alike
+            box: ViewExtent | None = None  # of all recordings, so that all views have one camera
             runs = list[_SourceRun]()
             for name, source in sources.items():
                 runs.append(_SourceRun(name, len(runs), source, longest))
@@ -118,7 +118,7 @@ class _SourceRun:
         self.entities: set[str] = set()
         self.last_frame = self._vertices = 0
         self.curves = read_residuals(source)
-        self.ranges: dict[str, tuple[float, float]] = {}  # the smallest and the largest of what is compared
+        self.ranges: dict[str, tuple[float, float]] = {}  # smallest and largest value of each compared quantity
 
     def widen_extent(self, source: RecordingSource, box: ViewExtent | None, aspect: float) -> ViewExtent | None:
         """Return the extent, widened to the recording's positions, for a given aspect ratio."""

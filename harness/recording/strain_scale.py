@@ -20,6 +20,7 @@ DEFAULT_STRAIN_RANGE = 0.1
 MIN_STRAIN_RANGE = 1e-3
 
 NUM_LEVELS = 65
+"""Number of colours of the scale; NUM_LEVELS - 1 is a multiple of 4, so that each of its five labels is at a level."""
 NEUTRAL_COLOUR = (128, 128, 128, 255)
 """Colour of a strain that is NaN."""
 

@@ -133,7 +133,7 @@ def build_blueprint(
     run = rrb.TextDocumentView(origin="/run", name="Run and machine")
     tabs = (_build_solve_plots(last, value_ranges),) if info.is_solve else (series, convergence)
     return rrb.Blueprint(
-        # In a grid, the viewer moves the plots below the mesh in windows higher than wide, such as a phone's.
+        # A grid, because the viewer then moves the plots below the mesh in windows that are higher than wide.
         rrb.Grid(
             build_scene_view("", info.title, extent, springs_visible=not len(info.mesh.triangles)),
             rrb.Tabs(*tabs, run, active_tab=0),
