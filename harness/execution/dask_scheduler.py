@@ -1,8 +1,6 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # Dask and ruamel.yaml have no type annotations.
-"""Provide a Dask scheduler: remote, on this machine, or on a batch system.
-
-A file describes the batch system.
+"""Provide a Dask scheduler: remote, on this machine, or on a batch system that a file describes.
 """
 
 from __future__ import annotations
@@ -32,18 +30,19 @@ MAX_QUEUE_WAITS = 60
 """Number of periods of CONNECT_TIMEOUT that the first job of a batch system may wait in the queue."""
 
 DASK_LOG_LEVEL = logging.CRITICAL
-"""Log level: Dask's messages about ended workers are suppressed, for the outcome of each run is reported."""
+"""Log level that suppresses Dask's messages about ended workers, because the outcome of each run is reported."""
 
 
 @contextmanager
 def open_scheduler(scheduler_address: str) -> Generator[Any]:
     """Yield the given address, or a cluster that runs as long as the context.
 
-    Raises InputError.
-
     A local cluster accepts TLS connections only, with a certificate that its processes store in memory. Any client of a
     scheduler can execute code, and the loopback interface is open to all users of the machine. The HTTP servers have no
     authentication and therefore serve no pages.
+
+    Raises:
+        InputError: the address or the file of the batch system is invalid, or a package is missing.
     """
     kind, _, many = scheduler_address.partition(":")
     if kind == "local":
@@ -60,7 +59,7 @@ def open_scheduler(scheduler_address: str) -> Generator[Any]:
         quiet: Any = {"dashboard_address": None, "silence_logs": DASK_LOG_LEVEL}
         with config.set({"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}):
             resource_tracker.ensure_running()
-            with block_interrupts():  # Ctrl-C is for this process, which ends the workers
+            with block_interrupts():  # only this process receives Ctrl-C, and ends the workers
                 cluster = LocalCluster(n_workers=int(many), threads_per_worker=1, security=secure, **quiet)
             with cluster as found:
                 yield found

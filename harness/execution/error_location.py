@@ -13,8 +13,8 @@ from springbench.solvers.jit import source_digest
 def format_error(error: BaseException) -> str:
     """Format the type and the message of an error in one line.
 
-    The message has at most 300 characters. An exception of user code may fail to produce its message; a placeholder
-    then takes its place.
+    The message has at most 300 characters. If an exception of user code fails to produce its message, a
+    placeholder replaces it.
     """
     try:
         words = " ".join(str(error).split())[:300]
@@ -26,8 +26,8 @@ def format_error(error: BaseException) -> str:
 def locate_error(error: BaseException, user_files: Collection[str]) -> str:
     """Return `file:line` of an error.
 
-    The line is the last one in user_files, else the last one in any user code, else the last one. The line that raised
-    the error is appended if it is another one.
+    The line is the last one in `user_files`, else the last one in any user code, else the line that raised the error.
+    That line is appended if it is another one.
 
     Args:
         error: exception with a traceback.

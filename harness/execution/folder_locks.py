@@ -45,7 +45,7 @@ def lock_folder_exclusive(folder: Path) -> Generator[None]:
         try:
             yield
         finally:
-            _remove_partial_files(folder)  # of workers that were ended
+            _remove_partial_files(folder)  # files of killed workers
 
 
 @contextmanager
@@ -105,10 +105,9 @@ run_after_fork(_close_locks)
 class UnitClaims:
     """Claims of this process on units of a shared folder.
 
-    The first process to claim a unit computes it.
-    A claim is a lock on one byte of `.claims` (POSIX record locks, which work on network file systems too). It is
-    released when its process ends, however that happens. Units are files of rows. A unit whose file has changed since
-    the start was finished by another process.
+    The first process to claim a unit computes it. A claim is a lock on one byte of `.claims` (POSIX record locks, which
+    work on network file systems too). It is released when its process ends, however that happens. Units are files of
+    rows. A unit whose file has changed since the start was finished by another process.
     """
 
     def __init__(self, folder: Path, units: Sequence[Path]) -> None:
@@ -130,7 +129,7 @@ class UnitClaims:
             return CLAIMED_ELSEWHERE
         return (
             DONE_ELSEWHERE if self._has_changed(unit) else ""
-        )  # it may have been done just before the lock was let go
+        )  # another process may have finished it just before it released the lock
 
     def _has_changed(self, unit: Path) -> bool:
         return _file_identity(unit) != self._units[unit]

@@ -71,7 +71,7 @@ def block_interrupts() -> Generator[None]:
 
 
 def is_interrupted() -> bool:
-    """Return whether Ctrl-C was received, be it deferred."""
+    """Return whether Ctrl-C was received, also if it is still deferred."""
     return _interrupted or _deferrals > 0
 
 
@@ -84,7 +84,7 @@ def exit_process() -> NoReturn:
     _kill_workers()
     with suppress(OSError, ValueError):
         print(INTERRUPT_MESSAGE, file=sys.stderr, flush=True)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what fails from here on was interrupted
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # errors from here on are consequences of the interrupt
     atexit._run_exitfuncs()  # pyright: ignore[reportPrivateUsage]
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
@@ -103,7 +103,7 @@ def _handle_interrupt(number: int, frame: FrameType | None) -> None:
         frame = frame.f_back
     _deferrals, _interrupted = 0, True
     if logging := sys.modules.get("logging"):
-        logging.disable()  # what threads of libraries log of the workers that they lose
+        logging.disable()  # threads of libraries would log the loss of their workers
     _kill_workers()
     raise KeyboardInterrupt
 

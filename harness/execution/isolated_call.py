@@ -1,4 +1,4 @@
-"""Call a function, in a separate process where it runs user code."""
+"""Call a function; in a separate process if it runs user code."""
 
 from __future__ import annotations
 

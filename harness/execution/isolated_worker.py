@@ -1,13 +1,12 @@
 """Isolated worker: runs user code in a process of its own.
 
-The code may crash, hang or exhaust memory without affecting this process. Between both is a supervisor
-(`springbench.harness.execution.worker_supervisor`), which reads the worker's output and ends its processes. One
-worker runs all
-tasks one after the other, so modules stay imported and kernels compiled. It is replaced after a failure, or if a task
-left threads behind. It is a fork of this process, which repeats none of that cost, as long as nothing was started here
-that does not survive a fork, such as OpenMP's threads. Otherwise it is spawned.
+The code may crash, hang or exhaust memory without affecting this process. A supervisor process between the two
+(`springbench.harness.execution.worker_supervisor`) reads the worker's output and ends its processes. One worker runs
+all tasks one after the other, so modules stay imported and kernels compiled. It is replaced after a failure, or if a
+task left threads behind. It is a fork of this process, which repeats neither imports nor compilation, as long as
+nothing was started here that does not survive a fork, such as OpenMP's threads. Otherwise it is spawned.
 
-Files are read in a sandbox likewise (`springbench.harness.execution.sandbox`), which shares nothing with this process.
+Files are read in a sandbox (`springbench.harness.execution.sandbox`), which shares nothing with this process.
 """
 
 from __future__ import annotations
@@ -68,9 +67,10 @@ _MAX_PRINTED_BYTES = 2**13
 class TaskFailure(Exception):
     """A task returned no result.
 
-    status: `time-limit` after too long a time, `killed` if its worker was ended from outside, `failed` if it ended its
-    process or raised an error that no program should catch.
-    reason: all that is known about the failure.
+    Attributes:
+        status: `time-limit` if it exceeded its wall time, `killed` if its worker was ended from outside, `failed` if it
+            ended its process, exceeded its memory limit or raised an error that is not the project's own.
+        reason: all that is known about the failure.
     """
 
     def __init__(self, status: str, reason: str) -> None:
@@ -81,8 +81,9 @@ class TaskFailure(Exception):
 class IsolatedWorker:
     """Runs tasks in an isolated worker process.
 
-    initialiser: called first in each worker.
-    fork: whether the worker may be a fork of this process, which is safe while no other thread runs here.
+    Args:
+        initialiser: called first in each worker.
+        fork: whether the worker may be a fork of this process, which is safe while no other thread runs here.
     """
 
     def __init__(self, initialiser: Callable[[], object] = int, *, fork: bool = True) -> None:
@@ -96,7 +97,7 @@ class IsolatedWorker:
             return
         if self._worker is None or not self._worker.is_ready:
             self.stop_worker()
-            with interrupts.block_interrupts():  # a worker that has started is known to this, and never receives Ctrl-C
+            with interrupts.block_interrupts():  # no Ctrl-C before a started worker is assigned, and none in the worker
                 self._worker = _WorkerProcess(self._ready, fork=self._fork)
 
     def run_task(
@@ -151,7 +152,7 @@ class IsolatedWorker:
             Generator that yields the connection to wait for, and returns the task's value.
 
         Raises:
-            as `run_task`.
+            SpringbenchError, TaskFailure: as `run_task`.
         """
         if not can_isolate_processes():
             return _run_unlimited(function, tick)
@@ -237,7 +238,7 @@ class _WorkerProcess:
                     raise TaskFailure(
                         "failed", f"took more than {limits.memory_gib:g} GiB with the processes it started, {heard}"
                     )
-                if not self._process.is_alive() and not self._calls.poll():  # others may hold the pipe open
+                if not self._process.is_alive() and not self._calls.poll():  # other processes may have the pipe open
                     raise EOFError
             answer = self._calls.recv()
             heard.read_to_end(_OUTPUT_WAIT_SECONDS)
@@ -279,7 +280,7 @@ class _WorkerProcess:
         if self._process.is_alive():
             self._process.terminate()
             with suppress(OSError):
-                os.kill(self._process.pid or 0, signal.SIGCONT)  # for one that was stopped
+                os.kill(self._process.pid or 0, signal.SIGCONT)  # a stopped process cannot handle SIGTERM
             self._wait_for_exit(_GRACE_SECONDS, listen)
         if self._process.is_alive():
             self._process.kill()
@@ -310,7 +311,7 @@ class _TaskOutput:
         self._ticks, self._output, self._tick, self._log = ticks, output, tick, log
         self._phase, self._steps, self._tail, self._all = "", 0, b"", bytearray()
         self._count, self._pending, self._ended = 0, bytearray(), False
-        self.end = os.urandom(16)  # what the worker writes behind the last that a piece said
+        self.end = os.urandom(16)  # end marker, which the worker writes after the task's last output
         self._waits_since: float | None = None
         self._waited = 0.0
 
@@ -362,7 +363,7 @@ class _TaskOutput:
         self._tail = (self._tail + output)[-_MAX_TAIL_BYTES:]
 
     def close_output(self) -> None:
-        """Show the rest of the output. Write output that was too long to the log, and report that."""
+        """Show the rest of the output, and write output that was too long to the log."""
         self._show_output(bytes(self._pending))
         self._pending.clear()
         if self._count <= _MAX_PRINTED_BYTES:

@@ -22,7 +22,7 @@ from springbench.solvers.platform_calls import list_usable_cores, measure_memory
 _PROJECT_ROOT = Path(__file__).resolve().parents[2]
 _PACKAGES = ("harness", "solvers")
 _LOAD_SAMPLE_SECONDS, _IDLE_ROUND_UP = 0.3, 0.25
-"""Duration of the sample of core usage [s], and the load of a core that still counts as idle."""
+"""Duration of the sample of core usage [s], and total load [cores] that still counts as idle."""
 
 _REPORTED_LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "cholespy", "pyarrow", "rerun-sdk", "pyvista", "vtk")
 
@@ -31,10 +31,11 @@ _REPORTED_LIBRARIES = ("numpy", "scipy", "numba", "llvmlite", "cholespy", "pyarr
 class MachineInfo:
     """Properties of the machine that affect speed; they do not identify its owner.
 
-    cpu: name of the processor.
-    cores: number of cores that this process may use.
-    memory_gib: memory [GiB], to one decimal.
-    operating_system: operating system, release and architecture.
+    Attributes:
+        cpu: name of the processor.
+        cores: number of cores that this process may use.
+        memory_gib: memory [GiB], to one decimal.
+        operating_system: operating system, release and architecture.
     """
 
     cpu: str
@@ -158,7 +159,7 @@ def _count_idle_cores() -> ThreadChoice:
 
     It is computed once, so that all runs use the same number.
     """
-    import psutil  # as long to load as the rest of this module
+    import psutil  # only here: it takes as long to import as the rest of this module
 
     usable = _count_usable_cores()
     mine = list_usable_cores()
@@ -188,8 +189,8 @@ def limit_threads(threads: int) -> Generator[None]:
     Raises:
         InputError: if this process may not use that many threads.
     """
-    # Imported here: BLAS can only be limited once it is loaded. NumPy and SciPy bring one BLAS each, and a process that
-    # computes nothing should not wait for them.
+    # Imported here: BLAS can only be limited once it is loaded. NumPy and SciPy contain one BLAS each, and a process
+    # that computes nothing should not wait for them.
     import numba
 
     import_module("scipy.linalg")

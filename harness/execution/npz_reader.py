@@ -1,7 +1,7 @@
-"""Reader of numeric arrays in untrusted .npz and .npy files, in a sandboxed subprocess within limits.
+"""Reader of numeric arrays in untrusted .npz and .npy files.
 
-The whole array is read, so that its checksum is verified. Pickles, other types, and by default NaN and infinities are
-rejected.
+The files are read in a sandboxed subprocess within limits. The whole array is read, so that its checksum is verified.
+Pickles, other types, and by default NaN and infinities are rejected.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import sandbox
 
 MAX_NPZ_BYTES = 100_000_000
-"""Maximum size of an array in float64, and of a file [bytes]. A scene writes such numbers as text, which takes 17 times
-as much.
+"""Maximum size of an array in float64, and of a file [bytes].
+
+Scenes contain such numbers as text, which takes 17 times as much.
 """
 _BASE_SECONDS, _BYTES_PER_SECOND = 5.0, 2e7
 _MEMORY_LIMIT = 2**28 + 3 * MAX_NPZ_BYTES
@@ -115,7 +116,7 @@ def _extract_array(path: Path, name: str, allows_nonfinite: bool) -> NDArray[np.
             if found[0].file_size > MAX_NPZ_BYTES:
                 problem = f"its array `{name}` takes {found[0].file_size:,} bytes; at most {MAX_NPZ_BYTES:,} are read"
                 raise InputError(InputMistake(problem, path))
-            content = packed.read(found[0])  # to its end, where the check sum is compared
+            content = packed.read(found[0])  # the checksum is verified only at the end
     except zipfile.BadZipFile as error:
         raise InputError(InputMistake(f"is no whole .npz file ({error}); write it once more", path)) from None
     return _parse_npy(content, InputMistake(f"its array `{name}`", path), allows_nonfinite)

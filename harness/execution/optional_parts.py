@@ -1,6 +1,6 @@
-"""Parts that a light installation may lack: recordings (Rerun), and pictures of scenes (PyVista and VTK).
+"""Optional parts of an installation: recordings (Rerun), and pictures of scenes (PyVista and VTK).
 
-Each is an extra of the package, and takes half a gigabyte. All else works without them.
+Each is an extra of the package and takes half a gigabyte. Everything else works without them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ RECORDINGS = OptionalPart("record", "recordings", "Rerun", ("rerun", "rerun_bind
 PICTURES = OptionalPart("pictures", "pictures of scenes", "PyVista and VTK", ("pyvista", "vtkmodules"))
 OPTIONAL_PARTS = (RECORDINGS, PICTURES)
 NOTEBOOKS = OptionalPart("notebook", "the viewer in a notebook", "rerun-notebook", ("rerun_notebook", "rerun"))
-"""No part of the complete installation, as programs without a notebook have no use for it."""
+"""Not part of the complete installation, because only notebooks use it."""
 
 
 def find_part(error: ModuleNotFoundError) -> OptionalPart | None:

@@ -1,7 +1,7 @@
 """Deferral of pandas in the processes of a command.
 
-PyArrow imports pandas as soon as it builds an array, to recognise data frames. That takes 0.3 s, and no command has
-any. `to_pandas` imports it as ever.
+PyArrow imports pandas as soon as it builds an array, to recognise data frames. That takes 0.3 s, and no command uses
+data frames. `to_pandas` still imports pandas.
 """
 
 from __future__ import annotations
@@ -12,13 +12,19 @@ _is_requested = False
 
 
 def request_deferral() -> None:
-    """Request that `defer_pandas` takes effect in this process and its forks; for processes that are ours alone."""
+    """Request that `defer_pandas` takes effect in this process and its forks.
+
+    Only for processes that run no other program.
+    """
     global _is_requested
     _is_requested = True
 
 
 def defer_pandas() -> None:
-    """Keep PyArrow from importing pandas until a data frame is requested, if that was requested and is possible."""
+    """Prevent PyArrow from importing pandas until a data frame is requested.
+
+    Does nothing without `request_deferral`, or if pandas is imported already.
+    """
     if not _is_requested or "pandas" in sys.modules:
         return
     import pyarrow as pa

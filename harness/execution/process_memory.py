@@ -10,8 +10,9 @@ from contextlib import suppress
 class ProcessTreeMemory:
     """Monitor of the additional memory of all descendants of a process.
 
-    root: process id.
-    gib: limit of their sum [GiB].
+    Args:
+        root: id of the process.
+        gib: limit of the additional memory of all descendants [GiB].
     """
 
     def __init__(self, root: int, gib: float) -> None:
@@ -22,9 +23,9 @@ class ProcessTreeMemory:
 
     @property
     def is_exceeded(self) -> bool:
-        """Whether the limit is exceeded, counting processes started since.
+        """Whether new processes, and the growth of earlier ones, exceed the limit.
 
-        Earlier ones have limits of their own.
+        False without new processes, because the earlier ones have limits of their own.
         """
         new = set(found := list(_iterate_descendants(self._root))) - self._before.keys()
         if not new:

@@ -1,4 +1,4 @@
-"""Progress of a sweep: bars with the remaining time on a terminal and in a notebook, plain lines elsewhere.
+"""Progress of a sweep: bars on a terminal and in a notebook, plain lines elsewhere.
 
 Nothing here runs concurrently with measurements: bars are redrawn between steps, while the clock is stopped.
 """
@@ -23,8 +23,9 @@ _MAX_SILENT_SECONDS = 10.0
 """Seconds without output after which a line is printed, even if no run has ended."""
 
 _MIN_KNOWN_SHARE = 0.2
-"""Fraction of the runs, or of their cost, from which the remaining time is estimated. It is one half while some kind of
-run has no finished run.
+"""Fraction of the runs, or of their cost, from which the remaining time is estimated.
+
+It is one half while some kind of run has no finished run.
 """
 
 _MIN_PACE_SHARE = 0.05
@@ -34,8 +35,9 @@ _MIN_PACE_SHARE = 0.05
 class RunCost(NamedTuple):
     """Relative cost of a run, before its seconds are known.
 
-    kind: runs of one kind, such as those of one solver, take time in proportion to their amount.
-    amount: cost in any unit.
+    Attributes:
+        kind: runs of one kind, such as those of one solver, take time in proportion to their amount.
+        amount: cost in any unit.
     """
 
     kind: str = ""
@@ -69,8 +71,10 @@ class RunProgress(Protocol):
     """Receiver of the events of one run."""
 
     def report_tick(self, phase: str) -> None:
-        """Report a finished step by the name of its phase, or an event of
-        `springbench.harness.execution.progress_events`."""
+        """Report a finished step by the name of its phase, or another event.
+
+        The other events are those of `springbench.harness.execution.progress_events`.
+        """
         ...
 
     def finish_run(self, outcome: str) -> None:
@@ -168,7 +172,7 @@ class RemainingTime:
             running: started runs; from a twentieth of its steps on, a run's own pace is used.
 
         Returns:
-            seconds, or None while too few runs have ended for an estimate.
+            Seconds, or None while too few runs have ended for an estimate.
         """
         known = max(self._ended / max(1, self._runs), self.finished_amount / (self.total_amount or 1.0))
         kinds = {kind for kind, amounts in self._left.items() if amounts}
@@ -270,7 +274,7 @@ def _format_running(going: Sequence[_RunState]) -> str:
 
 
 class _NotebookProgress(Progress):
-    """Bars that a notebook redraws in place, by the update of an output, which needs no widgets."""
+    """Bars that a notebook redraws in place by updating an output, without widgets."""
 
     _drawn: Any = None
 

@@ -1,7 +1,7 @@
 """Run a function in a sandboxed subprocess that may hang, exhaust memory or crash.
 
-It reads untrusted input. One subprocess serves all calls of a process, one after the other, and is restarted after a
-failure. Before each call it limits its own processor time and memory, both counted from that moment. Function,
+The functions read untrusted input. One subprocess serves all calls of a process, one after the other, and is restarted
+after a failure. Before each call it limits its own processor time and memory, both counted from that moment. Function,
 arguments and result are transferred as pickles.
 """
 

@@ -1,6 +1,6 @@
-"""Text that follows from the sources of this project, cached for the user until one of them changes.
+"""Cache of texts that depend only on the sources of this project.
 
-Such text is derived by importing all solvers, which takes a second or more.
+A text is valid until a source changes. Building one imports all solvers, which takes a second or more.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from springbench.solvers.jit import source_digest
 _LIBRARIES = ("pydantic",)
 """Libraries that the text depends on."""
 _MAX_STATES = 8
-"""Number of stored texts of one name, which serve as many checkouts."""
+"""Number of stored texts of one name, so that several checkouts can use the cache."""
 
 
 def read_cached_text(name: str, build_text: Callable[[], str], *inputs: str) -> str:

@@ -4,11 +4,11 @@
     lock_timing_shared      waits while a run is timed exclusively, or waits for that
     reserve_cores           as lock_timing_shared, on cores reserved for this process
 
-Runs that wait to be timed have priority. Processes that were timed therefore analyse their results concurrently, and
-not each before the next one is timed. A process that prepares a timed run (`TimingSession`) counts as waiting;
-otherwise two processes would alternate indefinitely, each preparing while the other one analyses. The locks are files,
-which the system releases when a process dies. All commands and workers of a machine share them, in the folder
-`SPRINGBENCH_LOCKS` or else in the folder for temporary files.
+Runs that wait to be timed have priority. Processes that were timed therefore analyse their results together after the
+timings, instead of each before the next one is timed. A process that prepares a timed run (`TimingSession`) counts as
+waiting; otherwise two processes would alternate indefinitely, each preparing while the other one analyses. The locks
+are files, which the system releases when a process dies. All commands and workers of a machine share them, in the
+folder `SPRINGBENCH_LOCKS` or else in the folder for temporary files.
 """
 
 from __future__ import annotations
@@ -57,8 +57,10 @@ def lock_timing_shared(tick: ProgressCallback) -> Generator[None]:
 class TimingSession:
     """Session of one timed run: preparation, timing (`lock_timing_exclusive`), and analysis of its result.
 
-    exclusive: whether the run is timed alone. Otherwise it is timed on reserved cores (`reserve_cores`) without waiting
-    for other sessions.
+    Args:
+        tick: progress callback, which reports the waiting time.
+        exclusive: whether the run is timed alone. Otherwise it is timed on reserved cores (`reserve_cores`) without
+            waiting for other sessions.
     """
 
     def __init__(self, tick: ProgressCallback, *, exclusive: bool) -> None:
@@ -114,7 +116,7 @@ def reserve_cores(number: int, tick: ProgressCallback) -> Generator[list[int]]:
             if len(claimed) < number:
                 with report_activity(tick, WAITING):
                     while len(claimed) < number:
-                        _release_locks(*claimed.values())  # or two that have half of what they want wait for each other
+                        _release_locks(*claimed.values())  # otherwise two processes with half of their cores deadlock
                         claimed = {}
                         sleep(_RETRY_SECONDS)
                         claimed = _claim_free_cores(mine, number)

@@ -63,6 +63,8 @@ def run_tasks(
 ) -> Iterator[tuple[int, Any]]:
     """Run tasks in a pool of workers and yield each result as it is completed.
 
+    Closing the generator stops the workers.
+
     Args:
         num_workers: maximum number of concurrent workers.
         initialiser: called first in each worker.
@@ -75,9 +77,7 @@ def run_tasks(
         (index, value or TaskFailure) in order of completion.
 
     Raises:
-        the SpringbenchError that a task raises.
-
-    Closing the generator stops the workers.
+        SpringbenchError: a task raised it.
     """
     left = dict(enumerate(groups))
     with ExitStack() as cleanup:

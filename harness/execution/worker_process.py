@@ -29,8 +29,10 @@ from springbench.solvers.platform_calls import disable_core_dumps, get_signal, s
 
 ProgressCallback = Callable[[str], None]
 TaskFunction = Callable[[ProgressCallback], Any]
-"""Function of a task. Its argument is the progress callback, which receives the name of the phase after each step. The
-function and its result must pickle.
+"""Function of a task.
+
+Its argument is the progress callback, which receives the name of the phase after each step. The function and its result
+must be picklable.
 """
 
 DUMP_SIGNAL = get_signal("SIGUSR1")
@@ -44,7 +46,9 @@ _FULL_CHECK_SECONDS = 10.0
 them."""
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
-"""`PR_SET_PDEATHSIG`: Linux sends a process a signal when its parent dies. `PR_SET_CHILD_SUBREAPER`: Linux makes it the
+"""Numbers of two options of `prctl`.
+
+`PR_SET_PDEATHSIG`: Linux sends a process a signal when its parent dies. `PR_SET_CHILD_SUBREAPER`: Linux makes it the
 parent of orphaned descendants.
 """
 
@@ -52,9 +56,10 @@ parent of orphaned descendants.
 class TaskLimits(NamedTuple):
     """Limits of a task; None is unlimited.
 
-    wall_seconds: wall time [s].
-    memory_gib: memory of all its processes [GiB], beyond what a worker uses anyway.
-    log_path: file for output that is too long to be shown.
+    Attributes:
+        wall_seconds: wall time [s].
+        memory_gib: memory of all its processes [GiB], beyond what the worker uses before the task.
+        log_path: file for output that is too long to be shown.
     """
 
     wall_seconds: float | None = None
@@ -65,9 +70,10 @@ class TaskLimits(NamedTuple):
 class TaskOutcome(NamedTuple):
     """Result of a task.
 
-    value: return value.
-    error: its error, or a description of another failure.
-    is_clean: whether no thread, process or broken device is left behind.
+    Attributes:
+        value: return value.
+        error: its error, or a description of another failure.
+        is_clean: whether no thread, process or broken device is left behind.
     """
 
     value: Any
@@ -90,7 +96,7 @@ def serve_tasks(
     """
     tie_to_parent(parent)
     adopt_orphans()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's affair, which ends this
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     nowhere = os.open(os.devnull, os.O_RDONLY)
     for standard, to in enumerate((nowhere, output, output)):
@@ -105,16 +111,16 @@ def serve_tasks(
     faulthandler.register(DUMP_SIGNAL, dump.fileno(), all_threads=True)
     disable_core_dumps()
     initialiser()
-    gc.freeze()  # what the parent had need not be looked through after each piece
+    gc.freeze()  # excludes objects inherited from the parent from each collection
     me, here = os.getpid(), os.getcwd()
     looked = monotonic()
     with suppress(EOFError, OSError):  # the task may have closed the connection
         while (request := calls.recv()) is not None:
             piece, limits, end = request
             answer = _run_task(piece, limits, lambda phase: ticks.send_bytes(phase.encode()))
-            if os.getpid() != me:  # a copy of this process that the piece has made
+            if os.getpid() != me:  # a fork of this process, made by the task
                 os._exit(0)
-            with suppress(OSError, ValueError, AttributeError):  # closed by the piece, or put away
+            with suppress(OSError, ValueError, AttributeError):  # closed or replaced by the task
                 sys.stdout.flush()
             with suppress(OSError):
                 os.write(1, end)
@@ -124,8 +130,8 @@ def serve_tasks(
             if monotonic() - looked > _FULL_CHECK_SECONDS:
                 looked = monotonic()
                 gc.unfreeze()
-            gc.collect()  # now, and not while the next piece is timed
-            gc.freeze()  # compiled kernels leave 10^5 objects, which take longer to look through than a short run
+            gc.collect()  # now, and not while the next task is timed
+            gc.freeze()  # compiled kernels leave 10^5 objects, whose collection takes longer than a short run
 
 
 def tie_to_parent(parent: int, death_signal: signal.Signals = KILL_SIGNAL) -> None:
@@ -173,7 +179,7 @@ def _list_children() -> set[int]:
     """List the children of this process without the sandbox that reads files."""
     if not has_children():
         return set()
-    import psutil  # which takes longer to load than most pieces have
+    import psutil  # only here: its import takes longer than most tasks
 
     return {child.pid for child in psutil.Process().children()} - {get_sandbox_pid()}
 

@@ -59,7 +59,7 @@ def supervise_worker(
     disable_core_dumps()
     output, theirs = os.pipe()
     me = os.getpid()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the command's affair, which ends this
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command handles Ctrl-C and ends this process
     signals = {signal.SIGTERM, DUMP_SIGNAL}
     signal.pthread_sigmask(signal.SIG_BLOCK, signals)
     worker = os.fork()
@@ -175,7 +175,7 @@ class _Supervisor:
         """Kill all descendants, including those started meanwhile."""
         if not has_children():
             return
-        # Imported only where something is left. A stop meanwhile would find a part of the module: it waits.
+        # Imported only if descendants are left. SIGTERM is blocked, because its handler needs the complete module.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         import psutil
 
