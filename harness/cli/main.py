@@ -372,7 +372,7 @@ def view(recordings: RecordingsArgument) -> None:
 
 def main() -> None:
     """Run the command that the arguments name."""
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for some in every installed package
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # else it searches all packages for them
     # Typer builds the parsers of all registered commands, which takes a tenth of the time of `list`.
     one = copy(app)
     named = [

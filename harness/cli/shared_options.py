@@ -1,4 +1,4 @@
-"""Shared command-line options, options of runs from their model, and a command group that reports errors."""
+"""Shared command-line options, generated options of runs, and a command group that reports errors."""
 
 from __future__ import annotations
 

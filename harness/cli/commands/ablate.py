@@ -75,7 +75,7 @@ def ablate(
         isolated=not in_process,
     )
     rows = read_ablation(path)
-    if rows[0]["status"] != "ok":  # of the whole scene, with which all others are compared
+    if rows[0]["status"] != "ok":  # the first row is that of the whole scene, with which the others are compared
         print_message(f"{sweep.name}: {rows[0]['status']}: {rows[0]['reason']}")
         raise typer.Exit(1)
     get_output_console().print(split_wide_table(build_ablation_table(rows)))

@@ -1,4 +1,4 @@
-"""Command `springbench convergence`: are given settings converged?"""
+"""Command `springbench convergence`: check whether given settings are converged."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def convergence(
 
 
 def _read_setting(text: str) -> StepSetting:
-    """Read a setting; raise InputError if it is none."""
+    """Read a setting; raise InputError if it is invalid."""
     from springbench.harness.results.setting_verdict import MAX_SETTING, parse_setting
 
     try:
@@ -147,7 +147,7 @@ def _study_setting(
     options: dict[str, float],
     print_message: Callable[[str], None],
 ) -> ConvergenceStudy:
-    """Run the study, write its table, its picture and the setting in the engine's own words."""
+    """Run the study, and write its table, its picture and the commands or scripts of its settings."""
     from springbench.harness.config.config_loader import find_scene_mistakes
     from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
     from springbench.harness.experiments.accuracy.method_recommendation import DEFAULT_T_END, find_default_t_end
@@ -211,7 +211,17 @@ def _format_setting(setting: StepSetting) -> str:
 def _export_setting(
     simulator: SettingSimulator, setting: StepSetting, name: str, folder: Path, end: Positions | None
 ) -> list[str]:
-    """Return how to repeat a setting: the command of a solver of ours, or an engine's script, which is written."""
+    """Return the lines that describe how to repeat a setting.
+
+    They are a command of springbench or, for an external engine, the call of a script that is written to `folder`.
+
+    Args:
+        simulator: simulator of the study.
+        setting: substeps and iterations.
+        name: stem of the script's files.
+        folder: folder of the script's files.
+        end: final positions (n, 3) [m]; None if the setting failed.
+    """
     import shlex
 
     from springbench.harness.cli.commands.export_script import write_engine_script

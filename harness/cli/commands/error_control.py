@@ -1,6 +1,6 @@
-"""Run `springbench run SCENE --error 1e-3`: simulate a scene to an error.
+"""Command `springbench run SCENE --error 1e-3`: simulate a scene to a given error.
 
-It writes a row and a recording.
+It writes rows and a recording.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def run_error_control(
         config: file of the scene.
         error: relative error at t_end.
         results: folder of results.
-        print_message: prints a remark.
+        print_message: prints a message.
         t_end: simulated time [s]; that of the scene if None.
         sizes: mesh sizes, at most one.
         verify: whether to compare with the reference solution.
@@ -92,7 +92,8 @@ def run_error_control(
         rejected_options: other options on the command line, which are not supported here.
 
     Returns:
-        Whether energy has grown only by its sources, and the verification passes if there is one.
+        Whether energy has grown only by its sources and, with `verify`, the measured error is at most the requested
+        one.
 
     Raises:
         InputError: an option is invalid.
@@ -210,9 +211,17 @@ def _search_method(
     stored_trials: Sequence[ResultRow],
     print_message: PrintMessage,
 ) -> SearchResult:
-    """Search the cheapest method, first among those that were cheap for a similar error.
+    """Search for the cheapest method, first among those that were cheap for a similar error.
 
-    Raises RunFailed.
+    Args:
+        error_target: scene, size and end time.
+        error: requested relative error.
+        growth: growth of a perturbation up to the end time.
+        stored_trials: rows of earlier searches; without any, all methods are tried.
+        print_message: prints a message.
+
+    Raises:
+        RunFailed: no method reaches the error.
     """
     nearest, pairs = select_best_predicted(stored_trials, error)
     if not pairs:
@@ -233,7 +242,7 @@ def _verify_error(
 ) -> float | None:
     """Print and return the error of positions p (n, 3) [m] against the reference.
 
-    The result is None if there is none.
+    The result is None if there is no reference.
     """
     from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
 

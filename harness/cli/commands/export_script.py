@@ -1,6 +1,4 @@
-"""Command `springbench export-script`: export a simulation as a script for an external engine.
-
-The simulation is a point of an accuracy config.
+"""Command `springbench export-script`: export a point of an accuracy config as a script for an external engine.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def _load_source(file: Path, options: dict[str, Any]) -> tuple[FileMesh, MeshSup
     from springbench.harness.config.config_loader import load_scene
     from springbench.harness.scenes.mesh_support import find_mesh_support
 
-    with _silence_log():  # the report repeats the remarks on the mesh
+    with _silence_log():  # the report contains the warnings about the mesh
         scene = load_scene(file)
         if not isinstance(scene.mesh, FileMesh):
             raise InputError(InputMistake("names no mesh file; expected `mesh: {kind: file, path: ...}`", file))

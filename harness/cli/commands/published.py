@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 PublishedOption = Annotated[Path, typer.Option(help="Folder of the published set.")]
 
 ALL_STUDIES, ENTRIES = "all", "entries"
-"""Names that stand for every study, and for the archives that others have contributed."""
+"""Names that stand for all studies, and for all contributed archives."""
 
 MAX_ENTRY_BYTES = 2**20
-"""Largest contributed archive: it is part of every clone."""
+"""Maximum size of a contributed archive [bytes], which is part of every clone."""
 
 
 def publish_study(

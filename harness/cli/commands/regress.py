@@ -1,4 +1,4 @@
-"""The command `springbench regress`: did it become slower?
+"""Command `springbench regress`: find performance regressions.
 
 The subject selects what is compared: this checkout with a git revision, two solvers (a gates file), two stored results,
 or the stored results of many commits.
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from springbench.harness.experiments.regression.revision_comparison import ComparisonOptions
 
 STORED_FOLDERS = (Path("results/bench"), Path(".benchmarks"))
-"""Default folders of a history: those of this project, and those of pytest-benchmark."""
+"""Default folders of a history: that of this project, and that of pytest-benchmark."""
 
 _SCENE_OPTIONS = ("--solver", "--size", "--max-iterations", "--rtol")
 _TIMING_OPTIONS = ("--budget", "--max-ratio", "--clock")
@@ -166,7 +166,10 @@ def _compare_stored(baseline: Path, new: Path, relative_to: str | None) -> Regre
 
 
 def _find_history_changes(paths: Sequence[Path]) -> RegressionVerdict:
-    """Print the changes over commits. They are not judged: the verdict is pass if there are enough results."""
+    """Print the changes over commits.
+
+    The changes do not affect the verdict, which is pass if there are enough results.
+    """
     from springbench.harness.report.change_detection import (
         MIN_RESULTS,
         build_history_table,

@@ -1,4 +1,4 @@
-"""Reference pages of commands, config keys, columns, Python API and solvers, generated from their definitions."""
+"""Reference pages of commands, config keys, columns, API and solvers, generated from their definitions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def _insert_notice(text: str) -> str:
 
 
 def find_stale_pages(pages: Mapping[str, str], folder: Path) -> list[Path]:
-    """Find the files of pages that have another text, or are missing.
+    """Find the files of pages that are missing or differ from their texts.
 
     Args:
         pages: texts by file name.

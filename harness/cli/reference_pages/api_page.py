@@ -104,7 +104,10 @@ def _format_annotation(sign: str, annotation: Any) -> str:
 
 
 def _read_alias_text(module: str, name: str) -> str:
-    """Read the string below the definition of an alias, in the module or where it imports the name from."""
+    """Read the string below the definition of an alias.
+
+    The definition is in the module, or in the one from which it imports the name.
+    """
     tree = ast.parse(Path(str(sys.modules[module].__file__)).read_text(encoding="utf-8"))
     for node, below in pairwise(tree.body):
         targets = [ast.unparse(target) for target in getattr(node, "targets", ())]

@@ -50,7 +50,9 @@ def format_docstring(docstring: str | None, *, with_arguments: bool = True) -> s
 
 
 def read_section_entries(docstring: str | None, section: str) -> dict[str, str]:
-    """Read the texts of the entries of a section by name; an entry of several names gives each the same text.
+    """Read the texts of the entries of a section by name.
+
+    An entry of several names gives each of them the same text.
 
     Args:
         docstring: text of the docstring.
