@@ -287,15 +287,29 @@ class AlternatingSolver:
         return self.other if problem.system.velocity_rate == self._rate else self.usual
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
+        """Return the iterates of the solver that is prepared for the problem."""
         return self.select_solver(problem).iterates(problem)
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
+        """Solve a problem with the solver that is prepared for it.
+
+        Args:
+            problem: step problem of one of the two systems.
+            stop: stop rule of the solve.
+        """
         return self.select_solver(problem).solve(problem, stop)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
+        """Return the residual [J^(1/2)] by the solver that is prepared for the problem.
+
+        Args:
+            problem: step problem of one of the two systems.
+            p: positions (n, 3) [m].
+        """
         return self.select_solver(problem).residual_at(problem, p)
 
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
+        """Return the phases of an iteration of the solver that is prepared for the problem."""
         return self.select_solver(problem).iteration_phases(problem)
 
 
