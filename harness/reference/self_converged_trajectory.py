@@ -6,8 +6,8 @@ Here p is the motion by implicit Euler, of order 1, whose limit Richardson extra
 BDF2, which is the reference. Norms are Frobenius norms over the free vertices. Steps are solved by Newton's method; a
 motion with a step that does not converge is not used. Contact has no equation of motion that could be integrated
 instead. Its limit may depend on the integrator, which determines the restitution of an impact and the velocity that
-lagged friction opposes. Where the limits differ, there is no reference. Half-spaces
-stiffen with 1/h^2, so that their limit is a rigid contact; barriers retain the stiffness of the scene's own step.
+lagged friction opposes. Where the limits differ, there is no reference. Half-spaces stiffen with 1/h^2, so that their
+limit is a rigid contact; barriers retain the stiffness of the scene's own step.
 """
 
 from __future__ import annotations

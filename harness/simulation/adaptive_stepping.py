@@ -81,7 +81,7 @@ class Trajectory:
         num_rejected_steps: number of rejected steps.
         num_factorisations: number of factorisations.
         num_iterations: number of iterations of the steps' solves; force evaluations of a solver with substeps.
-        step_size_range: smallest and largest step size [s]; twice the mean size of a solver with substeps.
+        step_size_range: smallest and largest step size [s]; the mean size in both entries for a solver with substeps.
         wall_seconds: wall time [s], without the preparation of the first steps.
         frame_seconds: wall time (k,) [s] in which each frame was computed; frames of one step share its time equally.
         cpu_seconds: processor time [s] of this thread, including preparation.
