@@ -54,9 +54,7 @@ def require_device(solver: str) -> Any:
     try:
         cuda = import_module("numba.cuda")
         cuda.current_context()
-    except (
-        Exception
-    ) as error:  # a missing driver, a missing device and a locked device raise different exceptions
+    except Exception as error:  # a missing driver, a missing device and a locked device raise different exceptions
         why = " ".join(str(error).split()).rstrip(":. ")
         raise Unsupported(f"{solver}: there is no CUDA device ({why}); {INSTALL_HINT}") from error
     return cuda

@@ -1,5 +1,4 @@
-"""Command `springbench export-script`: export a point of an accuracy config as a script for an external engine.
-"""
+"""Command `springbench export-script`: export a point of an accuracy config as a script for an external engine."""
 
 from __future__ import annotations
 
