@@ -72,7 +72,13 @@ __all__ = [
 
 
 def load_scene(path: str | Path) -> SceneSpec:
-    """Load a scene from a YAML file, an assignment's JSON file, or by the name of a shipped scene; raise InputError.
+    """Load a scene from a file, or a shipped scene by its name.
+
+    Args:
+        path: YAML file, JSON file of an assignment, or name of a shipped scene.
+
+    Raises:
+        InputError: for any mistake in the scene.
 
     Example:
         >>> scene = springbench.load_scene("configs/scenes/chain.yaml")
@@ -113,6 +119,7 @@ def make_scene(
         >>> scene.mesh.kind
         'chain'
     """
+    # Objects are validated already. Placeholders stand for them while the other parts of the scene are checked.
     listed = [dict(effect) if isinstance(effect, Mapping) else {"kind": "gravity"} for effect in effects]
     given = dict(mesh) if isinstance(mesh, Mapping) else {"kind": "grid"}
     data = {**fields, "mesh": given, "effects": listed}
@@ -168,7 +175,8 @@ class Simulation:
             parameters: parameters of a solver that is given by name.
 
         Raises:
-            InputError, and the errors of the solver's preparation.
+            InputError: for a mistake in the scene, the integrator or the solver's parameters.
+            Exception: of any type, from the preparation of the solver.
         """
         size = size if size is not None else scene.default_size
         self._spec, self._scene = scene, build_scene(scene, size or 0, integrator)
@@ -212,7 +220,11 @@ class Simulation:
         return np.array([self.step() for _ in range(count)])
 
     def draw_state(self) -> PngImage:
-        """Draw the present positions, after the positions at the start; raise RunFailed if the system cannot draw."""
+        """Draw the positions at the start and the present ones.
+
+        Raises:
+            RunFailed: if the system cannot draw.
+        """
         states = [self._start, self._state] if self._state.index > self._start.index else [self._state]
         springs, origin = self._scene.all_springs, compute_local_origin(self.mesh.rest_positions)
         replay = RecordingReplay(
@@ -260,11 +272,11 @@ def run_config(
     results: str | Path = "results",
     rerun: bool = False,
 ) -> Any:
-    """Run what is missing of a sweep, as `springbench run`, and return its rows.
+    """Run the missing runs of a sweep, as `springbench run` does, and return its rows.
 
     Args:
         config: file of a sweep or a scene, name of a shipped one, or a sweep as a mapping.
-        name: name of a sweep that is a mapping.
+        name: name of the sweep; required for a mapping.
         folder: folder of the scenes and the code that a mapping names.
         results: folder that contains a results folder for each sweep.
         rerun: whether to repeat runs that have results.
@@ -326,10 +338,16 @@ def _to_plain_data(value: Any, at: ConfigKey = ()) -> Any:
 
 
 def load_rows(folder: str | Path) -> Any:
-    """Load the rows of a sweep's results folder, such as "results/quickstart"; raise InputError.
+    """Load the rows of a sweep's results folder.
+
+    Args:
+        folder: results folder, such as "results/quickstart".
 
     Returns:
         A pandas DataFrame; the columns are described in configs/reference/columns.md.
+
+    Raises:
+        InputError: for a damaged file of rows.
 
     Example:
         >>> rows = springbench.load_rows("results/small")
@@ -343,7 +361,7 @@ def load_rows(folder: str | Path) -> Any:
 
 
 def _to_dataframe(table: Any) -> Any:
-    """Convert rows to a DataFrame in which columns of integers and truth values may lack some."""
+    """Convert rows to a DataFrame whose integer and boolean columns may contain missing values."""
     import pandas as pd  # pyright: ignore[reportMissingTypeStubs]
     import pyarrow as pa
 
@@ -351,7 +369,7 @@ def _to_dataframe(table: Any) -> Any:
 
 
 class RunRecording(RecordingReplay):
-    """A finished run, read from its recording, of which a notebook displays the picture.
+    """A finished run, read from its recording; a notebook displays its picture.
 
     Example:
         >>> path = sorted(Path("results/small/recordings").glob("chain-5-newton-*.rrd"))[0]
@@ -374,11 +392,17 @@ class RunRecording(RecordingReplay):
 
 
 def open_recording(path: str | Path) -> RunRecording:
-    """Open a recording, of which a notebook displays the picture; raise InputError if it cannot be read.
+    """Open a recording; a notebook displays its picture.
+
+    Args:
+        path: path of the recording.
 
     Returns:
         Times (k,) [s], positions (k, n, 3) [m] relative to `origin` (3,), springs and scalars. Its method
         `absolute_positions(k)` adds the origin in double precision.
+
+    Raises:
+        InputError: if the recording cannot be read.
 
     Example:
         >>> path = sorted(Path("results/small/recordings").glob("chain-5-newton-*.rrd"))[0]
@@ -419,7 +443,10 @@ def view_recording(path: str | Path, *, width: int | Literal["auto"] = "auto", h
 
 @dataclass(frozen=True, slots=True)
 class PngImage:
-    """A PNG image that a notebook displays; content: bytes of the file.
+    """A PNG image that a notebook displays.
+
+    Attributes:
+        content: bytes of the file.
 
     Example:
         >>> springbench.PngImage(b"...").save("picture.png").name

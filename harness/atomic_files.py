@@ -68,6 +68,7 @@ def open_lock_file(path: Path, access: int = os.O_RDWR, *, hint: str = "") -> in
 
     Raises:
         InputError: if something else is at this path.
+        OSError: for any other failure, such as a missing folder.
     """
     flags = access | sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"))
     try:
@@ -176,8 +177,8 @@ def describe_misnamed_file(head: bytes, size: int) -> str:
 
 
 def explain_unreadable_file(path: Path) -> str:
-    """Describe an existing file that has the name of a data file but other content; "" for any other one."""
-    if not path.is_file():  # a pipe would not end
+    """Describe why a file cannot contain data, as `describe_misnamed_file` does; "" for other files."""
+    if not path.is_file():  # reading a pipe would block
         return ""
     try:
         with path.open("rb") as file:

@@ -100,7 +100,7 @@ def _select_columns(table: Table, columns: Sequence[Column]) -> Table:
 def format_plain_table(lines: Sequence[Sequence[str]]) -> Iterator[str]:
     """Format lines of cells as a plain table whose first line has the headings.
 
-    It is for tables of many thousand lines, of which Rich lays out a thousand per second.
+    It is for tables of many thousand lines, because Rich formats only a thousand lines per second.
     """
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     for number, line in enumerate(lines):
@@ -139,7 +139,7 @@ def enable_logging() -> None:
 
 
 def reset_error_console() -> None:
-    """In a forked process, write to its own standard error with the parent's console width."""
+    """Make a forked process write to its standard error with the parent's console width."""
     width = get_error_console().width
     get_error_console.cache_clear()
     get_error_console().width = width

@@ -1,7 +1,7 @@
 """Base of all config models: frozen, and unknown keys are errors.
 
-The string below a field is its description. Sources are parsed for these only on request, for example for the JSON
-Schema; validation of a config does not need them.
+The string below a field is its description. Sources are parsed for descriptions only on request, for example for the
+JSON Schema; validation of a config does not need them.
 """
 
 from __future__ import annotations

@@ -31,9 +31,10 @@ def _ignore_message(message: str) -> None:
 class UserCodePolicy:
     """Policy for user code that a config names.
 
-    imports_code: whether the code is imported here; otherwise only its files identify it.
-    on_import: called with a description before each import.
-    solver_metadata: metadata of each solver class by solver name, as far as it was read before.
+    Attributes:
+        imports_code: whether the code is imported in this process; otherwise only its files identify it.
+        on_import: called with a description before each import.
+        solver_metadata: metadata of solver classes by solver name, if it was read before.
     """
 
     imports_code: bool = True
@@ -44,14 +45,19 @@ class UserCodePolicy:
 IMPORT_USER_CODE = UserCodePolicy()
 """Import user code."""
 SKIP_USER_CODE = UserCodePolicy(imports_code=False)
-"""Do not import user code; treat it as files."""
+"""Do not import user code; identify it by its files."""
 
 
 @dataclass(slots=True)
 class ConfigDocument:
     """A config as plain data, with line numbers and the mistakes found so far.
 
-    user_code: policy for code that the config names.
+    Attributes:
+        path: file of the config.
+        data: plain data of the file.
+        lines: line of each key.
+        mistakes: mistakes found so far.
+        user_code: policy for code that the config names.
     """
 
     path: Path
@@ -73,7 +79,7 @@ class ConfigDocument:
         self.mistakes.append(InputMistake(problem, self.path, line, format_key(at)))
 
     def add_errors(self, error: InputError) -> None:
-        """Add the mistakes of an error; those that name no file are at their key in this one."""
+        """Add the mistakes of an error; mistakes without a file are located by their key in this document."""
         for mistake in error.mistakes:
             if mistake.file is None:
                 self.add_mistake(mistake.problem, tuple(mistake.key.split(".")) if mistake.key else ())
@@ -83,7 +89,7 @@ class ConfigDocument:
     def validate_data(self, model: type[M], data: Any, at: ConfigKey = ()) -> M | None:
         """Validate data with a model and add its mistakes to the document.
 
-        The data is validated as strict JSON. A list may represent a tuple, but no boolean or text a number.
+        The data is validated as strict JSON: a list may represent a tuple, but a boolean or a text is no number.
 
         Args:
             model: pydantic model.
@@ -99,7 +105,7 @@ class ConfigDocument:
             problems: dict[ConfigKey, list[str]] = {}
             for detail in error.errors()[: MAX_MISTAKES + 1]:
                 if detail["type"] == "too_short" and detail["input"]:
-                    continue  # the list is short because its items were refused, which is reported
+                    continue  # the list is short because its items were rejected, which is reported
                 key = _locate_error(detail, data)
                 problems.setdefault(key, []).append(_describe_problem(detail, model, key))
             for key, messages in problems.items():

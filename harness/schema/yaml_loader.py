@@ -47,7 +47,8 @@ def read_config_bytes(path: Path) -> bytes:
 def read_yaml(path: Path) -> ConfigDocument:
     """Read a YAML file that contains one mapping.
 
-    Raise InputError with the line for anything else.
+    Raises:
+        InputError: with the line, for any other content.
     """
     try:
         text = read_config_bytes(path).decode("utf-8-sig")
@@ -96,7 +97,7 @@ def _explain_parse_error(problem: str, lines: list[str], column: int) -> str:
         return f"a value cannot begin with {line[column]!r}; put the value in quotes"
     if "undefined alias" in problem:
         return f"{problem}; put the value in quotes if the * belongs to it"
-    flow = "got ':'" in problem
+    flow = "got ':'" in problem  # in {} or [], where a comma or a bracket ends the value
     if not flow and "mapping values are not allowed" not in problem:
         return problem
     begin = 1 + max(line.rfind(mark, 0, column) for mark in ",{[") if flow else 0
@@ -130,7 +131,7 @@ def _parse_integer(text: str) -> int:
 def _parse_number(text: str) -> float | int:
     """Parse a float.
 
-    1e5, a whole number without a decimal point, may also be used as an integer.
+    A whole number without a decimal point, such as 1e5, becomes an integer, so that integer fields accept it.
     """
     value = float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
     return int(value) if "." not in text and abs(value) < 2**53 and value.is_integer() else value
@@ -168,7 +169,7 @@ class _NodeConverter:
             document.add_mistake(f"the YAML tag {quote_value(str(node.tag))} is not allowed; write a plain value", at)
             return None
         try:
-            node.value.encode()  # escapes can spell lone surrogates, which no later writer could write
+            node.value.encode()  # escapes can encode lone surrogates, which cannot be written to a file later
             return scalar(node.value)
         except ValueError:
             document.add_mistake(f"cannot read the value {quote_value(node.value)}", at)
