@@ -55,9 +55,12 @@ class AccuracyPlan:
 
 
 def load_accuracy(path: Path) -> AccuracyPlan:
-    """Load an accuracy config from a YAML file; raise InputError.
+    """Load an accuracy config from a YAML file.
 
     User code that it names is tried first in a worker process (`springbench.harness.config.user_code`).
+
+    Raises:
+        InputError: for all mistakes.
     """
     return load_in_sandbox(
         partial(_load_document, path), _find_plugins, _read_metadata, lambda accuracy: DEFAULT_LOAD_LIMITS
@@ -121,7 +124,7 @@ U = TypeVar("U", CurveSpec, WorkSpec)
 
 
 def _remove_duplicates(units: Sequence[U]) -> tuple[U, ...]:
-    """Return the first of the units that measure the same."""
+    """Return the units without those that measure the same as an earlier one."""
     first: dict[str, U] = {}
     for unit in units:
         first.setdefault(unit.build_file_stem(), unit)
@@ -157,7 +160,7 @@ class _StudyExpansion:
         for case in self._expand_cases(study, at):
             dt = case.scene.time_step
             steps = study.t_end / dt
-            if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:  # round-off of the quotient, and no more
+            if round(steps) < 1 or abs(steps - round(steps)) > 1e-9 * steps:  # allows for round-off of the quotient
                 problem = f"{study.t_end:g} s is no multiple of the time step {dt:.6g} s of {case.scene_name}"
                 self.document.add_mistake(problem, (*at, "t_end"))
             lists = [getattr(study, name) for name in STEP_OPTIONS]
@@ -176,10 +179,7 @@ class _StudyExpansion:
         return found
 
     def _select_sizes(self, name: str, study: AccuracyStudyConfig, at: ConfigKey) -> Sequence[int]:
-        """Return the study's mesh sizes, else the scene's default.
-
-        0 for a mesh from a file.
-        """
+        """Return the study's mesh sizes, else the scene's default; 0 for a mesh from a file."""
         scene = self.scenes[name]
         if not isinstance(scene.mesh, MeshGenerator):
             return (0,)

@@ -63,7 +63,7 @@ ASSIGNMENT_SOLVER = "numba"
 
 
 class ConfigKind(NamedTuple):
-    """A kind of config: its name, the keys of which it has one, and the commands that read it."""
+    """A kind of config: its name, the keys that identify it, and the commands that read it."""
 
     name: str
     keys: tuple[str, ...]
@@ -81,11 +81,11 @@ SWEEP = ConfigKind("a sweep", ("scenes",), _RUN_USAGE)
 ACCURACY = ConfigKind("an accuracy config", ("curves", "work"), "`springbench accuracy`")
 GATES = ConfigKind("a gates file", ("gates",), "`springbench regress` without --baseline")
 CONFIG_KINDS = (ACCURACY, GATES, SWEEP, SCENE)
-"""All kinds; an accuracy config has the key of a sweep, too, so it is first."""
+"""All kinds. An accuracy config also has the key of a sweep, so it is first."""
 
 
 def find_config_kind(keys: Iterable[str]) -> ConfigKind | None:
-    """Find the kind of a config by its top-level keys; None if it has the key of no kind."""
+    """Find the kind of a config by its top-level keys; None if no key identifies one."""
     present = set(keys)
     return next((kind for kind in CONFIG_KINDS if present & {*kind.keys}), None)
 
@@ -153,15 +153,15 @@ def load_config(
 ) -> SweepPlan:
     """Load a sweep from a file, or build one of a single scene.
 
-    The keyword arguments apply to scenes only; a sweep defines its own. A YAML scene without a stop rule gets
-    `DEFAULT_STOP_RULE`, and an assignment's scene gets the defaults of a sweep.
+    The keyword arguments apply to scenes only; a sweep defines its own. A YAML scene gets `DEFAULT_STOP_RULE` unless
+    `options` names a part of it or an error target. An assignment's scene gets the defaults of a sweep.
 
     Args:
         path: file of a sweep or a scene.
         solvers: names of solvers; the default solver if empty.
         sizes: mesh sizes; the scene's default if empty.
         imports_code: whether user code is tried first in a worker process. Otherwise its parameters are not checked.
-        options: options of `springbench.harness.config.sweep_config.SweepOptions`; None corresponds to null in a sweep.
+        options: options of `springbench.harness.config.sweep_config.SweepOptions`; None selects the default there.
 
     Raises:
         InputError: for all mistakes.
@@ -207,7 +207,7 @@ def load_sweep(path: Path) -> SweepPlan:
     """Load a sweep from a YAML file, validate its scenes and expand its grid.
 
     Raises:
-        InputError: if that fails.
+        InputError: for all mistakes.
     """
     return build_sweep_from_document(read_config(path, SWEEP)[1])
 
@@ -237,9 +237,12 @@ def read_plugin_metadata(solvers: Iterable[str]) -> dict[str, Any]:
 
 
 def load_scene(path: Path) -> SceneSpec:
-    """Load a scene from a YAML file, or from an assignment's JSON file; raise InputError.
+    """Load a scene from a YAML file, or from an assignment's JSON file.
 
     User code that it names is tried first in a worker process, as in `load_config`.
+
+    Raises:
+        InputError: for all mistakes.
     """
     return load_in_sandbox(
         partial(_load_scene, path),
@@ -325,7 +328,7 @@ def build_scene_from_document(document: ConfigDocument) -> SceneSpec:
 
 
 def _fill_from_fabric(document: ConfigDocument, fields: SceneFile, listed: list[Any]) -> list[Any]:
-    """Return the effects with the material of the scene's fabric; a fabric that provides nothing is a mistake."""
+    """Complete the effects with the material of the scene's fabric; an unused fabric is a mistake."""
     if fields.fabric is None:
         return listed
     name, warp = _split_fabric(fields.fabric)
@@ -336,7 +339,7 @@ def _fill_from_fabric(document: ConfigDocument, fields: SceneFile, listed: list[
 
 
 def _split_fabric(fabric: str | FabricChoice) -> tuple[str, Vector3 | None]:
-    """Return the name of a fabric and the direction of its warp, None if it is not stated."""
+    """Return the name of a fabric, and the direction of its warp or None."""
     return (fabric, None) if isinstance(fabric, str) else (fabric.name, fabric.warp)
 
 
@@ -453,7 +456,10 @@ def _expand_sweep(document: ConfigDocument, scenes: dict[str, SceneSpec]) -> Swe
 
 
 def _omit_missing_recordings(document: ConfigDocument, sweep: SweepConfig) -> SweepConfig:
-    """Return the sweep without recordings if Rerun is not installed; that the file requests some is a mistake."""
+    """Return the sweep without recordings if Rerun is not installed.
+
+    A file that requests recordings explicitly then gets a mistake.
+    """
     if RECORDINGS.is_installed() or not sweep.options.record:
         return sweep
     if "record" in sweep.options.model_fields_set:
@@ -474,7 +480,7 @@ def require_fixed_steps(runs: Iterable[RunSpec]) -> None:
 def check_scene_parts(
     document: ConfigDocument, name: str, scene: SceneSpec, sizes: Sequence[int]
 ) -> list[InputMistake]:
-    """Find mistakes between the parts of a scene, if the policy permits.
+    """Find parts of a scene that do not fit together, if the policy permits.
 
     A scene with user code is checked only if that code is imported.
 
@@ -491,10 +497,10 @@ def check_scene_parts(
 
 
 def find_scene_mistakes(scene: SceneSpec, sizes: Sequence[int]) -> list[InputMistake]:
-    """Find mistakes between the parts of a scene, by building it.
+    """Find parts of a scene that do not fit together, by building it.
 
     Args:
-        scene: scene whose parts are valid by themselves.
+        scene: scene whose parts are valid individually.
         sizes: mesh sizes, of which the smallest is built; nothing is built if there are none.
 
     Returns:

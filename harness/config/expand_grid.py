@@ -1,7 +1,4 @@
-"""Expansion of a sweep into its runs.
-
-They are the grid of all combinations without `exclude`, plus `include`.
-"""
+"""Expansion of a sweep into its runs: the grid of all combinations without `exclude`, plus `include`."""
 
 from __future__ import annotations
 
@@ -30,9 +27,12 @@ MAX_RUNS = 10_000
 class GridExpansion:
     """Expands one sweep, and adds mistakes to its document.
 
-    name: name of the sweep.
-    scenes: scenes by name.
-    solvers: solvers, in the order of the sweep.
+    Attributes:
+        document: config, which collects mistakes.
+        name: name of the sweep.
+        fields: validated fields of the sweep.
+        scenes: scenes by name.
+        solvers: solvers, in the order of the sweep.
     """
 
     def __init__(
@@ -77,6 +77,7 @@ class GridExpansion:
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
             if chosen["error_target"] is not None:
+                # The last of these options, the initial guess, has no default here: None selects that of the scene.
                 chosen |= {name: RunOptions.model_fields[name].default for name in ERROR_TARGET_OPTIONS[:-1]} | {
                     "initial_guess": None
                 }
@@ -93,10 +94,7 @@ class GridExpansion:
             )
 
     def _select_sizes(self, scene_name: str) -> Sequence[int]:
-        """Return the sweep's mesh sizes, else the scene's default.
-
-        0 for a mesh from a file.
-        """
+        """Return the sweep's mesh sizes, else the scene's default; 0 for a mesh from a file."""
         scene = self.scenes[scene_name]
         if not isinstance(scene.mesh, MeshGenerator):
             return (0,)

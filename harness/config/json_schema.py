@@ -57,12 +57,12 @@ def _build_tagged_union(models: dict[str, type[ConfigModel]], tag: str) -> Any:
 
     The key has the name of the model.
     """
-    make: Any = create_model  # the name of a field is known at run time alone
+    make: Any = create_model  # untyped, because the name of the field is known only at run time
     tagged: list[Any] = [
         make(name, __base__=model, __doc__=model.__doc__, **{tag: (Literal[name], ...)})
         for name, model in models.items()
     ]
-    own: Any = make(  # its keys are in its code, and a schema runs no user code
+    own: Any = make(  # any key is allowed: the keys are defined in user code, which a schema does not run
         f"Own {tag}",
         __config__=ConfigDict(extra="allow"),
         __doc__="Your own: `module:Name`, or `./file.py:Name` next to the config.",

@@ -22,11 +22,12 @@ RoundCount = Annotated[int, Field(ge=1, le=1000)]
 
 
 class RunOption(NamedTuple):
-    """Attributes of an option in addition to its type and description.
+    """Properties of an option in addition to its type and description.
 
-    short_format: format of its value in short descriptions.
-    column: column of rows, "" for none.
-    null_meaning: meaning of null, for options that a scene defines otherwise.
+    Attributes:
+        short_format: format of its value in short descriptions.
+        column: column of rows, "" for none.
+        null_meaning: meaning of null, for options whose default the scene defines.
     """
 
     short_format: str
@@ -76,8 +77,9 @@ class RunOptions(ConfigModel):
 
 DEFAULT_SOLVER: Final = "hybrid"
 DEFAULT_STOP_RULE: dict[str, Any] = {"max_iterations": 500, "rtol": 1e-4}
-"""Default stop rule of a single scene, without a sweep and in Python: the recommended solver is run to a tolerance. The
-defaults of a sweep, those of `RunOptions`, are the assignment's.
+"""Default stop rule of a scene that is run without a sweep, or from Python: the default solver iterates to a tolerance.
+
+A sweep has the defaults of `RunOptions`, which are those of the assignment.
 """
 
 ERROR_TARGET_OPTIONS: tuple[str, ...] = ("integrator", "max_iterations", "rtol", "initial_guess")
@@ -112,8 +114,8 @@ def build_list_model(*names: str, **usual: tuple[Any, ...]) -> Any:
     """Build a model with a value or a list of values for each option.
 
     Args:
-        names: options with their usual defaults.
-        usual: more options, with the defaults given here.
+        names: options with the defaults of `RunOptions`.
+        usual: further options, with the defaults given here.
     """
     fields: dict[str, Any] = {}
     for name in dict.fromkeys((*names, *usual)):

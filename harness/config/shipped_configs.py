@@ -1,7 +1,7 @@
 """Shipped scenes and configs, found by name: `quickstart`, `hanging-cloth`, `hard/geometry-line`.
 
-They are data of the package. A name is the path of a file in its folder `configs`, without `.yaml`. A scene of the
-folder `scenes` also has a name without that folder.
+The files are data of the package. A name is the path of a file in the folder `configs`, without `.yaml`. A scene in
+the folder `scenes` can also be named without that folder.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def list_shipped_configs() -> dict[str, Path]:
 
 
 def list_template_files() -> list[Path]:
-    """List the files of a new study."""
+    """List the template files of a new study."""
     return sorted(path for path in (SHIPPED_FOLDER / _TEMPLATE_FOLDER / "new-study").iterdir() if path.is_file())
 
 
@@ -53,7 +53,7 @@ def resolve_scene_path(name: str, folder: Path) -> Path:
 
 
 def suggest_shipped_scene(name: str) -> str:
-    """Suggest a shipped scene whose name is close to one that does not exist; empty for a file name."""
+    """Suggest a shipped scene with a name close to a missing one; empty if there is none."""
     near = get_close_matches(name, _list_short_names(), n=1)
     return f", and no shipped scene of this name; did you mean {near[0]!r}?" if near else ""
 
@@ -81,7 +81,7 @@ def locate_config(name: str | Path) -> Path:
 
 
 def get_config_name(path: Path) -> str:
-    """Return the name by which a command finds a config: the shortest one if it is shipped, else its path."""
+    """Return the shortest name of a shipped config, or the path of another config."""
     if not path.is_relative_to(SHIPPED_FOLDER):
         return str(path)
     name = path.relative_to(SHIPPED_FOLDER).with_suffix("").as_posix()

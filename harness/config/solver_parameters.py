@@ -2,8 +2,8 @@
 
 The parameters are the fields of a solver's dataclass. Importing a solver also imports Numba and its kernels, which
 would be most of the time of a command that has nothing to run. The valid parameters of shipped solvers are therefore
-cached for the user, by what a config states and the digest of all sources of solvers. Any change of the sources
-invalidates the entry, and checkouts with other sources have entries of their own.
+cached in the user's cache folder. The key of an entry is a hash of what a config states and of all sources of solvers,
+so any change of the sources invalidates it, and checkouts with other sources have separate entries.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _read_solver(document: ConfigDocument, entry: str | dict[str, Any], at: Conf
         return SolverSpec(name, known)
     if own:
         _try_plugin(document, name, requested, at)
-        return SolverSpec(name, requested)  # as `list` has them
+        return SolverSpec(name, requested)  # the same parameters as without an import of the code
     solver = load_target(SOLVER_TABLE[name])
     parameters = document.validate_data(build_parameter_model(name, solver), requested, at)
     if parameters is None:
@@ -146,7 +146,7 @@ def _hash_solver_sources() -> str:
 def _read_cache(path: Path) -> dict[str, Any] | None:
     try:
         found: Any = json.loads(path.read_text())
-    except (OSError, ValueError):  # there is no readable cache
+    except (OSError, ValueError):  # missing or damaged: the parameters are validated again
         return None
     return found if is_mapping(found) else None
 

@@ -125,11 +125,13 @@ class SweepConfig(ConfigModel):
 
 @dataclass(frozen=True, slots=True)
 class SolverSpec:
-    """A solver's name and all of its parameters, including defaults.
+    """A solver's name and parameters.
 
-    metadata: metadata of a user's class, as in `springbench.harness.results.solver_metadata`, with its `packages`;
-    empty for
-    shipped solvers.
+    Attributes:
+        name: name of a shipped solver, or of user code.
+        parameters: all parameters including defaults; for user code those that the config states.
+        metadata: metadata of a user's class, as in `springbench.harness.results.solver_metadata`, with its
+            `packages`; empty for shipped solvers.
     """
 
     name: str
@@ -162,7 +164,14 @@ class SolverSpec:
 class RunSpec(FixedOptions, RunOptions):
     """One run, built with `model_construct` from validated values.
 
-    size: 0 if the mesh is from a file. frames, time_step (that of the scene here) and initial_guess are resolved.
+    Frames, time step and initial guess are resolved: none of them is None.
+
+    Attributes:
+        sweep: name of the sweep.
+        scene_name: name of the scene, the stem of its file.
+        scene: the scene, with the time step of the run.
+        size: mesh size; 0 if the mesh is from a file.
+        solver: the solver with its parameters.
     """
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
@@ -190,7 +199,8 @@ class RunSpec(FixedOptions, RunOptions):
     def build_identity(self) -> str:
         """Build canonical JSON of everything that determines the run's result and timing on one machine.
 
-        Pictures are drawn later from the recording, and limits only determine when a run is stopped; both are excluded.
+        Names, pictures and limits are excluded. Pictures are drawn later, and a limit only determines whether the run
+        is stopped.
         """
         left_out = ("sweep", "scene_name", "pictures", "time_limit", "memory_limit")
         settings = {name: value for name, value in self if name not in left_out}
@@ -199,7 +209,7 @@ class RunSpec(FixedOptions, RunOptions):
             "solver": [identify_code(self.solver.name), dict(self.solver.parameters)],
         }
         settings["integrator"] = identify_code(self.integrator)
-        if self.timing == "exclusive":  # as it always was before there was another
+        if self.timing == "exclusive":  # defaults are omitted, so that results without these options remain valid
             del settings["timing"]
         if self.error_target is None:
             del settings["error_target"]

@@ -1,6 +1,6 @@
 """Types of the names and keys of configs written in Python, for type checkers.
 
-They contain the same information as the models; a test compares both.
+They repeat the names and keys of the models; a test compares both.
 """
 
 from __future__ import annotations
@@ -83,8 +83,9 @@ class OptionKeys(TypedDict, total=False):
 
 
 class SweepKeys(TypedDict, total=False):
-    """Keys of a sweep, as in `springbench.harness.config.sweep_config.SweepConfig`; a solver with parameters is a
-    mapping.
+    """Keys of a sweep, as in `springbench.harness.config.sweep_config.SweepConfig`.
+
+    A solver with parameters is a mapping.
 
     Example:
         >>> sweep: springbench.SweepKeys = {"scenes": ["chain.yaml"], "sizes": [5], "solvers": ["sparse", "newton"]}

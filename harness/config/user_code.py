@@ -33,8 +33,9 @@ class LoadLimits(NamedTuple):
 
 
 DEFAULT_LOAD_LIMITS = LoadLimits(60.0, 2.0)
-"""Limits for importing and binding user code before a command starts. A config may set a shorter time, or another
-amount of memory.
+"""Limits for importing and binding user code before a command starts.
+
+A config may set a shorter time, or another amount of memory.
 """
 
 T = TypeVar("T")
@@ -46,7 +47,7 @@ def resolve_tag(
 ) -> tuple[str, dict[str, Any]] | None:
     """Split a mapping into the name under its tag and its other keys.
 
-    User code becomes a Plugin.
+    The name of user code is returned as a `PluginName`.
 
     Args:
         document: config, which collects mistakes.
@@ -141,7 +142,7 @@ def _run_in_worker(piece: Callable[[ProgressCallback], Any], limits: LoadLimits,
     try:
         return workers.run_task(piece, hear, TaskLimits(*limits))
     except TaskFailure as lost:
-        reason = str(lost).replace(", before its first step", "")
+        reason = str(lost).replace(", before its first step", "")  # the worker's messages are about runs
         behind = "" if any(name in does for name in names) else f" with {', '.join(names)}"
         raise InputError(f"{does}{behind} {reason}") from None
     finally:
