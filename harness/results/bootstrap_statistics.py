@@ -1,14 +1,15 @@
-"""Bootstrap statistics of times, one for each meaning, so that tables are comparable.
+"""Bootstrap statistics of times: one statistic for each purpose, so that tables are comparable.
 
-    time of a thing              the median over the rounds (of a run: over its steps too)
+    time of a phase              the median over the rounds (of a run: over its steps too)
     time that a frame adds       the mean over the frames of the median over the rounds: such means are additive
     ratio of paired times        the median of the ratios, round by round, of interleaved measurements
     ratio on different days      exp(median over the frames of log(new / old)), of the least over the rounds
 
 A busy machine delays some rounds and accelerates none. The median is robust against delays of nearly half of them; a
-mean is not, and a minimum has no interval. Rounds of two days are not paired, and their load differs. There the least
-time is used, which load affects least, and the frames are resampled. Intervals are those of a percentile bootstrap
-(Efron 1979, `scipy.stats.bootstrap`), which resamples the rounds. It is seeded, so equal times give equal intervals.
+mean is not, and a minimum has no interval. Rounds of two days are not paired, and the load differs between the days.
+Their ratio uses the least time, which load affects least, and the frames are resampled. Intervals are those of a
+percentile bootstrap (Efron 1979, `scipy.stats.bootstrap`), which resamples the rounds. It is seeded, so equal times
+give equal intervals.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ def _bootstrap_interval(samples: Sequence[NDArray[np.float64]], statistic: Calla
 
     For a single round the interval is the value itself.
     """
-    from scipy.stats import bootstrap  # half a second to load: few commands need it
+    from scipy.stats import bootstrap  # takes half a second to import, and few commands need it
 
     middle = float(statistic(*samples, axis=-1))
     if len(samples[0]) < 2:

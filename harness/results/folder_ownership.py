@@ -18,7 +18,7 @@ OWNER_FILE = ".config"
 
 
 _MAX_PATH_BYTES = 4096
-"""Maximum length of a config path [bytes]; no path is longer."""
+"""Number of bytes of the owner file that are read; paths on Linux are at most as long."""
 
 
 def read_owner(folder: Path) -> Path | None:

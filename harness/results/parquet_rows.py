@@ -205,7 +205,7 @@ def _drop_invalid_units(
 ) -> pa.Table:
     """Remove the rows of units with invalid values.
 
-    Number (n,) is the index of each row's unit.
+    `number` (n,) is the index of each row's unit.
     """
     bad: dict[int, InputMistake] = {}
     what = "it is left out" if on_invalid else "take it out of the results"
@@ -255,10 +255,10 @@ def _concatenate_units(
 
 
 def _read_packed(paths: Sequence[Path]) -> dict[Path, pa.Table]:
-    """Read the rows of packed units, each packed file once.
+    """Read the rows of the units that are packed, each packed file once.
 
     Raises:
-        InputError: for a damaged one.
+        InputError: for a damaged packed file.
     """
     names: dict[Path, list[str]] = {}
     for path in paths:
@@ -375,12 +375,12 @@ def _read_unit(
 
 
 def _read_file(path: Path) -> pa.Table:
-    if not path.is_file() and path.exists():  # a pipe would be waited for
+    if not path.is_file() and path.exists():  # reading a pipe would block
         raise OSError("it is no plain file")
     try:
         with path.open("rb") as content:
             return _read_within_limits(content)
-    except FileNotFoundError:  # it was packed a moment ago
+    except FileNotFoundError:  # another process may have packed it meanwhile
         if found := _read_packed([path]).get(path):
             return found
         raise OSError("it is no plain file") from None
@@ -403,7 +403,7 @@ def _read_within_limits(content: BinaryIO) -> pa.Table:
     if size > _MAX_FILE_BYTES:
         raise OSError(f"it claims {size:,} bytes, and at most {_MAX_FILE_BYTES:,} are read")
     texts = [field.name for field in fields if pa.types.is_string(field.type)]
-    with pq.ParquetFile(content, read_dictionary=texts) as file:  # the same text many times takes no more memory
+    with pq.ParquetFile(content, read_dictionary=texts) as file:  # repeated texts are stored once
         table = file.read()
     size = sum(map(_count_text_bytes, table.itercolumns()))
     if size > _MAX_FILE_BYTES:
@@ -412,7 +412,7 @@ def _read_within_limits(content: BinaryIO) -> pa.Table:
 
 
 def _count_text_bytes(column: Any) -> int:
-    """Compute the bytes of a dictionary-encoded text column after decoding."""
+    """Compute the bytes of a dictionary-encoded text column after decoding; 0 for other columns."""
     if not pa.types.is_dictionary(column.type):
         return 0
     return sum(pc.sum(pc.binary_length(chunk.dictionary).take(chunk.indices)).as_py() or 0 for chunk in column.chunks)

@@ -40,7 +40,7 @@ TABLE_FILES = {
 }
 """File of each table.
 
-The names differ from those of packed rows: reports and queries over `results/` do not find them.
+The names differ from those of packed rows, so that reports and queries over `results/` do not find them.
 """
 
 RUN_KEYS = (
@@ -80,7 +80,7 @@ class PublishedStudy:
 
     @property
     def config_path(self) -> Path:
-        """Config that the study was made from."""
+        """Config from which the study was made."""
         return (self.folder / str(self.metadata["config"])).resolve()
 
     @property
@@ -99,7 +99,7 @@ class PublishedStudy:
         return path if path.is_file() else None
 
     def read_table(self, table: str) -> pa.Table:
-        """Read a table. Raises InputError if the study has no such table."""
+        """Read a table; raise InputError if the study has no such table."""
         import pyarrow.parquet as pq  # a study may be listed without it
 
         path = self.find_table(table)
@@ -141,7 +141,7 @@ def find_study(published: Path, name: str) -> PublishedStudy:
 
 
 def read_study(folder: Path) -> PublishedStudy:
-    """Read `study.json` of a folder. Raises InputError if it is damaged."""
+    """Read `study.json` of a folder; raise InputError if it is damaged."""
     path = folder / STUDY_FILE
     try:
         if not path.is_file():

@@ -1,6 +1,4 @@
-"""Quantities of a run in tables, pictures, figures and pages.
-
-Each has one definition and one name.
+"""Quantities of a run in tables, pictures, figures and pages, each with one definition and one name.
 
     ms a step         median wall time of the timed steps, over all frames and rounds [ms]
     least             the smallest of the same times [ms]
@@ -74,7 +72,7 @@ def compute_max_strain(frames: NDArray[np.int64], strains: NDArray[np.float64]) 
         strains: largest strain of each frame (k,).
 
     Returns:
-        maximum, or NaN without a frame after the start.
+        The maximum, or NaN without a frame after the start.
     """
     after = strains[frames > 0]
     return float(after.max()) if len(after) else float("nan")

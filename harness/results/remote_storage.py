@@ -74,11 +74,12 @@ def fetch_rows(value: Path | str) -> Path:
 class RemoteStorage:
     """A URL and its local folder.
 
-    url: as the user gave it.
-    folder: local folder in the user's cache.
-    filesystem: file system of fsspec.
-    root: path of the results on that file system.
-    index: remote and local state of each file at the last synchronisation.
+    Attributes:
+        url: URL as the user gave it.
+        folder: local folder in the user's cache.
+        filesystem: file system of fsspec.
+        root: path of the results on that file system.
+        index: by file name, the remote and the local token at the last synchronisation.
     """
 
     url: str
@@ -125,7 +126,7 @@ class RemoteStorage:
             new = [n for n in new if self._local_token(n) in ("", self.index.get(n, ["", ""])[1])]
             for start in range(0, len(new), _BATCH_SIZE):
                 self._download_files(new[start : start + _BATCH_SIZE], there)
-        except Exception as error:  # of whatever library speaks to it
+        except Exception as error:  # each storage library has exceptions of its own
             raise InputError(InputMistake(f"cannot be read: {_format_error(error)}", key=self.url)) from error
         for name in [name for name in self.index if name not in there]:
             if self._local_token(name) == self.index.pop(name)[1]:
@@ -159,6 +160,7 @@ class RemoteStorage:
                 batch = new[start : start + _BATCH_SIZE]
                 for above in {str(PurePosixPath(f"{self.root}/{name}").parent) for name in batch}:
                     self.filesystem.makedirs(above, exist_ok=True)
+                # Tokens are taken before the transfer, so that a change during it is uploaded by the next command.
                 self.index |= {name: ["", self._local_token(name)] for name in batch}
                 self.filesystem.put([str(self.folder / n) for n in batch], [f"{self.root}/{n}" for n in batch])
             for name in gone:
@@ -166,7 +168,7 @@ class RemoteStorage:
                 del self.index[name]
             self.filesystem.invalidate_cache()
             there = self._list_remote()
-        except Exception as error:  # of whatever library speaks to it
+        except Exception as error:  # each storage library has exceptions of its own
             raise RunFailed(
                 f"{self.url}: cannot be written: {_format_error(error)}; all results remain "
                 f"in {self.folder}, and the next command "
@@ -184,7 +186,7 @@ class RemoteStorage:
         return {name: _remote_token(about) for name, about in files.items() if _is_safe_name(name)}
 
     def _local_token(self, name: str) -> str:
-        """Return a token that changes with a local file, "" if it is missing."""
+        """Return a token that changes when a local file changes; "" if it is missing."""
         try:
             about = (self.folder / name).stat()
         except FileNotFoundError:

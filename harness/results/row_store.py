@@ -27,14 +27,11 @@ FILE_COLUMN = "file"
 """Column of a packed file that names the unit."""
 
 _FOOTER_BYTES = 2**15
-"""Number of bytes at the end of a file in which its schema is searched."""
+"""Number of bytes at the end of a file that are searched for its schema."""
 
 
 def packed_path(folder: Path) -> Path:
-    """Return the path of the packed file of a folder of rows.
-
-    It may not exist.
-    """
+    """Return the path of the packed file of a folder of rows; it may not exist."""
     return folder.parent / f"{folder.name}.parquet"  # with_name rejects "."
 
 
@@ -87,7 +84,7 @@ def _read_packed_units(path: Path, *state: int) -> frozenset[str]:
     try:
         if not path.is_file():
             raise OSError("it is no plain file")
-        with path.open("rb") as file:  # pyarrow takes some paths for URLs, and none that is no UTF-8
+        with path.open("rb") as file:  # pyarrow interprets some paths as URLs, and rejects paths that are not UTF-8
             names = pq.read_table(file, columns=[FILE_COLUMN], partitioning=None)[FILE_COLUMN]
         if names.null_count:
             raise OSError(f"rows without a {FILE_COLUMN}")
@@ -112,11 +109,12 @@ def has_rows(unit: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class UnitGroup:
-    """A group of files with one schema.
+    """A group of files with one schema: unpacked units, or one packed file.
 
-    files: paths of the files.
-    unit_numbers: for each file, the index of its unit in the request.
-    packed_numbers: for a packed file, the indices of its units by name.
+    Attributes:
+        files: paths of the files.
+        unit_numbers: for each unpacked file, the index of its unit in the request.
+        packed_numbers: for a packed file, the indices of its units by name; None for unpacked files.
     """
 
     files: tuple[str, ...]
@@ -166,11 +164,11 @@ def read_group_schema(part: UnitGroup) -> pa.Schema:
 def _read_schema_key(path: str) -> bytes | None:
     """Read a key that files of one schema share.
 
-    Only the end of the file is read. It is the schema as pyarrow stores it there, or the path for files of other
-    writers. None for other files.
+    The key is the schema that pyarrow stores at the end of the file, or the path if another program wrote the file. It
+    is None if the file is no Parquet file.
     """
     try:
-        if not os.path.isfile(path):  # a pipe would be waited for
+        if not os.path.isfile(path):  # reading a pipe would block
             return None
         with open(path, "rb", buffering=0) as file:
             size = file.seek(0, os.SEEK_END)

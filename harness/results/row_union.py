@@ -4,7 +4,7 @@
 
 Files of one schema are read together. DuckDB's `union_by_name` would do the same for files of any schema, but takes 140
 kB of memory per file. Units that cannot be read together raise `SchemaMismatch`. The caller then reads unit by unit and
-can name the invalid one. A path that DuckDB would interpret as a pattern raises it too.
+can name the invalid one. A path that DuckDB would interpret as a pattern raises `SchemaMismatch` too.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ MEMORY_LIMIT = 2**29
 class SchemaMismatch(Exception):
     """The units cannot be read together.
 
-    damaged_units: indices of units that are not files of rows.
+    Attributes:
+        damaged_units: indices of units that are not files of rows.
     """
 
     def __init__(self, why: str, damaged: Sequence[int] = ()) -> None:
@@ -46,7 +47,7 @@ class SchemaMismatch(Exception):
 
 @dataclass(frozen=True, slots=True)
 class RowUnion:
-    """Groups of units, with their common schema and the SQL of their rows."""
+    """Groups of units, with their common schema and the SQL that reads their rows."""
 
     groups: list[UnitGroup]
     schema: pa.Schema
@@ -136,7 +137,7 @@ def build_union(
 
 
 _GLOB_PATTERN = re.compile(r"[*?\[\\\ud800-\udfff]")
-"""Characters that DuckDB interprets as a pattern of several files, and those that UTF-8 lacks."""
+"""Characters that DuckDB interprets as a pattern of several files, and surrogates, which UTF-8 cannot encode."""
 
 
 def _check_literal_paths(files: Sequence[str]) -> list[str]:
@@ -190,7 +191,7 @@ def read_table(
                 numbers.append(_compute_unit_numbers(part, read[_UNIT_COLUMN]))
                 tables.append(read.drop_columns([_UNIT_COLUMN]).cast(whole.schema))
                 count += len(read)
-                if not checked and count > max_rows:  # only then can a file claim as many
+                if not checked and count > max_rows:  # before that no single file can exceed it
                     _check_row_counts(whole.files, max_rows)
                     checked = True
     number = np.concatenate(numbers)

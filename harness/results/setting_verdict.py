@@ -1,4 +1,4 @@
-"""Verdict on given settings: whether substeps and iterations are converged, and which setting would be."""
+"""Verdict on given settings: whether substeps and iterations are converged, and which setting is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ERROR_LEVELS = (0.05, 0.01)
 
 
 MAX_EXTRAPOLATION, MIN_ORDER = 16, 0.3
-"""Largest factor of an extrapolation beyond the map, and the least order of convergence for which there is one."""
+"""Largest factor of an extrapolation beyond the map, and the least order of convergence that permits one."""
 
 
 class StepSetting(NamedTuple):
@@ -139,7 +139,7 @@ class ConvergenceStudy:
         return {result.setting: result for result in self.results}[setting]
 
     def find_cheapest(self, max_error: float) -> SettingResult | None:
-        """Return the cheapest setting within a relative error; None if there is none, or it cannot be measured."""
+        """Return the cheapest setting within a relative error; None if none is known."""
         within = [result for result in self.results if result.error <= max_error and max_error >= self.min_error]
         return min(within, key=lambda result: result.frame_seconds, default=None)
 
@@ -154,9 +154,10 @@ class ConvergenceStudy:
         return all(map(self.is_setting_converged, self.assessments))
 
     def predict_setting(self, max_error: float) -> StepSetting | None:
-        """Predict a setting beyond the map that meets an error, by the trend of its finest row and column.
+        """Predict a setting beyond the map that meets an error.
 
-        The error is taken to be proportional to a power of the number of substeps or iterations.
+        The prediction extrapolates the finest row and column of the map, on the assumption that the error is
+        proportional to a power of the number of substeps or iterations.
 
         Args:
             max_error: relative error.
@@ -207,7 +208,7 @@ class ConvergenceStudy:
         return lines
 
     def _describe_several(self) -> list[str]:
-        """Describe several settings: what they have in common, a line for each, and what the nearest one lacks."""
+        """Describe several settings: how many are converged, each of them, and the nearest one."""
         good = [one for one in self.assessments if self.is_setting_converged(one)]
         nearest = min(self.assessments, key=lambda one: self.find_result(one.setting).error)
         count = f"{len(good)} of the {len(self.assessments)}" if good else f"None of the {len(self.assessments)}"
@@ -290,7 +291,7 @@ def list_settings(given: Sequence[StepSetting], num_doublings: int) -> list[Step
 
 
 def find_doubled(settings: Iterable[StepSetting], given: StepSetting, name: str) -> StepSetting | None:
-    """Return the setting that differs in one number, which is at least twice that of a given one.
+    """Find the setting that differs from a given one in one number, which is at least twice as large.
 
     Args:
         settings: settings of a map.
@@ -324,7 +325,11 @@ MAX_SETTING = 1_000_000
 
 
 def parse_setting(text: str) -> StepSetting:
-    """Parse a setting such as 2x5, or 8 for substeps alone; ValueError if it is none, or beyond MAX_SETTING."""
+    """Parse a setting such as 2x5, or 8 for substeps alone.
+
+    Raises:
+        ValueError: if the text is no setting, or a number exceeds MAX_SETTING.
+    """
     substeps, cross, iterations = text.lower().replace("×", "x").replace(" ", "").partition("x")
     found = StepSetting(int(substeps), int(iterations) if cross else 0)
     if not 1 <= found.substeps <= MAX_SETTING or (cross and not 1 <= found.iterations <= MAX_SETTING):
@@ -333,7 +338,7 @@ def parse_setting(text: str) -> StepSetting:
 
 
 def _extend_numbers(numbers: Iterable[int], num_doublings: int) -> list[int]:
-    """Return numbers with those by powers of two below the smallest and above the largest; 0 stays alone."""
+    """Extend numbers by powers of two below the smallest and above the largest; 0 is not extended."""
     known = set(numbers)
     if 0 in known:
         return [0]
@@ -343,11 +348,11 @@ def _extend_numbers(numbers: Iterable[int], num_doublings: int) -> list[int]:
 
 
 SIMILAR_STIFFNESS = 0.02
-"""Relative difference of the sag below which the material seems as stiff as it is."""
+"""Relative difference of the sag below which the effective stiffness counts as correct."""
 
 
 def describe_percent(value: float) -> str:
-    """Describe a share in percent, or as unknown."""
+    """Format a share in percent; "unknown" if it is not finite."""
     return f"{100 * value:.3g} %" if isfinite(value) else "unknown"
 
 

@@ -1,7 +1,4 @@
-"""Metadata of solvers as columns of rows.
-
-Reports therefore need not import the solvers, which may be user code.
-"""
+"""Metadata of solvers as columns of rows, so that reports need not import the solvers, which may be user code."""
 
 from __future__ import annotations
 
@@ -23,7 +20,7 @@ def list_packages(solver: str) -> tuple[str, ...]:
 def read_solver_metadata(solver: str) -> dict[str, Any]:
     """Read the columns `family`, `citation`, `is_minimiser` and `is_substepping` of a solver.
 
-    Empty for an unknown name.
+    The result is empty for an unknown name.
     """
     if solver not in SOLVER_TABLE:
         return {}

@@ -1,8 +1,8 @@
 """Comparison of repeated runs with published ones: outcome, iterations, residuals, and ratios of times.
 
-Bitwise equal columns are `identical`. A run is `close` if its outcome is the same and its iterations and residuals are
-within the tolerances below. Anything else `differs`. Milliseconds are never compared. A ratio of times that the load of
-a machine disturbed is `undecided`.
+A run whose columns are bitwise equal is `IDENTICAL`. It is `CLOSE` if its outcome is the same and its iterations and
+residuals are within the tolerances below, and `DIFFERENT` otherwise. Absolute times are never compared. A ratio of
+times that the load of a machine disturbed is `UNDECIDED`.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from springbench.harness.results.published_set import RUN_KEYS
 from springbench.harness.results.time_ratios import MAX_PREEMPTED_SHARE, MethodTimes, compute_time_ratios
 
 ITERATION_TOLERANCE, ITERATION_SLACK = 0.1, 3
-"""Relative and absolute difference of a step's iterations: where the descent left is round-off, single ones change."""
+"""Largest relative and absolute difference of a step's iterations: near round-off a few of them are arbitrary."""
 RESIDUAL_FACTOR = 2.0
-"""Factor between two residuals that have not met the tolerance, for the same reason."""
+"""Largest factor between the residuals of two solves that did not converge; round-off affects these, too."""
 MAX_DIFFERING_SHARE = 0.02
 """Largest share of runs that may differ between processors.
 
-Where a step has two possible outcomes, the last bit decides. Between an EPYC and a Xeon that is one run in a thousand
-of the hard cases; a tenth of them has few runs, so that two per cent are allowed.
+Where a step has two possible outcomes, the last bit decides. Between an EPYC and a Xeon, one run in a thousand of the
+hard cases differed. A quick reproduction repeats only a tenth of the runs, so two per cent are allowed.
 """
 
 CURVE_LEVELS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-6)
@@ -141,10 +141,11 @@ def group_curves(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[Any, ...], lis
 
 
 def compare_repeated_curve(published: RunRows, repeated: RunRows) -> RunAgreement:
-    """Compare the convergence of a solver on a frozen step with the published one.
+    """Compare the convergence of a solver on a step snapshot with the published one.
 
-    It is close if it reaches each of `CURVE_LEVELS` after as many iterations, within the tolerances and one sample.
-    What a curve that ended at its time limit did not reach is not compared: that depends on the machine.
+    A curve is close if it reaches each of `CURVE_LEVELS` after as many iterations, within the tolerances and one
+    sample. Levels that a curve did not reach before its time limit are not compared, because they depend on the
+    machine.
 
     Args:
         published: rows of the published curve, at least one.
@@ -162,7 +163,7 @@ def compare_repeated_curve(published: RunRows, repeated: RunRows) -> RunAgreemen
     lowest = [min(curve.values(), default=math.inf) for curve in (old, new)]
     for level in CURVE_LEVELS:
         if any(level / RESIDUAL_FACTOR <= end <= level * RESIDUAL_FACTOR for end in lowest):
-            continue  # whether such an end is below the level is round-off
+            continue  # round-off decides whether such a curve reaches the level
         (was, sample), (now, _) = (_find_first_iteration(curve, level) for curve in (old, new))
         if "time-limit" in statuses and math.inf in (was, now):
             continue
@@ -179,7 +180,10 @@ def _read_curve(rows: RunRows) -> dict[int, float]:
 
 
 def _find_first_iteration(curve: Mapping[int, float], level: float) -> tuple[float, float]:
-    """Return the first iteration at a level or below, infinite if there is none, and its distance to the one before."""
+    """Find the first iteration at a level or below, and its distance to the sample before it.
+
+    The iteration is infinite if the curve does not reach the level.
+    """
     before = 0
     for iteration, stationarity in curve.items():
         if stationarity <= level:
@@ -189,11 +193,11 @@ def _find_first_iteration(curve: Mapping[int, float], level: float) -> tuple[flo
 
 
 def compare_time_ratios(published: Sequence[MethodTimes], repeated: Sequence[MethodTimes]) -> list[RunAgreement]:
-    """Compare ratios of times, to the same reference method, of methods on both sides.
+    """Compare the ratios of times to a reference method that both sides have.
 
-    A ratio is close within the accepted interval of the published one. Outside it is undecided if the load of a machine
-    delayed one of its times or more than MAX_PREEMPTED_SHARE of all, or if its own interval reaches into the accepted
-    one: a busy machine also slows what it does not interrupt.
+    A ratio is close within the accepted interval of the published one. Outside that interval it is undecided in three
+    cases: the load of a machine delayed one of its times, or more than MAX_PREEMPTED_SHARE of all times, or its own
+    interval overlaps the accepted one. A busy machine also slows what it does not interrupt.
 
     Args:
         published: times of the published study.

@@ -1,8 +1,8 @@
-"""Ratios of times to a reference method on the same task: what may be compared between machines.
+"""Ratios of times to a reference method on the same task, which are comparable between machines.
 
-A ratio has an interval. Of runs it is the 95 % interval over the steps (`bootstrap_statistics.estimate_slowdown`), of
-accuracy studies the range over the rounds. Another machine may leave the interval by OTHER_MACHINE_FACTOR, because it
-has other vector units and caches.
+A ratio has an interval. For runs it is the 95 % interval over the steps (`bootstrap_statistics.estimate_slowdown`), for
+accuracy studies the range over the rounds. On another machine the ratio may exceed the interval by
+OTHER_MACHINE_FACTOR, because vector units and caches differ.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from springbench.harness.results import bootstrap_statistics
 from springbench.harness.results.published_set import RUN_KEYS
 
 OTHER_MACHINE_FACTOR = 2.0
-"""Factor by which a ratio may differ on another machine; archives are verified with the same one."""
+"""Factor by which a ratio may differ on another machine; archives are verified with it too."""
 
 REFERENCE_SOLVERS = ("numba", "sparse", "hybrid", "newton")
-"""Solvers that serve as reference, the first that a scene has."""
+"""Solvers that serve as reference, in order of preference; without these, the first method by name does."""
 
 MethodKey = tuple[Any, ...]
 
@@ -31,7 +31,7 @@ class MethodTimes(NamedTuple):
         task: scene and size; in accuracy studies also what is solved, and to which error.
         method: what differs between the methods of a task; the solver is first.
         seconds: times by step or by round [s], positive.
-        is_paired_by_step: whether they are times of steps; rounds otherwise.
+        is_paired_by_step: whether the times are those of steps; otherwise they are those of rounds.
         is_preempted: whether the load of the machine delayed them.
     """
 
@@ -72,11 +72,11 @@ class MethodTimeRatio(NamedTuple):
 
 
 MAX_PREEMPTED_SHARE = 0.1
-"""Largest share of interrupted steps of a run, or of interrupted times of a study, on a machine that is not busy."""
+"""Share of interrupted steps of a run, or of interrupted times of a study, above which the machine was busy."""
 
 
 def list_step_times(rows: Iterable[Mapping[str, Any]]) -> list[MethodTimes]:
-    """List the shortest time of each step, by the methods of each scene and size.
+    """List the shortest times of all steps, for each scene, size and method.
 
     Args:
         rows: rows of timed runs.
@@ -96,7 +96,7 @@ def list_step_times(rows: Iterable[Mapping[str, Any]]) -> list[MethodTimes]:
 
 
 def compute_time_ratios(times: Iterable[MethodTimes]) -> list[MethodTimeRatio]:
-    """Compute the ratio of each method of a task to the reference method there."""
+    """Compute the ratio of each method of a task to the reference method of that task."""
     tasks: dict[tuple[Any, ...], list[MethodTimes]] = {}
     for one in times:
         tasks.setdefault(one.task, []).append(one)
