@@ -69,8 +69,8 @@ def read_assignment_scene(path: Path) -> AssignmentScene:
     mesh = build_spring_network(cells, "face-pairs", obj)
     fans = np.concatenate(
         [NO_TRIANGLES, *map(fan_triangles, cells.polygons.values())]
-    )  # as the assignment's code cuts faces
-    if len(fans) == len(mesh.triangles):  # else faces repeat others, which count once
+    )  # the assignment's code splits faces into fans
+    if len(fans) == len(mesh.triangles):  # otherwise faces repeat others, and `mesh` counts each once
         mesh = replace(mesh, triangles=fans)
     pins = _to_zero_based_pins(scene.b, len(mesh.rest_positions), path)
     if scene.m is None:

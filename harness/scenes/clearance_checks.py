@@ -1,4 +1,4 @@
-"""Clearance of moving obstacles: of pinned points along their motion, and between planes.
+"""Clearance of moving obstacles: from pinned points along their motion, and between planes.
 
 Points that move no faster than L relative to an obstacle and are at a distance d from it at time t stay outside of it
 until t + d/L. A motion is therefore checked in steps of that length (conservative advancement, Mirtich 1996,
@@ -17,7 +17,7 @@ from springbench.solvers.contact.half_space.half_space_potential import ConvexOb
 from springbench.solvers.model.step_problem import Positions
 
 _MIN_STEP_FRACTION_PER_KEY, _MIN_STEP_FRACTION_TOTAL = 512, 4096
-"""Shortest steps relative to the interval between two key times, and to the whole; thinner overlaps are missed."""
+"""Maximum numbers of steps between two key times, and in total; shorter overlaps in time are missed."""
 _ROTATING_PLANE_SAMPLES = 64
 """Total number of sample times for rotating planes."""
 
@@ -41,10 +41,10 @@ def find_first_violation(
         obstacle_motion: its motion, None if it is at rest.
         points: declared positions (q, 3) [m].
         point_motion: their motion, None if they are at rest.
-        min_distance: [m].
+        min_distance: minimum distance [m].
 
     Returns:
-        The time [s] and all distances (q,) [m] at that time, None if there is no such time.
+        The time [s] and all distances (q,) [m] at that time; None if there is no such time.
     """
     times = merge_key_times(obstacle_motion, point_motion)
     shortest = (times[-1] - times[0]) / _MIN_STEP_FRACTION_TOTAL

@@ -27,9 +27,9 @@ END_OF_STEP_REASON = ("separates the pairs that it finds at the end of a step",)
 def collision_primitives(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the edges (m, 2) and faces (f, 3) of the mesh that can collide.
 
-    Edges are the sides of triangles, and stretch springs between other vertices. Faces are the triangles, and such
-    springs i, j as triangles i, j, j. Without these, parallel ropes would not collide, because the edge-edge barrier
-    vanishes for nearly parallel edges.
+    Edges are the sides of triangles, and stretch springs with an end outside of all triangles. Faces are the triangles,
+    and a triangle i, j, j for each such spring i, j. Without the latter, parallel ropes would not collide, because the
+    edge-edge barrier vanishes for nearly parallel edges.
     """
     triangles = mesh.triangles
     sides = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
@@ -59,6 +59,7 @@ def compute_barrier_stiffness(
     if stiffness is not None:
         return np.full(len(mass), stiffness)
     projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
+    # Exact pins of all vertices add nothing to Q, and determine the positions of vertices without mass.
     system = System(mass, time_step, pins=DirichletPins(np.arange(len(mass)), np.full(len(mass), np.inf)))
     return _STIFFNESS_FRACTION * np.asarray(assemble_system_matrix(system, projective).diagonal(), np.float64)
 
@@ -117,7 +118,7 @@ def require_intersection_free(
         effect_name: name of the effect in the message.
         energy: barrier, which finds the pairs.
         start: initial positions (n, 3) [m].
-        min_distance: the minimum distance [m] that the message states; that of the search belongs to `energy`.
+        min_distance: minimum distance [m] that the message states; the search uses that of `energy`.
         mesh: mesh of the scene, by which the message names vertices, edges and triangles.
 
     Raises:

@@ -33,7 +33,7 @@ _SMALLEST_VOLUME = 1e-250
 """Volume [m^3] below which products may underflow."""
 
 _PAIRS_PER_CHUNK = 200_000
-"""Number of pairs tested per chunk."""
+"""Approximate number of pairs tested per chunk, for 64 triangles near each edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ def _has_separating_axis(p: FloatArray, edges: IndexArray, triangles: IndexArray
 
 
 def _intersects_certainly(p: FloatArray, edges: IndexArray, triangles: IndexArray) -> NDArray[np.bool_]:
-    """Return which pairs (k, 2) and (k, 3) intersect inside of both, whatever the round-off."""
+    """Return which pairs (k, 2) and (k, 3) intersect in the interior of both, regardless of round-off."""
     a, b = p[edges[:, 0]], p[edges[:, 1]]
     u, v, w = (p[triangles[:, k]] for k in range(3))
     sides = _certain_sign(u, v, w, a) * _certain_sign(u, v, w, b)
@@ -142,7 +142,7 @@ def _intersects_certainly(p: FloatArray, edges: IndexArray, triangles: IndexArra
 
 
 def _certain_sign(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
-    """Return the signs (k,) of the volumes of tetrahedra (k, 3) each; 0 where round-off could change one."""
+    """Return the signs (k,) of the volumes of tetrahedra with corners (k, 3); 0 where round-off could change one."""
     u, v, w = b - a, c - a, d - a
     volume = np.einsum("ij,ij->i", u, np.cross(v, w))
     products = np.abs(v[:, [1, 2, 0]] * w[:, [2, 0, 1]]) + np.abs(v[:, [2, 0, 1]] * w[:, [1, 2, 0]])

@@ -20,7 +20,7 @@ from springbench.harness.schema.base_model import ConfigModel, Vector3
 
 WANG_2011 = "Wang, O'Brien and Ramamoorthi 2011"
 IMPLAUSIBLE_FACTOR = 100.0
-"""Factor beyond the range of the table from which on a material is probably a mistake."""
+"""Factor beyond the range of the table above which a material is probably a mistake."""
 
 
 class PublishedFabric(NamedTuple):
@@ -106,7 +106,7 @@ def find_fabric(name: str) -> PublishedFabric:
 
 
 def fill_effect(effect: Any, name: str, warp: Vector3 | None = None) -> Any:
-    """Return the data of an effect with the fabric's values where it states no material of its own.
+    """Complete the data of an effect that states no material with the values of a fabric.
 
     Args:
         effect: data of an effect as read from a scene; only `springs` and `bending` have a material.
@@ -128,7 +128,7 @@ def fill_effect(effect: Any, name: str, warp: Vector3 | None = None) -> Any:
 
 
 class PlausibleRange(NamedTuple):
-    """The range of a quantity in the table, and the mistakes that lead far out of it."""
+    """Range of a quantity in the table, and questions about the likely mistake in a value far outside it."""
 
     quantity: str
     unit: str

@@ -1,9 +1,9 @@
 """Key-frame motion: rotation about an axis and translation, both interpolated in time.
 
-    q(t) = about + R(axis, turn(t)) (q - about) + offset(t)
+    q(t) = pivot + R(axis, angle(t)) (q - pivot) + offset(t)
 
-linearly between key frames, or by the monotone cubics of Fritsch and Carlson (1980), which are smooth and never
-overshoot a key frame. Before the first key frame and after the last one the points are at rest.
+The interpolation between key frames is linear, or by the monotone cubics of Fritsch and Carlson (1980), which are
+smooth and never overshoot a key frame. Before the first key frame and after the last one the points are at rest.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def _interpolate_smooth(times: NDArray[np.float64], values: NDArray[np.float64],
 
 
 _MAX_SLOPE_RATIOS = {"linear": 1.0, "smooth": 3.0}
-"""Bound of the slopes at two key frames relative to the secant: the condition of Fritsch and Carlson."""
+"""Bound of the slope between two key frames relative to that of the secant (Fritsch and Carlson's condition)."""
 
 _INTERPOLATIONS: dict[str, Any] = {"linear": _interpolate_linear, "smooth": _interpolate_smooth}
 

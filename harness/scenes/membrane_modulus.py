@@ -1,6 +1,6 @@
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 # SciPy's and NumPy's stubs leave the types of some results unknown.
-"""Membrane stiffness of spring networks: stiffness by areas, and the modulus that a network has.
+"""Membrane stiffness of spring networks: spring stiffness by areas, and the modulus of a network.
 
 Stiffness by areas (Van Gelder 1998, "Approximate simulation of elastic membranes by triangulated spring meshes"):
 
@@ -37,12 +37,12 @@ from springbench.harness.scenes.mesh.mesh_checks import build_edge_table, find_c
 FloatArray = NDArray[np.float64]
 
 _REGULARISATION = 1e-9
-"""Part of the diagonal that is added to it, for motions without stiffness; the elongation does not excite them."""
+"""Fraction of the diagonal that is added to it, because some motions have no stiffness; no elongation excites these."""
 _PLANE_RATIO = 1e-3
 """Thickness relative to the extent below which a surface is planar."""
 _NUM_DIRECTIONS = 180
 _SOFT_RATIO = 1e-3
-"""Ratio of the smallest to the largest modulus below which a direction has none."""
+"""Ratio of the smallest to the largest modulus below which the smallest counts as zero."""
 
 
 class MembraneModulus(NamedTuple):
@@ -76,12 +76,12 @@ class MembraneModulus(NamedTuple):
         )
 
 
-@lru_cache(maxsize=2)  # a scene requests it for each family of springs
+@lru_cache(maxsize=2)  # a scene calls it once for each family of springs
 def compute_area_stiffness(mesh: Mesh) -> FloatArray:
-    """Compute the stiffness of each spring by its areas for the constant 1, (m,).
+    """Compute the stiffness of each spring by its areas, for a material constant of 1, (m,).
 
     Raises:
-        InputError: for a mesh without faces of a file, and a spring without length or without faces.
+        InputError: for a mesh without faces from a file, and for a spring without length or without an adjacent face.
     """
     if mesh.spring_areas is None:
         problem = "area needs the faces of a mesh from a file; use continuum, which suits generated meshes"
@@ -105,9 +105,9 @@ def compute_area_stiffness(mesh: Mesh) -> FloatArray:
 def compute_membrane_modulus(mesh: Mesh, springs: NDArray[np.int64], stiffness: FloatArray) -> MembraneModulus:
     """Compute the modulus of a surface by direction, with its inner vertices in equilibrium.
 
-    No motion strains a curved surface alike everywhere, except for a stretch in all directions. For curved surfaces
-    the tensor is that of vertices that follow the strain, times the part that relaxation leaves of a uniform stretch.
-    Directions are angles to the vertical, or to x where most of the surface is horizontal.
+    A curved surface has no uniform strain except a stretch in all directions. Its tensor is that of vertices that
+    follow the strain, times the fraction that relaxation leaves of the energy of a uniform stretch. Directions are
+    angles to the vertical, or to x where most of the surface is horizontal.
 
     Args:
         mesh: a mesh with triangles.

@@ -1,4 +1,4 @@
-"""Orthotropic cloth: different stiffness along warp and weft, and lowest at 45 degrees.
+"""Orthotropic cloth: different stiffness along warp, weft and bias (45 degrees to both).
 
     k(theta) = (warp if cos 2 theta >= 0, else weft) cos^2 2 theta + bias sin^2 2 theta
 

@@ -1,4 +1,4 @@
-"""Build the simulated system of a scene for a mesh size, with only the terms that the scene requires."""
+"""Builder of the simulated system of a scene for a mesh size, with only the terms that the scene requires."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ class Scene:
         varying_forces: the other external forces.
         velocity_filters: changes of the velocity before a step.
         pin_targets: (q, 3) [m], in the order of `system.pins`.
-        pin_motions: which of the targets move, and how.
-        initial_velocity: of every vertex [m/s], without the start's spin.
+        pin_motions: rows of the targets that move, with their motion.
+        initial_velocity: velocity of every vertex [m/s], without the spin of the start.
         integrator: the time integrator; its factor and velocity rule are those of the system.
         intersection_checks: primitives that must not intersect; empty unless an effect prevents intersections.
         alternate_scene: the same scene with the time step of every second step, if that differs.
@@ -135,9 +135,9 @@ class Scene:
 
     @cached_property
     def all_springs(self) -> Springs:
-        """All springs with stiffness, by effect and in mesh order, those that only pull last.
+        """All springs with stiffness, by effect and in mesh order, then springs that only pull.
 
-        Length constraints follow, with infinite stiffness.
+        Exact length constraints follow, as springs of infinite stiffness.
         """
         exact = [x for x in self.system.length_constraints if (x.min_length == x.max_length).all()]
         return Springs.from_parts(
@@ -209,9 +209,9 @@ def build_scene(spec: SceneSpec, size: int, integrator: str = "implicit-euler", 
 
 
 def _make_coarser_builder(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] | None:
-    """Return a builder of the coarser scene, None if there is none.
+    """Return a builder of the scene on a mesh of half the size; None if there is none.
 
-    There is none for fixed-size meshes, the coarsest ones, and effects with vertex indices.
+    There is none for meshes of fixed size, for the coarsest meshes, and for effects that select vertices by index.
     """
     half = (size + 1) // 2
     numbered = any(isinstance(e, VertexSelection) and (e.indices or e.stride > 1) for e in spec.effects)
@@ -291,12 +291,15 @@ def _warn_unusual(spec: SceneSpec) -> None:
 
 
 def find_implausible_materials(effects: Sequence[SceneEffect], mesh: Mesh, mass: NDArray[np.float64]) -> Iterator[str]:
-    """Describe stiffnesses and densities of a cloth that are far from those of published fabrics.
+    """Find stiffnesses and densities of a cloth that are far from those of published fabrics.
 
     Args:
         effects: the effects of the scene; those that state a material are checked.
         mesh: the mesh; only cloth is checked.
         mass: vertex masses (n,) [kg].
+
+    Yields:
+        Descriptions of the values.
     """
     if mesh.dimension != 2 or not len(mesh.triangles):
         return

@@ -1,8 +1,7 @@
-"""Effects and meshes from plug-ins: named by a scene, and imported where they are used.
+"""Effects and meshes from plug-ins: named by a scene, and imported in the process that uses them.
 
-A scene is passed around with `PluginEffect` and `PluginMesh`, which contain only name and parameters.
-`SceneSpec.load_plugins` replaces them, in a process that may crash. Results of the plug-in code are checked, and its
-errors name it.
+A loaded scene contains `PluginEffect` and `PluginMesh`, which have only a name and parameters. `SceneSpec.load_plugins`
+replaces them in the process that uses them. Results of plug-in code are checked, and error messages name the plug-in.
 """
 
 from __future__ import annotations
@@ -34,14 +33,14 @@ from springbench.solvers.model import integrators
 from springbench.solvers.plugins.plugin_discovery import PluginName, load_target
 
 IMPORT_NOTICE = "\0importing "
-"""Message of a process, with the name of the plug-in, before it imports third-party code."""
+"""Prefix of the progress event, followed by the name of the plug-in, before its code is imported."""
 
 
 def load_plugin(document: ConfigDocument, plugin: PluginName, part_kind: str, key: ConfigKey) -> Any:
     """Load a plug-in, which runs its code.
 
     Args:
-        document: document that names it and gets the mistakes.
+        document: document that names it, which collects mistakes.
         plugin: name of the plug-in.
         part_kind: expected kind, a key of PLUGIN_KINDS.
         key: location in the document, for the mistakes.
@@ -78,7 +77,7 @@ def build_plugin_part(
     """Build an effect or a mesh from a plug-in class, which is imported.
 
     Args:
-        document: document that names it and gets the mistakes.
+        document: document that names it, which collects mistakes.
         plugin: name of the plug-in.
         part_kind: "effect" or "mesh".
         parameters: values of the model's fields.

@@ -1,4 +1,4 @@
-"""A validated scene specification."""
+"""Models of a scene: the fields of its file, and the validated specification."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ InitialGuess = Literal["assignment", "previous", "inertial", "extrapolated", "co
 
 
 def registered_name(table: PluginTable) -> Any:
-    """Return the type of a registered name or a plug-in (see
-    `springbench.solvers.plugins.plugin_discovery`).
+    """Return the type of the names in a table, including those of plug-ins.
 
-    The validation context provides the folder of the config.
+    The validation context provides the folder of the config
+    (`springbench.solvers.plugins.plugin_discovery.PluginTable.resolve_name`).
     """
 
     def checked(value: str, info: ValidationInfo) -> str:
@@ -162,13 +162,16 @@ class SceneSpec(SceneFields):
     """Line numbers of the keys in that file, for messages."""
 
     def choose_initial_guess(self, integrator: str) -> InitialGuess:
-        """Return the default initial guess for an integrator: extrapolated for multi-stage integrators."""
+        """Return the initial guess of the scene for an integrator.
+
+        It is `extrapolated` instead of `previous` for integrators that evaluate forces at their stages.
+        """
         method = integrators.INTEGRATORS.get(integrator, integrators.IMPLICIT_EULER)
         says = self.initial_guess != "previous" or isinstance(method, integrators.SingleStageIntegrator)
         return self.initial_guess if says else "extrapolated"
 
     def keep_effects(self, effect_indices: Sequence[int]) -> dict[str, Any]:
-        """Return the fields `effects` and `plugins` of the scene restricted to effects with these indices."""
+        """Return the fields `effects` and `plugins`, restricted to the effects with these indices."""
         plugins = {place: plugin for place, plugin in self.plugins.items() if place == "mesh"}
         places = {f"effects[{i}]": f"effects[{k}]" for k, i in enumerate(effect_indices)}
         plugins |= {places[place]: plugin for place, plugin in self.plugins.items() if place in places}
@@ -190,7 +193,8 @@ class SceneSpec(SceneFields):
     def with_time_step(self, time_step: float) -> SceneSpec:
         """Return the scene with another time step [s], the same for all steps.
 
-        Barriers retain their default stiffness. If it grew with 1/dt^2, shorter steps would never resolve an impact.
+        Barriers of default stiffness retain that of the declared time step. If the stiffness grew with 1/dt^2, shorter
+        steps would never resolve an impact.
         """
         if time_step == self.time_step:
             return self

@@ -33,7 +33,7 @@ area         As continuum in dimension 1. On surfaces and solids of files each s
 liu2013      k_e = constant * (resolution - 1) / (reference - 1), constants [N/m] as given for the size
     `reference_size`: Liu et al. 2013 use 150, 300, 600, 1200 for their curtain at 11, 21, 41, 81 vertices per side.
     Proportional to 1/h, the rule stiffens a cloth under refinement; it exists to reproduce their figures. It
-    requires a mesh size and does not support meshes from files; the other two rules do.
+    requires a mesh size and does not support meshes from files; the other rules do.
 """
 
 from __future__ import annotations
@@ -124,6 +124,8 @@ def _count_overlapping_bends(mesh: Mesh) -> NDArray[np.int64]:
 
     A BEND spring spans two STRETCH springs.
     """
+    # A sparse matrix with the number of the STRETCH spring, from 1, at both orders of its vertices. The product of the
+    # rows of the two ends of a BEND spring is nonzero at the vertex between them.
     (i, j), (a, b) = (mesh.springs[mesh.spring_families[family]].T for family in (STRETCH, BEND))
     n, name = len(mesh.rest_positions), np.arange(1, len(i) + 1)
     spring = scipy.sparse.coo_array((np.tile(name, 2), (np.r_[i, j], np.r_[j, i])), shape=(n, n)).tocsr()

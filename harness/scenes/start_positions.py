@@ -26,7 +26,11 @@ class RestStart(ConfigModel):
     """Angular velocity about the mean position [rad/s]."""
 
     def compute_positions(self, rest_positions: Positions) -> Positions:
-        """Return the initial positions (n, 3) [m]; raise InputError if the mesh lacks a named vertex."""
+        """Return the initial positions (n, 3) [m] from the rest positions (n, 3) [m].
+
+        Raises:
+            InputError: if the mesh lacks a named vertex.
+        """
         return rest_positions
 
     def compute_spin_velocity(self, p: Positions) -> Positions:

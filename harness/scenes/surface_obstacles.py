@@ -75,7 +75,7 @@ class RecordedFrames(ConfigModel):
 
     @cached_property
     def frame_positions(self) -> FloatArray:
-        """Read the positions (frames, points, 3) [m]; raise InputError on failure."""
+        """Positions of all frames (frames, points, 3) [m], read on first use; raise InputError on failure."""
         path = self.positions if isinstance(self.positions, Path) else None
         found = read_npz_array(path, "positions") if path else np.array(self.positions)
         if found.ndim != 3 or found.shape[2] != 3 or not found.size or not (np.abs(found) <= MAX_COORDINATE).all():
@@ -130,7 +130,7 @@ class MeshObstacle(ConfigModel):
 
     @model_validator(mode="after")
     def _check_readable(self) -> MeshObstacle:
-        """Read files during validation: a mistake found during serialisation has no location."""
+        """Read files during validation, because a mistake found during serialisation has no location."""
         if isinstance(self.mesh, FileMesh) or self.frames:
             try:
                 self.build_surface()
@@ -140,7 +140,7 @@ class MeshObstacle(ConfigModel):
 
     @model_serializer(mode="wrap")
     def _dump_contents(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Dump the contents of files: they define the obstacle, and a recording must contain them."""
+        """Dump the contents of files, which define the obstacle and which a recording must contain."""
         contents: dict[str, Any] = dump(self)
         if self.frames is None:
             contents.pop("frames", None)  # absent if None values were excluded
@@ -261,10 +261,10 @@ def _count_subdivisions(radius: float, sag: float) -> int:
 
 
 def _triangulate_capsule(one: CapsuleObstacle, sag: float) -> SurfaceMesh:
-    """Triangulate a capsule by rings, spaced on the half circles like their corners, and two end points."""
+    """Triangulate a capsule as rings between two poles, with one angular spacing along and across the rings."""
     around = 2 * int(np.ceil(np.pi / 2 / np.arccos(max(0.5, 1.0 - 0.5 * sag / one.radius))))
     turn, half = np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(0, np.pi, around // 2 + 1)
-    half = np.insert(half, len(half) // 2, 0.5 * np.pi)
+    half = np.insert(half, len(half) // 2, 0.5 * np.pi)  # the top end of the cylinder; the next ring is its bottom
     first, x, y, z = one.model_copy(update={"motion": None}).build_obstacle().frame(0.0)
     long = float(np.linalg.norm(np.subtract(*one.end_points)))
     high = one.radius * np.cos(half) + np.where(np.arange(len(half)) < len(half) / 2, long, 0.0)

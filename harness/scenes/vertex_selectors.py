@@ -64,7 +64,7 @@ class VertexSelection(ConfigModel):
     sphere: BallRegion | None = None
     """All vertices with rest positions in this ball."""
     nearest_to: tuple[Vector3, ...] = ()
-    """For each of these points [m] the vertex with the nearest rest position, the first one of equals."""
+    """For each of these points [m] the vertex with the nearest rest position; the lowest index decides ties."""
     boundary_loops: tuple[NonNegativeInt, ...] = ()
     """Boundary loops of the mesh's triangles; the longest is 0."""
     holes: tuple[NonNegativeInt, ...] = ()
@@ -84,7 +84,7 @@ class VertexSelection(ConfigModel):
 
     @model_serializer(mode="wrap")
     def _dump_used_selectors(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Dump without unused optional selectors: run identities depend on this dump, older ones lack them."""
+        """Dump without unused optional selectors, so that new selectors do not change the ids of existing runs."""
         contents: dict[str, Any] = dump(self)
         return {key: value for key, value in contents.items() if value or key not in _OPTIONAL_SELECTORS}
 
@@ -156,7 +156,7 @@ _OPTIONAL_SELECTORS = {"sphere", "nearest_to", "boundary_loops", "holes", "attri
 
 
 def find_selections(effect: Any) -> Iterator[tuple[str, VertexSelection]]:
-    """Yield the selections of an effect: itself, with an empty name, and its fields."""
+    """Yield the selections of an effect: the effect if it is one, with the name "", and those in its fields."""
     if isinstance(effect, VertexSelection):
         yield "", effect
     for key, value in effect:
