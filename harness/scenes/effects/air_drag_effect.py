@@ -1,8 +1,7 @@
 """Air drag on vertices in still air: f = -c v, or f = -c |v| v.
 
-Linear drag is an energy (see `springbench.solvers.model.energies.quadratic_energy`): unconditionally stable, and
-part of Q.
-Quadratic drag acts on the velocity before each step, by the exact solution of m dv/dt = -c |v| v:
+Linear drag is an energy (see `springbench.solvers.model.energies.quadratic_energy`): it is unconditionally stable, and
+part of Q. Quadratic drag acts on the velocity before each step, by the exact solution of m dv/dt = -c |v| v:
 v <- m v / (m + c dt |v|), which is unconditionally stable too, and of order 1. Integrators that evaluate forces at
 their stages treat it as a force, limited to what stops a vertex in one step, and retain their order. Wind on triangles
 includes drag as well, by their area and their angle to the flow.
@@ -80,7 +79,12 @@ class AirDragEffect(ConfigModel):
 
 @dataclass(frozen=True, eq=False)
 class QuadraticDragForce:
-    """The force for c (n,) [kg/m], limited to `limit` (n,) [kg/s] times the velocity."""
+    """Force of quadratic drag at the stages of an integrator.
+
+    Attributes:
+        c: coefficients (n,) [kg/m].
+        limit: largest ratio of force to velocity (n,) [kg/s].
+    """
 
     c: NDArray[np.float64]
     limit: NDArray[np.float64]

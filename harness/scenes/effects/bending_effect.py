@@ -56,7 +56,7 @@ class BendingEffect(ConfigModel):
 
         Args:
             mesh: mesh with triangles, at most two at each edge.
-            mass: vertex masses (n,) [kg], from which a bending length makes a rigidity.
+            mass: vertex masses (n,) [kg], used to convert a bending length to a rigidity.
             time_step: dt [s], which does not matter here.
 
         Raises:

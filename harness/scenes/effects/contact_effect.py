@@ -75,7 +75,7 @@ class ContactEffect(ConfigModel):
             time_step: dt [s], in which a vertex may advance into an obstacle.
 
         Raises:
-            InputError: if the mesh is too fine for the thickness.
+            InputError: if a spring is at most `min_distance` long at rest.
         """
         lengths = mesh.rest_lengths
         if len(lengths) and not self.min_distance < lengths.min():
@@ -97,10 +97,7 @@ class ContactEffect(ConfigModel):
         return EffectContribution(derived_energies=(derived,), scene_checks=(partial(self._check_start, mesh),))
 
     def _check_start(self, mesh: Mesh, start: Positions, pins: Sequence[PinGroup]) -> None:
-        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle.
-
-        Also raise it for planes without a gap between them.
-        """
+        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, or for planes without a gap."""
         limit = self.min_distance - self.max_penetration
         for k, given in enumerate(self.obstacles):
             obstacle = given.build_obstacle()
@@ -112,7 +109,7 @@ class ContactEffect(ConfigModel):
                 mesh, "vertex {} starts", k, obstacle.signed_distance(start, 0.0), np.arange(len(start))
             )
         planes = [one for one in self.obstacles if one.kind == "plane"]
-        if len(planes) > 1 and any(one.motion for one in planes):  # others leave the room that the start is in
+        if len(planes) > 1 and any(one.motion for one in planes):  # planes at rest leave at least the space of the start
             solid = [one.build_obstacle() for one in planes]
             for time in sample_times([one.motion for one in planes]):
                 if (radius := largest_gap_radius(solid, time)) < limit:

@@ -1,5 +1,7 @@
-"""Dashpots: damping along the springs, f = -c n n'(v_i - v_j), scaled by a rule of
-`springbench.harness.scenes.spring_stiffness`."""
+"""Dashpots: damping along the springs, f = -c n n'(v_i - v_j).
+
+The coefficients c are scaled by a rule of `springbench.harness.scenes.spring_stiffness`.
+"""
 
 from math import inf
 from typing import ClassVar, Literal

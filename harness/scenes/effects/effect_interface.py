@@ -72,9 +72,12 @@ class DerivedEnergies(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PinGroup:
-    """Vertices (q,) pinned to targets (q, 3) [m] with a penalty weight [N/m]; an infinite weight is exact.
+    """Vertices that are pinned to targets.
 
     Attributes:
+        vertices: pinned vertices (q,).
+        targets: targets (q, 3) [m].
+        weight: penalty weight [N/m]; infinite for exact pins.
         motion: motion of the targets, None if they are fixed.
 
     Example:
@@ -137,7 +140,8 @@ class EffectContribution:
     end_of_step_reasons: tuple[str, ...] = ()
     """Reasons why each stage has to lie at the end of a step, in words."""
     continuous_forms: tuple[Callable[[], EffectContribution], ...] = field(default=())
-    """Builds an equivalent form with forces and energies only, for integrators that evaluate forces at their stages."""
+    """At most one function that builds an equivalent form with forces and energies only, for integrators that evaluate
+    forces at their stages."""
 
     def adapt_to_integrator(self, integrator: integrators.AnyIntegrator) -> EffectContribution:
         """Return the form of the contribution that an integrator supports."""
@@ -161,10 +165,11 @@ class SceneEffect(Protocol):
 
     Its class states `max_convergence_order`, a class variable: the order of the error in the step size up to which
     integrators retain their own order with the effect. It is infinite if the effect is smooth and evaluated where it
-    acts; without it, no order is guaranteed. Optional class variables: `is_dissipative`, True if the effect removes
-    energy from any motion; `is_baseline_effect`, True if the baseline scenes of the effects' cost contain it, so it has
-    no cost of its own; and `find_evidence(observed: ObservedMotion) -> str`, a class method that returns the evidence
-    in the motion of a scene that the effect is missing, or "".
+    acts; without it, no order is guaranteed. The class may have two more class variables. `is_dissipative` is True if
+    the effect removes energy from any motion. `is_baseline_effect` is True if the baseline scenes of the effects' cost
+    contain the effect, so that no cost of it is measured. It may also have a class method
+    `find_evidence(observed: ObservedMotion) -> str`, which returns the evidence in the motion of a scene that the
+    effect is missing, or "".
 
     Example:
         >>> class Drag(springbench.ConfigModel):
@@ -203,9 +208,11 @@ class ObservedMotion:
     """Observed motion of a scene, for the detection of missing effects.
 
     Attributes:
+        mesh: the mesh at rest.
         springs: ends (m, 2) and rest lengths (m,) [m].
         mean_spring_length: mean rest length, or the mesh's spacing [m].
-        mass: (n,) [kg].
+        mass: vertex masses (n,) [kg].
+        time_step: duration of a frame [s].
         has_pins: whether vertices are pinned.
         is_driven: whether forces or obstacles maintain the motion.
         is_damped: whether an effect dissipates energy.

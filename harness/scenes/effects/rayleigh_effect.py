@@ -38,7 +38,7 @@ class RayleighEffect(ConfigModel):
 
         Args:
             mesh, time_step: mesh and dt [s], which do not matter here.
-            mass: vertex masses (n,) [kg], times which the mass coefficient is the damping [kg/s].
+            mass: vertex masses (n,) [kg]; the damping [kg/s] is the mass coefficient times these.
         """
         damping = self.mass_coefficient * mass
         return EffectContribution(

@@ -34,12 +34,12 @@ NUM_SAMPLED_FRAMES = 30
 
 
 class SelfContactEffect(ConfigModel):
-    """Separates points from triangles and edges from edges of the mesh by a barrier that diverges as their gap closes.
+    """Separates points from triangles and edges from edges of the mesh by a barrier.
 
-    Formulas: `springbench.solvers.contact.potentials.barrier`. All intermediate positions are intersection-free.
-    Pairs that share a
-    vertex are excluded. Pairs that are closer at rest than thickness plus range have both reduced in proportion to
-    their rest distance, so the mesh may be arbitrarily fine. Vertices in no edge and no triangle do not collide.
+    The barrier diverges as the gap of a pair closes (formulas: `springbench.solvers.contact.potentials.barrier`). All
+    intermediate positions are intersection-free. Pairs that share a vertex are excluded. For pairs that are closer at
+    rest than `min_distance` plus `dhat`, both are reduced in proportion to the rest distance, so the mesh may be
+    arbitrarily fine. Vertices in no edge and no triangle do not collide.
     """
 
     max_convergence_order: ClassVar[float] = 1.0

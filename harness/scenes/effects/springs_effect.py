@@ -1,7 +1,7 @@
-"""Springs: one linear spring per mesh spring, with a stiffness by a rule of
-`springbench.harness.scenes.spring_stiffness`.
+"""Springs: one linear spring per spring of the mesh.
 
-Springs of infinite stiffness have no energy: they are length constraints.
+The stiffness follows from a rule of `springbench.harness.scenes.spring_stiffness`. Springs of infinite stiffness have
+no energy: they are length constraints.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class SpringsEffect(ConfigModel):
     def build_contribution(self, mesh: Mesh, mass: NDArray[np.float64], time_step: float) -> EffectContribution:
         """Return the springs as energies, and the length constraints.
 
-        Springs that only pull have an energy of their own. Kinds without springs are omitted.
+        Springs that only pull have an energy of their own. Energies without springs are omitted.
 
         Args:
             mesh: mesh, whose springs have the rest lengths and stiffnesses that it states.
@@ -101,7 +101,7 @@ class SpringsEffect(ConfigModel):
             # A spring without any rest length is never slack.
             pulls = own.only_pulls[stiff] & (own.rest_length[stiff] > 0.0)
             springs, cables = (build_rest_springs(mesh, some, k[some]) for some in (stiff[~pulls], stiff[pulls]))
-            # It has kernels, and listing runs must not import Numba.
+            # Imported here because its kernels need Numba, which listing runs must not import.
             from springbench.solvers.model.energies.tension_only_energy import TensionOnlySprings
 
             parts = springs, TensionOnlySprings.from_springs(cables)

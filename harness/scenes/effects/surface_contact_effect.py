@@ -1,4 +1,4 @@
-"""Contact of points, edges and triangles of the mesh with the surfaces of obstacles, meshes among them."""
+"""Contact of points, edges and triangles of the mesh with the surfaces of obstacles, including meshes."""
 
 from __future__ import annotations
 
@@ -35,17 +35,16 @@ from springbench.solvers.contact.obstacle_mesh import MeshPrimitives, ObstacleCo
 from springbench.solvers.model.step_problem import Energy, Positions
 
 _MAX_SAG_FRACTION = 0.1
-"""Largest inward deviation of the triangles of round obstacles, relative to the thickness."""
+"""Largest inward deviation of the triangles of round obstacles, relative to `min_distance`."""
 
 
 class SurfaceContactEffect(ConfigModel):
     """Separates points, edges and triangles of the mesh from those of obstacles by a barrier.
 
     The barrier acts on either side and diverges as the gap closes (formulas:
-    `springbench.solvers.contact.potentials.barrier`). All
-    intermediate positions are intersection-free. Moving obstacles advance along their motion without passing through
-    the mesh. Planes, spheres, capsules and boxes are represented by triangles too; those of round obstacles lie at most
-    a tenth of the thickness inside.
+    `springbench.solvers.contact.potentials.barrier`). All intermediate positions are intersection-free. Moving
+    obstacles advance along their motion without passing through the mesh. Planes, spheres, capsules and boxes are
+    represented by triangles too; those of round obstacles lie at most a tenth of `min_distance` inside.
     """
 
     max_convergence_order: ClassVar[float] = 1.0
@@ -70,11 +69,15 @@ class SurfaceContactEffect(ConfigModel):
 
     @property
     def resolved_dhat(self) -> float:
-        """Barrier activation distance beyond the thickness [m], with its default resolved."""
+        """Barrier activation distance beyond `min_distance` [m], with its default resolved."""
         return self.min_distance if self.dhat is None else self.dhat
 
     def build_obstacle_surfaces(self, rest_positions: Positions) -> list[SurfaceMesh]:
-        """Build the surfaces of the obstacles in their declared poses; `rest_positions` (n, 3) [m] of the mesh."""
+        """Build the surfaces of the obstacles in their declared poses.
+
+        Args:
+            rest_positions: rest positions of the mesh (n, 3) [m]; the triangles of planes extend beyond them.
+        """
         return [
             build_obstacle_surface(one, _MAX_SAG_FRACTION * self.min_distance, rest_positions) for one in self.obstacles
         ]
@@ -116,7 +119,7 @@ class SurfaceContactEffect(ConfigModel):
             rigid = [one.motion for one in self.obstacles if one.motion is not None and not is_deforming(one)]
             carried = [motion.transform_points(motion.invert_points(p, begin), end) for motion in rigid]
             for (x, _), one in zip(shapes, self.obstacles, strict=True):
-                if is_deforming(one):  # as it does on the whole
+                if is_deforming(one):  # by the mean displacement of its points
                     carried.append(
                         p + (place_obstacle_points(one, x, end) - place_obstacle_points(one, x, begin)).mean(axis=0)
                     )

@@ -19,7 +19,7 @@ of the air in one step, f dt <= m |u|; otherwise light cloth is unstable in a st
 
                 (the assignment adds a gravity of -9.8 newtons to the second component; here gravity is another effect)
 
-in newtons on vertices, or in metres per second on triangles.
+The field is in newtons on vertices, and in metres per second on triangles.
 """
 
 from collections.abc import Callable
