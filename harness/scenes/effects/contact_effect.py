@@ -109,7 +109,7 @@ class ContactEffect(ConfigModel):
                 mesh, "vertex {} starts", k, obstacle.signed_distance(start, 0.0), np.arange(len(start))
             )
         planes = [one for one in self.obstacles if one.kind == "plane"]
-        if len(planes) > 1 and any(one.motion for one in planes):  # planes at rest leave at least the space of the start
+        if len(planes) > 1 and any(one.motion for one in planes):  # the start lies between fixed planes
             solid = [one.build_obstacle() for one in planes]
             for time in sample_times([one.motion for one in planes]):
                 if (radius := largest_gap_radius(solid, time)) < limit:
