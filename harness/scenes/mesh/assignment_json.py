@@ -17,7 +17,7 @@ MAX_SCENE_BYTES = 2**22
 
 
 class AssignmentJson(ConfigModel):
-    """Keys of a scene. `b` counts vertices from 1."""
+    """Keys of a scene; `b` counts vertices from 1."""
 
     obj: str = Field(min_length=1)
     """Path of the OBJ file, relative to the JSON file."""

@@ -99,4 +99,5 @@ def _interpolate_rows(places: PointArray, along: PointArray, values: PointArray)
 def _count_rows(size: int) -> int:
     """Return the number of cells from crown to base along the outline."""
     length = float(np.linalg.norm(np.diff(_HORIZONTAL_OUTLINE, axis=0), axis=1).sum())
+    # 0.127 is the mean of half width and half depth at the waist, where cells are about square.
     return max(8, count_cells(length, 2 * np.pi * 0.127 / size))

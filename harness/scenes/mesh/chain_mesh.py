@@ -24,9 +24,10 @@ def _require_nonzero(direction: tuple[float, float, float]) -> tuple[float, floa
 
 
 class ChainMesh(MeshGenerator):
-    """`size` vertices from the origin along `direction`; vertices and springs are numbered along the line.
+    """A chain of `size` vertices from the origin along `direction`.
 
-    Parts: first, last, ends. Mass is proportional to length. Dimension 1: every spring is a piece of the same rope.
+    Vertices and springs are numbered along the line. Parts: first, last, ends. Mass is proportional to length.
+    Dimension 1: every spring is a piece of the same rope.
     """
 
     kind: Literal["chain"] = "chain"

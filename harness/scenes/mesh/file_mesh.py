@@ -83,7 +83,9 @@ class FileMesh(SpringValueKeys):
     Without it the columns are the cell data of the file's lines."""
 
     def build_mesh(self, size: int = 0) -> Mesh:
-        """Build the file's mesh, ignoring the size; `mesh.spring_network` defines springs and masses.
+        """Build the file's mesh, ignoring the size.
+
+        Springs and masses are those of `springbench.harness.scenes.mesh.spring_network.build_spring_network`.
 
         Raises:
             InputError: for a file that is missing, malformed, empty or too large.
@@ -94,7 +96,7 @@ class FileMesh(SpringValueKeys):
         return self._add_spring_properties(build_spring_network(cells, rule, path), cells)
 
     def _add_spring_properties(self, mesh: Mesh, cells: MeshCells) -> Mesh:
-        """Add the values of springs, by the table or by the cell data of the file's lines that the keys name."""
+        """Add the values of springs from the table, or from the cell data of the file's lines."""
         columns, has_table = dict[str, NDArray[np.float64]](), self.spring_table is not None
         if self.spring_table is not None:
             table = read_data_table(self.spring_table)
@@ -134,7 +136,7 @@ def read_cells(path: Path) -> MeshCells:
 
 
 def _read_other_cells(path: Path) -> MeshCells:
-    """Read cells with meshio in a subprocess; raise InputError on any failure."""
+    """Read the cells of a file of any format except OBJ in a subprocess; raise InputError on any failure."""
     check_mesh_file(path)
     state = path.stat()
     found = _read_cached(path, state.st_mtime_ns, state.st_size)
@@ -162,7 +164,7 @@ def _read_other_cells(path: Path) -> MeshCells:
     )
 
 
-@lru_cache(maxsize=2)  # a scene builds its mesh several times, and a child takes a while to start
+@lru_cache(maxsize=2)  # a scene builds its mesh several times, and a subprocess starts slowly
 def _read_cached(path: Path, mtime_ns: int, size: int) -> MeshFileContent:
     """Read a mesh file, cached by path, modification time [ns] and size [bytes]."""
     limits = sandbox.CallLimits(
@@ -183,7 +185,7 @@ def _find_group_problem(found: MeshFileContent) -> str:
 
 
 def _find_cell_problem(points: np.ndarray, blocks: list[tuple[str, IndexArray]]) -> str:
-    """Describe what is wrong with meshio's points and cells; empty if they are valid."""
+    """Describe what is wrong with the points and cells of a file; empty if they are valid."""
     if points.ndim != 2 or not 1 <= points.shape[1] <= 3:
         return f"has points of shape {points.shape}; expected 1 to 3 coordinates each"
     if not np.all(np.abs(points) <= MAX_COORDINATE):

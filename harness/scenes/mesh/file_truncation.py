@@ -1,8 +1,8 @@
-"""Signs that a mesh file was cut before its end, by format.
+"""Detection of mesh files that were cut before their end, by format.
 
-A reader that fails on such a file reports a symptom: a shape, a decoding error. Some readers accept it, and VTK
-fills what is missing with arbitrary numbers. The checks count what the head of the file declares, or look for its end
-marker.
+A reader that fails on such a file reports a symptom, such as a shape or a decoding error. Some readers accept it, and
+VTK replaces the missing part by arbitrary numbers. The checks compare the contents with the counts that the head of the
+file declares, or look for its end marker.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ _VTK_COMPONENTS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9}
 
 
 def find_strict_truncation(suffix: str, content: bytes) -> str:
-    """Describe what a cut file lacks; empty for a complete one, and for formats without an end.
+    """Describe what a truncated file lacks; empty for a complete one, and for formats that are not checked.
 
     Args:
-        suffix: of the file, lower case.
-        content: of the file.
+        suffix: suffix of the file, lower case with the dot.
+        content: content of the file.
     """
     check = _STRICT_CHECKS.get(suffix)
     return check(content) if check else ""
@@ -110,10 +110,10 @@ class _VtkScan:
 
 
 def _find_cut_vtk(content: bytes) -> str:
-    """Compare the sections of a legacy VTK file with the numbers that follow them.
+    """Compare the counts that the sections of a legacy VTK file declare with the numbers that follow.
 
-    (VTK file formats, https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html)
-    Sections that are not in the table end the check.
+    The format is that of https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html. The check ends at
+    the first section of an unknown name.
     """
     if not content.startswith(b"# vtk DataFile"):
         return ""
@@ -185,4 +185,4 @@ _WEAK_CHECKS: dict[str, Callable[[bytes], str]] = {
     ".mesh": _find_missing_word(b"End", "End"),
     **dict.fromkeys((".nas", ".bdf", ".fem"), _find_missing_word(b"ENDDATA", "ENDDATA")),
 }
-"""Checks that some complete files fail, of files that cannot be read."""
+"""Checks that some complete files fail; they apply only to files that cannot be read."""

@@ -2,8 +2,8 @@
 # JSON and YAML have no types.
 """Reader of the geometry of glTF 2.0 files, `.gltf` and `.glb`: triangles and lines of the default scene.
 
-(Khronos, glTF 2.0 specification, https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html) Positions are transformed
-to the scene by the nodes. Materials, skins, morph targets and animations are skipped. Compressed and sparse data are
+The specification is https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html (Khronos). Positions are transformed to
+the scene by the nodes. Materials, skins, morph targets and animations are skipped. Compressed and sparse data are
 rejected.
 """
 
@@ -49,7 +49,8 @@ class GltfContent(NamedTuple):
 def read_gltf(path: Path) -> GltfContent:
     """Read a glTF file and the buffers in its folder.
 
-    Raise ValueError, or an exception of the standard library, if it is broken.
+    Raises:
+        ValueError: if the file is broken; some faults raise other exceptions of the standard library.
     """
     document, binary = _split_container(path.read_bytes())
     version = str(document.get("asset", {}).get("version", "2.0"))
@@ -201,12 +202,15 @@ def _read_transform(node: dict[str, Any]) -> FloatArray:
 
 
 def _split_primitive(corners: IndexArray, mode: int) -> IndexArray:
-    """Split the corners of a primitive into triangles (f, 3), lines (s, 2), or points (n, 1)."""
+    """Split the corners of a primitive into triangles (f, 3), lines (s, 2), or points (n, 1).
+
+    Modes of glTF: 0 points, 1 lines, 2 line loop, 3 line strip, 4 triangles, 5 triangle strip, 6 triangle fan.
+    """
     if mode == 4:
         return corners[: len(corners) // 3 * 3].reshape(-1, 3)
     if mode == 5:
         strip = np.column_stack([corners[:-2], corners[1:-1], corners[2:]])
-        strip[1::2, 1:] = strip[1::2, :0:-1]
+        strip[1::2, 1:] = strip[1::2, :0:-1]  # every second triangle has the opposite orientation
         return strip
     if mode == 6:
         return np.column_stack([np.full(max(len(corners) - 2, 0), corners[0]), corners[1:-1], corners[2:]])

@@ -1,4 +1,4 @@
-"""A mesh: rest positions, triangles for drawing and areas, springs by family."""
+"""A mesh: rest positions, triangles, and springs by family."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STRETCH, SHEAR, BEND = "stretch", "shear", "bend"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SpringProperties:
-    """Properties of springs that a mesh states itself.
+    """Properties of springs that the mesh defines.
 
     Attributes:
         stiffness: (m,) [N/m], NaN for springs whose stiffness an effect determines.
@@ -35,7 +35,7 @@ class Mesh:
         rest_positions: (n, 3) [m], also the initial positions.
         springs: (m, 2), vertex indices, in a fixed order.
         spring_families: STRETCH, SHEAR and BEND -> indices of their springs, a partition of range(m).
-        triangles: (f, 3), for pictures and wind, empty for a chain.
+        triangles: (f, 3), vertices of the surface; empty if there is none.
         mass_fractions: (n,), share of the total mass of each vertex, sums to 1.
         dimension: 1 chain and truss, 2 cloth, 3 solid.
         spacing: typical rest length h [m].
@@ -117,9 +117,9 @@ class Mesh:
 
 
 def sort_unique_vertices(vertices: NDArray[np.int64], n: int) -> NDArray[np.int64]:
-    """Return the sorted unique vertices of n.
+    """Return vertices in ascending order, each once.
 
-    `np.unique` would load `numpy.ma`, a tenth of the time of the command `list`.
+    `np.unique` would import `numpy.ma`, which takes a tenth of the time of the command `list`.
 
     Args:
         vertices: vertex indices below n, in any order.

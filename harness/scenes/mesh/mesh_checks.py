@@ -25,20 +25,20 @@ from springbench.harness.scenes.mesh.mesh_topology import (
 NO_VERTICES: IndexArray = np.empty(0, np.int64)
 
 _MIN_EXTENT, _MAX_EXTENT, _TYPICAL_EXTENT = 0.01, 20.0, 1.5
-"""Extents of cloth [m] that are plausible, and a typical one, by which a unit is guessed."""
+"""Smallest and largest plausible extent of cloth [m], and a typical one, from which a unit is guessed."""
 _GUESSED_UNITS = (("millimetres", 0.001), ("centimetres", 0.01), ("inches", 0.0254), ("kilometres", 1000.0))
 _FAR_RATIO = 1e5
 """Distance from the origin relative to the extent beyond which single precision loses the shape."""
 _NEAR_RATIO = 0.05
 """Distance of vertices, relative to their shortest edges, below which they nearly coincide."""
 _JUNCTION_RATIO = 1e-4
-"""Distance of a vertex from an edge, relative to the edge, below which it lies on it."""
+"""Distance of a vertex from an edge, relative to the edge's length, below which the vertex lies on the edge."""
 _SLIVER_RATIO = 50.0
 """Aspect ratio above which a triangle is a sliver."""
 _SHORT_RATIO = 0.01
 """Length of an edge relative to the median below which it is suspiciously short."""
 _MAX_INTERSECTION_TRIANGLES = 200_000
-"""Number of triangles above which self-intersections are not searched: it would take minutes."""
+"""Number of triangles above which self-intersections are not searched, because the search would take minutes."""
 
 
 class MeshFinding(NamedTuple):
@@ -74,7 +74,7 @@ class EdgeTable(NamedTuple):
         edges: (m, 2), the lower vertex first.
         side_edges: edge of each side of each triangle, (f, 3).
         is_forward: whether a side runs from the lower vertex to the higher, (f, 3).
-        num_triangles: of each edge, (m,).
+        num_triangles: number of triangles at each edge, (m,).
     """
 
     edges: IndexArray
@@ -160,11 +160,14 @@ def check_size(points: PointArray) -> list[MeshFinding]:
 
 
 def find_near_vertices(points: PointArray, pairs: IndexArray) -> tuple[IndexArray, PointArray]:
-    """Find pairs of vertices whose distance is a small fraction of their edges, (k, 2), with distances (k,) [m].
+    """Find pairs of vertices whose distance is a small fraction of their edges.
 
     Args:
-        points: (n, 3) [m].
-        pairs: edges (m, 2); vertices without an edge are compared with nothing.
+        points: positions (n, 3) [m].
+        pairs: edges (m, 2); vertices without an edge are ignored.
+
+    Returns:
+        The pairs (k, 2), without those that an edge joins, and their distances (k,) [m].
     """
     from scipy.spatial import cKDTree
 
@@ -179,7 +182,7 @@ def find_near_vertices(points: PointArray, pairs: IndexArray) -> tuple[IndexArra
     place = points[used]
     target = find_weld_targets(place, 0.0)
     same, first = np.flatnonzero(target != np.arange(len(used))), np.flatnonzero(target == np.arange(len(used)))
-    tree: Any = cKDTree(place[first])  # one for each place: a place may have a thousand vertices
+    tree: Any = cKDTree(place[first])  # one vertex for each place, because a thousand may coincide
     lists: list[list[int]] = tree.query_ball_point(place[first], radius[first]).tolist()
     i = np.repeat(first, [len(some) for some in lists])
     j = first[np.array([one for some in lists for one in some], np.int64)]
@@ -228,7 +231,7 @@ def _round_up(value: float) -> float:
 
 
 def find_t_junctions(points: PointArray, table: EdgeTable) -> tuple[IndexArray, IndexArray]:
-    """Find boundary vertices inside a boundary edge of which they are no end.
+    """Find boundary vertices in the interior of a boundary edge.
 
     Args:
         points: positions (n, 3) [m].
@@ -263,9 +266,9 @@ class OrientationCheck(NamedTuple):
     """Orientation of a surface.
 
     Attributes:
-        flipped: triangles against the majority of their part, (f,).
+        flipped: whether a triangle is oriented against the majority of its connected part, (f,).
         is_orientable: whether a consistent orientation exists.
-        is_consistent: whether the triangles have one.
+        is_consistent: whether the orientation of the triangles is consistent.
     """
 
     flipped: NDArray[np.bool_]
@@ -292,7 +295,7 @@ def check_orientation(table: EdgeTable) -> OrientationCheck:
 
 
 def _pair_sides(table: EdgeTable) -> tuple[IndexArray, IndexArray, NDArray[np.bool_]]:
-    """Return the two triangles of each manifold inner edge, and whether they run along it in opposite directions."""
+    """Return the two triangles of each manifold inner edge, and whether their orientations agree."""
     sides = table.side_edges.ravel()
     inner = np.flatnonzero(table.num_triangles[sides] == 2) if len(sides) else NO_VERTICES
     order = inner[np.argsort(sides[inner], kind="stable")].reshape(-1, 2)
@@ -378,7 +381,7 @@ def check_surface(points: PointArray, triangles: IndexArray) -> list[MeshFinding
 
 
 def _check_facing(points: PointArray, triangles: IndexArray, table: EdgeTable) -> list[MeshFinding]:
-    """Check that neighbours face the same side, and a closed surface outwards."""
+    """Check that neighbouring triangles face the same side, and that a closed surface faces outwards."""
     facing = check_orientation(table)
     if not facing.is_orientable:
         problem = "a surface has one side only (a Moebius strip, or faces joined so)"
@@ -417,7 +420,7 @@ def check_edges(points: PointArray, pairs: IndexArray) -> list[MeshFinding]:
 def check_self_intersections(points: PointArray, triangles: IndexArray) -> list[MeshFinding]:
     """Find triangles that pass through each other.
 
-    Joins in one place and T-junctions do not count.
+    Contact at coincident vertices and at T-junctions does not count.
 
     Args:
         points: positions (n, 3) [m].

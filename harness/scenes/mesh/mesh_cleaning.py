@@ -1,7 +1,7 @@
 """Cleaning of the cells of a mesh file: unit and up axis, welding, degenerate faces, unused vertices.
 
-Nothing happens without an option that requests it. The steps run in this order, and each one that changes cells logs
-how many. All lengths are in metres, after scaling.
+Each step is omitted unless an option requests it. The steps run in this order, and each logs how many cells it changed.
+All lengths are in metres, after scaling.
 
 A face is degenerate if it names a vertex twice, or if its corners lie on a line: the area is below
 FLAT_RATIO L^2 / 2, with L the longest distance from the first corner or along a side. Single-precision files store
@@ -130,8 +130,11 @@ def find_weld_targets(points: PointArray, distance: float) -> IndexArray:
     A cluster is connected by pairs of points within the distance.
 
     Args:
-        points: (n, 3) [m].
-        distance: [m], 0 for points in one place.
+        points: positions (n, 3) [m].
+        distance: welding distance [m], 0 for points in one place.
+
+    Raises:
+        ValueError: if the distance joins too many pairs of points.
     """
     from scipy.spatial import cKDTree  # imported only when vertices are welded
 
@@ -160,7 +163,7 @@ def _weld_vertices(cells: MeshCells, distance: float, path: Path) -> MeshCells:
 
 
 def _renumber_vertices(cells: MeshCells, remains: NDArray[np.bool_], number: IndexArray) -> MeshCells:
-    """Keep some of the vertices, remains (n,), under new numbers (n,); -1 for those that no cell uses."""
+    """Reduce cells to the vertices `remains` (n,), under new numbers (n,), -1 for vertices that no cell uses."""
     groups = {name: number[group] for name, group in cells.vertex_groups.items()}
     groups = {name: sort_unique_vertices(group[group >= 0], int(remains.sum())) for name, group in groups.items()}
     return replace(

@@ -1,9 +1,9 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 # meshio has no types.
-"""Mesh file readers that run in a subprocess: meshio's formats, and own readers of PLY, STL, OFF, .vtp and glTF.
+"""Mesh file readers that run in a subprocess: meshio, and the project's readers of PLY, STL, OFF, VTP and glTF.
 
-The subprocess is that of `springbench.harness.execution.sandbox`. meshio and VTK accept some truncated files as
-complete; `springbench.harness.scenes.mesh.file_truncation` recognises these.
+`springbench.harness.execution.sandbox` starts the subprocess. meshio and VTK accept some truncated files as complete;
+`springbench.harness.scenes.mesh.file_truncation` recognises these.
 """
 
 from __future__ import annotations
@@ -45,10 +45,12 @@ class MeshFileContent(NamedTuple):
     """Contents of a mesh file.
 
     Attributes:
-        points: (n, 3).
+        points: positions (n, d), with d from 1 to 3.
+        cell_blocks: blocks of cells of one kind.
         vertex_groups: points by group name.
         attributes: point data (n,); components of vectors have a number in their name, `normal.0`.
-        face_locations: line or number of each cell of a block.
+        face_locations: for each block, the line or the number of each cell.
+        location_unit: whether these are lines or numbers of faces.
         line_attributes: cell data of the cells `line`, in their order, each (lines,).
     """
 
@@ -67,7 +69,7 @@ class _MeshioCells(Protocol):
 
 
 class _MeshioMesh(Protocol):
-    """The part of meshio's result that is used."""
+    """The used part of meshio's result."""
 
     points: NDArray[Any]
     cells: list[_MeshioCells]
@@ -215,7 +217,7 @@ def _convert_polygons(read: ply_reader.PolygonContent) -> MeshFileContent:
 
 _VTK_POLYDATA = re.compile(rb"^DATASET\s+POLYDATA", re.M | re.I)
 _VTK_HEAD_BYTES = 2_000
-"""Bytes in which a legacy VTK file names its kind of data, behind a title of 256 characters at most."""
+"""Number of bytes that contain the kind of data of a legacy VTK file, after a title of at most 256 characters."""
 
 
 def _convert_legacy_polydata(path: Path) -> bytes:
@@ -281,7 +283,7 @@ def _collect_groups(raw: _MeshioMesh) -> dict[str, NDArray[np.int64]]:
     """Collect the points of named point sets and cell sets, and of Gmsh's physical groups."""
     found: dict[str, list[NDArray[Any]]] = {name: [np.asarray(some)] for name, some in raw.point_sets.items()}
     for name, sets in raw.cell_sets.items():
-        if name.startswith("gmsh:"):  # numbers of bounding entities, of no cells
+        if name.startswith("gmsh:"):  # these list bounding entities, not cells
             continue
         for block, some in zip(raw.cells, sets, strict=True):
             if some is not None:

@@ -1,4 +1,4 @@
-"""Report on a mesh file: what it contains, and what is suspicious, with places and remedies."""
+"""Report on a mesh file: its contents, and suspicious features with their places and remedies."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class MeshReport(NamedTuple):
         return {"file": str(self.path), **self.facts, "findings": found}
 
     def format_facts(self) -> list[tuple[str, str]]:
-        """Return what the file contains, as pairs of a name and words; the counts come first."""
+        """Return the contents of the file as pairs of a name and a text; the counts come first."""
         return [("contents", _format_counts(self.facts)), *_format_facts(self.facts)]
 
     def format_lines(self) -> Iterator[str]:
@@ -172,7 +172,7 @@ def find_mesh_remarks(mesh: Mesh, support: MeshSupport | None) -> list[MeshFindi
 
 
 def format_finding(finding: MeshFinding, numbering: Mesh | MeshCells) -> str:
-    """Format a finding with its first places; vertices by their numbers in the file.
+    """Format a finding with its first places, in which vertices have their numbers in the file.
 
     Args:
         finding: fault or remark, with its vertices, edges, triangles or faces.
@@ -198,7 +198,7 @@ def format_finding(finding: MeshFinding, numbering: Mesh | MeshCells) -> str:
 
 
 def _check_cells(cells: MeshCells) -> list[MeshFinding]:
-    """Check the cells as they are in the file for degenerate ones."""
+    """Find degenerate cells among the cells as they are in the file."""
     found: list[MeshFinding] = []
     remedy = "`faces: drop-degenerate` repairs this"
     repeated, flat = [NO_VERTICES], [NO_VERTICES]

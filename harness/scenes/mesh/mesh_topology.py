@@ -39,18 +39,18 @@ def build_offset_pairs(index: IndexArray, *offsets: tuple[int, ...]) -> IndexArr
 def build_lattice_triangles(index: IndexArray) -> IndexArray:
     """Build two triangles per cell of a lattice, (f, 3).
 
-    Cells are split from [r, c] to [r+1, c+1]; the normals are rows x columns.
+    Cells are split from [r, c] to [r+1, c+1]. Normals are the cross product of the directions of increasing r and c.
     """
     a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
     return np.stack([a, c, d, a, d, b], axis=1).reshape(-1, 3)
 
 
 def build_capped_triangles(rings: IndexArray, first: int, last: int) -> IndexArray:
-    """Build the triangles (f, 3) of a lattice of rings with two end points.
+    """Build the triangles (f, 3) of a lattice of rings that two end points close.
 
     Args:
         rings: vertices (r, k) of r rings; the last column equals the first.
-        first, last: end points next to the first and to the last ring.
+        first, last: end points next to the first ring and to the last one.
     """
     begin = np.column_stack([np.full(rings.shape[1] - 1, first), rings[0, :-1], rings[0, 1:]])
     end = np.column_stack([np.full(rings.shape[1] - 1, last), rings[-1, 1:], rings[-1, :-1]])
@@ -63,7 +63,8 @@ def sort_unique_pairs(pairs: IndexArray) -> IndexArray:
         return NO_PAIRS
     i, j = pairs.T
     base = int(pairs.max()) + 1
-    codes: IndexArray = np.sort(np.minimum(i, j) * base + np.maximum(i, j))  # np.unique hashes them, ten times slower
+    # np.unique would hash the codes, which is ten times slower.
+    codes: IndexArray = np.sort(np.minimum(i, j) * base + np.maximum(i, j))
     return np.stack(np.divmod(codes[np.diff(codes, prepend=-1) > 0], base), axis=1)
 
 
@@ -143,7 +144,7 @@ def lump_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArray:
 def find_connected_parts(num_vertices: int, pairs: IndexArray) -> IndexArray:
     """Return the number of the connected part of each vertex, (n,).
 
-    Parts are numbered by their first vertex.
+    Parts are numbered in the order of their first vertices.
 
     Args:
         num_vertices: n; a vertex without a pair is a part.
@@ -194,13 +195,13 @@ def assemble_mesh(
     file_numbers: IndexArray | None = None,
     attributes: Mapping[str, PointArray] | None = None,
 ) -> Mesh:
-    """Assemble a mesh from springs by family, (k, 2) each: first all STRETCH, then all SHEAR, then all BEND.
+    """Assemble a mesh from vertices and springs by family.
 
     Args:
         rest_positions: (n, 3) [m].
         springs: springs of each family, (k, 2) vertex indices.
         triangles: (f, 3) vertex indices; by default none.
-        vertex_weights: (n,), proportional to the vertex masses; by default half the length of the springs of each.
+        vertex_weights: (n,), proportional to the vertex masses; by default half the total length of adjacent springs.
         dimension: 1 chain and truss, 2 cloth, 3 solid.
         spacing: typical rest length [m]; by default the mean spring length.
         resolution: mesh size, usually vertices per side.
@@ -211,7 +212,7 @@ def assemble_mesh(
         attributes: vertex attributes, each (n,).
 
     Returns:
-        The mesh, whose springs are in the order of their families.
+        The mesh; its springs are those of STRETCH, then of SHEAR, then of BEND.
 
     Example:
         >>> import numpy as np

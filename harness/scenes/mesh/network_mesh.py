@@ -36,7 +36,8 @@ class NetworkMesh(SpringValueKeys):
     springs: VertexPairs = ()
     """Springs along the lines (stretch), as pairs of zero-based vertices."""
     spring_table: Path | None = None
-    """CSV or Parquet table of the springs instead of `springs`: columns `i` and `j`, zero-based vertices, and values"""
+    """CSV or Parquet table of the springs instead of `springs`: columns `i` and `j`, zero-based vertices, and values of
+    springs."""
     shear: VertexPairs = ()
     """Springs across cells."""
     bend: VertexPairs = ()
@@ -137,7 +138,7 @@ def _to_pairs(pairs: VertexPairs) -> NDArray[np.int64]:
 
 
 def _require_all(table: DataTable, name: str) -> NDArray[np.float64]:
-    """Return a column whose cells are all given."""
+    """Return a column; raise InputError if a cell of it is empty."""
     values = table.require_column(name)
     if np.isnan(values).any():
         raise table.make_error(f"{name} is empty; give each vertex one", int(np.isnan(values).argmax()))

@@ -1,6 +1,7 @@
-"""Reader of OFF files in text (Geomview): points and polygons; colours, normals and texture coordinates are ignored.
+"""Reader of OFF files in text (Geomview): points and polygons.
 
-One point or face a line. The word OFF may have the prefixes ST, C and N, and may be absent.
+Each point and each face is on its own line. The word OFF may have the prefixes ST, C and N, and may be absent. Colours,
+normals and texture coordinates are ignored.
 """
 
 from __future__ import annotations

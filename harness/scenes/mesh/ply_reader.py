@@ -171,7 +171,7 @@ class _TextBody:
 
     def __init__(self, body: bytes) -> None:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # NumPy warns of text that is no number
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy only warns if a text is no number
             try:
                 self._values = np.fromstring(body, np.float64, sep=" ") if body.strip() else np.empty(0)
             except (DeprecationWarning, ValueError):
@@ -202,7 +202,7 @@ class _TextBody:
         return self._read_unequal_rows(element, expected, begun)
 
     def _locate_properties(self, element: PlyElement) -> tuple[dict[str, int], int]:
-        """Locate the properties of the row that starts here, and the end of the row."""
+        """Locate the properties of the row at the current position, and the end of the row."""
         places, at, begun = dict[str, int](), self._position, self._position
         for one in element.properties:
             places.setdefault(one.name, at - begun)
@@ -276,7 +276,7 @@ class _BinaryBody:
         return self._read_unequal_rows(element, expected, begun)
 
     def _parse_length(self, element: PlyElement, one: PlyProperty) -> int:
-        """Read the length of the list that starts here, and advance past it."""
+        """Read the length of the list at the current position, and advance past it."""
         (value,) = self._read_values(element, one.length_type, 1).tolist()
         if not 0 <= value < 2**32 or value != int(value):
             raise ValueError(f"a list of its {element.name} has the length {value:g}; expected a whole number")

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from springbench.harness.scenes.mesh.mesh_topology import IndexArray, PointArray, lump_areas
 
 MAX_CONCAVE_CORNERS = 2_000
-"""Maximum number of corners: ear clipping searches all corners for each ear."""
+"""Maximum number of corners of a concave face, because ear clipping searches all corners for each ear."""
 _ROUNDOFF = 16.0 * float(np.finfo(np.float64).eps)
 """Round-off of an area, relative to coordinates times face size."""
 _EQUAL_TOLERANCE = 1e-6
@@ -140,9 +140,9 @@ def compute_vertex_areas(rest: PointArray, polygons: IndexArray, surface: Triang
 
 
 def find_repeated_rows(cells: IndexArray) -> IndexArray:
-    """Return the first cell with the same vertices for each cell (f, k).
+    """Return for each cell (f, k) the index of the first cell with the same vertices, (f,).
 
-    The order of vertices is ignored; a new cell yields its own index. Shape (f,).
+    The order of vertices is ignored.
     """
     rows = np.sort(cells, axis=1)
     order = np.lexsort(rows.T[::-1]) if len(rows) > 1 else np.arange(len(rows))  # stable: the first one leads
@@ -154,7 +154,14 @@ def find_repeated_rows(cells: IndexArray) -> IndexArray:
 
 
 class FaceCover(NamedTuple):
-    """Faces of `corners` corners, rows (c,), and the faces of `larger_corners` corners that contain them, rows (c,)."""
+    """Faces that are parts of larger faces.
+
+    Attributes:
+        corners: number of corners of the smaller faces.
+        rows: indices of these faces, (c,).
+        larger_corners: number of corners of the larger faces.
+        larger_rows: index of the larger face that contains each of them, (c,).
+    """
 
     corners: int
     rows: IndexArray
@@ -258,7 +265,7 @@ def _winds_once(flat: PointArray, slack: PointArray) -> NDArray[np.bool_]:
 
 
 def _has_crossing_sides(flat: PointArray, slack: PointArray) -> NDArray[np.bool_]:
-    """Return whether two sides of a closed path (f, k, 2) cross; touching does not count."""
+    """Return whether two sides of a closed path (f, k, 2) cross; contact without crossing does not count."""
     k = flat.shape[1]
     a, b, found = flat, np.roll(flat, -1, axis=1), np.zeros(len(flat), np.bool_)
     for shift in range(2, k // 2 + 1):
@@ -301,7 +308,7 @@ def _clip_ears(
         again = lost & (since[r] > 0) & rejected[r].any(axis=1)
         rejected[r[again]] = False
         since[r[again]] = 0
-        empty = left & (np.abs(turn[r]) <= slack[r, None])  # corners without area go where there is no ear
+        empty = left & (np.abs(turn[r]) <= slack[r, None])  # without any ear, corners without area are clipped
         ears = np.where((lost & ~again)[:, None], empty, ears)
         failed[r[lost & ~again & ~ears.any(axis=1)]] = True
         some = np.flatnonzero(ears.any(axis=1))

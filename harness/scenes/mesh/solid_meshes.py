@@ -135,8 +135,8 @@ class BlockMesh(MeshGenerator):
 
 
 def _lumped_lengths(n: int) -> PointArray:
-    """Return the share of the adjacent cells of each vertex on a line.
+    """Return the length that each of n vertices on a line represents, relative to a cell, (n,).
 
-    The product over the axes is the volume of a vertex.
+    The product over the axes is the volume that a vertex represents.
     """
     return np.where((np.arange(n) == 0) | (np.arange(n) == n - 1), 0.5, 1.0)

@@ -1,4 +1,4 @@
-"""Contents of a mesh file, cells on points, and their conversion to a spring network."""
+"""Contents of a mesh file as points and cells, and their conversion to a spring network."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class MeshCells:
         points: (n, 3) [m].
         polygons: number of corners k >= 2 -> (f, k).
         polygon_locations: k -> line of each polygon, (f,), or its number in the file.
-        location_unit: which of the two.
+        location_unit: whether `polygon_locations` are lines or numbers.
         segments: (s, 2).
         segment_locations: line of each segment, (s,), or empty.
         tetrahedra: (t, 4).
@@ -93,7 +93,7 @@ def describe_repeated_corner(num_corners: int) -> str:
 
 
 def check_mesh_file(path: Path, *, max_bytes: int = MAX_FILE_BYTES) -> None:
-    """Check that a file can be read and has a plausible content.
+    """Check that a file can be read, has a valid size, and is no pointer or web page.
 
     Args:
         path: the file.
@@ -204,7 +204,7 @@ class FaceTriangulation(NamedTuple):
         triangles: (f, 3).
         areas: vertex areas (n,) [m^2]; None if they are thirds of the triangles.
         crossed: place and number of corners of faces whose sides cross; these have no triangles.
-        repeats: places of faces that repeat another, or a part of it, and of that one.
+        repeats: pairs of places: a face that repeats another one or a part of it, and that other face.
         faces: number of corners k -> the triangulated faces (f, k), and their areas (f,) [m^2].
     """
 
@@ -254,7 +254,8 @@ def _sum_triangle_areas(points: PointArray, triangles: IndexArray) -> PointArray
 def _distribute_areas(surface: FaceTriangulation, springs: Mapping[str, IndexArray], num_vertices: int) -> PointArray:
     """Return the area that each spring represents, (m,) [m^2], sides first, then diagonals.
 
-    A side of a triangle has its area, a side of a face of k corners 2/k of it, the diagonals together four times it.
+    A side of a triangle represents the area of the triangle, and a side of a face of k corners 2/k of the face's area.
+    The diagonals of a face together represent four times its area.
     """
     pairs, shares = [NO_PAIRS], [np.empty(0)]
     for k, (faces, area) in surface.faces.items():
@@ -293,7 +294,7 @@ def _make_crossed_face_error(cells: MeshCells, path: Path, place: int, corners: 
 
 
 def _warn_repeated_faces(cells: MeshCells, path: Path, repeats: list[tuple[int, int]]) -> None:
-    """Warn about faces that repeat others; pairs of locations, the repetition first."""
+    """Warn about faces that repeat others, given as pairs of locations with the repetition first."""
     what = "line" if cells.location_unit == "line" else "face, counted from 0"
     listed = ", ".join(f"{place} repeats {other}" for place, other in repeats[:_MAX_REPEATS])
     more = f", and {len(repeats) - _MAX_REPEATS:,} more" if len(repeats) > _MAX_REPEATS else ""

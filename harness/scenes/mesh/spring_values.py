@@ -2,8 +2,8 @@
 # SciPy's and NumPy's stubs leave the types of some results unknown.
 """Rest length, stiffness and prestress of each spring of a network or a file's mesh.
 
-Of each spring at most one of its stiffness k and its axial stiffness EA is stated, and at most one of its rest length
-r, its tension T and its force density q = T / l, where l is the distance of its ends in the mesh:
+For each spring at most one of stiffness k and axial stiffness EA is stated, and at most one of rest length r, tension T
+and force density q = T / l, where l is the distance of its ends in the mesh:
 
     k = EA / r        r = l - T / k        r = l / (1 + T / EA)        T = q l
 
@@ -33,7 +33,7 @@ SpringFlags = bool | tuple[bool, ...] | ColumnName
 """One flag for all springs, a list with one for each, or the name of a column."""
 
 VALUE_KEYS = ("stiffness", "axial_stiffness", "rest_length", "tension", "force_density", "tension_only")
-"""Keys of the values of springs, also the names of the columns that are read without being named."""
+"""Keys of the values of springs, and the names of the columns that are read if no key names a column."""
 
 
 class SpringValueKeys(ConfigModel):
@@ -100,7 +100,7 @@ def match_table_rows(table: DataTable, springs: IndexArray, num_vertices: int) -
 
     Args:
         table: rows that name springs by their zero-based vertices, in any order.
-        springs: (m, 2); equal ones are taken in their order.
+        springs: vertices of each spring (m, 2); several springs of one pair are used in their order.
         num_vertices: number of vertices.
 
     Raises:
@@ -118,11 +118,14 @@ def match_table_rows(table: DataTable, springs: IndexArray, num_vertices: int) -
 
 
 def find_springs(pairs: IndexArray, springs: IndexArray) -> IndexArray:
-    """Return the spring (r,) that joins each pair of vertices (r, 2), -1 if there is none, or no further one.
+    """Find the spring that joins each pair of vertices.
 
     Args:
-        pairs: (r, 2), in either direction.
-        springs: (m, 2); several springs of one pair are taken in their order.
+        pairs: pairs of vertices (r, 2), in either direction.
+        springs: vertices of each spring (m, 2); several springs of one pair are used in their order.
+
+    Returns:
+        Index of the spring of each pair (r,); -1 if there is none, or each is used by an earlier pair.
     """
     numbers = dict[tuple[int, int], list[int]]()
     for number, (i, j) in reversed(list(enumerate(np.sort(springs, axis=1).tolist()))):

@@ -11,9 +11,9 @@ from springbench.harness.scenes.mesh.mesh_topology import assemble_mesh, lump_le
 
 
 class StarMesh(MeshGenerator):
-    """The hub, vertex 0, at the origin, and `size` vertices on a horizontal circle; a spring from the hub to each.
+    """A hub at the origin, and springs from it to `size` vertices on a horizontal circle.
 
-    Parts: hub, rim. Mass is proportional to length, so the hub has half of it. Dimension 1.
+    The hub is vertex 0. Parts: hub, rim. Mass is proportional to length, so the hub has half of it. Dimension 1.
     """
 
     kind: Literal["star"] = "star"

@@ -1,6 +1,7 @@
-"""Reader of STL files, text or binary: triangles whose corners in one place are one vertex, in order of appearance.
+"""Reader of STL files, text or binary.
 
-Binary files may begin with `solid` too; their size, and the absence of facets in words, distinguish them. Bytes behind
+Corners of triangles in one place become one vertex; vertices are numbered in the order of their appearance. Binary
+files may begin with `solid` too; their size, and the absence of the words of a text file, distinguish them. Bytes after
 the declared triangles are ignored.
 """
 

@@ -1,7 +1,7 @@
 """Reader of VTK's XML files of surfaces and lines (.vtp): text, base64 or raw, compressed or not.
 
-(VTK file formats, https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html) Polygons, strips and lines
-of all pieces are read, and point data; vertex cells are ignored.
+The format is that of https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html. The reader returns
+polygons, strips and lines of all pieces, point data, and the cell data of lines; vertex cells are ignored.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ class VtpContent(NamedTuple):
 def read_vtp(content: bytes) -> VtpContent:
     """Read the contents of a .vtp file.
 
-    Raise ValueError, or an exception of the standard library, if it is broken.
+    Raises:
+        ValueError: if the file is broken; some faults raise other exceptions of the standard library.
     """
     found = _APPENDED_DATA.search(content)
     if found:
@@ -134,7 +135,7 @@ class _DataArrays:
         if (kind := array.get("type", "")) not in _NUMPY_TYPES:
             raise ValueError(f"has numbers of type {kind!r}; expected one of {', '.join(_NUMPY_TYPES)}")
         dtype, form = np.dtype(self._order + _NUMPY_TYPES[kind]), array.get("format", "ascii")
-        text = "".join([array.text or "", *(child.tail or "" for child in array)])  # children state its range
+        text = "".join([array.text or "", *(child.tail or "" for child in array)])  # the children are ranges
         if form == "ascii":
             return np.array(text.split(), dtype)
         if form == "appended":
@@ -166,7 +167,11 @@ class _DataArrays:
 
 
 def _read_bytes(source: bytes, at: int, count: int, *, raw: bool) -> tuple[bytes, int]:
-    """Read `count` bytes from an offset; return them and their end, raise ValueError if there are fewer."""
+    """Read `count` bytes from an offset; return them and the offset of their end.
+
+    Raises:
+        ValueError: if the source has fewer bytes.
+    """
     end = at + (count if raw else 4 * -(-count // 3))
     part = source[at:end]
     found = part if raw else base64.b64decode(part)[:count]
