@@ -33,7 +33,7 @@ def list_template_files() -> list[Path]:
 
 
 def find_shipped_scene(name: str) -> Path | None:
-    """Find a shipped scene by its name, with or without its folder; None if there is none."""
+    """Find a shipped scene by its name, with or without the folder; None if it is missing."""
     shipped = list_shipped_configs()
     return shipped.get(f"{SCENE_FOLDER}/{name}") or (shipped.get(name) if "/" in name else None)
 
@@ -59,7 +59,7 @@ def suggest_shipped_scene(name: str) -> str:
 
 
 def locate_config(name: str | Path) -> Path:
-    """Return the path of a config that is given by a path, or by the name of a shipped one.
+    """Return the path of a config, given by a path or a shipped name.
 
     Args:
         name: path of a file; or name of a shipped config, if there is no such file.
