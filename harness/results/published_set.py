@@ -163,7 +163,7 @@ _MAX_CONFIG_PATH = 1000
 
 
 def _find_wrong_key(metadata: Any) -> str:
-    """Return the first key of `study.json` that commands need and that is missing or has a wrong value."""
+    """Return the first required key of `study.json` that is missing or has a wrong value."""
     if not isinstance(metadata, dict):
         return "config"
     keys = cast("dict[str, Any]", metadata)

@@ -16,12 +16,18 @@ class RegressionVerdict(StrEnum):
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a command that ends with this verdict; 2 stands for a mistake of the user."""
+        """Exit code of a command that ends with this verdict.
+
+        It is never 2, the exit code for a mistake of the user.
+        """
         return {RegressionVerdict.PASS: 0, RegressionVerdict.FAIL: 1, RegressionVerdict.INCONCLUSIVE: 3}[self]
 
 
 def combine_verdicts(verdicts: Iterable[RegressionVerdict]) -> RegressionVerdict:
-    """Return FAIL if any test fails, else PASS if there are tests and all pass, else INCONCLUSIVE."""
+    """Combine the verdicts of several tests.
+
+    The result is FAIL if any test fails, PASS if there are tests and all pass, and INCONCLUSIVE otherwise.
+    """
     found = set(verdicts)
     if RegressionVerdict.FAIL in found:
         return RegressionVerdict.FAIL

@@ -291,7 +291,7 @@ def list_settings(given: Sequence[StepSetting], num_doublings: int) -> list[Step
 
 
 def find_doubled(settings: Iterable[StepSetting], given: StepSetting, name: str) -> StepSetting | None:
-    """Find the setting that differs from a given one in one number, which is at least twice as large.
+    """Find a setting with one number at least twice that of a given one, and the other equal.
 
     Args:
         settings: settings of a map.
@@ -338,7 +338,7 @@ def parse_setting(text: str) -> StepSetting:
 
 
 def _extend_numbers(numbers: Iterable[int], num_doublings: int) -> list[int]:
-    """Extend numbers by powers of two below the smallest and above the largest; 0 is not extended."""
+    """Extend numbers by halving the smallest and doubling the largest repeatedly; 0 is not extended."""
     known = set(numbers)
     if 0 in known:
         return [0]

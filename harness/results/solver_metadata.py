@@ -1,4 +1,7 @@
-"""Metadata of solvers as columns of rows, so that reports need not import the solvers, which may be user code."""
+"""Metadata of solvers as columns of rows.
+
+Reports read these columns and need not import the solvers, which may be user code.
+"""
 
 from __future__ import annotations
 

@@ -60,7 +60,10 @@ def group_runs(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[Any, ...], list[
 
 
 def build_run_key(run: RunRows) -> tuple[Any, ...]:
-    """Build the key of a run on any machine: `RUN_KEYS`, and the number of frames of a completed run."""
+    """Build the key that identifies a run on any machine.
+
+    It consists of the values of `RUN_KEYS`, and the number of frames of a completed run.
+    """
     frames = max(row["frame"] or 0 for row in run) if run[0]["status"] == "ok" else 0
     return (*(run[0][name] for name in RUN_KEYS), frames)
 
