@@ -79,7 +79,10 @@ class ConfigDocument:
         self.mistakes.append(InputMistake(problem, self.path, line, format_key(at)))
 
     def add_errors(self, error: InputError) -> None:
-        """Add the mistakes of an error; mistakes without a file are located by their key in this document."""
+        """Add the mistakes of an error.
+
+        A mistake without a file is located in this document by its key.
+        """
         for mistake in error.mistakes:
             if mistake.file is None:
                 self.add_mistake(mistake.problem, tuple(mistake.key.split(".")) if mistake.key else ())
