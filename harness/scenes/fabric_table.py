@@ -128,7 +128,14 @@ def fill_effect(effect: Any, name: str, warp: Vector3 | None = None) -> Any:
 
 
 class PlausibleRange(NamedTuple):
-    """Range of a quantity in the table, and questions about the likely mistake in a value far outside it."""
+    """Range of a quantity in the table.
+
+    Attributes:
+        quantity: name of the quantity, for messages.
+        unit: unit of the quantity.
+        low, high: smallest and largest value in the table.
+        if_small, if_large: question about the likely mistake in a value far below or above the range.
+    """
 
     quantity: str
     unit: str

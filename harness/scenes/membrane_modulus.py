@@ -136,7 +136,10 @@ def compute_membrane_modulus(mesh: Mesh, springs: NDArray[np.int64], stiffness: 
 
 
 class _SurfaceNetwork:
-    """Springs of a mesh, linear about the rest shape, with displacements in the surface, or in space for solids."""
+    """Springs of a mesh, linearised about the rest shape.
+
+    Displacements are in the surface, or in space for solids.
+    """
 
     def __init__(self, mesh: Mesh, springs: NDArray[np.int64], stiffness: FloatArray) -> None:
         from scipy.sparse import csr_array  # imported only for materials by areas
@@ -204,7 +207,10 @@ def _is_planar(mesh: Mesh) -> bool:
 
 
 def _compute_tangent_frames(mesh: Mesh) -> FloatArray:
-    """Return two orthonormal tangents of each vertex, (n, 2, 3), the first one along the vertical or along x."""
+    """Return two orthonormal tangents of each vertex, (n, 2, 3).
+
+    The first one is along the vertical, or along x where most of the surface is horizontal.
+    """
     a, b, c = (mesh.rest_positions[mesh.triangles[:, k]] for k in range(3))
     area, normals = np.cross(b - a, c - a), np.zeros_like(mesh.rest_positions)
     for k in range(3):

@@ -1,4 +1,7 @@
-"""Builder of the simulated system of a scene for a mesh size, with only the terms that the scene requires."""
+"""Builder of the simulated system of a scene for a mesh size.
+
+The system has only the terms that the scene requires.
+"""
 
 from __future__ import annotations
 
@@ -268,7 +271,7 @@ def _require_unique(spec: SceneSpec, parts: list[EffectContribution]) -> None:
 
 
 def _require_end_of_step_stages(parts: list[EffectContribution], method: integrators.AnyIntegrator, name: str) -> None:
-    """Raise InputError if an effect requires stages at the end of the step and the integrator has others."""
+    """Raise InputError if an effect requires stages at the end of the step, unlike the integrator."""
     there = [
         n
         for n, known in integrators.INTEGRATORS.items()

@@ -156,7 +156,10 @@ _OPTIONAL_SELECTORS = {"sphere", "nearest_to", "boundary_loops", "holes", "attri
 
 
 def find_selections(effect: Any) -> Iterator[tuple[str, VertexSelection]]:
-    """Yield the selections of an effect: the effect if it is one, with the name "", and those in its fields."""
+    """Yield the vertex selections of an effect, with their names.
+
+    These are the effect itself if it is a selection, with the name "", and the fields that are selections.
+    """
     if isinstance(effect, VertexSelection):
         yield "", effect
     for key, value in effect:

@@ -159,7 +159,11 @@ class SpringsEffect(ConfigModel):
 
 
 def _require_stretch(stretch: StretchConstant | None, mesh: Mesh) -> StretchConstant:
-    """Return the constant of the springs along the lines; raise InputError if it is missing or has no effect."""
+    """Return the constant of the springs along the lines.
+
+    Raises:
+        InputError: if it is missing or has no effect.
+    """
     along, own = mesh.spring_families[STRETCH], mesh.spring_properties
     stated = np.zeros(len(along), np.bool_) if own is None else ~np.isnan(own.stiffness[along])
     if stretch is not None:

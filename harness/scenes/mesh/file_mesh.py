@@ -136,7 +136,7 @@ def read_cells(path: Path) -> MeshCells:
 
 
 def _read_other_cells(path: Path) -> MeshCells:
-    """Read the cells of a file of any format except OBJ in a subprocess; raise InputError on any failure."""
+    """Read the cells of a file in a subprocess, except OBJ; raise InputError on any failure."""
     check_mesh_file(path)
     state = path.stat()
     found = _read_cached(path, state.st_mtime_ns, state.st_size)

@@ -23,7 +23,7 @@ _VTK_COMPONENTS = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9}
 
 
 def find_strict_truncation(suffix: str, content: bytes) -> str:
-    """Describe what a truncated file lacks; empty for a complete one, and for formats that are not checked.
+    """Describe what a truncated file lacks; empty for a complete or an unchecked one.
 
     Args:
         suffix: suffix of the file, lower case with the dot.

@@ -1,9 +1,10 @@
 # pyright: reportMissingTypeStubs=false, reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownVariableType=false
 # meshio has no types.
-"""Mesh file readers that run in a subprocess: meshio, and the project's readers of PLY, STL, OFF, VTP and glTF.
+"""Readers of mesh files that run in a subprocess.
 
-`springbench.harness.execution.sandbox` starts the subprocess. meshio and VTK accept some truncated files as complete;
-`springbench.harness.scenes.mesh.file_truncation` recognises these.
+They are meshio, and the project's readers of PLY, STL, OFF, VTP and glTF. `springbench.harness.execution.sandbox`
+starts the subprocess. meshio and VTK accept some truncated files as complete, which
+`springbench.harness.scenes.mesh.file_truncation` recognises.
 """
 
 from __future__ import annotations
@@ -183,9 +184,9 @@ def _read_with_meshio(path: Path) -> _MeshioMesh:
 
 
 def _tag_ungrouped_entities(read_entities: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a reader of Gmsh entities so that entities without a physical group get the tag 0, which means none.
+    """Wrap a reader of Gmsh entities: those without a physical group get the tag 0.
 
-    meshio counts blocks of cells incorrectly if some entities have no tag at all.
+    The tag 0 means no group. meshio counts blocks of cells incorrectly if some entities have no tag at all.
     """
 
     def read(*arguments: Any) -> Any:

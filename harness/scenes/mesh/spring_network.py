@@ -274,7 +274,7 @@ def _distribute_areas(surface: FaceTriangulation, springs: Mapping[str, IndexArr
 
 
 def _sum_by_pair(springs: IndexArray, pairs: IndexArray, values: PointArray, num_vertices: int) -> PointArray:
-    """Sum values of pairs (p, 2) to the springs (m, 2) of these vertices, (m,); other pairs are ignored."""
+    """Sum the values (p,) of pairs (p, 2) that are springs (m, 2), for each spring, (m,)."""
     codes, expected = (np.sort(some, axis=1) @ [num_vertices, 1] for some in (springs, pairs))
     order = np.argsort(codes, kind="stable")
     if not len(order):

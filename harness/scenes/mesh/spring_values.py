@@ -181,7 +181,10 @@ def _resolve_values(
     q: NDArray[np.float64],
     flags: NDArray[np.float64],
 ) -> SpringProperties:
-    """Compute stiffness and rest length of each spring; all arguments are (m,), NaN for values that are not stated."""
+    """Compute the stiffness and the rest length of each spring.
+
+    All arguments are of shape (m,), with NaN for values that are not stated.
+    """
     has_k, has_ea, has_r, has_t, has_q = (~np.isnan(x) for x in (k, ea, r, t, q))
     _require(~(has_k & has_ea), "has a `stiffness` too; give one of the two", "axial_stiffness")
     _require(~(has_r & has_t), "has a `rest_length` too; give one of the two", "tension")

@@ -137,7 +137,9 @@ def _build_icosahedron() -> tuple[PointArray, IndexArray]:
 
 
 def _divide_faces(faces: IndexArray, size: int) -> tuple[IndexArray, IndexArray, IndexArray]:
-    """Subdivide faces into points in the order of (i, j), i + j <= size, i towards corner 1, j towards corner 2.
+    """Subdivide the faces of an icosahedron into points and triangles.
+
+    The points of a face are in the order of (i, j), i + j <= size, with i towards corner 1 and j towards corner 2.
 
     Returns:
         The vertices of the points (20, t), their weights of the face's corners (t, 3), which sum to `size`, and
