@@ -18,8 +18,8 @@ IndexArray = NDArray[np.int64]
 class SewingEffect(ConfigModel):
     """Threads that pull two rows of vertices together.
 
-    Each vertex of either row has a thread to the nearest vertex at rest of the other row. A thread pulls if it is longer
-    than its current limit, which decreases linearly from `start_time` to `end_time`; it never pushes.
+    Each vertex of either row has a thread to the nearest vertex at rest of the other row. A thread pulls if it is
+    longer than its current limit, which decreases linearly from `start_time` to `end_time`; it never pushes.
     """
 
     max_convergence_order: ClassVar[float] = 1.0
