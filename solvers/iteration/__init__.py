@@ -1,1 +1,1 @@
-"""Shared parts of the methods: objective, descent, line search, saddle points, spring forms, vertex terms."""
+"""Shared parts of the methods: iteration loop, descent, preconditioners, saddle check, vertex terms."""

@@ -1,11 +1,10 @@
-"""The base of methods with exact gradients: points, and a line search that distinguishes descent from round-off.
+"""The base of methods with exact gradients: points and a line search.
 
 The line search halves a step until the objective decreases enough
-(`springbench.solvers.kernels.line_search_conditions`). The
-change of the objective is computed from differences (see `springbench.solvers.kernels.objective_kernels`), so that
-the search works
-until the gradient itself is round-off. The rounding error of other energies' values is taken into account; within it
-the slope must decrease instead.
+(`springbench.solvers.kernels.line_search_conditions`). The change of the objective is computed from differences (see
+`springbench.solvers.kernels.objective_kernels`), so that the search works until the gradient itself is round-off. The
+rounding error of other energies' values is taken into account: if the change is within it, the slope must decrease
+instead.
 """
 
 from __future__ import annotations
@@ -73,9 +72,7 @@ class DescentMethod(Protocol):
         ...
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
-        """Return whether a stationary point may be a minimum.
-
-        It may be one as far as the method can determine.
+        """Return whether a stationary point may be a minimum; False for a recognised saddle point.
 
         Args:
             step: the objective.
@@ -116,8 +113,9 @@ def backtracking_line_search(
         directional_curvature: second derivative along the direction [J], if a decrease is expected from it.
         relax_locally: relaxation that lowers the objective from given positions; its result is tried first at each
             point.
-        uses_rounded_slope: whether a decrease is also sufficient if it is by the slope along the rounded displacement:
-            the rounding of positions may absorb most of a displacement, as at stiff pins.
+        uses_rounded_slope: whether a decrease is also sufficient if it satisfies Armijo's condition with the slope
+            along the rounded displacement. The rounding of positions may absorb most of a displacement, for example at
+            stiff pins.
         slope: derivative along the direction [J], if it is known.
     """
     slope = inner_product(at.gradient, direction) if slope is None else slope
@@ -222,7 +220,10 @@ class ResidualMetric:
             self.stats["nnz_factor"] = float(self.factor.nonzeros)
 
     def energy_roundoff(self, p: Positions) -> float:
-        """Return a bound of g H^-1 g [J] for a gradient g due to rounding of the positions p (n, 3)."""
+        """Return a bound of g' H^-1 g [J] for a gradient g that is round-off.
+
+        The round-off is due to the rounding of the positions p (n, 3).
+        """
         return (EPS * objective_kernels.compute_max_magnitude(p)) ** 2 * self.unpinned_trace
 
     def significant_vertices(self, p: Positions, decrease: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -265,12 +266,12 @@ class ResidualMetric:
             e: correction Q^-1 g (n, 3) [m], overwritten.
             gradient: gradient g (n, 3) [N].
         """
-        if not self._has_penalty_pins:  # then |Q^-1 g|_Q is what g does along it
-            return max(inner_product(e, gradient), 0.0) ** 0.5  # in this order, so that NaN remains
+        if not self._has_penalty_pins:  # e vanishes at exact pins, so that |e|_Q^2 = e'g
+            return max(inner_product(e, gradient), 0.0) ** 0.5  # this order of arguments returns NaN for NaN
         e[self.system.pins.vertices] = 0.0
         product = np.empty_like(e)
         self._multiply_matrix.call(self._Q.indptr, self._Q.indices, self._Q.data, e, product)
-        return sqrt(max(inner_product(e, product), 0.0))  # in this order, so that NaN remains
+        return sqrt(max(inner_product(e, product), 0.0))  # this order of arguments returns NaN for NaN
 
 
 @dataclass(frozen=True, eq=False)

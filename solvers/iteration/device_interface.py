@@ -1,7 +1,7 @@
 """Options and interfaces for methods that run on the processor or on a device.
 
-A method that supports both inherits `DeviceOptions` or `PrecisionOptions`, and delegates its `prepare` to its file in
-`springbench.solvers.cuda`, which is imported only if a device is requested.
+A method that supports both inherits `DeviceOptions` or `PrecisionOptions`. For a device, its `prepare` delegates to the
+module `device_*` of the method, which is imported only then.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ SIMULATOR_NAME = "Numba's simulator, no device"
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceOptions:
-    """The option where to compute.
+    """The option that selects the processor or a device.
 
     Attributes:
         device: processor or device.
@@ -35,7 +35,10 @@ class DeviceOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class PrecisionOptions(DeviceOptions):
-    """The precision of device kernels, float32 by default, with residuals in float64; the processor uses float64."""
+    """The precision of device kernels, float32 by default.
+
+    Residuals are in float64, and so are all computations of the processor.
+    """
 
     precision: Literal["float32", "float64"] | None = None
 
@@ -96,13 +99,13 @@ class PreparedDeviceSolver(Protocol):
         ...
 
     def iterates_without_copy(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
-        """Yield the iterates of `iterates` when computed, as callables that copy them."""
+        """Yield the iterates of `iterates` as callables, each of which copies one to the host."""
         ...
 
 
 def device_columns_of(prepared: object) -> dict[str, Any]:
     """Return the columns that describe a prepared solver's device; empty for one on the processor."""
-    usual = getattr(prepared, "usual", prepared)  # of two systems
+    usual = getattr(prepared, "usual", prepared)  # a solver of two systems has the device solver as this attribute
     return dict(usual.device_columns) if isinstance(usual, PreparedDeviceSolver) else {}
 
 

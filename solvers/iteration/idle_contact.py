@@ -3,7 +3,7 @@
 A step with barrier energies is first solved by the method without them, with the same kernels as in a scene without
 contact. Its solution q is one of the step with contact too if barriers vanish at q and the straight path from the
 initial guess to q is free of collisions: there the gradient and the Hessian of barriers vanish as well. One certificate
-a step replaces those of all iterates. Otherwise, and if a barrier acts at the initial guess, the method with contact
+per step replaces those of all iterates. Otherwise, and if a barrier acts at the initial guess, the method with contact
 solves the step from the initial guess.
 
 The k-th iterate is that of the method without contact where its certificate is valid, else that of the method with
@@ -107,7 +107,9 @@ class IdleContactSolver:
 def skip_idle_contact(
     with_contact: ResidualSolver, system: System, prepare_contact_free: Callable[[], PreparedSolver]
 ) -> PreparedSolver:
-    """Return the method that ignores barrier energies where they vanish; itself for a system without them.
+    """Return the method that ignores barrier energies where they vanish.
+
+    For a system without barrier energies it is the given method.
 
     Args:
         with_contact: the method, prepared for the system.
@@ -127,12 +129,18 @@ class _Certificate:
         self._energies: list[BarrierEnergy] = [energy for energy in problem.energies if is_barrier_energy(energy)]
 
     def may_be_idle(self) -> bool:
-        """Return whether barriers vanish at the initial guess, and at the positions of the initial residual."""
+        """Return whether barriers vanish at the initial guess and at the current positions.
+
+        The initial residual is computed at the latter.
+        """
         guess, current = self._problem.initial_guess, self._problem.current_positions
         return self._vanish_at(guess) and (current is guess or self._vanish_at(current))
 
     def is_idle_at(self, p: Positions) -> bool:
-        """Return whether barriers vanish at p (n, 3) and the path from the initial guess is free of collisions."""
+        """Return whether contact makes no difference to a step that ends at p (n, 3).
+
+        That is the case if barriers vanish at p and the path from the initial guess is free of collisions.
+        """
         direction = p - self._problem.initial_guess
         return (
             bool(np.isfinite(direction).all())

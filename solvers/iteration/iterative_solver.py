@@ -99,7 +99,10 @@ class SolverState(ABC):
 
     @property
     def solver_phases(self) -> Mapping[str, tuple[int, float]] | None:
-        """Iterations and counted cost of each method so far, for a solver that switches between several."""
+        """Iterations and counted cost of each method so far.
+
+        It is None for a solver that does not switch between methods.
+        """
         return None
 
     @abstractmethod
@@ -107,7 +110,10 @@ class SolverState(ABC):
         """Do one iteration; return False if round-off prevents descent and the positions do not change."""
 
     def compute_start_residual(self) -> float | None:
-        """Return the residual at the initial guess [J^(1/2)] before any iteration, None if it costs extra work."""
+        """Return the residual at the initial guess [J^(1/2)] before any iteration.
+
+        It is None if it costs extra work.
+        """
         return self.start_residual
 
     def residual(self) -> float:
@@ -119,7 +125,7 @@ class SolverState(ABC):
         return float("nan")
 
     def can_terminate(self) -> bool:
-        """Return whether the iterate may be a minimum if it is stationary; a saddle point returns False."""
+        """Return whether a stationary iterate may be a minimum; False for a saddle point."""
         return True
 
     def run_unchecked(self, num_iterations: int) -> int:
@@ -134,8 +140,10 @@ class SolverState(ABC):
         return 1
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Iterate up to the limits; return count, residual and reason, see
-        `springbench.solvers.kernels.iteration_loop`."""
+        """Iterate up to the limits; return count, residual and reason.
+
+        See `springbench.solvers.kernels.iteration_loop`.
+        """
         return _interpreted_loop(self, limits)
 
 
@@ -145,7 +153,9 @@ _interpreted_loop = iteration_loop.build_loop(
 
 
 class IterativeSolver(ABC):
-    """A method after the setup for a system; with `description` and `stats` it is a `PreparedSolver`.
+    """A method after the setup for a system.
+
+    With `description` and `stats` it is a `PreparedSolver`.
 
     Attributes:
         residual_iterate: the iterate of the residuals. It is "previous" for a method that computes them in its
@@ -228,6 +238,7 @@ class IterativeSolver(ABC):
                 limit, close = max(limit, stop.rtol * initial_residual), stop.rtol <= _MINIMUM_CHECK_RTOL
             limits = LoopLimits(stop.max_iterations, limit, near, iteration_loop.RESIDUAL_EACH)
         count, residual, ended = self._iterate_to_roundoff(run, problem, limits, stop.roundoff_floor)
+        # A method that recognises saddles continues from them by itself.
         while close and _has_converged(ended) and not run.can_terminate():
             left = limits._replace(max_iterations=stop.max_iterations - count)
             more, residual, ended = self._iterate_to_roundoff(run, problem, left, stop.roundoff_floor)
@@ -235,6 +246,7 @@ class IterativeSolver(ABC):
             if not more and ended != iteration_loop.REASON_ITERATIONS:
                 ended = iteration_loop.REASON_STALLED
         reason = _TERMINATION_REASONS[ended]
+        # Other methods restart from a lower point along negative curvature, which counts as an iteration.
         while (close and _has_converged(ended)) or ended == iteration_loop.REASON_STALLED:
             lower = self._find_lower_point(problem, run.positions, count)
             if lower is None:
@@ -262,11 +274,14 @@ class IterativeSolver(ABC):
         return found
 
     def release_state(self, run: SolverState) -> None:
-        """Take back the state of a solve that has ended, for a method whose next solve reuses it."""
+        """Recycle the state of a finished solve.
+
+        A method whose next solve reuses the state overrides this.
+        """
         return
 
     def _find_lower_point(self, problem: StepProblem, p: Positions, num_iterations: int) -> Positions | None:
-        """Return a point to which negative curvature leads from the end point p of a solve, or None."""
+        """Return a point lower than a saddle at the end point p of a solve, or None."""
         system = problem.system
         if self.identifies_saddles or self.residual_iterate == "none" or system.length_constraints:
             return None
@@ -333,9 +348,10 @@ class IterativeSolver(ABC):
         return lambda p: self.residual_at(problem, p)
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] of a mean displacement as large as the initial guess's largest coordinate.
+        """Return the scale of residuals [J^(1/2)] for the round-off check; 0 disables the check.
 
-        The check for round-off begins at a small fraction of it; 0 disables the check.
+        It is the residual of a mean displacement as large as the initial guess's largest coordinate. The check begins
+        at a small fraction of it.
         """
         return 0.0
 
@@ -379,14 +395,20 @@ def _has_converged(ended: int) -> bool:
 
 
 def is_far_from_origin(p: Positions) -> bool:
-    """Return whether coordinates (n, 3) [m] are so large that their rounding dominates that of their differences."""
+    """Return whether the rounding of coordinates dominates that of their differences.
+
+    This depends on the ratio of the largest coordinate of p (n, 3) [m] to the extent of p.
+    """
     return (
         bool(np.abs(p).max(initial=0.0) > _FAR_ORIGIN_RATIO * np.ptp(p, axis=0).max(initial=0.0)) if len(p) else False
     )
 
 
 def compute_max_coordinate(problem: StepProblem) -> float:
-    """Return the largest coordinate [m] of the initial guess, with exactly pinned vertices on their targets."""
+    """Return the largest coordinate [m] of the initial guess.
+
+    Exactly pinned vertices are on their targets.
+    """
     p, (indices, vertices) = problem.initial_guess, problem.system.exact_pins
     if len(vertices):
         p = p.copy()

@@ -51,7 +51,7 @@ def build_preconditioner(
     Args:
         name: name of the preconditioner.
         metric: Q, whose factor is the preconditioner or whose diagonal regularises its blocks.
-        objective: the objective, whose other energies must be barriers for a preconditioner of the clamped Hessian.
+        objective: the objective. Except for `cholesky`, its energies without elements must be barriers.
         solver: name of the solver, for the message.
 
     Raises:
@@ -162,9 +162,14 @@ def assemble_diagonal_blocks(step: StepObjective, hessian: Hessian, p: Positions
 
 
 def _diagonal_block_indices(number: NDArray[np.int64], vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the diagonal blocks of elements with vertices (m, k), as (m, k^2), -1 off the diagonal.
+    """Return the indices of the diagonal blocks of elements, -1 for the other blocks.
 
-    The block is the vertex's index (n + 1,), whose last entry is for the vertex -1.
+    Args:
+        number: index of the diagonal block of each vertex (n + 1,); the last entry is for the vertex -1.
+        vertices: vertices of the elements (m, k), -1 for none.
+
+    Returns:
+        Indices (m, k^2).
     """
     k = vertices.shape[1]
     places = np.full((len(vertices), k * k), -1)
@@ -173,7 +178,9 @@ def _diagonal_block_indices(number: NDArray[np.int64], vertices: NDArray[np.int6
 
 
 class ScaledPreconditioner:
-    """The preconditioner (S Q S)^-1 with S_i = (I + W_i/Q_ii)^(1/2) at some vertices, I at all others.
+    """The preconditioner (S Q S)^-1.
+
+    S_i is (I + W_i/Q_ii)^(1/2) at some vertices, and I at all others.
 
     Attributes:
         inverse_scaling: these vertices (c,), and S_i^-1 (c, 3, 3).
@@ -208,7 +215,10 @@ class ScaledPreconditioner:
 
 
 def _contact_blocks(step: StepObjective, hessian: Hessian, n: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the vertices (c,) with contact and the blocks (c, 3, 3) [N/m] of elements and pairs outside Q."""
+    """Return the vertices (c,) with contact and their blocks (c, 3, 3) [N/m].
+
+    The blocks are those of elements and pairs outside Q.
+    """
     blocks, acted, number = np.zeros((n, 3, 3)), np.zeros(n, np.bool_), np.append(np.arange(n), -1)
     for one, curvature in zip(step.element_energies, hessian.element_hessians, strict=True):
         if not one.is_projective:

@@ -1,13 +1,14 @@
-"""The check whether a solve has ended at a saddle point, for methods that do not factorise the Hessian.
+"""The check whether a solve has ended at a saddle point.
 
-Methods that follow gradients preserve symmetry, and so they may converge to a saddle; the residual does not show it.
+It is for methods that do not factorise the Hessian. Methods that follow gradients preserve symmetry, and so they may
+converge to a saddle; the residual does not show it.
 First a bound over springs and vertices rules out negative curvature, at the cost of one gradient; it succeeds where no
 spring is compressed by more than inertia resists. Else conjugate gradients search for a direction of negative curvature
 within a limited number of products with the Hessian (`springbench.solvers.kernels.curvature_search`). A search that
 finds none proves nothing.
 
 Negative curvature counts if it leads to a point that is lower by more than the round-off of the objective. So a valley
-of minima, along which the curvature is zero and round-off gives it a sign, is no saddle.
+of minima, along which the curvature is zero up to round-off of either sign, is no saddle.
 
 Systems with length constraints are not checked: there the curvature within the constraints decides.
 """
@@ -27,13 +28,14 @@ from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import VALUE_ROUNDOFF, Hessian, StepObjective
 
 _MIN_PRODUCTS = 32
-"""Number of products of any search. Saddles of the hard cases need 1 to 28; motion-burst, a block that turns, most."""
+"""Smallest limit of products per search. Saddles of the hard cases need 1 to 28; motion-burst, a rotating block, needs
+most."""
 
 _ITERATIONS_PER_PRODUCT = 16
-"""Iterations of the solve for each product beyond that number. A product takes a third of an iteration of L-BFGS."""
+"""Iterations of a solve per product of its limit, if that is larger. A product costs a third of an L-BFGS iteration."""
 
 _MAX_HALVINGS = 40
-"""Maximum number of halvings: from the extent of the mesh to a millionth of a millionth of it."""
+"""Maximum number of halvings: from the extent of the mesh to 1e-12 of it."""
 
 
 class SaddleCheck:
@@ -68,7 +70,9 @@ class SaddleCheck:
     def find_negative_curvature(
         self, problem: StepProblem, p: Positions, max_products: int
     ) -> tuple[Positions, float] | None:
-        """Return a direction (n, 3) with maximum 1 and the negative curvature along it [N/m], or None.
+        """Return a direction of negative curvature and the curvature along it, or None.
+
+        The direction (n, 3) has maximum 1; the curvature is in N/m.
 
         Args:
             problem: the step.
@@ -112,7 +116,10 @@ class SaddleCheck:
 
 
 def _has_element_form(step: StepObjective, hessian: Hessian) -> bool:
-    """Return whether all energies that act have an element-wise form; barrier energies out of range do not act."""
+    """Return whether all active energies have an element-wise form.
+
+    Barrier energies out of range are not active.
+    """
     return len(step.other_energies) == len(step.barrier_energies) and not any(
         len(blocks.vertices) for blocks in hessian.barrier_hessian.pair_blocks
     )
@@ -156,7 +163,10 @@ def _round_off(step: StepObjective, p: Positions) -> float:
 
 
 def _find_lower_prediction(step: StepObjective, p: Positions) -> Positions | None:
-    """Return the inertial prediction if it is lower than p; a stiff system is slow to leave a saddle."""
+    """Return the inertial prediction if it is lower than p, else None.
+
+    It is tried first, because a stiff system is slow to leave a saddle.
+    """
     fall = step.inertial_prediction()
     change, noise = step.objective_change(p, fall)
     is_lower = change + noise < -_round_off(step, p)
@@ -164,7 +174,9 @@ def _find_lower_prediction(step: StepObjective, p: Positions) -> Positions | Non
 
 
 def _descend_along(step: StepObjective, p: Positions, x: Positions, curvature: float) -> Positions | None:
-    """Return the lowest of the points p + t x and p - t x, for t the extent of the mesh, half of it, and so on.
+    """Return the lowest point along a direction of negative curvature.
+
+    The candidates are p + t x and p - t x, for t the extent of the mesh, half of it, and so on.
 
     Args:
         step: the objective.

@@ -21,9 +21,10 @@ def compute_anchor_stiffness(system: System) -> NDArray[np.float64]:
 
 
 def compute_anchor_positions(problem: StepProblem) -> Positions:
-    """Return the minimum y/h (n, 3) [m] of these terms, with exact pins on their targets.
+    """Return the minimiser y/h (n, 3) [m] of these terms.
 
-    It is computed as target + (f + w (p_pin - target))/h, which avoids rounding if the force is small.
+    Exact pins are on their targets. The minimiser is computed as target + (f + w (p_pin - target))/h, which avoids
+    rounding if the force is small.
     """
     s = problem.system
     weight, away = np.zeros(s.num_vertices), problem.external_force.copy()
