@@ -1,7 +1,8 @@
-"""The terms of the objective that do not change from step to step: springs, constant forms, Hessian pattern.
+"""The terms of the objective that do not change from step to step.
 
-The degrees of freedom are the free vertices. The matrix of the Hessian is analysed once
-(`springbench.solvers.objective.hessian_pattern`), and terms that are constant in a run are summed once.
+They are springs, constant forms and the pattern of the Hessian. The degrees of freedom are the free vertices. The
+matrix of the Hessian is analysed once (`springbench.solvers.objective.hessian_pattern`), and terms that are constant in
+a run are summed once.
 """
 
 from __future__ import annotations
@@ -26,7 +27,14 @@ from springbench.solvers.objective.hessian_pattern import BlockMatrix
 
 
 class ElementEnergy(NamedTuple):
-    """An energy with an element-wise form in one step: its index in the system, its law and its elements."""
+    """An energy with an element-wise form in one step.
+
+    Attributes:
+        energy_index: its index in the system.
+        is_projective: whether it is projective, and so part of Q.
+        element_law: law of its elements.
+        elements: its elements in this step.
+    """
 
     energy_index: int
     is_projective: bool
@@ -51,6 +59,10 @@ class FixedObjective:
     """The parts of a system's objective that do not change from step to step.
 
     Attributes:
+        system: the system.
+        springs: all springs of the system, as one energy.
+        objective_terms: springs, inertia and penalty pins, for the kernels.
+        quadratic_form: sum of the quadratic forms, None if there are none.
         element_energy_indices: indices of energies with an element-wise form.
         other_energy_indices: indices of energies without one.
         forms_with_force: indices of quadratic forms with a force, or with one that changes from step to step.
@@ -114,16 +126,16 @@ class FixedObjective:
         return any(is_barrier_energy(self.system.energies[k]) for k in self.other_energy_indices)
 
     def ignore_barriers(self) -> FixedObjective:
-        """Return the objective without barrier energies, for problems of the same system and with the same matrix."""
+        """Return the objective without barrier energies, for problems of the same system."""
         found, energies = copy(self), self.system.energies
         found.other_energy_indices = [k for k in self.other_energy_indices if not is_barrier_energy(energies[k])]
         return found
 
     @property
     def interpreted_energies(self) -> str:
-        """Energies without an element-wise form, which run through Python, as words to append to a description.
+        """Text about energies without an element-wise form, to append to a description.
 
-        It is empty if there are none.
+        They run through Python. The text is empty if there are none.
         """
         names = sorted({type(self.system.energies[k]).__name__ for k in self.other_energy_indices})
         return f"; each iteration runs Python for {', '.join(names)}" if names else ""
@@ -155,7 +167,10 @@ class FixedObjective:
         return number
 
     def free_vertex_pairs(self, vertices: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return all pairs of different free vertices within each row (a, k), by free index, unique and ascending."""
+        """Return all pairs of different free vertices within each row (a, k).
+
+        The pairs are by free index, unique and ascending.
+        """
         (a, k), size = vertices.shape, len(self.system.free_vertices)
         capacity = a * k * (k - 1) // 2
         pairs, scratch = np.empty((capacity, 2), np.int64), np.empty(capacity, np.int64)

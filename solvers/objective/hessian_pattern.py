@@ -1,9 +1,10 @@
-"""The matrix of a Hessian: 3 x 3 blocks between free vertices, their positions per energy, and the factorisation.
+"""The matrix of a Hessian and its factorisation.
 
-The pattern covers springs, projective energies and elements, which are known before the first step. If another energy
-needs more blocks, a step extends the pattern (`springbench.solvers.objective.step_matrix`). The last extended one is
-cached for steps that need exactly that pattern, so that a result depends on its problem only, not on earlier ones. The
-matrices of a system count their factorisations together.
+It consists of 3 x 3 blocks between free vertices. The pattern covers springs, projective energies and elements, which
+are known before the first step. If another energy needs more blocks, a step extends the pattern
+(`springbench.solvers.objective.step_matrix`). The last extended one is cached for steps that need exactly that pattern,
+so that a result depends on its problem only, not on earlier ones. The matrices of a system share a count of
+factorisations.
 """
 
 from __future__ import annotations
@@ -160,7 +161,8 @@ class BlockMatrix:
         if k == 1:
             self._element_indices[energy] = vertices, self.block_indices.diagonal_block[vertices]
             return True
-        # Pairs differ at each point, and the system clears each page of new memory: the previous indices are replaced.
+        # Pairs differ at each point. The array of the previous indices is reused, because the operating system clears
+        # each page of new memory.
         self._element_indices.pop(energy, None)
         memory = self._index_memory.get(energy)
         if memory is None or memory.shape[1] != k * k or len(memory) < m:
@@ -185,7 +187,10 @@ class BlockMatrix:
         return np.asarray(csr_array(blocks.T).data, np.int64)
 
     def _pair_block_indices(self, i: IndexArray, j: IndexArray) -> IndexArray:
-        """Return the blocks between vertices i and j, of one shape; -1 if one is not free."""
+        """Return the blocks between vertices i and j, arrays of one shape.
+
+        A block is -1 if one of its vertices is not free.
+        """
         i, j = self._free_index[i], self._free_index[j]
         return np.where((i >= 0) & (j >= 0), np.searchsorted(self._block_keys, i * self._num_free + j), -1)
 

@@ -49,15 +49,24 @@ class PsdProjection:
 
     Attributes:
         use_absolute: whether eigenvalues are replaced by absolute values instead of clamped.
-        _vertex_mask: mask of the vertices (n,) whose elements are projected; None for all.
+        num_examined, num_projected: numbers of elements examined and of elements projected so far.
     """
 
     def __init__(self, *, use_absolute: bool = False, vertex_mask: NDArray[np.bool_] | None = None) -> None:
+        """Create a projection.
+
+        Args:
+            use_absolute: whether eigenvalues are replaced by absolute values instead of clamped.
+            vertex_mask: mask of the vertices (n,) whose elements are projected; None for all.
+        """
         self.use_absolute, self._vertex_mask = use_absolute, vertex_mask
         self.num_examined = self.num_projected = 0
 
     def select_elements(self, vertices: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return the mask of the elements (m, k) with a selected vertex; -1 is no vertex."""
+        """Return the mask of the elements (m, k) with a selected vertex.
+
+        The vertex -1 is none. The elements are added to `num_examined`.
+        """
         if self._vertex_mask is None:
             met = np.ones(len(vertices), np.bool_)
         else:

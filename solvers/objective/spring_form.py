@@ -1,11 +1,11 @@
-"""Decomposition of a system's energies into springs and terms that the compiled methods compute like springs.
+"""Decomposition of a system's energies into springs and terms computed like springs.
 
 A constant quadratic form (bending, attachments, linear drag) is equivalent to springs of zero rest length between the
 vertices that it couples, and a weight of each single vertex (see
-`springbench.solvers.kernels.quadratic_form_kernels`). So the
-kernels of springs compute its forces and its value. Its force at the origin, A'W d, is constant in a step and is added
-to the external force. Strain limits and dashpots are evaluated with the spring between the same vertices (see
-`springbench.solvers.kernels.edge_elements`); in Q they too are springs of zero rest length.
+`springbench.solvers.kernels.quadratic_form_kernels`). So the kernels of springs compute its forces and its value. Its
+force at the origin, A'W d, is constant in a step and is added to the external force. Strain limits and dashpots are
+evaluated with the spring between the same vertices (see `springbench.solvers.kernels.edge_elements`); in Q they too are
+springs of zero rest length.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ class SpringForm:
 
     Attributes:
         springs: springs of the system.
-        springs_and_forms: these and the pairs of the forms.
-        joined_pairs: these, with a spring and a pair between the same vertices as one; their value differs by a
-            constant.
+        springs_and_forms: the springs, and the pairs of the forms as springs of zero rest length.
+        joined_pairs: the same, where a spring and a pair between the same vertices are one spring; the value differs by
+            a constant.
         system_pairs: all pairs in Q: the joined ones and the edges, without rest lengths if there are edges.
         vertex_weight: weight h of all forms at each vertex (n,) [N/m].
         form_builders: builders of each form for a step.
-        strain_limits, dashpots: edge energies, with k [N/m] of both.
+        strain_limits, dashpots: edge energies; the stiffness of both is in N/m.
         unsupported_energies: names of unsupported energies.
         has_cancellation: whether pairs and springs of some vertices cancel, so that the pattern of Q omits their
             coupling.
@@ -60,7 +60,10 @@ class SpringForm:
     has_cancellation: bool = False
 
     def compute_force(self, problem: StepProblem) -> Positions:
-        """Return the external force plus the constant one of the forms, (n, 3) [N]; not a copy without forms."""
+        """Return the external force plus the constant one of the forms, (n, 3) [N].
+
+        Without forms it is the array of the problem, not a copy.
+        """
         if not self.form_builders:
             return problem.external_force
         out = problem.external_force.copy()
@@ -69,7 +72,7 @@ class SpringForm:
         return out
 
     def negative_energy(self, p: Positions) -> float:
-        """Return the absolute energy [J] of the pairs with negative stiffness at p (n, 3) [m]."""
+        """Return the absolute energy [J] of pairs with negative stiffness at p (n, 3)."""
         return 0.5 * abs(float(np.einsum("ij,ij->", p, self._negative_stiffness @ p))) if self.form_builders else 0.0
 
     @property
@@ -85,7 +88,10 @@ class SpringForm:
         ).stiffness_matrix(len(self.vertex_weight))
 
     def attach_edges(self, springs: Springs) -> AttachedEdges | None:
-        """Attach the strain limits and dashpots to springs between the same vertices; None if there are none."""
+        """Attach the strain limits and dashpots to springs between the same vertices.
+
+        The result is None if there are none.
+        """
         if not self.has_edges:
             return None
         from springbench.solvers.kernels.edge_elements import AttachedEdges
@@ -122,12 +128,18 @@ class SpringForm:
         return packets._replace(edges=edges)
 
     def edge_energy_scale(self, p: Positions) -> float:
-        """Return the sum of k |v|^2 [J] over strain limits and dashpots at p (n, 3), the scale of cancellation."""
+        """Return the sum of k |v|^2 [J] over strain limits and dashpots at p.
+
+        It is the scale of cancellation in their energy; p is (n, 3) [m].
+        """
         return sum(float(e.stiffness @ e.edge_lengths(p) ** 2) for e in (*self.strain_limits, *self.dashpots))
 
 
 def is_packed_edge(energy: Any) -> bool:
-    """Return whether an energy has the law of strain limits or dashpots, which packets of springs evaluate."""
+    """Return whether packets of springs evaluate an energy.
+
+    They evaluate the laws of strain limits and dashpots.
+    """
     from springbench.solvers.model.energies.dashpot_energy import Dashpots
     from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
 
@@ -182,11 +194,11 @@ def decompose_energies(system: System) -> SpringForm:
 
 
 def _join_pairs(springs: Springs, pairs: NDArray[np.int64], weight: NDArray[np.float64]) -> Springs:
-    """Return springs and pairs of zero rest length, those between the same vertices as one spring.
+    """Return springs and pairs of zero rest length, joined between the same vertices.
 
     k/2 (l - r)^2 + w/2 l^2 = (k + w)/2 (l - k r/(k + w))^2 up to a constant. A pair that would leave no positive
-    stiffness stays apart. Vertex blocks need both apart, because a compressed spring loses its transverse stiffness
-    there and a pair does not.
+    stiffness remains separate. Vertex blocks need both separately, because a compressed spring loses its transverse
+    stiffness there and a pair does not.
 
     Args:
         springs: the springs.
@@ -208,7 +220,10 @@ def _join_pairs(springs: Springs, pairs: NDArray[np.int64], weight: NDArray[np.f
 
 
 def _merge_parallel_pairs(springs: Springs) -> Springs:
-    """Return springs of zero rest length with the stiffness of all springs between each two vertices."""
+    """Return one spring of zero rest length between each two vertices.
+
+    It has the stiffness of all springs between them.
+    """
     ends, pair = np.unique(np.sort(springs.edges, axis=1), axis=0, return_inverse=True)
     stiffness = np.zeros(len(ends))
     np.add.at(stiffness, pair.ravel(), springs.stiffness)

@@ -14,8 +14,8 @@ from springbench.solvers.objective.hessian_pattern import BlockMatrix, IndexArra
 class StepMatrix:
     """The matrix of a step's Hessians.
 
-    Blocks outside the common pattern, and those that may be needed near the positions where this first occurs, are
-    analysed once. The result is valid as long as it suffices, usually to the end of the step.
+    When a block outside the common pattern is first needed, the pattern is extended by it and by the blocks that may
+    be needed nearby. The extended pattern is reused as long as it suffices, usually to the end of the step.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class StepMatrix:
         Args:
             fixed_objective: the objective, without the pairs of barriers.
             barrier_energies: barriers whose candidate pairs extend the pattern.
-            pattern_positions: positions (n, 3) [m] near which the first extension takes its pairs; None for p itself.
+            pattern_positions: positions (n, 3) [m] near which the first extension finds its pairs; None for p itself.
         """
         self._fixed_objective, self._barrier_energies = fixed_objective, barrier_energies
         self._pattern_positions = pattern_positions
@@ -52,7 +52,10 @@ class StepMatrix:
         return known
 
     def _extend_matrix(self, known: BlockMatrix, i: IndexArray, j: IndexArray, p: Positions) -> BlockMatrix:
-        """Return a matrix with the blocks of another one, those (i, j), and those that may be needed near p."""
+        """Return a matrix with the blocks of another one and additional blocks.
+
+        These are the blocks (i, j) and those that may be needed near p.
+        """
         near = (
             self._fixed_objective.free_vertex_pairs(energy.candidate_vertices(p)) for energy in self._barrier_energies
         )
@@ -61,7 +64,7 @@ class StepMatrix:
 
 
 def _covers_blocks(matrix: BlockMatrix, i: IndexArray, j: IndexArray, block_vertices: list[IndexArray]) -> bool:
-    """Return whether a matrix has blocks (i, j) and those between the vertices of each barrier energy."""
+    """Return whether a matrix has blocks (i, j) and those of barrier energies."""
     return matrix.has_blocks(i, j) and all(
         matrix.has_element_blocks(-1 - k, vertices) for k, vertices in enumerate(block_vertices)
     )

@@ -1,11 +1,10 @@
-"""The objective of a step, its gradient and its Hessian, evaluated fast; `StepProblem` is the reference evaluator.
+"""Fast evaluation of the objective of a step, its gradient and its Hessian.
 
-One compiled pass evaluates all springs, another all constant quadratic forms, and one each energy with an element-wise
-form (`springbench.solvers.model.energies.element_energies`). Other energies supply their own value, gradient and
-Hessian. The
-degrees of freedom are the free vertices: exactly pinned ones stay on their targets. The matrix of the Hessian is
-analysed once, or once per step (`hessian_pattern`, `step_matrix`). Terms that are constant in a run or a step are
-summed once.
+`StepProblem` is the reference evaluator. One compiled pass evaluates all springs, another all constant quadratic forms,
+and one each energy with an element-wise form (`springbench.solvers.model.energies.element_energies`). Other energies
+supply their own value, gradient and Hessian. The degrees of freedom are the free vertices: exactly pinned ones stay on
+their targets. The matrix of the Hessian is analysed once, or once per step (`hessian_pattern`, `step_matrix`). Terms
+that are constant in a run or a step are summed once.
 """
 
 from __future__ import annotations
@@ -39,6 +38,7 @@ SLOPE_FALLBACK_RATIO = 1e-10
 
 _NO_INDICES, _NO_VALUES = np.empty(0, np.int64), np.empty(0)
 _TENSIONS_AT_POINT = _NO_VALUES
+"""Argument of the kernels for the tensions at the positions, instead of given ones."""
 
 
 class TrialStep(NamedTuple):
@@ -57,7 +57,9 @@ class TrialStep(NamedTuple):
 
 
 class StepObjective:
-    """The objective g of one step. All positions are (n, 3) [m], with exactly pinned vertices on their targets.
+    """The objective g of one step.
+
+    All positions are (n, 3) [m], with exactly pinned vertices on their targets.
 
     Attributes:
         element_energies: energies with an element-wise form, except those without elements in this step.
@@ -119,7 +121,10 @@ class StepObjective:
 
     @property
     def has_contact_elements(self) -> bool:
-        """Whether elements act that are not part of Q, i.e. those of contact that may become active in this step."""
+        """Whether there are elements that are not part of Q.
+
+        These are elements of contact that may become active in this step.
+        """
         return any(not one.is_projective for one in self.element_energies)
 
     def max_step_size(self, p: Positions, search_direction: Positions, initial_step: float = 1.0) -> float:
@@ -155,7 +160,10 @@ class StepObjective:
         return self._pins
 
     def inertial_prediction(self) -> Positions:
-        """Return the positions (n, 3) under inertia and external force alone, pinned vertices on their targets."""
+        """Return the positions (n, 3) under inertia and external force alone.
+
+        Pinned vertices are on their targets.
+        """
         problem, fixed, out = self.problem, self.fixed_objective, np.empty(self.problem.inertial_target.shape)
         target, force, pins = map(
             as_kernel_array, (problem.inertial_target, problem.external_force, problem.pin_targets)
@@ -215,9 +223,10 @@ class StepObjective:
     def try_step(
         self, p: Positions, direction: Positions, step_size: float, slope: float, curvature: float
     ) -> TrialStep:
-        """Return the trial p + step_size * direction of a line search, with its gradient if the decrease suffices.
+        """Return the trial p + step_size * direction of a line search.
 
-        Without other energies than springs and quadratic forms this is one kernel.
+        With springs and quadratic forms alone, one kernel does this, and computes the gradient if the decrease
+        suffices. With other energies the gradient is None.
 
         Args:
             p: positions (n, 3) [m].
@@ -252,7 +261,7 @@ class StepObjective:
         return out
 
     def hessian(self, p: Positions) -> Hessian:
-        """Build the Hessian at p for a factorisation."""
+        """Build the Hessian at p (n, 3)."""
         return Hessian(self, p)
 
     def element_hessians(self, p: Positions) -> list[FloatArray]:
@@ -298,7 +307,10 @@ class StepObjective:
 
 
 class Hessian:
-    """The Hessian [N/m] at a point, over the free vertices (f,), with the blocks of elements and of collisions."""
+    """The Hessian [N/m] at a point, over the free vertices (f,).
+
+    It includes the blocks of elements and of collisions.
+    """
 
     def __init__(self, step: StepObjective, p: Positions) -> None:
         self._step_objective, self._positions, self._kernels = step, p, step.fixed_objective.kernels
@@ -340,7 +352,9 @@ class Hessian:
     def factorise(
         self, negative_fraction: float = 1.0, shift: FloatArray | float = 0.0, tension: FloatArray | None = None
     ) -> bool:
-        """Factorise the Hessian and return whether it is positive definite; the defaults give the exact Hessian.
+        """Factorise the Hessian and return whether it is positive definite.
+
+        The defaults give the exact Hessian.
 
         Args:
             negative_fraction: fraction of the negative transverse part of springs to include.
@@ -448,7 +462,10 @@ class Hessian:
         return b[self.free_vertices] if len(self.free_vertices) < len(b) else b
 
     def _extend_to_all(self, x: Positions, b: Positions) -> Positions:
-        """Return x (f, 3) with rows of zeros at vertices that are not free, as many in all as in b."""
+        """Return x (f, 3) with rows of zeros at vertices that are not free.
+
+        The result has the shape of b.
+        """
         if len(x) == len(b):
             return x
         out = np.zeros_like(b)
@@ -488,7 +505,10 @@ class Hessian:
         )
 
     def matvec(self, x: Positions) -> Positions:
-        """Return the exact Hessian times x (n, 3); x and the product are zero at vertices that are not free."""
+        """Return the exact Hessian times x (n, 3).
+
+        The product is zero at vertices that are not free.
+        """
         x = np.ascontiguousarray(x)
         product, has_elements = np.empty_like(x), bool(self._step_objective.element_energies)
         multiply = spring_hessian.multiply_hessian if has_elements else self._kernels.multiply_hessian.call

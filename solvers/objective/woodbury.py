@@ -1,14 +1,15 @@
-"""Factorisation of H = S + V V' for a sparse S and a few columns V (Woodbury 1950; Sherman and Morrison 1950).
+"""Factorisation of H = S + V V' for a sparse S and a few columns V.
 
-It serves energies that couple all their vertices by a few scalars c, as gas does by its volume:
+Sources: Woodbury 1950; Sherman and Morrison 1950. It serves energies that couple all their vertices by a few scalars c,
+as gas does by its volume:
 
     E = S(p) + phi(c(p)),   Hess E = sparse + V V'
 
     H^-1 = S^-1 - W C^-1 W',   W = S^-1 V,   C = I + V'W
 
-S may be indefinite although H is not, as that of gas is without the stiffness of its volume. By Sylvester's law of
-inertia, applied to both elimination orders of [[S, V], [V', -I]], the number of negative eigenvalues of H is that of S
-minus that of C. So if S has no Cholesky factor, a factorisation with negative pivots replaces it.
+S may be indefinite although H is not: for gas, S lacks the stiffness of the volume. By Sylvester's law of inertia,
+applied to both elimination orders of [[S, V], [V', -I]], the number of negative eigenvalues of H is that of S minus
+that of C. So if S has no Cholesky factor, a factorisation with negative pivots replaces it.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from springbench.solvers.objective.hessian_pattern import BlockMatrix
 
 @runtime_checkable
 class RankUpdateEnergy(Energy, Protocol):
-    """An energy whose Hessian is sparse plus a rank update: a product of a few columns."""
+    """An energy whose Hessian is sparse plus a product of a few columns."""
 
     def sparse_hessian(self, p: Positions) -> csr_array:
         """Return the Hessian minus V V' [N/m], shape (3n, 3n)."""
@@ -59,7 +60,7 @@ def low_rank_columns(energies: Sequence[Energy], p: Positions) -> NDArray[np.flo
     """Return V of all energies, or None if there is none.
 
     Args:
-        energies: energies, of which those that are no `RankUpdateEnergy` have no columns.
+        energies: energies; those that are no `RankUpdateEnergy` have no columns.
         p: positions (n, 3) [m].
 
     Returns:
@@ -70,7 +71,10 @@ def low_rank_columns(energies: Sequence[Energy], p: Positions) -> NDArray[np.flo
 
 
 class Woodbury:
-    """The factorisation of H = S + V V' with S in a block matrix; same interface as `BlockCholesky`."""
+    """The factorisation of H = S + V V', with the interface of `BlockCholesky`.
+
+    S is a block matrix.
+    """
 
     def __init__(self, matrix: BlockMatrix, V: NDArray[np.float64]) -> None:
         """Create the factorisation for given columns; S follows with `factorise`.
@@ -117,9 +121,9 @@ class Woodbury:
 
 
 def _factorise_indefinite(graph: csr_array, values: NDArray[np.float64]) -> tuple[LinearSolve, int] | None:
-    """Return the product with S^-1 and the number of negative eigenvalues, from pivots on the diagonal.
+    """Return the product with S^-1 and the number of negative eigenvalues.
 
-    It is None if a pivot is zero or would have to be chosen off the diagonal.
+    The result is None if a pivot is zero or would have to be chosen off the diagonal.
     """
     S: Any = csc_array(bsr_array((values, graph.indices, graph.indptr), shape=(3 * graph.shape[0], 3 * graph.shape[1])))
     settings: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
