@@ -1,1 +1,1 @@
-"""Methods that minimise the objective of a step, or that integrate a step without an objective."""
+"""Methods that minimise the objective of a step, or integrate it without an objective."""

@@ -1,8 +1,7 @@
 """Accelerated first-order methods with any energies and any factor of Q.
 
-Kernels of `springbench.solvers.kernels.accelerated_descent` alternate with the energies' own values and gradients
-and with the
-factor's solve.
+Kernels of `springbench.solvers.kernels.accelerated_descent` alternate with the energies' own values and gradients and
+with the factor's solve.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ class AccelerationScheme:
         name: name in the registry.
         coefficient_rule: rule of the coefficients, see `acceleration_coefficients`.
         history_size: number of pairs in the history.
-        max_retries: shorter steps along a direction before the plain correction.
+        max_retries: maximum number of shorter steps along a direction before the plain correction.
         needs_projective: whether energies must be projective.
     """
 
@@ -45,7 +44,7 @@ class AccelerationScheme:
 
 
 class AcceleratedState(SolverState):
-    """The state of a solve that also provides the gradient and the total decrease of the objective."""
+    """The state of a solve with the gradient and the total decrease of the objective."""
 
     @property
     @abstractmethod

@@ -117,6 +117,7 @@ class _ProjectedEdges:
 
     @classmethod
     def from_energies(cls, energies: Sequence[Energy]) -> _ProjectedEdges:
+        """Concatenate the springs and strain limits among the energies."""
         springs = Springs.from_parts([energy for energy in energies if isinstance(energy, Springs)])
         limits = [energy for energy in energies if isinstance(energy, StrainLimits)]
         return cls(
@@ -165,7 +166,7 @@ class PreparedAdmm(IterativeSolver):
         return _AdmmState(self, problem, initial_guess)
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return self.residual_metric.residual_scale(problem)
 
 
@@ -201,7 +202,7 @@ class _AdmmState(SolverState):
         self._right_hand_side, self._scaled_dual = np.empty_like(self.positions), np.zeros((len(edges.edges), 3))
 
     def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents any further change."""
+        """Do one iteration; return True."""
         self._project_edges.call(
             *self._edges, self.positions, self._constant_term, self._scaled_dual, self._right_hand_side
         )
@@ -209,7 +210,10 @@ class _AdmmState(SolverState):
         return True
 
     def residual(self) -> float:
-        """Return the residual; costs a gradient and a solve in addition to those of the iteration."""
+        """Return the residual [J^(1/2)] at the iterate.
+
+        It costs a gradient and a solve in addition to those of the iteration.
+        """
         gradient = self._step.gradient(self.positions)
         return self._residual_metric.correction_residual(
             self._residual_metric.solve_correction(gradient, np.zeros_like(gradient))

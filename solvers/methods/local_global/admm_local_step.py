@@ -1,4 +1,7 @@
-"""The local step of ADMM: z and u of each edge, and their part of the right-hand side (`local_global.admm`)."""
+"""The local step of ADMM (`local_global.admm`).
+
+It computes z and u of each edge, and their part of the right-hand side.
+"""
 
 from __future__ import annotations
 

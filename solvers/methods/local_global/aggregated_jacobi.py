@@ -9,10 +9,9 @@ dominant. Hence S and 2 S^-1 - Q are positive definite. As Q majorises the Hessi
 With bending terms the eigenvalues can exceed 2; D is then the diagonal times half of the largest eigenvalue.
 
 The iterations are accelerated by Chebyshev polynomials, as Wang (2015) accelerates Jacobi's method
-(`springbench.solvers.methods.quasi_newton.chebyshev`). They require nonnegative eigenvalues of
-I - S Q. For odd l, S is therefore
-divided by the largest possible eigenvalue of S Q, 1 + (m - 1)^l, where m is that of D^-1 Q. The factor of Q serves
-only to compute the residual.
+(`springbench.solvers.methods.quasi_newton.chebyshev`). They require nonnegative eigenvalues of I - S Q. For odd l, S is
+therefore divided by the largest possible eigenvalue of S Q, 1 + (m - 1)^l, where m is that of D^-1 Q. The factor of Q
+serves only to compute the residual.
 """
 
 from __future__ import annotations
@@ -83,7 +82,7 @@ class AggregatedJacobi:
         """Prepare the method for a system.
 
         Raises:
-            Unsupported: if an energy is not projective; contact is not.
+            Unsupported: if an energy is not projective, such as contact.
             NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         if without_vertex_contact(system) is not system:
@@ -108,7 +107,9 @@ def require_valid_sweeps(sweeps: int) -> None:
 
 
 class AggregatedSweeps:
-    """Several Jacobi sweeps for Q x = b from x = 0, as one sparse matrix.
+    """Several Jacobi sweeps for Q x = b as one sparse matrix.
+
+    The sweeps start at x = 0.
 
     Attributes:
         nonzeros: number of stored entries of the matrix.
@@ -169,7 +170,7 @@ class PreparedAggregatedJacobi(IterativeSolver):
         return self.residual_solver.build_residual(problem)(p)
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return self.local_global.residual_scale(problem)
 
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
@@ -190,5 +191,5 @@ class _AggregatedJacobiState(InterpretedState):
         self._compute_residual = prepared.residual_solver.build_residual(problem)
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] at the iterate."""
         return self._compute_residual(self.positions)

@@ -1,8 +1,8 @@
-"""Local-global steps in C++: compiled on demand, cached in the user's cache folder, called by ctypes.
+"""Local-global steps in C++, compiled on demand and called by ctypes.
 
-A source has `prepare`, `local`, `global_` and `release`, see `eigen_local_global.cpp` in this folder. If it does not
-compile, its solver raises an error with the reason. Springs of length zero, for which the formula defines no direction,
-get none.
+Libraries are cached in the user's cache folder. A source has `prepare`, `local`, `global_` and `release`, see
+`eigen_local_global.cpp` in this folder. If it does not compile, its solver raises an error with the reason. A spring of
+length zero, for which the formula defines no direction, has the projection d = 0.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ SHARED_LIBRARY_FLAGS = ("-shared", "-fPIC")
 def compile_cpp(
     source: Path, folder: Path, requirements: str, options: Sequence[str] = (), libraries: Sequence[str] = ()
 ) -> Path:
-    """Return the program or library compiled in `folder`; recompile it after a change of the sources or headers.
+    """Compile a source into `folder` and return the program or library.
+
+    An earlier result is returned if the source, the headers and the options are unchanged.
 
     Args:
         source: C++ source.
@@ -148,7 +150,7 @@ PreparedType = TypeVar("PreparedType", bound=PreparedLocalGlobal)
 def prepare_cpp_backend(
     kind: type[PreparedType], system: System, springs: Springs, native: CppBackend, choice: str
 ) -> PreparedType:
-    """Prepare the iteration over compiled steps; the norm and the coupling use our own matrices.
+    """Prepare the iteration over compiled steps; the norm and the coupling use matrices assembled in Python.
 
     Args:
         kind: class to construct.
@@ -163,7 +165,7 @@ def prepare_cpp_backend(
 
 
 class _SystemNorm:
-    """The norm, coupling and trace of Q, computed by our own matrices on demand."""
+    """The norm, coupling and trace of Q, computed on demand with matrices assembled in Python."""
 
     def __init__(self, system: System, springs: Springs) -> None:
         self._system, self._springs = system, springs

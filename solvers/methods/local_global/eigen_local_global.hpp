@@ -34,7 +34,7 @@ inline Sparse selection(const std::int64_t* rows, std::int64_t count, std::int64
 
 class LocalGlobal {
 public:
-    // edges: (m, 2); free: the f vertices without exact pins; pinned, w: the q penalty pins; inertia: M/dt^2.
+    // edges: (m, 2); free: the f vertices without exact pins; pinned, w: the q penalty pins.
     LocalGlobal(std::int64_t n, std::int64_t m, std::int64_t q, std::int64_t f, const std::int64_t* edges,
                 const std::int64_t* pinned, const std::int64_t* free, const double* k, const double* rest,
                 const double* mass_over_dt2, const double* w)

@@ -1,4 +1,7 @@
-"""The elimination schedule of an iteration over a factor: blocks of subtrees that fit the cache, and those above."""
+"""The elimination schedule of an iteration over a factor.
+
+It has blocks of subtrees that fit the cache, and the blocks above them.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,8 @@ from springbench.solvers.linalg.dense_inverse import DenseInverse
 from springbench.solvers.linalg.memory import allocate_aligned
 
 MAX_BLOCK_BYTES = 2 << 20
-"""Maximum size of the panels of a block. Up to 8 MiB all are equal; half of this costs up to 3 %, a quarter 8 %."""
+"""Maximum size of the panels of a block. Sizes up to 8 MiB are equally fast; half of this size costs up to 3 %, a
+quarter 8 %."""
 
 VISIT_DOWN, VISIT_UP = 0, 1
 """Offset of a visit from twice the block's index."""
@@ -45,7 +49,10 @@ class EliminationSchedule(NamedTuple):
 
 
 def schedule_supernodal(factor: SupernodalCholesky) -> EliminationSchedule:
-    """Build the schedule of a supernodal factor: each group is cut into blocks, the top is one block."""
+    """Build the schedule of a supernodal factor.
+
+    Each group is cut into blocks; the top is one block.
+    """
     squares, panels, at = factor.inverse_blocks, factor.panels, factor.layout
     places, chunks, spans = at.row_slots, at.chunks, at.group_spans
     top, top_end = spans[-1, -2:].tolist()
@@ -84,7 +91,10 @@ def schedule_supernodal(factor: SupernodalCholesky) -> EliminationSchedule:
 
 
 def schedule_inverse(factor: DenseInverse) -> EliminationSchedule:
-    """Build the schedule of a small inverse: column panels for one pass, with right-hand sides stored behind."""
+    """Build the schedule of a small inverse.
+
+    It has column panels for one pass; the right-hand sides are stored behind the solutions.
+    """
     inverse = factor.inverse_matrix
     n = len(inverse)
     first = np.arange(0, n, MAX_PANEL_WIDTH)
@@ -124,7 +134,10 @@ def allocate_vectors(dtype: Any, rows: int) -> tuple[NDArray[Any], ...]:
 def _measure_subtrees(
     chunks: NDArray[np.int64], places: NDArray[np.int32], top: int, square: int, panel: int
 ) -> tuple[list[int], list[int], list[int]]:
-    """Return each chunk's subtree size [bytes], its first chunk, and its number of children; the top is excluded."""
+    """Return size [bytes], first chunk and number of children of each chunk's subtree.
+
+    The top is excluded.
+    """
     _, _, at, _, below, quads, slot = chunks.T
     above = places[np.minimum(at, len(places) - 1)] if len(places) else np.zeros(len(chunks), np.int64)
     inside = (below > 0) & (above < top)
@@ -164,9 +177,10 @@ def _cut_blocks(begin: int, end: int, size: list[int], first: list[int], childre
 
 
 def _order_visits(blocks: list[tuple[int, int]], first: list[int], number: int) -> list[int]:
-    """Order the blocks of a group for both passes; `number` is the index of the first block.
+    """Order the blocks of a group for both passes.
 
-    The pass down visits each block after those above it. The pass up visits them in storage order, after all below.
+    `number` is the index of the first block. The pass down visits each block after those above it. The pass up visits
+    them in storage order, after all below.
     """
     begins = [begin for begin, _ in blocks]
     below: list[list[int]] = [[] for _ in blocks]  # by the first block of their subtrees

@@ -25,7 +25,9 @@ from springbench.solvers.model.step_problem import PluginContractError, Position
 
 
 class FixedPointSolver(ABC):
-    """The base of such a solver, a frozen dataclass of its parameters.
+    """The base of a solver that is defined by one formula.
+
+    A subclass is a frozen dataclass of its parameters.
 
     Example:
         >>> from dataclasses import dataclass
@@ -55,7 +57,13 @@ class FixedPointSolver(ABC):
         """
 
     def prepare(self, system: System) -> PreparedFixedPoint:
-        """Return the prepared solver; raise Unsupported for other than projective energies, or NotPositiveDefinite."""
+        """Prepare the solver for a system.
+
+        Raises:
+            Unsupported: if an energy is not projective.
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            PluginContractError: if `next_iterate` does not take three arguments.
+        """
         name = type(self).__name__
         try:
             inspect.signature(self.next_iterate).bind(None, None, None)
@@ -99,7 +107,7 @@ class _FixedPointState(SolverState):
         self._correction = np.full_like(guess, np.nan)
 
     def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents descent."""
+        """Do one iteration; return True."""
         p, base = self.positions, self._ready.base
         self._correction = base.solve_correction(self._problem.gradient(p), np.zeros_like(p))
         self.positions, self._previous_positions = (
@@ -122,6 +130,9 @@ class _FixedPointState(SolverState):
 
 
 def source_line_of(function: Callable[..., Any]) -> str:
-    """Return `file:line` of the definition of a function, or its name if it is not written in Python."""
+    """Return `file:line` of the definition of a function.
+
+    For a function that is not written in Python, it is the name.
+    """
     code = getattr(function, "__code__", None)
     return f"{Path(code.co_filename).name}:{code.co_firstlineno}" if code else getattr(function, "__qualname__", "")

@@ -105,7 +105,10 @@ def _max_direct_coordinate(base: PreparedLocalGlobal, springs: Springs) -> float
 def _build_plan(
     order: EliminationSchedule, first: IndexArray, anchor_stiffness: FloatArray, measure: FloatArray, loose: FloatArray
 ) -> local_global_iteration.IterationPlan:
-    """Build the plan over a factor's spans, with the first packet of each (groups + 1,)."""
+    """Build the plan over a factor's blocks.
+
+    `first` has the first packet of each block, (blocks + 1,).
+    """
     spans = np.ascontiguousarray(
         np.column_stack([order.block_spans[:, :2], first[:-1], first[1:], order.block_spans[:, 2:]])
     )
@@ -144,7 +147,7 @@ class StepScratch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PreparedCompiledLocalGlobal(IterativeSolver):
-    """The iterations over a factor's own rows (see `springbench.solvers.kernels.local_global_iteration`).
+    """The iterations over the rows of a factor (see `springbench.solvers.kernels.local_global_iteration`).
 
     Attributes:
         base: the uncompiled iteration.
@@ -154,8 +157,8 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         norm_packets: packets of |e|_Q^2.
         vertex_rows: rows of the vertices.
         padding_row: last row.
-        use_corrections: whether it solves for corrections.
-        max_coordinate: largest coordinate [m] up to which it may solve for positions.
+        use_corrections: whether corrections are solved for, instead of positions.
+        max_coordinate: largest coordinate [m] at which positions are solved for; beyond it corrections are.
     """
 
     residual_iterate: ClassVar[ResidualIterate] = "previous"
@@ -222,7 +225,7 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
     def with_corrections(self) -> PreparedCompiledLocalGlobal:
         """The iterations that solve for corrections."""
         order = _build_schedule(self.base)
-        assert order is not None  # `of` was given one
+        assert order is not None  # `self` was built from one
         return self.from_schedule(self.base, self.spring_form, order, True)
 
     @property
@@ -232,7 +235,11 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
 
     @property
     def description(self) -> str:
-        """The linear solver, the distance for corrections if scenes may reach it, and the threads used if not all."""
+        """Description of the linear solver.
+
+        It states the distance beyond which corrections are solved for, if scenes may reach it, and the number of
+        threads, if not all are used.
+        """
         beyond = (
             f"; corrections beyond {self.max_coordinate:.1g} m of the origin"
             if self.max_coordinate < _USUAL_EXTENT
@@ -269,9 +276,10 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         return compute_max_coordinate(problem) * self.base.unpinned_trace**0.5
 
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """Return the local step over all springs at the initial guess, and one solve with the unrefined factor.
+        """Return the local step over all springs and one solve, at the initial guess.
 
-        Within a step neither runs alone, because blocks alternate between both.
+        The solve is without refinement of the factor's precision. Within a step neither runs alone, because blocks
+        alternate between both.
         """
         (a, b, _, _), right, p = work = self.allocate_scratch()
         target, force, pins, guess = self.step_arrays(problem, problem.initial_guess)
@@ -324,14 +332,20 @@ class PreparedCompiledLocalGlobal(IterativeSolver):
         return StepScratch(arrays, self.spring_packets.build_right_hand_side(self.iteration_plan.anchor_stiffness), p)
 
     def num_threads(self) -> int | None:
-        """Return the smaller of the allowed threads and the groups of subtrees; None for one thread."""
+        """Return the number of threads of a solve; None for one thread.
+
+        It is the smaller of the allowed threads and the groups of subtrees.
+        """
         groups = int(self.iteration_plan.top_range[2])
         threads = min(numba.get_num_threads(), groups) if groups > 1 else 1
         return threads if threads > 1 else None
 
 
 class _CompiledState(SolverState):
-    """A solve whose iterations are one call, in memory that all solves share; single iterations use their own."""
+    """A solve whose iterations are one call.
+
+    All solves share the memory of that call; single iterations use separate memory.
+    """
 
     def __init__(self, prepared: PreparedCompiledLocalGlobal, problem: StepProblem, guess: Positions) -> None:
         self._prepared, self._problem, self._guess = prepared, problem, guess
@@ -348,7 +362,7 @@ class _CompiledState(SolverState):
         packets = self._spring_packets, made.norm_packets
         memory = made.vertex_rows, *made.shared_scratch, tuple(self._arrays)
         answer = solve_step(made.iteration_plan, *packets, *memory, limits, threads, made.thread_team, self.positions)
-        self._arrays[-1] = self.positions  # where the next ones go on
+        self._arrays[-1] = self.positions  # the next iterations continue from there
         return answer
 
     def residual_from(self, p: Positions) -> float:
@@ -357,7 +371,7 @@ class _CompiledState(SolverState):
         return self.run_iterations(iteration_limit(1))[1]
 
     def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents descent."""
+        """Do one iteration; return True."""
         made = self._prepared
         (a, b, c, e), right, p = self._own_scratch
         fixed = made.iteration_plan, self._spring_packets, made.norm_packets, (a, b, c, e), right, p

@@ -42,7 +42,7 @@ from springbench.solvers.objective.fixed_objective import FixedObjective
 from springbench.solvers.objective.step_objective import StepObjective
 
 _MAX_WOODBURY_ROWS = 900
-"""Maximum number of rows for Woodbury's formula, of 300 sticking vertices; beyond it conjugate gradients are faster."""
+"""Maximum number of rows for Woodbury's formula (300 sticking vertices); conjugate gradients are faster beyond it."""
 
 _MAX_ACTIVE_SET_PASSES = 4
 _MAX_HALVINGS = 12
@@ -105,7 +105,7 @@ class ContactCorrections:
         return out
 
     def residual_norm(self, contact_free_correction: Positions) -> float:
-        """Return the residual |plain|_Q [J^(1/2)] over the unpinned vertices."""
+        """Return the residual |x|_Q [J^(1/2)] of a correction x (n, 3) over the unpinned vertices."""
         return self._base.correction_residual(contact_free_correction.copy())
 
     def solve_with_contact(
@@ -173,7 +173,10 @@ class ContactCorrections:
         return -contact_free_correction - columns @ pushed
 
     def _inverse_columns(self, vertices: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the columns (n, k) of Q^-1 of vertices, cached since contacts recur; each solve gives three."""
+        """Return the columns (n, k) of Q^-1 of vertices.
+
+        They are cached since contacts recur; each solve yields three columns.
+        """
         missing = [v for v in vertices.tolist() if v not in self._column_cache]
         if len(self._column_cache) > 4 * _MAX_WOODBURY_ROWS:
             self._column_cache, missing = {}, vertices.tolist()
@@ -185,7 +188,10 @@ class ContactCorrections:
         return np.array([self._column_cache[v] for v in vertices.tolist()]).T
 
     def _solve_cg(self, rows: PenaltyRows, gradient: Positions, contact_free_correction: Positions) -> Positions:
-        """Solve by conjugate gradients; Q times a direction follows from the residuals that Q^-1 is applied to."""
+        """Solve by conjugate gradients.
+
+        The product of Q with a direction follows from the residuals to which Q^-1 is applied.
+        """
         U = _build_direction_matrix(rows, len(contact_free_correction))
         pulls = csr_array(U * rows.stiffness) @ U.T
         model = ContactQuadraticModel(
@@ -198,7 +204,10 @@ class ContactCorrections:
 class ContactQuadraticModel(ConjugateGradientIteration):
     """Conjugate gradients for (Q + W) x = b, preconditioned by Q^-1.
 
-    solve: product with Q^-1; contact_matrix: W (3n, 3n).
+    Args:
+        solve: product with Q^-1.
+        contact_matrix: W (3n, 3n) [N/m].
+        b: right-hand side (n, 3) [N], overwritten.
     """
 
     def __init__(self, solve: Callable[[Positions], Positions], contact_matrix: csr_array, b: Positions) -> None:
@@ -342,7 +351,10 @@ class _HalfSpaceState(SolverState):
         )
 
     def _next_positions(self, p: Positions, gradient: Positions, contact_free_correction: Positions) -> Positions:
-        """Return a position with an objective not above that of p; p itself if round-off prevents any descent."""
+        """Return a position with an objective not above that of p.
+
+        It is p itself if round-off prevents any descent.
+        """
         x, length = np.zeros_like(p), 1.0
         for attempt in range(2 + _MAX_HALVINGS):
             if attempt < 2:

@@ -82,7 +82,7 @@ class PreparedLocalGlobal(IterativeSolver):
         return compute_max_coordinate(problem) * self.unpinned_trace**0.5
 
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """Return the local and the global step at the initial guess, as callables for separate timing."""
+        """Return the local and the global step at the initial guess, as callables."""
         constant, b = self.constant_right_hand_side(problem), np.empty_like(problem.inertial_target)
         p = self.apply_exact_pins(problem.initial_guess, problem)
         out, project = p.copy(), self.local_step_of(problem)
@@ -170,7 +170,11 @@ class PreparedLocalGlobal(IterativeSolver):
 
 
 class LocalGlobalState(SolverState):
-    """The state of a local-global solve with two alternating position arrays; right_hand_side: y (n, 3) [N]."""
+    """The state of a local-global solve with two alternating position arrays.
+
+    Attributes:
+        right_hand_side: y (n, 3) [N].
+    """
 
     def __init__(self, base: PreparedLocalGlobal, problem: StepProblem, guess: Positions) -> None:
         self.base, self._local_step = base, base.local_step_of(problem)
@@ -182,7 +186,7 @@ class LocalGlobalState(SolverState):
         self._has_stepped = False
 
     def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents descent."""
+        """Do one iteration; return True."""
         p = self.positions
         self._local_step(p, self.right_hand_side, self._b)
         self.base.solve_positions(self._b, p, self._previous_positions)
@@ -238,7 +242,7 @@ def prepare_local_global(
     *,
     is_low_precision: bool = False,
 ) -> PreparedLocalGlobal:
-    """Prepare the iteration with the local steps of the energies and a factor of the assembled Q.
+    """Prepare the iteration from the energies' local steps and a factor of Q.
 
     Args:
         system: the system.

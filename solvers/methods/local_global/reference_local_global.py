@@ -8,9 +8,8 @@ An iteration from p to LG(p) is a preconditioned gradient step of length one, Q^
 raises the energy, because A'KA - Hessian is positive semidefinite. Exact pins are eliminated: their rows are removed
 from Q, and their columns contribute to the right-hand side.
 
-Backends differ only in the implementation of the two steps: `DenseLocalGlobal` uses NumPy matrices,
-`SparseLocalGlobal` SciPy matrices, and
-`springbench.solvers.methods.local_global.compiled_local_global` compiled code.
+Backends differ only in the implementation of the two steps: `DenseLocalGlobal` uses NumPy matrices, `SparseLocalGlobal`
+SciPy matrices, and `springbench.solvers.methods.local_global.compiled_local_global` compiled code.
 """
 
 from __future__ import annotations
