@@ -1,1 +1,1 @@
-"""Newton's method, Newton-CG and the hybrid of both with local-global iterations."""
+"""Newton's method, Newton-CG, and the hybrid of L-BFGS and Newton's method."""

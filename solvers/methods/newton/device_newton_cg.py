@@ -1,13 +1,17 @@
-"""Newton-CG on a device: the iterates of `springbench.solvers.methods.newton.newton_cg` with additive
-Schwarz.
+"""Newton-CG on a device, preconditioned by additive Schwarz.
 
-Positions and gradients are float64, directions `real`: p + t d retains the digits of positions, and the next gradient
-corrects the error of a direction. The host reads few numbers: those of each trial once, and after each TOGETHER
-iterations of conjugate gradients, which run on the device, whether they have ended. H d = -g to r'z <= limit
+It computes the iterates of `springbench.solvers.methods.newton.newton_cg`. Positions and gradients are float64,
+directions `real`: p + t d retains the digits of positions, and the next gradient corrects the error of a direction. The
+host reads the numbers of each trial once. It also reads whether conjugate gradients have ended, after each
+ITERATIONS_PER_CHECK of their iterations on the device. They solve H d = -g to r'z <= limit
 (`springbench.solvers.linalg.krylov`):
 
-    turn     p = z + r'z / (r'z before) p         multiply   y = H p, and p'y         curve    whether p'y > 0
-    go       d += t p,   r -= t y                 apply      z = M^-1 r, and r'z      judge    whether r'z <= limit
+    update_direction        p = z + r'z / (r'z before) p
+    multiply_hessian        y = H p, and p'y
+    evaluate_curvature      whether p'y > 0
+    update_iterate          d += t p,   r -= t y
+    apply_preconditioner    z = M^-1 r, and r'z
+    check_convergence       whether r'z <= limit
 
 The scalars are in `now` on the device, written by kernels of one block. After the end all kernels return at once.
 """
@@ -111,7 +115,8 @@ def prepare_newton_cg(
 class PreparedNewtonCG(MinimisingSolver):
     """Newton-CG, prepared on a device, with the levels of the preconditioner on host and device.
 
-    `forcing` and `most` are the arguments of the preparation, `device_columns` the columns of the device in rows.
+    `forcing` has the upper and lower bound of eta, `most` is the maximum number of conjugate gradient iterations, and
+    `device_columns` are the columns of the device in rows.
     """
 
     uploaded_network: UploadedNetwork
@@ -135,7 +140,7 @@ class PreparedNewtonCG(MinimisingSolver):
         return _NewtonCGState(self)
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return compute_max_coordinate(problem) * self.metric.unpinned_trace**0.5
 
 

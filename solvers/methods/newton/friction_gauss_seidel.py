@@ -110,7 +110,7 @@ class FrictionGaussSeidel:
     def watchdog_search(
         self, step: StepObjective, at: DescentPoint, direction: Positions, newton_direction: NewtonDirection
     ) -> DescentPoint | None:
-        """Return a lower point along a direction, or after the watchdog steps; None if there is none.
+        """Return a lower point along a direction or after watchdog steps, or None.
 
         Args:
             step: objective of the step.
@@ -128,7 +128,10 @@ class FrictionGaussSeidel:
     def _take_watchdog_steps(
         self, step: StepObjective, origin: DescentPoint, direction: Positions, newton_direction: NewtonDirection
     ) -> DescentPoint | None:
-        """Take full Newton steps while each activates further half-spaces; return a point lower than the origin."""
+        """Take full Newton steps while each activates further half-spaces.
+
+        Return a point lower than the origin, or None.
+        """
         at, enough = origin, ARMIJO_FRACTION * inner_product(origin.gradient, direction)
         for _ in range(_WATCHDOG_STEPS):
             p = self.relax_friction(step, step.apply_exact_pins(at.positions + direction))
@@ -162,7 +165,9 @@ def _active_plane_mask(step: StepObjective, p: Positions) -> NDArray[np.bool_]:
 
 @jit_kernel
 def sweep_friction(planes, smoothing_length, matrix, p, gradient, sweeps):
-    """Relax friction by Gauss-Seidel sweeps over the vertices of half-spaces with friction limit F > 0.
+    """Relax friction by Gauss-Seidel sweeps over the vertices with friction.
+
+    These are the vertices of half-spaces with a friction limit F > 0.
 
     Args:
         planes: contact planes.

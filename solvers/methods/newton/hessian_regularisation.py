@@ -1,10 +1,9 @@
 """Regularised Hessians, which have a Cholesky factor even if the exact Hessian is indefinite.
 
-graded: the exact Hessian, or else the first positive definite one in a schedule of increasingly convex ones. With
-active collisions the schedule is finer, and each iterate starts one level below that of the previous iterate. The
-other strategies project the eigenvalues of elements (`springbench.solvers.objective.psd_projection`), whether the
-Hessian is
-indefinite or not:
+`shift-schedule` is the exact Hessian, or else the first positive definite one in a schedule of increasingly convex
+ones. With active collisions the schedule is finer, and each iterate starts one level below that of the previous
+iterate. The other strategies project the eigenvalues of elements (`springbench.solvers.objective.psd_projection`),
+whether the Hessian is indefinite or not:
 
     clamp          all, lambda -> max(lambda, 0)                                     Teran et al. 2005
     absolute       all, lambda -> |lambda|                                           Chen, Liu, Levin et al. 2024
@@ -128,7 +127,7 @@ class ShiftScheduleRule:
 
 
 class ContactScheduleRule(ShiftScheduleRule):
-    """A finer schedule for active collisions, with a warm start from the level of the previous iterate.
+    """A finer schedule for active collisions, which starts near the previous iterate's level.
 
     A compressed stack is indefinite for many iterations and becomes convex gradually; each of them would otherwise
     factorise the exact Hessian without success.

@@ -27,7 +27,7 @@ than any other method, and the exact method continues until a step does not deli
 smallest multiple of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative
 stiffness (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per
 factorisation when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the
-numbers of springs, entries and operations of the factors and from the factorisations made. Equal solves so make equal
+numbers of springs, entries and operations of the factors and from the factorisations made. So equal solves make equal
 decisions and have bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them.
 
 If a point that satisfies the tolerance has an indefinite Hessian, the step leaves along a direction of negative
@@ -106,7 +106,7 @@ _FLOAT32_CONDITION = 0.1 / float(np.finfo(np.float32).eps)
 """Largest condition number of Q, relative to the inertia, at which float32 leaves directions a digit."""
 
 _FIRST_PATIENCE = 10.0
-"""Multiple of the cost of an attempt after which the exact method is tried again, at first."""
+"""Initial multiple of the cost of an attempt, after which the exact method is tried again."""
 
 _MODEL_RANGE = (0.3, 0.7)
 """Range of the decrease, as a fraction of the slope, in which a step agrees with the quadratic model: half of it for a
@@ -119,7 +119,7 @@ _MAX_SHIFT = 1e3
 """Largest multiple of the inertia that is added to an exact Hessian; then its negative parts are reduced instead."""
 
 _NO_GRADIENT = np.empty((0, 3))
-"""In place of the gradient at a point of L-BFGS, whose residual is known and whose gradient nothing needs."""
+"""Placeholder for the gradient at a point of L-BFGS: the residual there is known, and the gradient is not used."""
 
 _LBFGS_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), (2e5, 0.023, 20.0)
 """Costs of an L-BFGS iteration (constant, per spring, per entry of the factor) and of a Newton step (constant, per
@@ -295,7 +295,7 @@ class _HybridState(SolverState):
             count += self._control.num_iterations if moved else 0
             if limits.residual_mode == RESIDUAL_EACH:
                 found = self.residual()
-                if not (self._point and self._point.is_past_saddle):  # no end next to a saddle, whose residual is small
+                if not (self._point and self._point.is_past_saddle):  # the residual is small next to a saddle
                     ended = check_residual(found, limits)
             if ended == REASON_ITERATIONS and not moved:
                 ended = REASON_STALLED
@@ -319,9 +319,10 @@ class _HybridState(SolverState):
 
 
 class _LbfgsFirstState(_HybridState):
-    """The state of a solve that prepares nothing for other methods while L-BFGS is the only one.
+    """The state of a solve by L-BFGS alone, until another method is needed.
 
-    Most steps of small meshes end so, and the other methods would take as long to start as L-BFGS takes for them.
+    Nothing is prepared for the other methods before that. Most steps of small meshes end with L-BFGS alone, and the
+    preparation of the other methods would cost as much as such a step.
     """
 
     _run: CompiledAccelerationState | None = None
@@ -329,7 +330,7 @@ class _LbfgsFirstState(_HybridState):
     _is_lbfgs_alone = True
 
     def _start_points(self) -> None:
-        """Leave the start to the first round."""
+        """Do nothing; the first round starts the solve."""
 
     def compute_start_residual(self) -> float:
         return self._start_run(measures_guess=True).guess_residual
@@ -366,7 +367,7 @@ class _LbfgsFirstState(_HybridState):
         return True
 
     def _end_lbfgs_alone(self, run: CompiledAccelerationState, residual: float, ended: int) -> None:
-        """Let the rule choose the method from now on."""
+        """End the phase of L-BFGS alone, and continue with the choice between the methods."""
         method, control = self._prepared.hybrid_iteration, self._control
         control.solver_phases, self._is_lbfgs_alone, self._run = dict(self.solver_phases), False, None
         self._point = DescentPoint(run.positions.copy(), _NO_GRADIENT)
@@ -385,7 +386,9 @@ class _LbfgsFirstState(_HybridState):
 
 
 def _limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
-    """Return the limits of rounds, which also end where the residual is due to rounded positions.
+    """Return the limits of rounds.
+
+    Rounds also end where the residual is due to rounded positions.
 
     Args:
         limits: limits of the solve.
@@ -396,7 +399,9 @@ def _limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
 
 
 class _MeasuredRule(ShiftScheduleRule):
-    """The smallest multiple of the inertia, or the shift schedule; measures the steps of the exact method.
+    """The smallest multiple of the inertia, or the shift schedule.
+
+    The rule also measures the steps of the exact method.
 
     Attributes:
         is_delivered: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
@@ -404,7 +409,12 @@ class _MeasuredRule(ShiftScheduleRule):
     """
 
     def __init__(self, inertia_diagonal: NDArray[np.float64], factor: BlockCholesky) -> None:
-        """Create the rule with the diagonal of the inertia (3f,) [N/m] and the factor, which counts factorisations."""
+        """Create the rule.
+
+        Args:
+            inertia_diagonal: diagonal of the inertia (3f,) [N/m].
+            factor: factor of the Hessian, which counts factorisations.
+        """
         self._inertia_diagonal, self._factor = inertia_diagonal, factor
         self._shift, self._level, self._before = InertiaShift(0.0, _MAX_SHIFT), cast(int | None, None), 0.0
         self._gains = {"shift": np.inf, "schedule": np.inf}  # [J] per factorisation, when last used
@@ -423,7 +433,10 @@ class _MeasuredRule(ShiftScheduleRule):
         return self._level
 
     def _factorise_shifted(self, hessian: Hessian, diagonal: NDArray[np.float64], shift: float) -> int | None:
-        """Factorise with a multiple of the inertia added, or by the shift schedule if it is infinite."""
+        """Factorise with a multiple of the inertia added.
+
+        An infinite multiple stands for the shift schedule.
+        """
         if shift == np.inf:
             return factorise_shifted(hessian, diagonal, first_level=1)
         added = shift * self._inertia_diagonal if shift > 0.0 else 0.0
@@ -440,7 +453,9 @@ class _MeasuredRule(ShiftScheduleRule):
 
 
 class HybridIteration:
-    """The iteration for one system: a round of L-BFGS, or a step of one of the Newton methods.
+    """The iteration for one system.
+
+    An iteration is a round of L-BFGS, or a step of one of the Newton methods.
 
     Attributes:
         metric: norm of residuals.
@@ -602,11 +617,14 @@ class _Approach:
         rounds: NDArray[Any],
         at: DescentPoint | None = None,
     ) -> None:
-        """Start at positions (n, 3) [m], or continue at a point `at` after rounds of L-BFGS from there."""
+        """Start at positions (n, 3) [m], or continue at a point `at`.
+
+        Rounds of L-BFGS have led from the positions to that point.
+        """
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = run
         self._point, self._rounds = at or DescentPoint(start, _NO_GRADIENT), rounds
-        self._num_lbfgs_iterations, self._rival_gain = 0, 0.0  # those of the rounds
+        self._num_lbfgs_iterations, self._rival_gain = 0, 0.0  # last values read from and written to `rounds`
         self._measured_rule: _MeasuredRule | None = None
         self._steepest = 0.0
         self._floor = method.round_off(start)
@@ -618,7 +636,7 @@ class _Approach:
         self._trial_cost = _FIRST_PATIENCE * method.newton_cost  # spent by the others until the exact method is tried
 
     def iterate_points(self) -> Iterator[DescentPoint]:
-        """Yield points of the method with the largest predicted gain, until one stalls or escapes from a saddle."""
+        """Yield points of the method with the largest predicted gain, without end."""
         while True:
             point = self._escape() if self._control.must_escape else None
             if point is None:
@@ -659,7 +677,7 @@ class _Approach:
         return max(self._gains, key=lambda name: self._gains[name])
 
     def _run_lbfgs(self) -> DescentPoint:
-        """Do rounds of L-BFGS until another method is predicted to gain more, or the limits are reached."""
+        """Do rounds of L-BFGS up to the limits, or until another method is preferable."""
         rounds, step, limits = self._rounds, self._step, self._control.limits
         if self._run is None:
             self._run = self._method.start_lbfgs(step, self._point.positions)
@@ -702,7 +720,10 @@ class _Approach:
             self._gains["lbfgs"], self._is_trial_due = 0.0, True
 
     def _take_newton_step(self) -> DescentPoint:
-        """Return the point after a step of the exact method; without a factor the first attempt is none."""
+        """Return the point after a step of the exact method.
+
+        If the Hessian has no factor in the first attempt, the current point is returned, and predicted tensions follow.
+        """
         self._rule.is_exact_only = self._predicting is None and any(self._gains.values())
         point, self._steepest = self._method.newton.next_point(self._step, self._point, self._steepest, self._rule)
         if point.is_stalled and self._rule.is_exact_only:
@@ -727,7 +748,10 @@ class _Approach:
         return DescentPoint(self._start, self._step.gradient(self._start))
 
     def _record_step(self, name: str, to: DescentPoint, num_factorisations: float) -> None:
-        """Record the decrease per cost of a Newton step, and when the exact method is tried next."""
+        """Record the decrease per cost of a Newton step.
+
+        This also determines when the exact method is tried next.
+        """
         fall = objective_decrease(self._step, self._point, to)
         cost = self._method.newton_cost * num_factorisations
         self._control.add_phase(name, int(to.positions is not self._point.positions), num_factorisations)
@@ -750,7 +774,7 @@ class _Approach:
             self._is_trial_due |= self._spent >= self._trial_cost
 
     def _escape(self) -> DescentPoint | None:
-        """Return a lower point next to the saddle point at which the iteration is, or None."""
+        """Return a lower point next to the current saddle point, or None."""
         self._control.must_escape = False
         step, diagonal = self._step, self._method.system_diagonal
         at = _current_point(self._run) if self._run is not None else self._point

@@ -1,4 +1,4 @@
-"""The multiple s of the inertia that makes a Hessian positive definite, tracked from step to step.
+"""The multiple s of the inertia that makes a Hessian positive definite.
 
     H + s M/dt^2
 

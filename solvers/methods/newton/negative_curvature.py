@@ -1,4 +1,6 @@
-"""Escape from saddle points, where the gradient (nearly) vanishes and the Hessian H is not positive definite.
+"""Escape from saddle points.
+
+There the gradient (nearly) vanishes and the Hessian H is not positive definite:
 
     x' H x < 0:   g decreases along x and along -x, by x' H x / 2 at second order
 
@@ -19,7 +21,8 @@ from springbench.solvers.model.step_problem import Positions
 from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
 _POWER_ITERATIONS = 60
-"""Number of power iterations for a direction of negative curvature. Each increases its dominance, however slowly."""
+"""Number of power iterations for a direction of negative curvature. Each amplifies
+that direction relative to the others."""
 
 _PROBE_ITERATIONS = 2
 """Number of power iterations to detect negative curvature before a saddle point is reached. If E only removes the
@@ -42,7 +45,7 @@ def is_positive_definite(step: StepObjective, p: Positions) -> bool:
 def escape_saddle(
     step: StepObjective, at: DescentPoint, hessian: Hessian, diagonal: NDArray[np.float64]
 ) -> DescentPoint | None:
-    """Return a point lower than a saddle point, or None if negative curvature is only round-off.
+    """Return a point lower than a saddle point; None if the curvature is round-off.
 
     H x = s (H + E) x has a negative s for a direction x of negative curvature, and all s are at most 1. So the power
     iteration with 1 - (H + E)^-1 H converges to it.

@@ -3,11 +3,10 @@
     H d = -g to |H d + g| <= eta |g|,   |r|^2 = r' Q^-1 r,   eta = .9 (|g| / |g previous|)^2  Eisenstat and Walker 1996
 
 For springs Q majorises H, so the eigenvalues of Q^-1 H are at most 1. Conjugate gradients stop at a direction of
-negative curvature with their current iterate; at the first direction, that is -Q^-1 g, a local-global iteration.
+negative curvature with their current iterate. If that is the first direction, d is -Q^-1 g, a local-global iteration.
 
-`springbench.solvers.iteration.preconditioners` documents the other preconditioners, and the matrix that replaces
-Q with active
-contacts. An iteration converges friction, and may consist of several steps, as in Newton's method.
+`springbench.solvers.iteration.preconditioners` documents the other preconditioners, and the matrix that replaces Q with
+active contacts. An iteration converges friction, and may consist of several steps, as in Newton's method.
 """
 
 from __future__ import annotations
@@ -59,8 +58,8 @@ class NewtonCG(PrecisionOptions):
     """Newton's method without a factorisation of the Hessian; needs as much memory as local-global.
 
     Args:
-        preconditioner: of conjugate gradients (`springbench.solvers.iteration.preconditioners`); a device
-        supports schwarz only.
+        preconditioner: of conjugate gradients (`springbench.solvers.iteration.preconditioners`); a device supports
+            schwarz only.
     """
 
     omitted_defaults: ClassVar[frozenset[str]] = PrecisionOptions.omitted_defaults | {"preconditioner"}
@@ -147,7 +146,7 @@ class TruncatedNewtonIteration:
                 return
             hessian, solve = self._linearise_at(step, found.positions)
             before, descent = inner_product(point.gradient, descent), solve(found.gradient)
-            # Safeguard of Eisenstat and Walker: eta decreases no faster than its own square.
+            # Safeguard of Eisenstat and Walker: eta is at least 0.9 times its previous square, while that exceeds 0.1.
             following = 0.9 * inner_product(found.gradient, descent) / before
             eta = min(loose, max(_MIN_ETA, following, 0.9 * eta**2 if 0.9 * eta**2 > 0.1 else 0.0))
             point = found
@@ -253,7 +252,10 @@ class _NewtonSystemCG(ConjugateGradientIteration):
 
 
 def _compiled_factor(metric: ResidualMetric) -> SupernodalCholesky | None:
-    """Return a factor of the metric that kernels support, however small; None if Q has none."""
+    """Return a factor of Q that the kernels support, or None.
+
+    A dense inverse is replaced by a supernodal factor, however small it is.
+    """
     if isinstance(metric.factor, DenseInverse):
         return SupernodalCholesky(metric.free_block)
     return metric.factor if isinstance(metric.factor, SupernodalCholesky) else None

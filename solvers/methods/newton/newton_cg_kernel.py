@@ -1,7 +1,8 @@
 """Compiled conjugate gradients on the exact Hessian, preconditioned by a factor of Q.
 
-H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r           see
-`springbench.solvers.methods.newton.newton_cg`
+    H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r
+
+See `springbench.solvers.methods.newton.newton_cg`.
 """
 
 from __future__ import annotations
@@ -137,9 +138,9 @@ _iterate_loop = compile_cg_loop(_update_direction, _update_iterate, _is_convex, 
 
 @jit_kernel
 def solve_direction(newton, gradient, descent, eta, most):
-    """Write newton.d (n, 3) [m]; it is -Q^-1 g if the Hessian is not convex along that.
+    """Solve H d = -g approximately, and write newton.d (n, 3) [m].
 
-    Vectors of `newton` are zero at the vertices that do not move.
+    It is -Q^-1 g if the Hessian is not convex along that. Vectors of `newton` are zero at vertices that do not move.
 
     Args:
         newton: the state.

@@ -1,4 +1,6 @@
-"""Newton's method with the exact Hessian and a direct factorisation (Nocedal and Wright 2006, section 3.4).
+"""Newton's method with the exact Hessian and a direct factorisation.
+
+Source: Nocedal and Wright 2006, section 3.4.
 
     p <- p - t (H + E)^-1 grad g(p)
 
@@ -119,9 +121,9 @@ class NewtonIteration:
         Args:
             metric: norm of residuals.
             indefinite: name of the regularisation.
-            has_local_roundoff: whether round-off is determined locally: a step whose decrease is round-off in total
-                moves the connected components in which it is not, e.g. those near the origin, and the line search uses
-                the slope along the rounded displacement.
+            has_local_roundoff: whether round-off is determined by connected components. If the total decrease of a
+                step is round-off, the components move whose decrease is not, e.g. those near the origin. The line
+                search then also uses the slope along the rounded displacement.
         """
         self._has_local_roundoff = has_local_roundoff
         self._metric, self._modification_rule = metric, REGULARISATION_RULES[indefinite]
@@ -238,7 +240,7 @@ def make_friction_search(metric: ResidualMetric) -> FrictionGaussSeidel | None:
     if not any(is_vertex_contact(energy) for energy in energies) or any(
         is_barrier_energy(energy) for energy in energies
     ):
-        return None  # its sweeps have no bounds
+        return None  # its sweeps are not limited to collision-free displacements
     from springbench.solvers.methods.newton.friction_gauss_seidel import FrictionGaussSeidel
 
     return FrictionGaussSeidel(metric)

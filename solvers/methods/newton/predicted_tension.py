@@ -33,7 +33,10 @@ _MAX_SHIFT = 10.0
 
 
 class RelaxationMethod(Protocol):
-    """The data of the method for one system: diagonals of the inertia and of Q, (3f,) [N/m]."""
+    """The data of the method for one system.
+
+    The diagonals are those of the inertia and of Q, (3f,) [N/m].
+    """
 
     metric: ResidualMetric
     inertia_diagonal: NDArray[np.float64]
@@ -66,7 +69,14 @@ class PredictedTensionNewton:
         self._shift, self._slope = InertiaShift(np.inf, _MAX_SHIFT), -np.inf
 
     def compute_first_step(self, at: DescentPoint) -> tuple[DescentPoint, float, bool]:
-        """Return a lower point by the true tensions, the decrease [J], and whether it lies off a saddle point."""
+        """Do the first step, with the true tensions.
+
+        Args:
+            at: current point.
+
+        Returns:
+            A lower point or the same one, the decrease [J], and whether the step has left a saddle point.
+        """
         step = self._step
         hessian = step.hessian(at.positions)
         descent = hessian.factorise_and_solve(at.gradient, 0.0)
@@ -86,7 +96,15 @@ class PredictedTensionNewton:
         return following, objective_decrease(step, at, following), curvature is not None
 
     def compute_next_step(self, point: DescentPoint) -> tuple[DescentPoint, float, bool]:
-        """Return a lower point or the same one, the decrease [J], and whether to continue with the exact Hessian."""
+        """Do a step with predicted tensions.
+
+        Args:
+            point: current point. The first of these steps starts at the origin of the solve instead, unless
+                `compute_first_step` was accurate.
+
+        Returns:
+            A lower point or the same one, the decrease [J], and whether to continue with the exact Hessian.
+        """
         step, at = self._step, self._first_point or point
         self._first_point = None
         hessian = step.hessian(at.positions)
@@ -110,7 +128,10 @@ class PredictedTensionNewton:
         return following, gain, self._shift.value == 0.0 and is_sufficient and slope >= _QUADRATIC_SLOPE_RATIO * before
 
     def _solve_shifted(self, hessian: Hessian, b: Positions, shift: float) -> Positions | None:
-        """Solve with a multiple of the inertia added; an infinite one drops negative transverse parts instead."""
+        """Solve with a multiple of the inertia added.
+
+        An infinite multiple drops negative transverse parts instead.
+        """
         keep, by = (1.0, shift) if shift < np.inf else (0.0, 0.0)
         added = by * self._method.inertia_diagonal if by > 0.0 else 0.0
         return hessian.factorise_and_solve(b, keep, added, self._predicted_tensions)
