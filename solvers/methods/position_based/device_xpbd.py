@@ -45,7 +45,7 @@ def prepare_xpbd(
         colour_starts: (colours + 1,), the first spring of each colour.
         real_dtype: floating-point type of the kernels.
         description: description of the solver.
-        small_steps: whether in small steps.
+        small_steps: whether to prepare the variant with small steps.
 
     Raises:
         Unsupported: if the device memory is too small.
@@ -146,7 +146,10 @@ class VertexData(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PreparedDeviceXpbd(DeviceSolver):
-    """XPBD, prepared on a device; `colour_starts` (colours + 1,) are the first springs of the colours."""
+    """XPBD, prepared on a device.
+
+    `colour_starts` (colours + 1,) has the first spring of each colour.
+    """
 
     residual_iterate: ClassVar[ResidualIterate] = "none"
 
@@ -223,7 +226,7 @@ class _DeviceXpbdState(DeviceSolverState):
         return self.position_output
 
     def launch_kernel(self, kernel: Any, num_items: int, *arguments: Any) -> None:
-        """Launch a kernel whose threads loop over `threads` items."""
+        """Launch a kernel whose threads loop over `num_items` items."""
         kernel[device_sums.count_blocks(num_items), device_sums.THREADS_PER_BLOCK, self.stream.cuda_stream](*arguments)
 
     def linearise_constraints(self) -> None:
@@ -269,7 +272,7 @@ class DeviceXpbdState(_DeviceXpbdState):
         self.linearise_constraints()
 
     def launch_iterations(self, num_iterations: int) -> int:
-        """Launch iterations; return how many of them moved something."""
+        """Launch iterations; return their number."""
         for _ in range(num_iterations):
             self.projection.launch_together(self.project_constraints)
         return num_iterations
@@ -301,7 +304,7 @@ class DeviceXpbdSmallStepsState(_DeviceXpbdState):
         return self._v if self._num_substeps else self._step.velocity
 
     def launch_iterations(self, num_iterations: int) -> int:
-        """Launch iterations; return how many of them moved something."""
+        """Launch iterations; return their number."""
         step, n, places = self._step, len(self.reference), self.prepared.vertex_data
         self._num_substeps += num_iterations
         if not self._num_substeps:

@@ -3,8 +3,8 @@
     D = x_i - x_j,   w = u_i - u_j,   v = D + w,   |v| - r = (|D| - r) + (D + v).w / (|D| + |v|)
 
 x, the positions without springs, and |D| - r are float64. The displacement u from there has the kernels' type: the
-error of float32 is relative to u and to the distance of a spring from its rest length. `ease` is computed where it is
-used.
+error of float32 is relative to u and to the distance of a spring from its rest length. The factor `ease` of
+`xpbd_projection` is computed where it is used.
 """
 
 from __future__ import annotations
@@ -51,7 +51,10 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
 
     @cuda.jit
     def soften(places, h, u, compliance, gives):
-        """Write 1/q for a step of h [s], in `real` and in float64; set u to 0."""
+        """Write 1/q for a step of h [s], and set u to 0.
+
+        1/q is written in `real` and in float64.
+        """
         i = cuda.grid(1)
         while i < gives.shape[0]:
             gives[i] = 1.0 / (places.mass[i] / (h * h) + places.pin_weight[i])
@@ -132,15 +135,15 @@ def write_device_positions(x, u, out):
 def predict_step(
     h, remaining_fraction, vertex_data, start_positions, pin_targets, vertex_compliance, force, v, before, x, u
 ):
-    """Write the positions without springs in a substep of h [s] to x; set u to 0.
+    """Write the positions of a substep without springs to x, and set u to 0.
 
     Args:
         h: substep [s].
         remaining_fraction: part of the step after this substep.
-        vertex_data: pins of the vertices, by rows.
+        vertex_data: pins of the vertices.
         start_positions: (n, 3) [m], where pins start.
         pin_targets: (q, 3) [m], where pins end.
-        vertex_compliance: inverse stiffness of inertia, pins and forms of each row (n,) [m/N].
+        vertex_compliance: inverse stiffness of inertia and pin of each vertex (n,) [m/N].
         force: constant force (n, 3) [N].
         v: velocities (n, 3) [m/s].
         before: receives the positions at the start of the substep (n, 3) [m].
@@ -159,7 +162,7 @@ def predict_step(
                 if math.isinf(w):
                     there = target
                 else:
-                    # Prediction by inertia alone, without the force that was added above.
+                    # Displacement from the inertial motion, without the force that was added above.
                     there += vertex_compliance[i] * w * (target - here - h * v[i, c])
             x[i, c] = there
         i += cuda.gridsize(1)

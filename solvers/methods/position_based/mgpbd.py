@@ -1,15 +1,14 @@
 """XPBD with a global dual solve by multigrid-preconditioned conjugate gradients (MGPBD: Li et al. 2025).
 
-It starts as XPBD does (`springbench.solvers.methods.position_based.xpbd`): at the positions without springs, with
-zero tensions. An
-iteration linearises all springs, solves for the increments of their tensions t, and moves the vertices accordingly:
+It starts as XPBD does (`springbench.solvers.methods.position_based.xpbd`): at the positions without springs, with zero
+tensions. An iteration linearises all springs, solves for the increments of their tensions t, and moves the vertices
+accordingly:
 
     (J W J' + K^-1) dt = C(p) - K^-1 t,    p <- p - W J' dt,   t <- t + dt
 
 with C the elongations of the springs (m,), J its derivative, a row n_e at i and -n_e at j, and W = 1/q the compliance
 of the vertices (`springbench.solvers.iteration.vertex_terms`). This is the paper's formula in terms of forces,
-lambda = -t dt^2.
-It is solved for s = K^-1/2 t instead, which avoids a division by a stiffness:
+lambda = -t dt^2. It is solved for s = K^-1/2 t instead, which avoids a division by a stiffness:
 
     A ds = b,    A = G o (N N'),    G = I + K^1/2 A_s W A_s' K^1/2,    b = K^1/2 C(p) - s
 
@@ -52,7 +51,7 @@ _NEAR_NULL_SWEEPS = 30
 """Gauss-Seidel sweeps on random vectors that yield near-null-space vectors."""
 
 _CG_RTOL, _MAX_CG_ITERATIONS = 1e-5, 100
-"""Relative residual at which a linear solve ends, and its maximum number of iterations."""
+"""Relative residual at which a linear solve ends, and the maximum number of its iterations."""
 
 _MIN_STEP_LENGTH = 2.0**-30
 """Shortest step size: a shorter step is round-off."""
@@ -60,7 +59,9 @@ _MIN_STEP_LENGTH = 2.0**-30
 
 @dataclass(frozen=True)
 class MultigridXpbd:
-    """MGPBD; uses neither the initial guess nor a tolerance, and stops at round-off of the tensions.
+    """MGPBD, which stops at round-off of the tensions.
+
+    It uses neither the initial guess nor a tolerance.
 
     Args:
         near_null_vectors: number of near-null-space vectors, each from sweeps on a random vector; 0 for constant
@@ -162,7 +163,7 @@ class PreparedMultigridXpbd(IterativeSolver):
         return MgpbdState(self, vertex_terms.compute_anchor_positions(problem))
 
     def scaled_constraints(self, p: Positions) -> tuple[NDArray[np.float64], Positions]:
-        """Compute K^1/2 C(p) (m,) [J^(1/2)] and the spring directions N (m, 3) at positions p (n, 3)."""
+        """Compute K^1/2 C(p) (m,) [J^(1/2)] and the spring directions N (m, 3)."""
         length, unit = unit_directions(self.incidence_matrix @ p, self.rest_direction)
         return self.root_stiffness * (length - self.rest_length), unit
 
@@ -174,7 +175,7 @@ class PreparedMultigridXpbd(IterativeSolver):
         return csr_array((entries, G.indices, G.indptr), shape=G.shape)
 
     def build_prolongation(self, A: csr_array) -> ProlongationHierarchy:
-        """Build the prolongation for A and its successors by the rule of the solver."""
+        """Build the prolongations for A and the dual matrices of the following iterations."""
         made = self.parameters
         if is_coarsest_level(A):
             return ProlongationHierarchy(A, np.empty((A.shape[0], 0)))
@@ -193,7 +194,7 @@ class MgpbdState(SolverState):
 
     Attributes:
         scaled_tension: s = K^-1/2 t (m,) [J^(1/2)].
-        dual_residual: b, the error of s (m,).
+        dual_residual: b, the error of s (m,) [J^(1/2)].
         num_cg_iterations: conjugate gradient iterations of the most recent iteration.
     """
 

@@ -7,10 +7,9 @@ k (|p_i - p_j| - r):
     dt = (k (|p_i - p_j| - r) - t) / (1 + k (1/q_i + 1/q_j)),    p_i -= dt/q_i n,    p_j += dt/q_j n
 
 with n the direction of the spring and q = c m/dt^2 + w the anchor stiffness of a vertex, so that pins of any weight
-need no separate constraints (see `springbench.solvers.iteration.vertex_terms`). This is the paper's formula in
-terms of forces,
-lambda = -t dt^2, and valid from k = 0 to the largest k. Small steps (Macklin et al. 2019) divides the time step
-instead, with one iteration per substep.
+need no separate constraints (see `springbench.solvers.iteration.vertex_terms`). This is the paper's formula in terms of
+forces, lambda = -t dt^2, and valid from k = 0 to the largest k. The variant with small steps (Macklin et al. 2019)
+divides the time step instead, with one iteration per substep.
 
 Neither minimises the objective of the step. Tensions are accumulated along directions that rotate during the iteration,
 without correction terms. The fixed point is the minimiser if springs do not rotate (a straight chain), and close to it
@@ -70,10 +69,10 @@ class Xpbd(PrecisionOptions):
 
 @dataclass(frozen=True)
 class XpbdSmallSteps(PrecisionOptions):
-    """XPBD with small steps: as many substeps of one iteration as the stop rule has iterations.
+    """XPBD with small steps, each with one iteration.
 
-    The k-th iterate is the whole step in k substeps. Pins move at constant velocity, and forces are constant within a
-    step. Neither the initial guess nor a tolerance is used.
+    A step has as many substeps as the stop rule has iterations: the k-th iterate is the whole step in k substeps. Pins
+    move at constant velocity, and forces are constant within a step. Neither the initial guess nor a tolerance is used.
     """
 
     is_minimiser: ClassVar[bool] = False
@@ -114,7 +113,7 @@ class PreparedXpbd(IterativeSolver):
     Attributes:
         coloured_constraints: the springs by colour.
         vertex_compliance: 1/q (n,) [m/N].
-        constraint_relaxation: (m,), documented with the kernels.
+        constraint_relaxation: `ease` (m,), see `xpbd_projection.run_projections`.
     """
 
     residual_iterate: ClassVar[ResidualIterate] = "none"
@@ -152,7 +151,7 @@ class XpbdState(SolverState):
         )
 
     def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents any further change."""
+        """Do one iteration; return True."""
         return self.run_unchecked(1) == 1
 
     def run_unchecked(self, num_iterations: int) -> int:
@@ -245,7 +244,7 @@ def _colour_constraints(
 def _compute_compliance(
     constraints: kernels.SpringConstraints, anchor_stiffness: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute the compliance 1/q (n,) [m/N], and the relative displacement of each spring (m,)."""
+    """Compute the compliance 1/q (n,) [m/N] and the factor `ease` (m,), see `run_projections`."""
     compliance = 1.0 / anchor_stiffness
     i, j = constraints.end_vertices.T
     return compliance, 1.0 / (1.0 + constraints.stiffness * (compliance[i] + compliance[j]))

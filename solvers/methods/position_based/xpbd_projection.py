@@ -58,7 +58,10 @@ class PinMotion(NamedTuple):
 
 @jit_inner
 def _project_constraints(constraints, ease, compliance, tension, p):
-    """Project all springs once, so that each has the force k (|p_i - p_j| - r); `tension` accumulates it if given."""
+    """Project all springs once.
+
+    After its projection a spring has the force k (|p_i - p_j| - r); `tension` accumulates it if given.
+    """
     ends, stiffness, rest_length, rest_direction = constraints
     for e in range(len(stiffness)):
         i, j = ends[e]
@@ -100,7 +103,9 @@ def run_projections(constraints, ease, compliance, tension, p, iterations):
 
 @jit_kernel
 def run_substeps(constraints, ease, compliance, pinned, force, before, p, v, h, count):
-    """Run `count` steps of size h, each with one pass; p and v are overwritten with the result.
+    """Run `count` steps of size h with one pass each.
+
+    The arrays p and v are overwritten with the result.
 
     Args:
         constraints, ease, compliance: as for `run_projections`, for steps of size h.
