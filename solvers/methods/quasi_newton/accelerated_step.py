@@ -1,7 +1,8 @@
-"""A whole accelerated step over a factor's own rows, without Python, for springs and spring-like energies.
+"""A whole accelerated step over the rows of a factor, without Python.
 
-The plan is that of `springbench.solvers.kernels.local_global_iteration`, which corrects positions within the solve.
-Here a solve is separate, because the acceptance of a trial depends on its objective.
+It supports springs and spring-like energies. The plan is that of `springbench.solvers.kernels.local_global_iteration`,
+which corrects positions within the solve. Here a solve is separate, because the acceptance of a trial depends on its
+objective.
 """
 
 from __future__ import annotations

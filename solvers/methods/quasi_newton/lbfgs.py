@@ -11,8 +11,8 @@ positive and below Q, s y is at least y Q^-1 y, and H stays positive definite. A
 are not projective do not contribute to Q.
 
 `preconditioner: a-jacobi` replaces Q^-1 by S, the aggregate of several Jacobi sweeps
-(`springbench.solvers.methods.local_global.aggregated_jacobi`): a product with a sparse
-matrix, which suits a graphics processor.
+(`springbench.solvers.methods.local_global.aggregated_jacobi`): a product with a sparse matrix, which suits a graphics
+processor.
 """
 
 from __future__ import annotations
@@ -115,7 +115,12 @@ class Lbfgs(WindowedAcceleration):
         return _PreparedLbfgsJacobi(base, metric, scheme, FixedObjective(system))
 
     def prepare_without_barriers(self, system: System) -> PreparedAccelerated:
-        """Prepare the method with the factor of Q that ignores barrier energies; raises as `prepare` does."""
+        """Prepare the method with the factor of Q, without barrier energies.
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
+            Unsupported: if Q does not fit in memory.
+        """
         return prepare_without_barriers(system, self._acceleration_scheme, self.linear_solver, self.precision)
 
     @property
@@ -147,12 +152,15 @@ class _PreparedLbfgsJacobi(IterativeSolver):
         return _LbfgsJacobiState(self._metric, self._local_global, self._acceleration_scheme, step, initial_guess)
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return self._local_global.residual_scale(problem)
 
 
 class _LbfgsJacobiState(InterpretedState):
-    """State of a solve with the Jacobi preconditioner; residuals are measured with the factor of Q."""
+    """State of a solve with the Jacobi preconditioner.
+
+    Residuals are measured with the factor of Q.
+    """
 
     def __init__(
         self,
@@ -166,5 +174,5 @@ class _LbfgsJacobiState(InterpretedState):
         self._metric = metric
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] at the iterate."""
         return self._metric.residual(self.gradient())

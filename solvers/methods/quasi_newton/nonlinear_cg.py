@@ -4,14 +4,13 @@ Shen et al. 2024; they precondition by the diagonal of the Hessian, as interior-
 
     d = -z + beta d_previous,   z = Q^-1 grad g,   y = g - g_previous,   w = Q^-1 y
     beta = (y z - (w y) (g d)/(d y)) / (d y)              Dai and Kou 2013
-    t = -(g d)/(d H d)                                    the minimum of the quadratic model along d
+    t = -(g d)/(d H d)                                    the minimiser of the quadratic model along d
 
 H d is a product, element by element. If d is no descent direction, or the model has negative curvature along it, d is
 reset to -z: a local-global iteration. A step without sufficient decrease is halved, and the step size is
-collision-free. With active surface contacts, P = S Q S replaces Q
-(`springbench.solvers.iteration.preconditioners`). Contact of
-single vertices is not supported: it activates abruptly and friction sticks within 1e-8 m, so no quadratic model
-is valid for a step along d. Landing sheets took 340 to 2,600 iterations where L-BFGS took 23 to 135.
+collision-free. With active surface contacts, P = S Q S replaces Q (`springbench.solvers.iteration.preconditioners`).
+Contact of single vertices is not supported: it activates abruptly and friction sticks within 1e-8 m, so no quadratic
+model is valid for a step along d. Landing sheets took 340 to 2,600 iterations where L-BFGS took 23 to 135.
 """
 
 from __future__ import annotations
@@ -110,7 +109,7 @@ class PreparedNonlinearCG(IterativeSolver):
         )
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return compute_max_coordinate(problem) * self.metric.unpinned_trace**0.5
 
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
@@ -176,7 +175,7 @@ class _NonlinearCGState(SolverState):
         return backtracking_line_search(self._step, self._current_point, direction, initial_step=-slope / curvature)
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] at the iterate."""
         gradient = self._current_point.gradient
         if self._solve == self._metric.solve:
             return self._metric.correction_norm(self._z.copy(), gradient)

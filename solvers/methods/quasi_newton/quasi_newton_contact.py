@@ -1,7 +1,8 @@
-"""Vertex contact for accelerated methods: corrections use Q + W instead of Q, as in `half_space_contact`.
+"""Vertex contact for accelerated methods, whose corrections use Q + W instead of Q.
 
-All pairs of a window belong to one W. W is reused while the same vertices are in contact with about the same stiffness;
-when that changes, the window restarts with another W. Without active contact the method is unchanged.
+W is that of `half_space_contact`. All pairs of a window belong to one W. It is reused while the same vertices are in
+contact with about the same stiffness; when that changes, the window restarts with another W. Without active contact the
+method is unchanged.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ _MAX_WEIGHT_RATIO = 2.0
 
 
 class ContactEngine:
-    """Acceleration engine with vertex contact; contact_free: the engine used while no contact is active."""
+    """Acceleration engine with vertex contact.
+
+    The engine `contact_free` is used while no contact is active.
+    """
 
     def __init__(
         self,
@@ -93,12 +97,15 @@ class _ContactAcceleration(InterpretedState):
         )
 
     def residual(self) -> float:
-        """Return the residual of the trial point."""
+        """Return the residual [J^(1/2)] at the iterate."""
         return self._corrections.residual_norm(self._contact_free_correction)
 
 
 def _are_rows_compatible(one: PenaltyRows, other: PenaltyRows) -> bool:
-    """Return whether the rows of one point can be reused at another; rows with a gap belong to one point alone."""
+    """Return whether the rows of one point can be reused at another.
+
+    Rows with a gap belong to one point alone.
+    """
     if not np.array_equal(one.vertices, other.vertices) or one.gap.any() or other.gap.any():
         return False
     return bool(

@@ -1,10 +1,9 @@
 """Accelerated first-order methods with one prefactored matrix: Anderson, Chebyshev and L-BFGS.
 
 They share the iteration (`springbench.solvers.kernels.accelerated_descent`) and differ in the coefficients of a
-direction. A step
-is fully compiled if the energies are springs, quadratic forms, strain limits and dashpots, and the factor's panels are
-supported by the kernels. Otherwise the kernels alternate with the energies' own values and gradients, and with the
-factor's own solve.
+direction. A step is fully compiled if the energies are springs, quadratic forms, strain limits and dashpots, and the
+factor's panels are supported by the kernels. Otherwise the kernels alternate with the energies' own values and
+gradients, and with the factor's own solve.
 
 No iteration raises the objective, except by round-off. A trial that would is shortened, or replaced by the plain
 correction, a local-global iteration, which descends by majorisation. If that does not descend either, within round-off,
@@ -198,7 +197,7 @@ class PreparedAccelerated(IterativeSolver):
         return self.acceleration_engine.init_lower_state(problem, initial_guess, measures_guess=measures_guess)
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return compute_max_coordinate(problem) * self.local_global.unpinned_trace**0.5
 
 
@@ -328,7 +327,7 @@ class CompiledAccelerationState(AcceleratedState):
                 step.objective_values[1] += parts.edge_energy_scale(p)
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Run iterations within the limits; return their number, the residual and the reason of the end."""
+        """Run iterations within the limits; return count, residual and reason."""
         return self._solve_kernels.run_solve.call(*self._state, limits, self.positions)
 
     def run_rounds(self, rounds: NDArray[Any], limits: LoopLimits) -> tuple[int, float, int]:
@@ -345,7 +344,7 @@ class CompiledAccelerationState(AcceleratedState):
         return self.run_iterations(ONE_ITERATION)[0] == 1
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] at the iterate."""
         return self.run_iterations(iteration_limit(0))[1]
 
     @property
