@@ -6,9 +6,8 @@ This is the first Newton step on the objective g from the start of the frame: (H
 codes use it. It has the order of the integrator that defines the step, 1 with implicit Euler and 2 with BDF2 (Choi and
 Ko 2002) and midpoint. The accuracy of a step cannot be controlled: where springs rotate far in one step, x is far from
 the minimum. E is zero wherever H has a Cholesky factor. Where compressed springs leave it none, part of their negative
-lateral stiffness is removed, and if necessary all of it
-(`springbench.solvers.methods.newton.hessian_regularisation`); Choi and Ko
-always remove all of it.
+lateral stiffness is removed, and if necessary all of it (`springbench.solvers.methods.newton.hessian_regularisation`);
+Choi and Ko always remove all of it.
 """
 
 from __future__ import annotations

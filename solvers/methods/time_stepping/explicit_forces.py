@@ -24,7 +24,10 @@ _EIGENVALUE_MARGIN = 1.02
 
 
 def estimate_max_frequency(system: System) -> float:
-    """Return a bound of the largest angular frequency [rad/s] of springs and constant forms, with all pins fixed."""
+    """Return a bound of the largest angular frequency [rad/s], with all pins fixed.
+
+    Springs at their largest stiffness and constant quadratic forms are taken into account.
+    """
     free = np.flatnonzero(system.unpinned_mask)
     constant = [e for e in system.energies if isinstance(e, (Springs, Quadratic)) and not is_lagged(e)]
     if not len(free) or not constant:
@@ -48,9 +51,14 @@ def estimate_max_frequency(system: System) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ExplicitForces:
-    """The forces of a system: springs and their packets, a form as in `FrameForces`, drag (n,) [1/s], load (n, 3) [N].
+    """The forces of a system.
 
-    The load is the force of the form at the origin.
+    Attributes:
+        springs: all springs.
+        spring_packets: packets of the springs at unpinned vertices.
+        form_pairs, form_weight, form_vertex_weight: quadratic form, as in `FrameForces`.
+        drag_rate: rate of the drag of each vertex (n,) [1/s], 0 for pinned ones.
+        constant_force: force of the form at the origin (n, 3) [N].
     """
 
     springs: Springs
@@ -135,9 +143,9 @@ class SingleIterateState(SolverState):
         self.positions, self.velocity = p, v
 
     def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents descent."""
+        """Return True; the step is complete from the start."""
         return True
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Iterate up to the limits; return count, residual and reason."""
+        """Return one iteration without a residual, whatever the limits are."""
         return 1, float("nan"), REASON_ITERATIONS

@@ -134,7 +134,7 @@ def kick_and_drift(inverse, velocity_factor, gained, first, second, h, p, v, for
 
 @jit_kernel
 def run_splitting(forces, drifts, velocity_factor, gained, count, h, p, v, force):
-    """Run `count` steps of size h: drift 0, kick 0, drift 1, ..., the last drift.
+    """Run `count` steps of size h: drift 0, kick 0, ..., the last drift.
 
     If a step neither starts nor ends with a drift, its last kick and the first kick of the next step share one force.
     The arrays p and v are overwritten with the result.
@@ -201,7 +201,11 @@ class AdaptiveSteps(NamedTuple):
 
 
 class StageScratch(NamedTuple):
-    """The motion at a stage, q [m] and w [m/s], and the derivatives q' and w' at all stages, (s, rows)."""
+    """The motion at a stage, and its derivatives at all stages.
+
+    The motion is q [m] and w [m/s]. The derivatives q' and w' are `stage_velocities` and `stage_accelerations`, (s,
+    rows).
+    """
 
     q: FloatArray
     w: FloatArray
@@ -258,7 +262,10 @@ def _error_squares(forces, weights, span, at):
 
 @jit_inner
 def _step_error(forces, errors, span, at):
-    """Return the sum of squares of a step's error; a second estimate moderates the first one."""
+    """Return the sum of squares of a step's error.
+
+    A second estimate moderates the first one.
+    """
     size = _error_squares(forces, errors[0], span, at)
     if len(errors) == 1:
         return size

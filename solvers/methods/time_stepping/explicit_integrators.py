@@ -267,7 +267,7 @@ class Tsitouras5(_AdaptiveStepSolver):
 
 @dataclass(frozen=True)
 class DormandPrince8(_AdaptiveStepSolver):
-    """Dormand and Prince's method of order 8, error orders 5 and 3, twelve force evaluations per substep."""
+    """Dormand and Prince's method of orders 8(5,3), twelve force evaluations per substep."""
 
     solver_name: ClassVar[str] = "dormand-prince-8"
     solver_info: ClassVar[SolverInfo] = replace(
@@ -328,7 +328,7 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
             h: first substep [s] of an adaptive method; by default from the largest frequency.
 
         Returns:
-            Positions and velocities (n, 3) at the end of the step, and the statistics of `integrate`.
+            Positions and velocities (n, 3) at the end of the step, and the statistics of `integrate_adaptive`.
         """
         s, pins, start, frame = self.system, self.system.pins.vertices, problem.step_start, self.system.time_step
         begin, end = np.ascontiguousarray(start.positions[pins]), problem.pin_targets.copy()
@@ -402,5 +402,8 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
 
 
 def _expand_to_rows(of_vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Repeat the value of each vertex for the four numbers of its row; zero for padding rows."""
+    """Repeat the value of each vertex for the three coordinates of its row.
+
+    The fourth number of a row and the padding rows are zero.
+    """
     return pad_rows(np.repeat(of_vertices[:, None], 3, axis=1))

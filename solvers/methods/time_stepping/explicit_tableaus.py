@@ -20,7 +20,10 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class SplittingMethod:
-    """A splitting method: its order, drifts (k + 1,) and kicks (k,), as fractions of a step."""
+    """A splitting method.
+
+    Its drifts (k + 1,) and kicks (k,) are fractions of a step.
+    """
 
     order: int
     drifts: FloatArray
@@ -45,7 +48,7 @@ class SplittingMethod:
         return len(self.kicks) - (self.drifts[0] == 0.0)
 
     def amplification_factor(self, y: float) -> complex:
-        """Return the largest eigenvalue of a step's matrix for an oscillator with omega h = y."""
+        """Return the largest eigenvalue of a step for an oscillator with omega h = y."""
         step = np.eye(2)
         for k, drift in enumerate(self.drifts):
             step = np.array([[1.0, drift * y], [0.0, 1.0]]) @ step
@@ -114,7 +117,7 @@ class ExplicitTableau:
 
 
 _MAX_TRIED_RATIO = 20
-"""Maximum ratio of tried steps to the stable number with an error tolerance."""
+"""Maximum ratio of tried steps to the stable number with an error tolerance; 10,000 more are allowed."""
 
 
 def compute_max_steps(count: int, tolerance: float) -> int:
@@ -128,9 +131,9 @@ def compute_max_steps(count: int, tolerance: float) -> int:
 
 
 def integrate_drag(kicks: FloatArray, h: float, drag: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the decay of a velocity by each kick, and its gain per acceleration [s], both (k, r).
+    """Return the decay and the gain of a velocity by each kick, both (k, r).
 
-    They are exact for linear drag.
+    The gain is per acceleration [s]. Both are exact for linear drag.
 
     Args:
         kicks: fractions of a step (k,).

@@ -7,9 +7,8 @@ For p' = v, M v' = F(p) - D v and s = 1/(gamma h), a stage (u, w) of positions a
 with P = p + sum a u_j and V = v + sum a w_j. The velocities are eliminated, so the matrix is that of a step problem. It
 is factorised at the start of the step. K is the exact Hessian of the energies there, as the order conditions require.
 If the step is too long for compressed springs, it may have no Cholesky factor. Adaptive steps are then halved. Fixed
-steps reduce the springs' negative lateral stiffness
-(`springbench.solvers.methods.newton.hessian_regularisation`); only ROS2
-retains its order in that case.
+steps reduce the springs' negative lateral stiffness (`springbench.solvers.methods.newton.hessian_regularisation`); only
+ROS2 retains its order in that case.
 """
 
 from __future__ import annotations
@@ -156,7 +155,7 @@ class Ros3P(_RosenbrockSolver):
 
 @dataclass(frozen=True)
 class Rodas(_RosenbrockSolver):
-    """RODAS: six stages, order 4 with an error estimate of order 3; L-stable and stiffly accurate."""
+    """RODAS: six stages, order 4 with embedded order 3; L-stable and stiffly accurate."""
 
     solver_name: ClassVar[str] = "rodas"
     coefficients: ClassVar[RosenbrockTableau] = RODAS_TABLEAU
@@ -176,7 +175,10 @@ class Rodas(_RosenbrockSolver):
 class AdaptiveStepStats(NamedTuple):
     """Statistics of adaptive steps in a frame.
 
-    Numbers of accepted and rejected steps, the last step size [s], and the reached time of the frame [s].
+    Attributes:
+        num_accepted_steps, num_rejected_steps: numbers of accepted and of rejected steps.
+        last_step_size: the last step size [s].
+        reached_time: time reached in the frame [s].
     """
 
     num_accepted_steps: int
@@ -198,7 +200,7 @@ class PreparedRosenbrock(IterativeSolver):
     """A Rosenbrock method, prepared for a system.
 
     Attributes:
-        fixed_objective: of the energies without drag.
+        fixed_objective: objective of the energies without drag.
         drag: coefficients d (n,) [N s/m].
         refinement_factor: number of fixed steps in a frame.
         error_tolerance: error of each adaptive step [m], 0 for fixed steps.
@@ -219,7 +221,7 @@ class PreparedRosenbrock(IterativeSolver):
 
     @property
     def order(self) -> int:
-        """Order of the error estimate."""
+        """Order of the method."""
         return self.coefficients.order
 
     @property
@@ -317,7 +319,7 @@ class _FrameIntegration:
         return self._start.positions.copy(), v
 
     def apply_pins(self, p: Positions, fraction: float) -> Positions:
-        """Return p with exactly pinned vertices moved to their targets at a fraction of the frame."""
+        """Move the exact pins of p to their positions at a fraction of the frame; return p."""
         p[self._exact_pins] = (
             self._end_targets
             if fraction == 1.0

@@ -1,4 +1,4 @@
-"""Coefficients of Rosenbrock methods for y' = F(y), in the form without products with the Jacobian J.
+"""Coefficients of Rosenbrock methods for y' = F(y), without products with the Jacobian J.
 
     (1/(gamma h) - J) u_i = F(y + sum_(j<i) a_ij u_j) + sum_(j<i) c_ij/h u_j,    y' = y + sum_i m_i u_i
 

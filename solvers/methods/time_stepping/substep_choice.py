@@ -1,4 +1,4 @@
-"""The substeps of an explicit method: their fixed number or their error tolerance, and derived properties."""
+"""The substeps of an explicit method, which have a fixed number or an error tolerance."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class PreparedSubstepping:
 
     @property
     def order(self) -> int:
-        """Order of the error."""
+        """Order of the method."""
         return self.method.order
 
     @property
@@ -50,7 +50,8 @@ class PreparedSubstepping:
     def with_tolerance(self, tolerance: float) -> Self:
         """Return the solver with another error tolerance [m] of substeps.
 
-        Raises Unsupported for a fixed size.
+        Raises:
+            Unsupported: if the substeps have a fixed size.
         """
         if not self.substep_choice.tolerance:
             raise Unsupported("the method chooses no steps by an error")

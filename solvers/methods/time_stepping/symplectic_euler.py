@@ -97,7 +97,7 @@ class SymplecticEuler:
 
 
 def bound_max_frequency(system: System, springs: Springs) -> float:
-    """Return an upper bound of the largest angular frequency [rad/s] of the springs in any shape.
+    """Return a bound of the springs' largest angular frequency [rad/s] in any shape.
 
     Args:
         system: the system; vertices pinned by penalty count as fixed.
@@ -141,7 +141,10 @@ class PreparedSymplecticEuler(IterativeSolver):
 
     @cached_property
     def _velocity_rate(self) -> NDArray[np.float64]:
-        """Change of the velocity in a substep by a unit force (n,) [s/kg], 0 for pinned vertices."""
+        """Change of the velocity in a substep by a unit force (n,) [s/kg].
+
+        It is 0 for pinned vertices.
+        """
         s, h = self.system, self.system.time_step / self.num_substeps
         return np.divide(h, s.mass, out=np.zeros(s.num_vertices), where=s.unpinned_mask)
 

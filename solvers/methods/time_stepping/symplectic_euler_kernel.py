@@ -1,4 +1,4 @@
-"""Compiled symplectic Euler: force of all springs in packets of eight vertices, then velocities, then positions."""
+"""Compiled symplectic Euler, with the springs in packets of eight vertices."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from springbench.solvers.kernels.spring_local_step import add_descent
 
 @jit_kernel
 def run_symplectic_euler(bundles, pins, begin, end, force, rate, h, count, p, v, acceleration):
-    """Run `count` substeps of size h; p and v, in rows of four, are overwritten with the result.
+    """Run `count` substeps of size h.
+
+    The arrays p and v, in rows of four, are overwritten with the result.
 
     Args:
         bundles: packets of the springs.
