@@ -1,18 +1,16 @@
-"""Augmented vertex block descent (Giles, Diaz and Yuksel 2025): length constraints within the sweeps of VBD.
+"""Augmented vertex block descent: length constraints within the sweeps of VBD.
 
-A constrained edge of length l has a tension t [N] and a stiffness k [N/m]:
+Source: Giles, Diaz and Yuksel 2025. A constrained edge of length l has a tension t [N] and a stiffness k [N/m]:
 
     E_e = k/2 (l + t/k - clip(l + t/k, low, high))^2      in a sweep of `vertex_block.vbd` over all vertices
     t <- k (l + t/k - clip(l + t/k, low, high)),   k <- min(k + beta |l - clip(l, low, high)|, bound k_0)     after it
 
-so t converges to the Lagrange multipliers of the step (`springbench.solvers.model.energies.augmented_lagrangian`),
-and the lengths
-to their feasible values, for any k. A solve converges when the gradient that the best multipliers leave is below the
-tolerance (`springbench.solvers.methods.vertex_block.lagrange_multipliers`), because the tensions t may cancel the
-gradient while
-lengths are still wrong. Here beta = ramp k_0/high and k_0 = 1/(1/q_i + 1/q_j), the anchor stiffness of the two ends;
-the paper has a beta of 10 N/m^2 and starts at 1 N/m. The choice here does not depend on the units of mass, length and
-time. A larger ramp corrects lengths sooner, but leaves a larger gradient in the meantime.
+so t converges to the Lagrange multipliers of the step (`springbench.solvers.model.energies.augmented_lagrangian`), and
+the lengths to their feasible values, for any k. A solve converges when the gradient that the best multipliers leave is
+below the tolerance (`springbench.solvers.methods.vertex_block.lagrange_multipliers`), because the tensions t may cancel
+the gradient while lengths are still wrong. Here beta = ramp k_0/high and k_0 = 1/(1/q_i + 1/q_j), the anchor stiffness
+of the two ends; the paper has a beta of 10 N/m^2 and starts at 1 N/m. The choice here does not depend on the units of
+mass, length and time. A larger ramp corrects lengths sooner, but leaves a larger gradient in the meantime.
 
 A step starts with gamma t and max(gamma k, k_0) of the previous step, which the solution stores for this warm start,
 gamma = `warm_start_decay`. `error_stabilisation` alpha widens the limits by alpha times the error at the start of the
@@ -178,7 +176,7 @@ class PreparedAugmentedVertexBlockDescent(IterativeSolver):
 
     @cached_property
     def least_squares_multipliers(self) -> LagrangeMultipliers:
-        """Return the least-squares multipliers of the length constraints."""
+        """The least-squares multipliers of the length constraints."""
         return LagrangeMultipliers(
             self._augment_system(np.zeros(len(self.min_stiffness))),
             self._exact_lengths,
@@ -238,7 +236,7 @@ class PreparedAugmentedVertexBlockDescent(IterativeSolver):
 
     @cached_property
     def _residual_solver(self) -> ContactFreeSolver:
-        """Return the residual solver: that of `VertexBlockDescent`, or with full spring stiffness if ramped."""
+        """The residual solver: that of `VertexBlockDescent`, or with full spring stiffness if ramped."""
         if self.exact_mask.all():
             return self.vertex_block_descent.residual_solver
         return cast(

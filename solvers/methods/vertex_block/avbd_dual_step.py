@@ -102,7 +102,10 @@ def build_augmented_iteration(sweeps: Any) -> Any:
 
     @jit_kernel
     def iterate(blocks, spaces, elements, right, work, p, iterations, hard, duals):
-        """Run n sweeps from p, which is overwritten, each with a dual step; edge parameters must be current."""
+        """Run n sweeps, each with a dual step, from p, which is overwritten.
+
+        The edge parameters must be current.
+        """
         for _ in range(iterations):
             sweeps(blocks, spaces, elements, right, 0.0, work, p, 1)
             _update_duals(hard, duals, p)

@@ -27,7 +27,7 @@ class VertexBlocks(NamedTuple):
         num_free: number of free rows.
         spring_packets: packets of the free rows, by colour.
         first_packet: first packet of each colour (colours + 1,).
-        anchor_stiffness: stiffness [N/m] of inertia and pins of each row (n + 2,).
+        anchor_stiffness: stiffness [N/m] of inertia, pins and forms of each free row (n + 2,), 0 elsewhere.
         majorant: that plus the stiffness of springs and elements (n + 2,) [N/m]; 1 for padding.
     """
 

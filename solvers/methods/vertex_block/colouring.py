@@ -18,7 +18,12 @@ from springbench.solvers.model.system_matrix_assembly import compute_row_starts,
 
 @dataclass(frozen=True, eq=False)
 class Colouring:
-    """The items by colour and index (order), and the start of each colour in that order (colours + 1,)."""
+    """A colouring of items.
+
+    Attributes:
+        item_order: the items by colour, then by index.
+        colour_starts: start of each colour in that order (colours + 1,).
+    """
 
     item_order: NDArray[np.int64]
     colour_starts: NDArray[np.int64]
@@ -52,7 +57,10 @@ def colour_vertices(edges: NDArray[np.int64], n: int) -> Colouring:
 
 
 def _colour_rows(groups: csr_array, items: csr_array) -> Colouring:
-    """Colour the rows of `groups`, adjacent if they have an entry in one column; `items` is the transpose."""
+    """Colour the rows of `groups`, where rows that share a column are adjacent.
+
+    `items` is the transpose.
+    """
     for matrix in (groups, items):
         matrix.sort_indices()
     count = len(groups.indptr) - 1
@@ -67,7 +75,9 @@ def _colour_rows(groups: csr_array, items: csr_array) -> Colouring:
 
 @jit_kernel
 def _assign_first_free_colours(pointers, groups, back, items, colour, taken):
-    """Write to `colour`, for each item in order, the first colour that no earlier item of its groups has.
+    """Write to `colour` the first free colour of each item, in order.
+
+    A colour is free if no earlier item in the groups of the item has it.
 
     Args:
         pointers, groups: groups[pointers[a]:pointers[a + 1]] are the groups of item a.

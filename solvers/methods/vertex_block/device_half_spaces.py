@@ -1,11 +1,11 @@
-"""Vertex contact with obstacles on a device: half-spaces, built at the start of a step and used in sweeps.
+"""Vertex contact with obstacles on a device, by half-spaces.
 
-The host only provides the frames of moving obstacles. The functions are shared with the CPU: the half-space of a vertex
-(`springbench.solvers.contact.half_space.separating_planes`), its terms in the gradient and block of the vertex, and
-the trial steps
-(`springbench.solvers.contact.half_space.half_space_steps`). They compute in float64, as few vertices are in contact.
-The springs'
-terms come from the kernels of `springbench.solvers.methods.vertex_block.device_vbd_kernels` in their type.
+They are built at the start of a step and used in sweeps. The host only provides the frames of moving obstacles. The
+functions are shared with the CPU: the half-space of a vertex
+(`springbench.solvers.contact.half_space.separating_planes`), its terms in the gradient and block of the vertex, and the
+trial steps (`springbench.solvers.contact.half_space.half_space_steps`). They compute in float64, as few vertices are in
+contact. The springs' terms come from the kernels of `springbench.solvers.methods.vertex_block.device_vbd_kernels` in
+their type.
 """
 
 from __future__ import annotations
@@ -255,9 +255,9 @@ def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
 
     @cuda.jit
     def press(spaces, x, u, sequence_number, control, first, out):
-        """Write the change of the half-space energy from the reference to u [J], one number per block.
+        """Write the change of the half-space energy from the reference to u [J].
 
-        The numbers are stored in `out` from `first` on; see `sum_objective` in
+        It is a sum per thread block. The sums are stored in `out` from `first` on; see `sum_objective` in
         `springbench.solvers.methods.vertex_block.device_vbd_kernels`.
         """
         if sequence_number == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:

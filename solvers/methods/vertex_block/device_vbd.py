@@ -1,7 +1,7 @@
-"""Vertex block descent on a device: the iterates of `springbench.solvers.methods.vertex_block.vbd`, one launch per
-colour.
+"""Vertex block descent on a device, with one launch per colour.
 
-Colours, their order, packets and sums are those of the CPU. Springs, quadratic forms and vertex contact with obstacles
+It computes the iterates of `springbench.solvers.methods.vertex_block.vbd`. Colours, their order, packets and sums are
+those of the CPU. Springs, quadratic forms and vertex contact with obstacles
 are supported; elements of other energies and barrier contact are not. Every REBASE_INTERVAL iterations the displacement
 is added to the reference in float64, and the gradient is computed there. Hence float32 iterates converge to the minimum
 in float64 as well.
@@ -94,7 +94,10 @@ def prepare_vbd(
 
 @dataclass(frozen=True, eq=False)
 class PreparedDeviceVertexBlockDescent(MinimisingSolver):
-    """VBD, prepared on a device, with lanes, anchor stiffness and majorant of each lane [N/m] there."""
+    """VBD, prepared on a device.
+
+    The lanes, and the anchor stiffness and majorant of each lane [N/m], are on the device.
+    """
 
     system: System
     spring_form: SpringForm
@@ -129,7 +132,7 @@ class PreparedDeviceVertexBlockDescent(MinimisingSolver):
         return DeviceSweepState(self)
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         stiffness = self.vertex_blocks.majorant[self.vertex_blocks.row_of_vertex][self.system.unpinned_mask]
         return compute_max_coordinate(problem) * float(stiffness.sum()) ** 0.5
 
@@ -215,7 +218,7 @@ class DeviceSweepState(DeviceSolverState):
         return self._rows
 
     def launch_iterations(self, num_iterations: int) -> int:
-        """Launch iterations; return how many of them moved something."""
+        """Launch iterations; return their number."""
         for number in range(self._num_iterations, self._num_iterations + num_iterations):
             if number % REBASE_INTERVAL == 0:
                 self._rebase_reference(moved=number > 0)

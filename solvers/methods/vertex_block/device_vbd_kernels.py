@@ -1,4 +1,4 @@
-"""Vertex block descent on a device: the Newton step of each vertex of a colour, and Chebyshev's extrapolation.
+"""Vertex block descent on a device: Newton steps of vertices, and Chebyshev's extrapolation.
 
 A colour is one launch, a vertex one thread: no two vertices of a colour are neighbours, so a thread writes one row that
 no other thread reads in this launch. Sums are computed per block, in block order, and then by one block in a tree, so
@@ -56,10 +56,10 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, anchor_stiffness,
         force, u,
     ):  # fmt: skip
-        """Return the force [N] on a lane's vertex at displacement u0, u1, u2, and its block [N/m].
+        """Return the force [N] on a lane's vertex, and its block [N/m].
 
-        The block is stored as its upper triangle. Also return whether a spring has zero length;
-        such a spring does not contribute to the block.
+        The vertex has the displacement u0, u1, u2. The block is stored as its upper triangle. Also return whether a
+        spring has zero length; such a spring does not contribute to the block.
         """
         lane, h = t % LANES, anchor_stiffness[t]
         f0, f1, f2 = force[0, t] - h * u0, force[1, t] - h * u1, force[2, t] - h * u2
@@ -93,9 +93,9 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
     def risen(
         t, first, last, u0, u1, u2, x0, x1, x2, f0, f1, f2, neighbour, kind, weights, arrows, far, anchor_stiffness, u,
     ):  # fmt: skip
-        """Return the energy change [J] of a step x0, x1, x2 of a lane's vertex, from where the force is f0, f1, f2.
+        """Return the energy change [J] of a step x0, x1, x2 of a lane's vertex.
 
-        All springs must have nonzero length.
+        The force before the step is f0, f1, f2. All springs must have nonzero length.
         """
         lane = t % LANES
         moved = x0 * x0 + x1 * x1 + x2 * x2
@@ -233,7 +233,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         own, start, neighbour, kind, weights, spring, direction, arrows,
         padding_row, far, free, anchor_stiffness, force, u, condition, control, sums,
     ):  # fmt: skip
-        """Write the objective at the reference plus u, minus that at the reference, to `sums` [J], one per block.
+        """Write the change of the objective from the reference to u to `sums` [J], one sum per block.
 
         It is evaluated in float64, from the stored u and spring vectors, so that decisions do not depend on round-off.
 
@@ -363,7 +363,10 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
 
     @cuda.jit
     def rebase(x, u, older, control):
-        """Add the displacement to the reference; the objective there is 0 by definition if it was known."""
+        """Add the displacement to the reference.
+
+        The objective there is 0 by definition, if it was known.
+        """
         i = cuda.grid(1)
         if i == 0 and not math.isnan(control[OBJECTIVE]):
             control[OBJECTIVE] = 0.0

@@ -1,11 +1,10 @@
-"""Element energies by vertex: the gradient and block of one vertex, and the energy change of its step.
+"""Element energies by vertex: gradient, block and energy change of one vertex.
 
     E = sum_e phi_e(z_e),   z = A p       gradient_i = sum_e a_ei phi'(z_e),   block_i = sum_e a_ei^2 phi''(z_e)
 
 with the element laws of `springbench.solvers.model.energies.element_energies`. If phi'' does not depend on z, a
-vertex's block B is
-constant in the step, and a step d of the vertex changes the energy by g'd + d'Bd/2, with its gradient g. Its elements
-are then evaluated once, and not again for the change. Positions have rows of four numbers.
+vertex's block B is constant in the step, and a step d of the vertex changes the energy by g'd + d'Bd/2, with its
+gradient g. Its elements are then evaluated once, and not again for the change. Positions have rows of four numbers.
 """
 
 from __future__ import annotations

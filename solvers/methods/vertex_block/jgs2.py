@@ -146,7 +146,7 @@ def assemble_rest_hessian(system: System, springs: Springs, lateral: float) -> c
 def compute_responses(H: csr_array, graph: csr_array, rings: int) -> VertexPatches:
     """Compute the responses W of all vertices.
 
-    A vertex whose patch has no Cholesky factor gets a patch of its own.
+    If a patch has no Cholesky factor, its other vertices do not respond to the vertex.
 
     Args:
         H: Hessian of the rest shape (3f, 3f).
@@ -181,7 +181,10 @@ def compute_responses(H: csr_array, graph: csr_array, rings: int) -> VertexPatch
 
 
 class _PatchFactor:
-    """Factor of H on a patch of vertices, reused if the next vertex has the same patch."""
+    """Factor of H on a patch of vertices.
+
+    It is reused if the next vertex has the same patch.
+    """
 
     def __init__(self, H: csr_array) -> None:
         self._H, self._patch_vertices = H, np.empty(0, np.int64)
@@ -189,7 +192,10 @@ class _PatchFactor:
         self._inverse = np.empty((0, 0))
 
     def compute_response(self, patch_vertices: NDArray[np.int64], vertex: int) -> NDArray[np.float64]:
-        """Compute the response W (k, 3, 3) of a vertex; `patch_vertices` (k,) are those of its patch."""
+        """Compute the response W (k, 3, 3) of a vertex.
+
+        `patch_vertices` (k,) are the vertices of its patch.
+        """
         if not np.array_equal(patch_vertices, self._patch_vertices):
             self._patch_vertices, self._factor = patch_vertices, self._factorise_patch(patch_vertices)
         own, alone = int(np.searchsorted(patch_vertices, vertex)), np.zeros((len(patch_vertices), 3, 3))
@@ -208,7 +214,7 @@ class _PatchFactor:
             out = np.empty((rows, 3))
             factor.solve(np.eye(rows, 3, -3 * own), out)
             return out
-        if len(self._inverse) < rows:  # of the whole mesh, which all vertices share: all at once is sooner
+        if len(self._inverse) < rows:  # all vertices share the patch of the whole mesh: invert it once
             self._inverse = np.empty((rows, rows))
             factor.solve(np.eye(rows), self._inverse)
         return self._inverse[:, columns]
@@ -239,7 +245,8 @@ class _VertexRotations:
     def compute_rotations(self, p: Positions) -> NDArray[np.float64]:
         """Compute the rotations R (f, 3, 3) at positions p (n, 3).
 
-        n is the direction of an incident spring, n0 its direction at rest.
+        R is the rotation nearest to the sum of k n n0' over the incident springs, with n the direction of a spring and
+        n0 its direction at rest.
         """
         i, j = self._edges.T
         _, unit = unit_directions(p[i] - p[j], self._rest_directions)

@@ -27,7 +27,14 @@ class VertexPatches(NamedTuple):
 
 
 class PatchScratch(NamedTuple):
-    """Scratch: local index (f,), initially -1; W of the largest patch; product, block (3, 3) and gradient (3,)."""
+    """The scratch memory of `compute_directions`.
+
+    Attributes:
+        local_index: index of each vertex within the patch (f,), initially -1.
+        rotated_response: W of the largest patch (k, 3, 3).
+        product, block: blocks (3, 3).
+        patch_gradient: W'g of the patch (3,).
+    """
 
     local_index: NDArray[np.int64]
     rotated_response: NDArray[np.float64]
@@ -95,7 +102,10 @@ def compute_directions(patches, rotations, pointers, columns, blocks, gradient, 
 
 @jit_inner
 def _multiply_patch(turned, place, a, pointers, columns, blocks, product):
-    """Write H_aa W_a / 2 plus the sum of H_ab W_b over b > a to `product`, half of a symmetric sum."""
+    """Write vertex a's half of the symmetric sum over a patch to `product`.
+
+    It is H_aa W_a / 2 plus the sum of H_ab W_b over b > a.
+    """
     for r in range(3):
         for c in range(3):
             product[r, c] = 0.0
@@ -113,7 +123,10 @@ def _multiply_patch(turned, place, a, pointers, columns, blocks, product):
 
 @jit_inner
 def _solve_block(half, x):
-    """Overwrite x with (half + half')^-1 x, or with x over the trace if that is not positive definite."""
+    """Overwrite x with (half + half')^-1 x.
+
+    If that matrix is not positive definite, x is divided by its trace instead.
+    """
     a, b, c = 2.0 * half[0, 0], half[0, 1] + half[1, 0], half[0, 2] + half[2, 0]
     d, e, f = 2.0 * half[1, 1], half[1, 2] + half[2, 1], 2.0 * half[2, 2]
     trace = a + d + f

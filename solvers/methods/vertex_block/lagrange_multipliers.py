@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # SciPy's type stubs for sparse matrices are incomplete.
-"""The Lagrange multipliers of length constraints at a point, by least squares, for the residual of a step.
+"""Least-squares Lagrange multipliers of length constraints, for the residual of a step.
 
     minimise grad g . d + |d|_Q^2 / 2   such that   low <= l + n . A d <= high
 
@@ -34,12 +34,15 @@ class LagrangeMultipliers:
     """The multipliers of a system's length constraints."""
 
     def __init__(self, augmented: System, constraints: LengthConstraints, stiffness: NDArray[np.float64]) -> None:
-        """Assemble the matrices; raise NotPositiveDefinite.
+        """Assemble the matrices.
 
         Args:
             augmented: the system without constraints, with their penalties in Q.
             constraints: the constraints.
             stiffness: stiffnesses of the penalties (m,) [N/m].
+
+        Raises:
+            NotPositiveDefinite: if the system leaves some positions undetermined.
         """
         Q = assemble_system_matrix(augmented, [e for e in augmented.energies if isinstance(e, ProjectiveEnergy)])
         free = augmented.free_vertices

@@ -1,4 +1,6 @@
-"""Vertex block descent (Chen, Liu, Yang and Yuksel 2024): one Newton step per vertex, one vertex after another.
+"""Vertex block descent: one Newton step per vertex, one vertex after another.
+
+Source: Chen, Liu, Yang and Yuksel 2024.
 
     B_i d_i = -grad_i g(p),   p_i += d_i,   B_i = q_i I + sum over its springs of k (nn' + max(0, 1 - r/l) (I - nn'))
 
@@ -148,7 +150,7 @@ class PreparedVertexBlockDescent(IterativeSolver):
         vertex_elements: the elements of the other energies.
         colour_packets: packets of the free vertices by colour.
         row_of_vertex: (n,), row of each vertex in the packets.
-        anchor_stiffness: inertia and penalty pins of each row [N/m].
+        anchor_stiffness: stiffness of inertia, penalty pins and forms of each row [N/m].
         hessian_majorant: (n,) [N/m], of all energies except contact.
         residual_solver: computes the residual at p by one local-global iteration; it has no other use.
     """
@@ -222,7 +224,7 @@ class PreparedVertexBlockDescent(IterativeSolver):
         if not any(map(is_barrier_energy, self.system.energies)):
             return sweeps
         from springbench.solvers.methods.vertex_block.vbd_barrier_contact import (
-            BarrierVbdState,  # imported only with vertex contact
+            BarrierVbdState,  # imported only with barriers
         )
         from springbench.solvers.objective.step_objective import StepObjective
 
@@ -280,7 +282,7 @@ class PreparedVertexBlockDescent(IterativeSolver):
         return self.residual_solver.build_residual(problem)(p)
 
     def residual_scale(self, problem: StepProblem) -> float:
-        """Return the residual [J^(1/2)] scale, below a small part of which round-off is checked."""
+        """Return the residual scale [J^(1/2)] for the round-off check."""
         return compute_max_coordinate(problem) * float(self.hessian_majorant[self.system.unpinned_mask].sum()) ** 0.5
 
     def pack_rows(self, x: Positions) -> NDArray[np.float64]:
@@ -344,11 +346,11 @@ class SweepState(SolverState):
         self._prepared.free_memory.append(self._memory)
 
     def step_state(self) -> bool:
-        """Do one iteration; return False if round-off prevents any further change."""
+        """Do one iteration; return True."""
         return self.run_unchecked(1) == 1
 
     def residual(self) -> float:
-        """Return the residual [J^(1/2)] of the iterate that `residual_iterate` names."""
+        """Return the residual [J^(1/2)] at the iterate."""
         if self._compute_residual is None:
             self._compute_residual = self._prepared.residual_solver.build_residual(self._problem)
         return self._compute_residual(self.positions)

@@ -90,10 +90,7 @@ class VbdSweeps(Protocol):
 
 
 class BarrierVbdState(SolverState):
-    """Iteration state of VBD with barriers.
-
-    majorant (n,) [N/m]: of all energies but contact; compute_residual: returns the residual of positions.
-    """
+    """Iteration state of VBD with barriers."""
 
     def __init__(
         self,
@@ -104,6 +101,16 @@ class BarrierVbdState(SolverState):
         radius: float,
         compute_residual: Callable[[Positions], float],
     ) -> None:
+        """Start the iteration.
+
+        Args:
+            sweeps: sweeps of the step without contact.
+            step: objective of the step.
+            initial_guess: positions without intersections (n, 3) [m], not modified.
+            majorant: stiffness of each vertex by all energies except contact (n,) [N/m].
+            radius: rho of the Chebyshev acceleration, 0 for none.
+            compute_residual: returns the residual [J^(1/2)] at positions.
+        """
         self._sweeps, self._step, self._majorant, self._compute_residual = sweeps, step, majorant, compute_residual
         self._squared, self._factor = radius**2, 0.0
         self.positions = step.apply_exact_pins(initial_guess)
@@ -155,7 +162,10 @@ class BarrierVbdState(SolverState):
         return np.asarray(-np.linalg.solve(block, gradient[:, :, None])[:, :, 0], np.float64)
 
     def _extrapolate(self, q: Positions) -> Positions:
-        """Extrapolate q from the previous start if that is collision-free and does not increase the objective."""
+        """Extrapolate q from the start of the previous iteration, if that is permitted.
+
+        The extrapolation must be collision-free and must not increase the objective.
+        """
         if not self._squared:
             return q
         before = self._factor

@@ -1,4 +1,4 @@
-"""Offset geometric contact (OGC) for vertex block descent: displacement bounds instead of collision detection on paths.
+"""Offset geometric contact (OGC) for vertex block descent, by displacement bounds.
 
 A detection finds the contacts, and a ball around each vertex within which it cannot pass through anything
 (`springbench.solvers.contact.offset_detection`). Sweeps follow in which no vertex leaves its ball
@@ -58,8 +58,9 @@ from springbench.solvers.model.step_problem import (
 from springbench.solvers.simd.spring_packets import LANES
 
 _REACH_GROWTH, _UNOBSTRUCTED_FRACTION = 4.0, 0.5
-"""Growth of a detection's reach after one in which more than this fraction of the vertices had nothing within it. The
-reach ends at what the predicted displacement needs, or at a mean edge, where the mesh itself is near."""
+"""Factor by which the reach of detections grows, and the fraction of vertices without anything in reach above which it
+grows. The reach is limited to what the predicted displacement needs, and to the length of a mean edge, where the mesh
+itself is near."""
 
 
 @dataclass(frozen=True)
@@ -319,7 +320,10 @@ def _select_kernel(sweeps: PreparedVertexBlockDescent) -> Any:
 
 @jit_inner
 def _is_entry(rows, k, slot, num_free):
-    """Return whether a vertex of a contact has an entry: it is free, and does not repeat the one before."""
+    """Return whether a vertex of a contact has an entry.
+
+    It has one if it is free and does not repeat the vertex before it.
+    """
     return rows[k, slot] < num_free and (slot == 0 or rows[k, slot] != rows[k, slot - 1])
 
 

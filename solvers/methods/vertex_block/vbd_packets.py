@@ -1,5 +1,7 @@
-"""Newton steps of eight vertices of one colour, in explicit LLVM vectors (see
-`springbench.solvers.simd.spring_packets`)."""
+"""Newton steps of eight vertices of one colour, in explicit LLVM vectors.
+
+See `springbench.solvers.simd.spring_packets`.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +27,19 @@ SPRING_SCRATCH_SIZE = 4
 """Numbers stored for each spring between the two passes: its vector and its length."""
 
 PACKET_SCRATCH_SIZE = 3
-"""Numbers stored for each vertex in front of them: the gradient of its dashpots."""
+"""Numbers stored for each vertex before those of its springs: the gradient of its dashpots."""
 
 _PIVOT_ROUNDOFF = 1e-14
-"""Pivots up to this fraction of the trace are round-off, of some ten springs."""
+"""Pivots up to this fraction of the trace are round-off, with about ten springs per vertex."""
 
 _ZERO, _HALF, _ONE = constant_packet(0.0), constant_packet(0.5), constant_packet(1.0)
 
 
 def _solve_newton_system(v: PacketBuilder, block: list[Any], g: list[Any]) -> tuple[list[Any], Any]:
-    """Return -B^-1 g for B = [[a, b, c], [b, d, e], [c, e, f]] by L D L', and where B is positive definite."""
+    """Return -B^-1 g by L D L', and where B is positive definite.
+
+    B is [[a, b, c], [b, d, e], [c, e, f]].
+    """
     builder: Any = v.builder
     a, b, c, d, e, f = block
     by_a = builder.fdiv(_ONE, a)
@@ -65,9 +70,10 @@ def _scratch_pointers(builder: Any, springs: SpringPacket, near: Any, entry: Any
 def _build_vertex_model(
     v: PacketBuilder, springs: SpringPacket, near: Any, x: Any, centre: list[Any], load: list[Any], weight: Any
 ) -> tuple[list[Any], list[Any], Any]:
-    """Return the negative gradients, the upper triangles of the blocks by rows, and whether a spring is too short.
+    """Return negative gradients, blocks, and whether a spring is too short.
 
-    load: force of inertia, external forces and pins; weight: their stiffness.
+    The blocks are upper triangles by rows. `load` is the force of inertia, external forces and pins, `weight` their
+    stiffness.
     """
     builder: Any = v.builder
     edges = None if springs.edges is None else EdgeBuilder(v, springs.edges, springs.packet_index)
@@ -145,7 +151,7 @@ def _energy_change(
 def _load_vertices(
     v: PacketBuilder, springs: SpringPacket, number: Any, x: Any, right: Any
 ) -> tuple[list[Any], list[Any], list[Any], Any]:
-    """Return the row offsets and positions of a packet's vertices, the load without springs, and its stiffness."""
+    """Return row offsets, positions, load without springs, and stiffness of a packet's vertices."""
     places = v.load_row_offsets(springs.row_offset, number)
     centre = v.gather_rows(x, places)
     *constants, weight = v.load_right_hand_side(right, number)
@@ -153,7 +159,10 @@ def _load_vertices(
 
 
 def _newton_step_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, majorant: Any, near: Any) -> Any:
-    """Move a packet's vertices in x; return whether a spring is too short, in which case none is moved."""
+    """Move a packet's vertices in x; return whether a spring is too short.
+
+    If one is, no vertex is moved.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, number, x, right, majorant, near = unpack_arguments(context, builder, signature, args)
@@ -193,9 +202,10 @@ def _vertex_model_code(typingctx: Any, bundles: Any, number: Any, x: Any, right:
 
 
 def _model_step_code(typingctx: Any, bundles: Any, number: Any, x: Any, right: Any, near: Any, sums: Any) -> Any:
-    """Write the Newton steps (3) of the model in `sums` after its gradients, followed by their energy changes.
+    """Write the Newton steps (3) of the model in `sums`, and their energy changes.
 
-    The changes are those of all energies in the vertex model, infinite where a block is not positive definite.
+    They follow the gradients, in place of the blocks. The changes are those of all energies in the vertex model, and
+    infinite where a block is not positive definite.
     """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:

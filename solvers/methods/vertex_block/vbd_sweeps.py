@@ -1,4 +1,4 @@
-"""Compiled vertex block descent: colour by colour, in packets of eight vertices, all others at rest."""
+"""Compiled vertex block descent: colour by colour, in packets of eight vertices."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ PADDING_COORDINATE = 1e100
 
 @jit_kernel
 def start_sweeps(vertex_rows, target, force, pin_targets, guess, right, work, p):
-    """Write the right-hand side of a step and its initial positions, and reset the scratch memory.
+    """Write the right-hand side and initial positions of a step; reset the scratch memory.
 
     Args:
         vertex_rows: rows of the vertices.

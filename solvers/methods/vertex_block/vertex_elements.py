@@ -1,7 +1,7 @@
 """Element energies for vertex-by-vertex methods: the couplings of vertices and the majorants.
 
 Springs, strain limits and dashpots are in packets of eight vertices (`springbench.solvers.kernels.edge_elements`).
-These are all other projective energies with an element-wise form.
+This module has all other projective energies with an element-wise form.
 
 If a single vertex moves, the change of a projective energy, w_e/2 |(A p)_e - d_e|^2, is bounded by its gradient and the
 diagonal of A'WA, which is its contribution to the majorant of the vertex.
@@ -40,7 +40,7 @@ class VertexElements:
 
     @classmethod
     def from_system(cls, system: System) -> VertexElements:
-        """Select those of a system."""
+        """Select these energies of a system."""
         known = (
             k
             for k, e in enumerate(system.energies)
@@ -54,7 +54,7 @@ class VertexElements:
         return [self.system.energies[k] for k in self.energy_indices]
 
     def vertex_pairs(self) -> NDArray[np.int64]:
-        """Return all pairs of vertices of an element, (., 2)."""
+        """Return all vertex pairs of all elements, (k, 2)."""
         found = [np.empty((0, 2), np.int64)]
         for energy in self.energies:
             vertices = energy.elements.vertices
@@ -96,8 +96,7 @@ class VertexElements:
 
     @cached_property
     def iteration_kernel(self) -> Any:
-        """The kernel `springbench.solvers.methods.vertex_block.vbd_sweeps.run_iterations` extended by these
-        energies."""
+        """The kernel `vbd_sweeps.run_iterations`, extended by these energies."""
         if not self.energy_indices:
             return plain.run_iterations
         from springbench.solvers.methods.vertex_block.vbd_element_sweeps import build_element_iteration
