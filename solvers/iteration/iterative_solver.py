@@ -281,7 +281,7 @@ class IterativeSolver(ABC):
         return
 
     def _find_lower_point(self, problem: StepProblem, p: Positions, num_iterations: int) -> Positions | None:
-        """Return a point lower than a saddle at the end point p of a solve, or None."""
+        """Return a point lower than a saddle at the end point p, or None."""
         system = problem.system
         if self.identifies_saddles or self.residual_iterate == "none" or system.length_constraints:
             return None

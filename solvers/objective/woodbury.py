@@ -126,6 +126,7 @@ def _factorise_indefinite(graph: csr_array, values: NDArray[np.float64]) -> tupl
     The result is None if a pivot is zero or would have to be chosen off the diagonal.
     """
     S: Any = csc_array(bsr_array((values, graph.indices, graph.indptr), shape=(3 * graph.shape[0], 3 * graph.shape[1])))
+    # Pivots on the diagonal have as many negative signs as S has negative eigenvalues.
     settings: Any = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     try:
         factor = splu(S, **settings)

@@ -25,6 +25,7 @@ def run_admm_local_step(edges, stiffness, low, high, rest_direction, weight, p, 
         u: scaled dual variables (m, 3) [m].
         out: output (n, 3) [N].
     """
+    # z - u = (2 d + (W - 1) v)/(1 + W), with v = A p + u and d the nearest vector without energy
     share, multiplier_share = 1.0 / (1.0 + weight), weight * (weight - 1.0) / (1.0 + weight)
     for i in range(len(p)):
         for c in range(3):

@@ -150,7 +150,9 @@ PreparedType = TypeVar("PreparedType", bound=PreparedLocalGlobal)
 def prepare_cpp_backend(
     kind: type[PreparedType], system: System, springs: Springs, native: CppBackend, choice: str
 ) -> PreparedType:
-    """Prepare the iteration over compiled steps; the norm and the coupling use matrices assembled in Python.
+    """Prepare the iteration over compiled steps.
+
+    The norm and the coupling use matrices assembled in Python.
 
     Args:
         kind: class to construct.

@@ -21,8 +21,8 @@ from springbench.solvers.model.step_problem import Positions
 from springbench.solvers.objective.step_objective import Hessian, StepObjective
 
 _POWER_ITERATIONS = 60
-"""Number of power iterations for a direction of negative curvature. Each amplifies
-that direction relative to the others."""
+"""Number of power iterations for a direction of negative curvature. Each amplifies that direction relative to the
+others."""
 
 _PROBE_ITERATIONS = 2
 """Number of power iterations to detect negative curvature before a saddle point is reached. If E only removes the

@@ -123,7 +123,7 @@ class NewtonIteration:
             indefinite: name of the regularisation.
             has_local_roundoff: whether round-off is determined by connected components. If the total decrease of a
                 step is round-off, the components move whose decrease is not, e.g. those near the origin. The line
-                search then also uses the slope along the rounded displacement.
+                search also uses the slope along the rounded displacement.
         """
         self._has_local_roundoff = has_local_roundoff
         self._metric, self._modification_rule = metric, REGULARISATION_RULES[indefinite]

@@ -269,6 +269,7 @@ def _step_error(forces, errors, span, at):
     size = _error_squares(forces, errors[0], span, at)
     if len(errors) == 1:
         return size
+    # The combination of both estimates in Hairer's DOP853.
     other = _error_squares(forces, errors[1], span, at)
     return size * size / (size + 0.01 * other) if size > 0.0 else 0.0
 
@@ -296,7 +297,7 @@ def integrate_adaptive(forces, stages, steps, p, v, at, step_stats):
     step_stats[0] = step_stats[1] = 0.0
     _evaluate_stage(forces, 0, p, v, at)
     while t < frame:
-        last = t + 1.0000001 * h >= frame
+        last = t + 1.0000001 * h >= frame  # round-off must not leave a tiny last step
         step = frame - t if last else h
         for s in range(1, end + 1):
             _write_stage(stages, s, step, p, v, at)

@@ -272,7 +272,7 @@ class PreparedRosenbrock(IterativeSolver):
         error_order = 1.0 + min(self.coefficients.order, self.coefficients.embedded_order)
         control = build_pi_controller(error_order, _MAX_STEP_FACTOR, _FAILURE_FACTOR)
         while t < frame:
-            last = t + 1.0000001 * h >= frame
+            last = t + 1.0000001 * h >= frame  # round-off must not leave a tiny last step
             length = frame - t if last else h
             made = within.try_step(p, v, length)
             ratio = within.error_norm(made) / self.error_tolerance if made else np.inf
@@ -319,7 +319,7 @@ class _FrameIntegration:
         return self._start.positions.copy(), v
 
     def apply_pins(self, p: Positions, fraction: float) -> Positions:
-        """Move the exact pins of p to their positions at a fraction of the frame; return p."""
+        """Move the exact pins of p to a fraction of the frame; return p."""
         p[self._exact_pins] = (
             self._end_targets
             if fraction == 1.0

@@ -1,10 +1,9 @@
 """Vertex block descent on a device, with one launch per colour.
 
 It computes the iterates of `springbench.solvers.methods.vertex_block.vbd`. Colours, their order, packets and sums are
-those of the CPU. Springs, quadratic forms and vertex contact with obstacles
-are supported; elements of other energies and barrier contact are not. Every REBASE_INTERVAL iterations the displacement
-is added to the reference in float64, and the gradient is computed there. Hence float32 iterates converge to the minimum
-in float64 as well.
+those of the CPU. Springs, quadratic forms and vertex contact with obstacles are supported; elements of other energies
+and barrier contact are not. Every REBASE_INTERVAL iterations the displacement is added to the reference in float64, and
+the gradient is computed there. Hence float32 iterates converge to the minimum in float64 as well.
 """
 
 from __future__ import annotations

@@ -233,9 +233,10 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         own, start, neighbour, kind, weights, spring, direction, arrows,
         padding_row, far, free, anchor_stiffness, force, u, condition, control, sums,
     ):  # fmt: skip
-        """Write the change of the objective from the reference to u to `sums` [J], one sum per block.
+        """Write the change of the objective from the reference to u [J].
 
-        It is evaluated in float64, from the stored u and spring vectors, so that decisions do not depend on round-off.
+        `sums` receives the sum of each thread block. It is evaluated in float64, from the stored u and spring vectors,
+        so that decisions do not depend on round-off.
 
         Args:
             own: row of each lane (lanes,), `padding_row` for none.

@@ -148,6 +148,7 @@ class BarrierVbdState(SolverState):
             energy.add_gradient(p, gradient)
         for one in blocks:
             k = one.vertices.shape[1]
+            # A positive semidefinite matrix of k x k blocks is at most k times the matrix of its diagonal blocks.
             own = np.einsum("piajb,ij->piab", one.values.reshape(-1, k, 3, k, 3), np.eye(k))
             moves = one.vertices >= 0
             np.add.at(total, one.vertices[moves], k * own[moves])

@@ -181,7 +181,7 @@ def build_offset_sweeps(*kinds: ElementKind) -> Any:
 
     @jit_closure
     def move_packet(blocks, elements, contacts, right, b, p, work):
-        """Move the vertices of a packet by their Newton steps, or by those of a majorant."""
+        """Move the vertices of a packet by Newton steps, or by those of a majorant."""
         bundles, sums = blocks.spring_packets, work.packet_sums
         short = vbd_vertex_model(bundles, b, p, right, work.spring_scratch, sums)
         if short:
