@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -13,12 +14,14 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 from springbench.harness.cli.main import app
 from springbench.harness.report.charts.figure_panels import AxisScale, CurvePlot, CurveSeries
 from springbench.harness.report.figures import figure_kinds
+from springbench.harness.report.figures.figure_files import write_figure
 from springbench.harness.report.figures.figure_layout import (
     MILLIMETRES_PER_INCH,
     compose_figure,
@@ -181,6 +184,27 @@ def test_the_command_writes_each_format_the_data_and_a_script_that_draws_them(
     assert done.returncode == 0, done.stderr
     assert stem.with_name("timing-step-again.pdf").stat().st_size > 3000
     assert len(stem.with_suffix(".py").read_text().splitlines()) < 110
+
+
+def test_a_script_draws_each_curve_in_its_own_way(tmp_path: Path) -> None:
+    x = np.array([1.0, 2.0, 3.0])
+    series = [
+        CurveSeries("front", SeriesStyle("#b9b6af", "None"), x, x, is_stepped=True),
+        CurveSeries("solver", SeriesStyle("#0072b2", "o"), x, x + 1.0, setting="tolerance 0.1"),
+        CurveSeries("solver", SeriesStyle("#0072b2", "o"), x, x + 2.0, setting="tolerance 0.01"),
+        CurveSeries("paper", SeriesStyle("#d55e00", "s"), x, x + 3.0, is_connected=False),
+    ]
+    scales = AxisScale("wall time", "linear"), AxisScale("error", "linear")
+    panels = [CurvePlot(("net",), ("work",), "net", "", *scales, series)]
+    options = FigureOptions(formats=("pdf",))
+    write_figure(compose_figure(panels, "Work", options), panels, tmp_path / "work", "Work", options)
+    with matplotlib.rc_context():
+        ax = runpy.run_path(str(tmp_path / "work.py"))["figure"].axes[0]
+    drawn = [line for line in ax.lines if len(line.get_xdata())]
+    assert [line.get_drawstyle() for line in drawn] == ["steps-post", "default", "default", "default"]
+    assert [line.get_linestyle() for line in drawn] == ["-", "-", "-", "None"]
+    assert [line.get_ydata()[0] for line in drawn] == [1.0, 2.0, 3.0, 4.0]
+    assert sum(isinstance(one, PathCollection) for one in ax.collections) == 3, "all but the step have marks"
 
 
 def test_without_a_title_its_words_and_the_origin_are_left_to_the_caption(results: dict[str, Path]) -> None:

@@ -156,15 +156,17 @@ def _describe_panel(panel: CurvePlot) -> tuple[str, dict[str, Any]]:
         key: {"words": scale.label, "scale": _MATPLOTLIB_SCALES[scale.division], "names": list(scale.place_names)}
         for key, scale in (("x", panel.x), ("y", panel.y))
     }
-    first = panel.series[0] if panel.series else None
-    how: dict[str, Any] = {
-        "steps": bool(first and first.is_stepped),
-        "joined": bool(first is None or first.is_connected),
+    curves = {
+        (one.label, one.setting): {
+            "is_stepped": one.is_stepped,
+            "is_connected": one.is_connected,
+            "is_horizontal": one.is_horizontal,
+        }
+        for one in panel.series
     }
-    lines, upright = ([line.value for line in some] for some in (panel.lines, panel.x_lines))
+    lines, x_lines = ([line.value for line in some] for some in (panel.lines, panel.x_lines))
     whole = " ".join(filter(None, (panel.subject, panel.title)))
-    across = bool(first and first.is_horizontal)
-    how |= {"across": across, "lines": lines, "upright": upright}
+    how: dict[str, Any] = {"curves": curves, "lines": lines, "x_lines": x_lines}
     return ":".join((*panel.group, *panel.name)), {"title": whole, **axes, **how}
 
 

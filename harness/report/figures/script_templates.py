@@ -34,22 +34,24 @@ figure, axes = plt.subplots({rows}, {columns}, figsize={inches}, layout="constra
 for ax in axes.flat[len(PANELS) :]:
     ax.set_axis_off()
 for ax, (panel, how) in zip(axes.flat, PANELS.items()):
-    for label, (color, marker, dash) in LOOKS.items():
-        mine = [row for row in data if (row["panel"], row["series"]) == (panel, label)]
+    for (label, setting), curve in how["curves"].items():
+        color, marker, dash = LOOKS[label]
+        mine = [row for row in data if (row["panel"], row["series"], row["setting"]) == (panel, label, setting)]
         x, y, low, high = ([float(row[key]) for row in mine] for key in ("x", "y", "lower", "upper"))
-        style = {{"drawstyle": "steps-post"}} if how["steps"] else {{}}
-        ax.plot(x, y, color=color, linestyle=dash if how["joined"] else "none", linewidth=1.1, **style)
+        style = {{"drawstyle": "steps-post"}} if curve["is_stepped"] else {{}}
+        ax.plot(x, y, color=color, linestyle=dash if curve["is_connected"] else "none", linewidth=1.1, **style)
         face = ["white" if row["is_stale"] == "True" else color for row in mine]
-        if len(mine) <= 12 and not how["steps"]:  # more marks than that hide the curve, and a step is no measurement
+        if len(mine) <= 12 and not curve["is_stepped"]:  # more marks hide the curve, and a step is no measurement
             ax.scatter(x, y, 13, marker=marker, facecolors=face, edgecolors=color, linewidths=0.8, zorder=3)
-        if how["across"]:
+        if curve["is_horizontal"]:
             ax.hlines(y, low, high, color=color, alpha=0.4)
         else:
             ax.vlines(x, low, high, color=color, alpha=0.4)
+    for label, (color, marker, dash) in LOOKS.items():
         ax.plot([], [], color=color, marker=marker, linestyle=dash, markersize=3.6, label=label)
     for y in how["lines"]:
         ax.axhline(y, color="gray", linewidth=0.6, linestyle="--")
-    for x in how["upright"]:
+    for x in how["x_lines"]:
         ax.axvline(x, color="gray", linewidth=0.6, linestyle="--")
     ax.set(title=how["title"], xlabel=how["x"]["words"], ylabel=how["y"]["words"])
     ax.set(xscale=how["x"]["scale"], yscale=how["y"]["scale"])
