@@ -46,7 +46,7 @@ class ChartPoint(NamedTuple):
     Attributes:
         series: curve, bar, or column of a heat map.
         x: abscissa, or row of a heat map.
-        y: value; a point without one is omitted, and is an empty cell of a heat map.
+        y: value; without one there is no bar, a gap in a line, and an empty cell of a heat map.
         low, high: interval of the value.
     """
 
@@ -128,7 +128,7 @@ def _build_lines(name: str, points: Sequence[ChartPoint], options: PageChartOpti
     coloured = [one for one in options.highlights or names if one in names]
     series: list[CurveSeries] = []
     for label in sorted(names, key=lambda one: one in coloured):
-        own = [point for point in points if point.series == label and point.y is not None]
+        own = [point for point in points if point.series == label]
         is_coloured = label in coloured
         style = SeriesStyle(_ACCENTS[coloured.index(label) % len(_ACCENTS)], "o") if is_coloured else _GREY
         x, y = (np.array([getattr(point, key) for point in own], float) for key in ("x", "y"))
