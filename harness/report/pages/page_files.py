@@ -118,16 +118,10 @@ def _looks_equal(picture: PagePicture) -> bool:
 
 
 def _find_orphans(pages: list[RenderedPage]) -> list[Path]:
-    """Find the picture files that no page shows, in the folders of the pages' pictures."""
+    """Find the picture files that no page shows, in the folder of pictures next to each page."""
     shown = {picture.path for page in pages for picture in page.pictures}
-    folders = {picture.path.parent for page in pages for picture in page.pictures}
-    return sorted(
-        path
-        for folder in folders
-        if folder.name == PICTURE_FOLDER
-        for path in folder.glob("*.png")
-        if path not in shown
-    )
+    folders = {page.path.parent / PICTURE_FOLDER for page in pages}
+    return sorted(path for folder in folders for path in folder.glob("*.png") if path not in shown)
 
 
 def _write_file(path: Path, content: bytes) -> None:
