@@ -1,18 +1,32 @@
 """Pages are made from the published set: equal data give equal bytes, and anything stale is found."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from matplotlib.patches import Rectangle
+from matplotlib.text import Annotation
 from springbench.harness.cli.main import app
 from springbench.harness.experiments.archive import study_publication
-from springbench.harness.report.charts.figure_panels import CellMap, CurvePlot
+from springbench.harness.report.charts.figure_panels import (
+    AxisScale,
+    CellMap,
+    CellOutcome,
+    CurvePlot,
+    CurveSeries,
+    FigurePanel,
+    MapCell,
+    ShadedBand,
+)
 from springbench.harness.report.figures.figure_layout import compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.pages.page_charts import ChartPoint, PageChartOptions, build_page_panel
 from springbench.harness.report.pages.page_files import check_pages, write_pages
+from springbench.harness.report.pages.page_templates import digest_panels
 from springbench.harness.report.pages.published_queries import PublishedQueries
+from springbench.harness.report.plot_style import SeriesStyle
 from springbench.harness.results.published_set import read_study
 from typer.testing import CliRunner
 
@@ -161,6 +175,15 @@ def test_a_table_that_was_edited_is_refused(checkout: Path) -> None:
     assert "differs from its checksum" in result.output
 
 
+def test_a_picture_of_a_page_without_pictures_is_of_no_page(checkout: Path) -> None:
+    write_pages(checkout)
+    (checkout / "results" / "findings" / "runs.md.j2").write_text("# Runs\n")
+    picture = checkout / "results" / "findings" / "pictures" / "iterations.png"
+    assert f"{picture} is a picture of no page" in check_pages(checkout)
+    write_pages(checkout)
+    assert not picture.exists()
+
+
 @pytest.mark.parametrize(
     ("template", "message"),
     [
@@ -176,6 +199,38 @@ def test_a_mistake_in_a_template_is_named(checkout: Path, template: str, message
     assert result.exit_code == 2
     assert "runs.md.j2" in result.output
     assert message in " ".join(result.output.split())
+
+
+CURVE = CurveSeries("newton", SeriesStyle("#0072b2", "o"), np.array([1.0, np.nan]), np.array([2.0, 3.0]))
+PLOT = CurvePlot(("page",), ("curves",), "", "", AxisScale("size"), AxisScale("time"), [CURVE])
+CELL = MapCell("contact", "newton", "80 % and more", "#1f7a55", "83")
+MAP = CellMap(("page",), ("shares",), "", "", [CELL], [CellOutcome("80 % and more", "#1f7a55")])
+
+
+@pytest.mark.parametrize(
+    ("shown", "changed"),
+    [
+        (MAP, replace(MAP, cells=[CELL._replace(mark="!")])),
+        (MAP, replace(MAP, cells=[CELL._replace(is_framed=True)])),
+        (MAP, replace(MAP, column_label="solver")),
+        (PLOT, replace(PLOT, bands=[ShadedBand(0.0, 1.0, "round-off")])),
+        (PLOT, replace(PLOT, machine_words="a processor")),
+        (PLOT, replace(PLOT, series=[replace(CURVE, callouts={0: "the default"})])),
+        (PLOT, replace(PLOT, series=[replace(CURVE, x=np.array([1.5, np.nan]))])),
+    ],
+)
+def test_the_digest_of_a_picture_covers_whatever_it_shows(shown: FigurePanel, changed: FigurePanel) -> None:
+    assert digest_panels([shown], "", 100.0) == digest_panels([replace(shown)], "", 100.0)
+    assert digest_panels([shown], "", 100.0) != digest_panels([changed], "", 100.0)
+
+
+def test_a_line_has_a_gap_where_a_value_is_missing() -> None:
+    points = [ChartPoint("a", float(x), y) for x, y in enumerate((1.0, None, 3.0, None))]
+    panel = build_page_panel("curves", "lines", points, PageChartOptions())
+    assert isinstance(panel, CurvePlot)
+    assert np.isnan(panel.series[0].y).tolist() == [False, True, False, True]
+    ax = compose_figure([panel], "", FigureOptions()).axes[0]
+    assert [text.xy for text in ax.texts if isinstance(text, Annotation)] == [(2.0, 3.0)], "the label is at a value"
 
 
 def test_bars_begin_at_no_difference_and_state_their_values() -> None:

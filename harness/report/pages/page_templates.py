@@ -23,15 +23,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.report.charts.figure_panels import CurvePlot, FigurePanel
+from springbench.harness.report.charts.figure_panels import FigurePanel
 from springbench.harness.report.figures.figure_kinds import find_figure_kind
 from springbench.harness.report.figures.figure_layout import compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
@@ -135,7 +136,7 @@ class _PageFields:
         if any(picture.path == path for picture in self.pictures):
             raise InputError(f"the picture {name} is there twice; give each a name of its own")
         options = FigureOptions(width_mm=width, formats=("png",), font_size=9.0)
-        digest = _digest_panels(panels, title, width)
+        digest = digest_panels(panels, title, width)
         self.pictures.append(PagePicture(path, digest, lambda: _draw_panels(panels, title, options)))
         return f"![{alt}]({PICTURE_FOLDER}/{name}.png)"
 
@@ -151,20 +152,20 @@ def render_page(template: Path, queries: PublishedQueries) -> RenderedPage:
         InputError: if the template has a mistake; the message names the template, and the line of a syntax error.
     """
     page = template.with_name(template.name.removesuffix(TEMPLATE_SUFFIX) + ".md")
-    fields = _PageFields(page, queries)
+    collector = _PageFields(page, queries)
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     environment.globals |= {
-        "value": fields.query_value,
+        "value": collector.query_value,
         "rows": queries.query_records,
-        "table": fields.build_table,
-        "figure": fields.add_figure,
-        "provenance": fields.describe_study,
+        "table": collector.build_table,
+        "figure": collector.add_figure,
+        "provenance": collector.describe_study,
         "has_study": queries.studies.__contains__,
     }
     for form in ("bars", "lines", "heatmap"):
-        environment.globals[form] = _bind_form(fields, form)
+        environment.globals[form] = _bind_form(collector, form)
     environment.filters |= {"percent": _format_percent, "sig": _format_significant, "count": _format_count}
     source = template.read_text(encoding="utf-8")
     try:
@@ -176,12 +177,12 @@ def render_page(template: Path, queries: PublishedQueries) -> RenderedPage:
     except (jinja2.TemplateError, TypeError, KeyError) as error:
         raise InputError(InputMistake(f"a field fails: {type(error).__name__}: {error}", template)) from error
     head = f"<!-- Made by `springbench pages` from {template.name}: edit that file. -->\n"
-    return RenderedPage(page, head + text, fields.pictures)
+    return RenderedPage(page, head + text, collector.pictures)
 
 
-def _bind_form(fields: _PageFields, form: Any) -> Callable[..., str]:
+def _bind_form(collector: _PageFields, form: Any) -> Callable[..., str]:
     def add_chart_of_form(name: str, title: str, sql: str, alt: str, **options: Any) -> str:
-        return fields.add_chart(form, name, title, sql, alt, **options)
+        return collector.add_chart(form, name, title, sql, alt, **options)
 
     return add_chart_of_form
 
@@ -211,15 +212,23 @@ def _format_count(value: int) -> str:
     return f"{value:,}"
 
 
-def _digest_panels(panels: Sequence[FigurePanel], title: str, width: float) -> str:
-    rows = list(chain.from_iterable(panel.csv_rows() for panel in panels))
-    words = [(panel.subject, panel.title, *panel.notes) for panel in panels]
-    plots = [panel for panel in panels if isinstance(panel, CurvePlot)]
-    marks = [
-        (plot.x, plot.y, plot.lines, plot.x_lines, [(one.style, one.is_bar) for one in plot.series]) for plot in plots
-    ]
-    shown = [title, width, words, rows, *([marks] if marks else [])]
-    return sha256(json.dumps(shown, default=str).encode()).hexdigest()
+def digest_panels(panels: Sequence[FigurePanel], title: str, width: float) -> str:
+    """Digest everything that a picture shows.
+
+    Args:
+        panels: panels of the picture.
+        title: its title.
+        width: its width [mm].
+    """
+    shown = [title, width, *panels]
+    return sha256(json.dumps(shown, default=_encode_for_digest).encode()).hexdigest()
+
+
+def _encode_for_digest(value: Any) -> Any:
+    """Encode a panel or one of its parts; what renders a mesh is known by the mesh."""
+    if is_dataclass(value):
+        return {one.name: getattr(value, one.name) for one in fields(value) if one.name != "render"}
+    return value.tolist() if isinstance(value, np.ndarray) else str(value)
 
 
 def _draw_panels(panels: Sequence[FigurePanel], title: str, options: FigureOptions) -> bytes:
