@@ -64,7 +64,7 @@ def inspect_recordings(
         found = summarise_recording(path)
         _print_summary(found, console)
         if csv:
-            _write_atomically(csv, lambda target, table=found.scalars: pyarrow.csv.write_csv(table, target))
+            _write_export(csv, lambda target, table=found.scalars: pyarrow.csv.write_csv(table, target))
             console.print(f"wrote {found.scalars.num_rows} values to {csv}", markup=False)
     if export:
         replay = read_replay(paths[0], [-1 if frame is None else frame])
@@ -236,10 +236,10 @@ def _export_mesh(replay: RecordingReplay, recording: Path, export: Path) -> None
         mesh = pv.PolyData(points, lines=np.insert(replay.springs, 0, 2, axis=1).ravel())
         mesh.cell_data["strain"] = compute_spring_strain(replay, 0)
     mesh.point_data["strain"] = compute_vertex_strain(replay, 0)
-    _write_atomically(export, lambda path: mesh.save(path))
+    _write_export(export, lambda path: mesh.save(path))
 
 
-def _write_atomically(target: Path, write: Callable[[Path], object]) -> None:
+def _write_export(target: Path, write: Callable[[Path], object]) -> None:
     try:
         write(target)
     except OSError as error:
