@@ -10,6 +10,8 @@ import pytest
 from pydantic import ValidationError
 from springbench.harness.errors import InputError
 from springbench.harness.scenes.mesh.file_mesh import FileMesh
+from springbench.harness.scenes.mesh.mesh_cleaning import drop_degenerate_cells
+from springbench.harness.scenes.mesh.spring_network import MeshCells
 
 SQUARE = "v 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\n"
 SEAM = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 0 1e-7\nv 1 1 0\nv 0 1 0\ng left\nf 1 2 3\ng right\nf 4 5 6\n"
@@ -97,6 +99,14 @@ def test_faces_without_area_are_dropped_with_their_springs(tmp_path):
     mesh = obj(tmp_path, text, faces="drop-degenerate", unused="drop").build_mesh()
     assert len(mesh.rest_positions) == 4
     assert mesh.springs.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
+
+
+def test_lines_without_length_are_dropped_with_their_cell_data():
+    segments = np.array([[0, 1], [1, 1], [1, 2]])
+    cells = MeshCells(np.eye(3), segments=segments, segment_attributes={"EA": np.array([1.0, 2.0, 3.0])})
+    cleaned, _ = drop_degenerate_cells(cells)
+    assert cleaned.segments.tolist() == [[0, 1], [1, 2]]
+    assert cleaned.segment_attributes["EA"].tolist() == [1.0, 3.0]
 
 
 def test_unused_vertices_stay_unless_they_are_dropped(tmp_path):

@@ -241,6 +241,7 @@ def drop_degenerate_cells(cells: MeshCells) -> tuple[MeshCells, dict[str, int]]:
         segment_locations=cells.segment_locations[has_length]
         if len(cells.segment_locations)
         else cells.segment_locations,
+        segment_attributes={name: values[has_length] for name, values in cells.segment_attributes.items()},
         tetrahedra=tetrahedra,
     )
     return cleaned, counts
