@@ -134,6 +134,13 @@ def test_stiffness_and_rest_length_follow_from_what_is_stated(tmp_path, values: 
     np.testing.assert_allclose(scene.all_springs.rest_length, rest, rtol=1e-14)
 
 
+def test_properties_of_springs_are_read_only(tmp_path: Path):
+    properties = load_text(tmp_path, f"kind: network, {LINE}, stiffness: 3").mesh.spring_properties
+    assert properties is not None
+    for array in (properties.stiffness, properties.rest_length, properties.only_pulls):
+        assert not array.flags.writeable
+
+
 def test_springs_without_a_stiffness_of_their_own_have_that_of_the_effect(tmp_path: Path):
     scene = load_text(tmp_path, f"kind: network, {LINE}, stiffness: [7, null], rest_length: [1, 0.5]", ", stretch: 10")
     np.testing.assert_allclose(scene.all_springs.stiffness, [7, 20])

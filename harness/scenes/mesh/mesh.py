@@ -80,7 +80,7 @@ class Mesh:
         arrays = [self.rest_positions, self.springs, self.triangles, self.mass_fractions]
         arrays += [self.mass, self.vertex_areas, self.spring_areas, self.file_numbers]
         if own := self.spring_properties:
-            arrays += [own.stiffness, own.rest_length]
+            arrays += [own.stiffness, own.rest_length, own.only_pulls]
         for array in [*arrays, *self.spring_families.values(), *self.parts.values(), *self.attributes.values()]:
             if array is not None:
                 array.flags.writeable = False
