@@ -144,6 +144,12 @@ def test_gusts_of_nothing_are_the_constant_wind():
     )
 
 
+def test_gusts_of_still_air_are_still_air():
+    v = np.tile([1.0, -2.0, 3.0], (len(PLATE.rest_positions), 1))
+    still = {"velocity": (0.0, 0.0, 0.0), "v": v}
+    np.testing.assert_array_equal(force(field="gusts", **still), force(**still))
+
+
 def test_gusts_on_vertices_have_the_force_as_their_mean():
     (blow,) = (
         WindEffect(field="gusts", force=(2.0, 0.0, 0.0), turbulence_intensity=0.2)

@@ -159,6 +159,8 @@ def _constant_field(wind: WindEffect, mesh: Mesh) -> WindField:
 def _gust_field(wind: WindEffect, mesh: Mesh) -> WindField:
     rng, mean = np.random.default_rng(wind.seed), wind.mean_field
     size = float(np.linalg.norm(mean))
+    if not size:
+        return _constant_field(wind, mesh)
     turns = 2.0 * np.pi * wind.frequency * np.exp(rng.uniform(np.log(0.25), np.log(4.0), _GUST_WAVES))
     phase = rng.uniform(0.0, 2.0 * np.pi, (_GUST_WAVES, 3))
     height = wind.turbulence_intensity * size * (2.0 / _GUST_WAVES) ** 0.5  # a cosine's mean square is 1/2
@@ -170,7 +172,7 @@ def _gust_field(wind: WindEffect, mesh: Mesh) -> WindField:
 
         return evaluate_gusts(t - x @ carried, turns, phase, mean, height)
 
-    return field if size else _constant_field(wind, mesh)
+    return field
 
 
 def _assignment_field(wind: WindEffect, mesh: Mesh) -> WindField:
