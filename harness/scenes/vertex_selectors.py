@@ -78,7 +78,8 @@ class VertexSelection(ConfigModel):
     def _check_selectors(self) -> Self:
         if not (self.has_selectors or self.stride > 1):
             raise ValueError(
-                "names no vertices; give at, indices, box, sphere, nearest, loops, holes, attribute or every"
+                "names no vertices; give parts, indices, box, sphere, nearest_to, boundary_loops, holes, attribute or "
+                "stride"
             )
         return self
 
