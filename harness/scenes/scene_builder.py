@@ -101,14 +101,13 @@ class Scene:
     pin_motions: tuple[tuple[NDArray[np.int64], KeyFrameMotion], ...] = ()
     start: RestStart = REST_START
     intersection_checks: tuple[IntersectionCheck, ...] = ()
+    alternate_scene: Scene | None = None
+    build_coarser: Callable[[], Scene] | None = None
 
     @property
     def has_self_contact(self) -> bool:
         """Whether an effect prevents self-intersection of the mesh."""
         return any(one.obstacle_positions is None for one in self.intersection_checks)
-
-    alternate_scene: Scene | None = None
-    build_coarser: Callable[[], Scene] | None = None
 
     def scene_of_step(self, step_index: int) -> Scene:
         """Return the scene of the step that follows step `step_index`."""
