@@ -278,7 +278,7 @@ def _require_end_of_step_stages(parts: list[EffectContribution], method: integra
     ]
     for i, part in enumerate(parts):
         if part.end_of_step_reasons and getattr(method, "stage_fraction", 0.0) != 1.0:
-            problem = f"{part.end_of_step_reasons[0]}, and {name} has other unknowns; take {' or '.join(there)}"
+            problem = f"{part.end_of_step_reasons[0]}, and {name} has stages at other times; take {' or '.join(there)}"
             raise InputError(InputMistake(problem, key=f"effects[{i}]"))
 
 

@@ -247,7 +247,7 @@ def test_exact_pins_that_move_are_refused():
 def test_integrators_whose_stages_are_at_other_times_are_refused(name):
     given = {"mesh": GridMesh(), "mass": 1.0, "time_step": 0.02, "frames": 1, "path": "scene.yaml"}
     spec = SceneSpec.model_validate(given | {"effects": (SpringsEffect(stretch=1.0), SELF_CONTACT)})
-    with pytest.raises(InputError, match=f"end of a step, and {name} has other unknowns"):
+    with pytest.raises(InputError, match=f"end of a step, and {name} has stages at other times"):
         build_scene(spec, 4, name)
     assert build_scene(spec, 4, "bdf2").intersection_checks
 
