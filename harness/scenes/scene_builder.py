@@ -28,8 +28,8 @@ from springbench.harness.scenes.key_frames import KeyFrameMotion
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_topology import lump_areas
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.scenes.start_positions import RestStart
-from springbench.harness.scenes.vertex_selectors import VertexSelection
+from springbench.harness.scenes.start_positions import MergedStart, RestStart
+from springbench.harness.scenes.vertex_selectors import find_selections
 from springbench.solvers.model import integrators
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.integrators import IMPLICIT_EULER, find_integrator
@@ -213,11 +213,16 @@ def build_scene(spec: SceneSpec, size: int, integrator: str = "implicit-euler", 
 def _make_coarser_builder(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] | None:
     """Return a builder of the scene on a mesh of half the size; None if there is none.
 
-    There is none for meshes of fixed size, for the coarsest meshes, and for effects that select vertices by index.
+    There is none for meshes of fixed size, for the coarsest meshes, and for effects and starts that select vertices by
+    index.
     """
     half = (size + 1) // 2
-    numbered = any(isinstance(e, VertexSelection) and (e.indices or e.stride > 1) for e in spec.effects)
-    return None if half < MIN_COARSENING_SIZE or numbered else partial(build_scene, spec, half, integrator)
+    selections = [selection for effect in spec.effects for _, selection in find_selections(effect)]
+    if half < MIN_COARSENING_SIZE or isinstance(spec.start, MergedStart):
+        return None
+    if any(selection.indices or selection.stride > 1 for selection in selections):
+        return None
+    return partial(build_scene, spec, half, integrator)
 
 
 def _build_mesh(spec: SceneSpec, size: int) -> Mesh:

@@ -408,9 +408,8 @@ def _guess_coarse_to_fine(scene: Scene, state: MotionState, step_problem: StepPr
         if scene.build_coarser is None:
             raise Unsupported(
                 "initial_guess: coarse-to-fine needs the scene on a mesh of half the size, and there is none: the mesh "
-                f"is from a file, or smaller than {2 * MIN_COARSENING_SIZE - 1}, or effects name "
-                "vertices by `indices` or `stride`; take "
-                "previous, inertial or extrapolated"
+                f"is from a file, or smaller than {2 * MIN_COARSENING_SIZE - 1}, or effects name vertices by `indices` "
+                "or `stride`, or the start is `merged`; take previous, inertial or extrapolated"
             )
         try:
             coarse = scene.build_coarser()

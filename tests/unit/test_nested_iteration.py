@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from springbench.harness.config.config_loader import load_config
+from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.effects.sewing_effect import SewingEffect
+from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.scenes.scene_spec import SceneSpec
+from springbench.harness.scenes.start_positions import MergedStart
 from springbench.harness.simulation.nested_iteration import build_interpolation
 from springbench.harness.simulation.time_loop import build_initial_state, build_problem, prepare, simulate_scene
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
@@ -22,6 +28,12 @@ def build_cloth_scene(folder, mesh="{kind: grid}", pins="parts: [top_corners]", 
     path.write_text(text, encoding="utf-8")
     (run,) = load_config(path, solvers=["lbfgs"], sizes=[size]).list_runs()
     return build_scene(run.scene, size, integrator)
+
+
+def build_spec(*effects: SceneEffect, start: MergedStart | None = None) -> SceneSpec:
+    return SceneSpec(
+        mesh=GridMesh(), mass=1.0, time_step=0.1, frames=1, effects=effects, start=start, path=Path("scene.yaml")
+    )
 
 
 @pytest.mark.parametrize("mesh", ["{kind: chain}", "{kind: grid}", "{kind: net}", "{kind: block}"])
@@ -83,6 +95,21 @@ def test_where_there_is_no_coarser_mesh_it_is_refused(tmp_path, given, why):
     scene = build_cloth_scene(tmp_path, **given)
     with pytest.raises(Unsupported, match=why):
         build_problem(scene, build_initial_state(scene), "coarse-to-fine")
+
+
+@pytest.mark.parametrize(
+    ("row", "is_numbered"),
+    [({"parts": ["right"]}, False), ({"indices": [220]}, True), ({"parts": ["right"], "stride": 7}, True)],
+)
+def test_rows_to_sew_by_index_have_no_coarser_mesh(row, is_numbered):
+    rows = {"first_row": {"parts": ["left"]}, "second_row": row, "stiffness": 1.0}
+    scene = build_scene(build_spec(SewingEffect.model_validate(rows)), 21)
+    assert (scene.build_coarser is None) == is_numbered
+
+
+def test_a_merged_start_has_no_coarser_mesh():
+    assert build_scene(build_spec(start=MergedStart(vertices=(0, 440))), 21).build_coarser is None
+    assert build_scene(build_spec(), 21).build_coarser is not None
 
 
 def test_a_scene_of_one_size_has_none(tmp_path):
