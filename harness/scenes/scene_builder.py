@@ -205,12 +205,14 @@ def build_scene(spec: SceneSpec, size: int, integrator: str = "implicit-euler", 
         intersection_checks=tuple(one for part in parts for one in part.intersection_checks),
         alternate_scene=None
         if other in (None, spec.time_step)
-        else build_scene(spec.with_time_step(other), size, integrator),
-        build_coarser=_make_coarser_builder(spec, size, integrator),
+        else build_scene(spec.with_time_step(other), size, integrator, log_warnings=log_warnings),
+        build_coarser=_make_coarser_builder(spec, size, integrator, log_warnings=log_warnings),
     )
 
 
-def _make_coarser_builder(spec: SceneSpec, size: int, integrator: str) -> Callable[[], Scene] | None:
+def _make_coarser_builder(
+    spec: SceneSpec, size: int, integrator: str, *, log_warnings: bool
+) -> Callable[[], Scene] | None:
     """Return a builder of the scene on a mesh of half the size; None if there is none.
 
     There is none for meshes of fixed size, for the coarsest meshes, and for effects and starts that select vertices by
@@ -222,7 +224,7 @@ def _make_coarser_builder(spec: SceneSpec, size: int, integrator: str) -> Callab
         return None
     if any(selection.indices or selection.stride > 1 for selection in selections):
         return None
-    return partial(build_scene, spec, half, integrator)
+    return partial(build_scene, spec, half, integrator, log_warnings=log_warnings)
 
 
 def _build_mesh(spec: SceneSpec, size: int) -> Mesh:

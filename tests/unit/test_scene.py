@@ -116,6 +116,23 @@ def test_unusual_valid_values_get_a_warning(
     assert (said in caplog.text) if said else not caplog.records
 
 
+def test_scenes_without_warnings_have_none_for_the_other_time_step(caplog: pytest.LogCaptureFixture):
+    spec = SceneSpec(
+        mesh=ChainMesh(),
+        mass=1.0,
+        time_step=0.1,
+        alternate_time_step=60.0,
+        frames=1,
+        effects=(SpringsEffect(stretch=1.0),),
+        path=Path("scene.yaml"),
+    )
+    with caplog.at_level("WARNING", logger="springbench"):
+        build_scene(spec, 4, log_warnings=False)
+        assert not caplog.records
+        build_scene(spec, 4)
+    assert "a time step of 60 s is long" in caplog.text
+
+
 @pytest.mark.parametrize(("height", "deep"), [(0.5, 0.0), (-0.25, 0.25)])
 def test_penetration_is_the_depth_of_the_deepest_vertex_in_an_obstacle(height: float, deep: float):
     floor = ContactEffect.model_validate({"obstacles": [{"kind": "plane", "point": [0, -5, 0]}]})
