@@ -188,7 +188,10 @@ def test_a_picture_of_a_page_without_pictures_is_of_no_page(checkout: Path) -> N
     ("template", "message"),
     [
         ("{{ value('SELECT count(*) FROM nothing') }}", "nothing"),
-        ("{{ value('SELECT size FROM dummy') }}", "wants one value"),
+        ("{{ value('SELECT size FROM dummy') }}", "gives 20 rows of 1 columns: select one column"),
+        ("{{ table('SELECT size FROM dummy WHERE false') }}", "table() expected rows"),
+        ("{{ provenance('dumy') }}", "unknown study 'dumy'; expected one of dummy; did you mean 'dummy'?"),
+        ("{{ figure('a', 'A', 'work', 'x', 'a') }}", "unknown study 'x'; expected one of dummy"),
         ("{{ unknown }}", "'unknown' is undefined"),
         ("text\n{% if %}", "runs.md.j2:2: "),
     ],

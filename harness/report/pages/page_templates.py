@@ -82,13 +82,19 @@ class _PageFields:
     def query_value(self, sql: str) -> Any:
         found = self.queries.query_records(sql)
         if len(found) != 1 or len(found[0]) != 1:
-            raise InputError(f"value() wants one value; {' '.join(sql.split())!r:.200} has {len(found)} rows")
+            columns = len(found[0]) if found else 0
+            raise InputError(
+                f"value() expected one value; the query {' '.join(sql.split())!r:.200} gives {len(found)} rows of "
+                f"{columns} columns: select one column, and one row by WHERE or an aggregate"
+            )
         return next(iter(found[0].values()))
 
     def build_table(self, sql: str, digits: int = 3) -> str:
         found = self.queries.query_records(sql)
         if not found:
-            raise InputError(f"table() wants rows; {' '.join(sql.split())!r:.200} has none")
+            raise InputError(
+                f"table() expected rows; the query {' '.join(sql.split())!r:.200} gives none: correct its WHERE"
+            )
         names = list(found[0])
         numeric = [all(isinstance(row[name], int | float | None) for row in found) for name in names]
         lines = [" | ".join(name.replace("_", " ") for name in names)]
@@ -111,14 +117,14 @@ class _PageFields:
         self, name: str, title: str, kind: str, study: str, alt: str, panels: str = "", width: float = 170.0
     ) -> str:
         found = find_figure_kind(kind)
-        with open_study_folder(self.queries.studies[study]) as folder:
+        with open_study_folder(self.queries.find_study(study)) as folder:
             entries = found.list_panels(folder, lambda table: set())
             selectors = [tuple(one.split(":")) for one in panels.split(",") if one] or found.default_panels
             drawn = found.prepare_panels(select_entries(entries, selectors))
         return self._add_panels(name, alt, title, drawn, width)
 
     def describe_study(self, study: str) -> str:
-        about = self.queries.studies[study].metadata
+        about = self.queries.find_study(study).metadata
         started = about["started"]
         date = started[-1][:10] if started else "undated"
         commits = ", ".join(commit[:9] for commit in about["commits"]) or "unknown"

@@ -20,7 +20,7 @@ from typing import Any
 
 import duckdb
 import pyarrow as pa
-from springbench.harness.errors import InputError
+from springbench.harness.errors import InputError, suggest_name
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy.engine_comparison import OWN_PROGRAM, compare_engines
 from springbench.harness.report.accuracy.liu2013_comparison import compare_with_paper
@@ -46,6 +46,16 @@ class PublishedQueries:
         self._connection = duckdb.connect(config={"threads": 1})
         for study in self.studies.values():
             self._create_views(study)
+
+    def find_study(self, name: str) -> PublishedStudy:
+        """Return the study of a name.
+
+        Raises:
+            InputError: if the published set has no study of this name.
+        """
+        if name not in self.studies:
+            raise InputError(f"unknown study {name!r}; expected {suggest_name(name, self.studies)}")
+        return self.studies[name]
 
     def query_records(self, sql: str) -> list[dict[str, Any]]:
         """Return the rows of a query as dictionaries.
