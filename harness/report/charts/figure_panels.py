@@ -8,11 +8,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.report.plot_style import SeriesStyle
+
+if TYPE_CHECKING:
+    from springbench.harness.recording.recorder_interface import RecordingReplay
 
 FloatArray = NDArray[np.float64]
 CsvRow = dict[str, str | float | int | bool]
@@ -245,8 +248,6 @@ class MeshPicture:
         aspect: width / height of the picture.
         render: returns the pixels, given width [pixels] and background.
         facts: lines below the title.
-        style: style of the solver.
-        mesh: path of the recording.
     """
 
     group: tuple[str, ...]
@@ -261,10 +262,8 @@ class MeshPicture:
     aspect: float
     render: MeshRenderer
     facts: Sequence[str] = ()
-    style: SeriesStyle | None = None
     notes: Sequence[str] = ()
     machine_words: str = ""
-    mesh: str = field(default="")
 
     def csv_rows(self) -> list[CsvRow]:
         """Return the vertices as rows of a CSV file."""
@@ -273,17 +272,27 @@ class MeshPicture:
         return [{"panel": panel, "x": x, "y": y, "z": z, "strain": e} for x, y, z, e in table]
 
 
-class MeshRenderer:
-    """Draws a picture at a width [pixels] on a background colour, or transparently for None."""
+class MeshRenderer(Protocol):
+    """Renders one frame of a recording with one camera.
+
+    Attributes:
+        replay: recording of the mesh.
+        frame: index of the frame.
+        aspect: width / height of the picture.
+    """
+
+    replay: RecordingReplay
+    frame: int
+    aspect: float
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
         """Return the pixels (height, width, 3 or 4).
 
         Args:
-            width: width of the picture [pixels]; the height follows from the aspect of the panel.
+            width: width of the picture [pixels]; the height follows from the aspect.
             background: colour of the background, or None for a transparent one.
         """
-        raise NotImplementedError
+        ...
 
 
 FigurePanel = CurvePlot | CellMap | MeshPicture

@@ -6,17 +6,17 @@ They show one run, all solvers of a scene, or all scenes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.recording.camera_framing import describe_outside
 from springbench.harness.recording.recorder_interface import RecordingReplay
-from springbench.harness.report.charts.figure_panels import MeshPicture, MeshRenderer
+from springbench.harness.report.charts.figure_panels import MeshPicture
 from springbench.harness.report.comparison_picture import find_reference_run, format_distance
 from springbench.harness.report.drawable_frames import (
     find_drawable_frames,
@@ -37,7 +37,6 @@ from springbench.harness.report.mesh_rendering import (
 from springbench.harness.report.number_format import format_count, format_quantity
 from springbench.harness.report.obstacle_meshes import points_to_frame
 from springbench.harness.report.page_layout import format_frame_time
-from springbench.harness.report.plot_style import SeriesStyle, assign_solver_styles
 from springbench.harness.report.provenance_words import PROVENANCE_COLUMNS, describe_provenance
 from springbench.harness.report.recorded_strain import compute_vertex_strain
 from springbench.harness.report.self_intersection_notes import describe_self_intersection
@@ -58,7 +57,6 @@ class _RecordedRun(NamedTuple):
     run: RunTimes
     label: str
     path: Path
-    style: SeriesStyle
     machine_words: str
 
     @property
@@ -73,9 +71,7 @@ class _RecordedRun(NamedTuple):
 
     def build_entry(self, group: tuple[str, ...], name: tuple[str, ...]) -> PanelEntry:
         """Build an entry for the last frame, with this group and name."""
-        return PanelEntry(
-            group, name, partial(_build_picture, group, name, self.path, self.label, self.style, self.machine_words)
-        )
+        return PanelEntry(group, name, partial(_build_picture, group, name, self.path, self.label, self.machine_words))
 
 
 def last_frame_panels(folder: Path) -> list[PanelEntry]:
@@ -113,10 +109,10 @@ def _find_recorded_runs(folder: Path) -> list[_RecordedRun]:
     """
     table = read_sweep_rows(folder)
     found = read_run_times(table)
-    names, looks = label_runs(found), assign_solver_styles(run.solver for run in found)
+    names = label_runs(found)
     provenance = {row["run_id"]: row for row in table.select(["run_id", *PROVENANCE_COLUMNS]).to_pylist()}
     there = [
-        _RecordedRun(one, names[one.run_id], path, looks[one.solver], describe_provenance([provenance[one.run_id]]))
+        _RecordedRun(one, names[one.run_id], path, describe_provenance([provenance[one.run_id]]))
         for one in sorted(found, key=lambda run: -(run.vertices or 0))
         for path in [*(folder / "recordings").glob(f"*-{one.run_id}.rrd")][:1]
     ]
@@ -126,7 +122,7 @@ def _find_recorded_runs(folder: Path) -> list[_RecordedRun]:
 
 
 def _build_picture(
-    group: tuple[str, ...], name: tuple[str, ...], path: Path, label: str, style: SeriesStyle, machine_words: str
+    group: tuple[str, ...], name: tuple[str, ...], path: Path, label: str, machine_words: str
 ) -> MeshPicture:
     replay = _read_cached_replay(path)
     frames = find_drawable_frames(replay)
@@ -144,16 +140,14 @@ def _build_picture(
         *(group, name, _subject_words(replay), ", ".join(title), replay.absolute_positions(frame), replay.springs),
         *(replay.triangles, compute_vertex_strain(replay, frame), limit, aspect),
         render=_FrameRenderer(
-            replace(replay, strain_range=limit), frame, fit_camera(points, aspect=aspect, angles=angles)
+            replace(replay, strain_range=limit), frame, fit_camera(points, aspect=aspect, angles=angles), aspect
         ),
         facts=(
             f"largest strain {100 * max_recorded_strain(replay):.3g} %",
             *describe_outside(framed_vertex_mask(replay, [frame])),
             *describe_self_intersection(replay, [frame]),
         ),
-        style=style,
         machine_words=machine_words,
-        mesh=str(path),
     )
 
 
@@ -169,11 +163,14 @@ def _subject_words(replay: RecordingReplay) -> str:
     return f"{scene}, size {size}" if size else str(scene)
 
 
-class _FrameRenderer(MeshRenderer):
-    """Renders one frame with one camera (`figure_panels.MeshRenderer`)."""
+@dataclass(slots=True, eq=False)
+class _FrameRenderer:
+    """Renders one frame with one camera, see `figure_panels.MeshRenderer`."""
 
-    def __init__(self, replay: RecordingReplay, frame: int, view: FittedCamera) -> None:
-        self.replay, self.frame, self.view, self.aspect = replay, frame, view, 1.0
+    replay: RecordingReplay
+    frame: int
+    view: FittedCamera
+    aspect: float
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
         """Render the frame, see `figure_panels.MeshRenderer`."""
@@ -186,7 +183,7 @@ def align_pictures(pictures: Sequence[MeshPicture]) -> list[MeshPicture]:
 
     Distances from the reference run are added to their facts.
     """
-    renders: list[Any] = [picture.render for picture in pictures]
+    renders = [picture.render for picture in pictures]
     replays = [render.replay for render in renders]
     limit = strain_scale_limit(replays, [render.frame for render in renders])
     points = np.concatenate([points_to_frame(r.replay, [r.frame]) for r in renders])
@@ -202,8 +199,7 @@ def align_pictures(pictures: Sequence[MeshPicture]) -> list[MeshPicture]:
         facts += [] if cost is None else [f"{format_quantity(float(cost))} ms a step"]
         if best is not None:
             facts.append(f"distance: {format_distance(render.replay, replays[best])}")
-        made = _FrameRenderer(replace(render.replay, strain_range=limit), render.frame, view)
-        made.aspect = aspect
+        made = _FrameRenderer(replace(render.replay, strain_range=limit), render.frame, view, aspect)
         notes = [_DISTANCE_NOTE] if best is not None else []
         out.append(replace(picture, strain_limit=limit, aspect=aspect, render=made, facts=facts, notes=notes))
     return out
@@ -223,12 +219,10 @@ def build_scene_sheet(pictures: Sequence[MeshPicture]) -> list[MeshPicture]:
     aspect = float(np.median([picture.aspect for picture in pictures]))
     out: list[MeshPicture] = []
     for picture in pictures:
-        render: Any = picture.render
-        replay, frame = render.replay, render.frame
+        replay, frame = picture.render.replay, picture.render.frame
         angles = choose_view_angles(replay.positions[frame], compute_area_vectors(replay, frame))
         view = fit_camera(points_to_frame(replay, [frame]), aspect=aspect, angles=angles)
-        made = _FrameRenderer(replace(replay, strain_range=limit), frame, view)
-        made.aspect = aspect
+        made = _FrameRenderer(replace(replay, strain_range=limit), frame, view, aspect)
         label, *how = picture.title.split(", ")
         facts = [f"{label}, {how[0]}", *how[1:], *picture.facts] if how else [label, *picture.facts]
         scene = picture.name[0].replace("-", " ")
