@@ -21,8 +21,6 @@ FRAME_SECONDS = 1.0 / 30.0
 ERROR_TARGETS = tuple(10.0**-k for k in range(1, 9))
 """Relative errors of the positions at the end time."""
 NO_WINNER = "none that was tried"
-SIMILAR_COST_RATIO = 1.25
-"""Cost ratio below which two families count as equal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +37,7 @@ class WinnerCell:
     cheapest_by_family: dict[str, WorkPoint]
 
     @property
-    def fastest_solver(self) -> str:
+    def cheapest_family(self) -> str:
         """The family of the cheapest simulation."""
         return min(
             self.cheapest_by_family,

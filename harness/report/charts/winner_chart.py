@@ -61,7 +61,7 @@ def build_winner_chart(table: AccuracyData, newest_fingerprint: str | None = Non
 
 
 def _build_cell(cell: WinnerCell, colors: dict[str, str], newest: str | None) -> MapCell:
-    family = cell.fastest_solver
+    family = cell.cheapest_family
     best = cell.cheapest_by_family.get(family)
     return MapCell(
         row=f"{cell.error:.0e}".replace("e-0", "e-"),
