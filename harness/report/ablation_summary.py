@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results import row_store
-from springbench.harness.results.parquet_rows import read_rows as read_rows
+from springbench.harness.results.parquet_rows import read_rows
 
 ResultRow = Mapping[str, Any]
 

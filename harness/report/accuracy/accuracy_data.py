@@ -168,7 +168,6 @@ class WorkPoint:
     t_end: float
     error: float
     reference_kind: str
-    end_error_rms: float
     seconds_per_simulated_second: float
     cpu_seconds_per_simulated_second: float
     round_seconds: tuple[float, ...]

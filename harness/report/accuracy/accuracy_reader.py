@@ -20,7 +20,7 @@ from springbench.harness.report.accuracy.accuracy_data import (
 )
 from springbench.harness.report.provenance_words import describe_commits, describe_processors
 from springbench.harness.results import row_store
-from springbench.harness.results.parquet_rows import read_rows as read_rows
+from springbench.harness.results.parquet_rows import read_rows
 
 ROUNDOFF_FACTOR = 100 * float(np.finfo(np.float64).eps)
 """Energy difference, relative to the terms' magnitude, beyond which a value below g* is a lower minimum.
@@ -198,7 +198,6 @@ def _build_work_point(row: _ResultRow, label: _RowLabeller) -> WorkPoint:
         t_end=_float_or_nan(row["t_end"]),
         error=_float_or_nan(row["error"]),
         reference_kind=row["reference_kind"] or "",
-        end_error_rms=_float_or_nan(row["end_error_rms_m"]),
         seconds_per_simulated_second=_float_or_nan(row["seconds_per_simulated_second"]),
         cpu_seconds_per_simulated_second=_float_or_nan(row["cpu_seconds"]) / _float_or_nan(row["t_end"]),
         round_seconds=tuple(row["seconds"] or ()),
