@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from importlib.metadata import requires
 
 LIGHT_EXTRAS = ("record", "pictures")
-"""Extras whose libraries are left out; the complete installation has them, too."""
+"""Extras whose libraries are left out, although they are dependencies of the package too."""
 
 
 def list_light_requirements(lines: Iterable[str]) -> list[str]:
@@ -22,6 +22,9 @@ def list_light_requirements(lines: Iterable[str]) -> list[str]:
 
     Args:
         lines: requirements of the package, as its metadata state them.
+
+    Returns:
+        The lines of the other requirements, for `pip install -r`.
     """
     left_out, needed = set[str](), dict[str, str]()
     for line in lines:
