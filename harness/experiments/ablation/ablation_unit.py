@@ -42,7 +42,7 @@ _REFERENCE_KINDS = ("solver", "time-step")
 REFERENCE_SOLVER = "newton"
 """Solver whose solution determines the distance of the scene's own solver from the minimum."""
 CONVERGED_STOP_RULE = StopRule(200, 1e-8)
-"""Its tolerance is far below any difference that an effect makes."""
+"""Stop rule of the reference solver; its tolerance is far below any difference that an effect makes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ def run_ablation(
 ) -> Path:
     """Execute the ablation of the only run of a scene's sweep, if it is missing.
 
-    The rounds of the run are those of the timing. Where the full scene has no solution, the file has one row.
+    Every variant is timed in as many rounds as the run has. Where the full scene has no solution, the file has one row.
 
     Args:
         sweep: sweep with one run.
@@ -193,7 +193,8 @@ def _measure_reference_errors(
 ) -> list[ResultRow]:
     """Measure the error of the full scene's solver, and that of its time step.
 
-    These are the distance from the minima of the steps, and the distance of those from half the time step.
+    The first is the distance from the motion of converged steps. The second is the distance of that motion from the one
+    with half the time step.
     """
     assert full.scene is not None
     settings = replace(settings, stop_criterion=CONVERGED_STOP_RULE)
@@ -208,7 +209,7 @@ def _measure_reference_errors(
                 simulate_motion(scene, load_target(SOLVERS[REFERENCE_SOLVER])(), settings, stride=every),
             )
             found.append(row | {"status": "ok"} | compute_motion_difference(full.scene, coarser, finer))
-        except Exception as error:  # the better solver may fail with any exception: then the error is not known
+        except Exception as error:  # the reference solver may raise any exception; the error is then unknown
             columns = build_failure_columns(error)
             found += [
                 {"kind": "error", "name": n, "status": "failed", "reason": columns["reason"]}

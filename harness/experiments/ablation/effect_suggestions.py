@@ -1,8 +1,7 @@
 """Suggest effects that a scene does not list although its motion indicates them.
 
-Each states its evidence.
-
-The class of an effect defines the evidence for it (`springbench.harness.scenes.effects.effect_interface.SceneEffect`).
+Each suggestion states its evidence. The class of an effect defines the evidence for it
+(`springbench.harness.scenes.effects.effect_interface.SceneEffect`).
 """
 
 from __future__ import annotations

@@ -27,8 +27,10 @@ ResultRow = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class EffectUnit(ABC):
-    """Unit that measures a scene's effects in a run
-    (`springbench.harness.experiments.experiment_units.ExperimentUnit`)."""
+    """Unit that measures the effects of a run's scene.
+
+    It implements `springbench.harness.experiments.experiment_units.ExperimentUnit`.
+    """
 
     run: RunSpec
     folder: Path
@@ -79,7 +81,7 @@ class EffectUnit(ABC):
 
     @abstractmethod
     def file_suffix(self) -> str:
-        """Return the suffix that distinguishes its file from others of the same run."""
+        """Return the suffix that distinguishes the unit's file from others of the same run."""
 
     @abstractmethod
     def measure_rows(self, tick: ProgressCallback) -> list[ResultRow]:

@@ -75,11 +75,14 @@ def time_interleaved(
         settings: settings of the simulations.
         tick: called after each motion and each round.
 
+    Returns:
+        The runs in the order of the variants.
+
     Raises:
         InputError: the full scene is invalid; other variants store the reason.
         Unsupported: the solver does not support the full scene; other variants store the reason.
     """
-    _prepare_variant(variants[0], size, integrator, solver)  # what is compiled and imported is not the scene's memory
+    _prepare_variant(variants[0], size, integrator, solver)  # so that compilation and imports are not counted as memory
     found = [_prepare_variant(variant, size, integrator, solver) for variant in variants]
     for turn in found:
         _store_motion(turn, settings)

@@ -1,12 +1,12 @@
 """Measure the per-iteration overhead of each effect with each solver.
 
-    price = median over rounds of (CPU time per iteration with the effect) / (CPU time per iteration without it)
+    ratio = median over rounds of (CPU time per iteration with the effect) / (CPU time per iteration without it)
 
-The baseline scene has only the effects that are declared `plain`. Both scenes are simulated interleaved, step by step,
-to the requested tolerance, so that a drift of the machine affects both alike. Rounds end once the interval of the ratio
-is narrower than MAX_INTERVAL_WIDTH, or at the largest number of rounds. A round that has taken MAX_ROUND_SECONDS ends
-with the next counted step, and then MIN_ROUNDS rounds suffice. Where a single step takes that long, the number of
-iterations per step is reduced. So the slowest solvers take minutes as well.
+The baseline scene has only the effects whose class sets `is_baseline_effect`. Both scenes are simulated interleaved,
+step by step, to the requested tolerance, so that a drift of the machine affects both alike. Rounds end once the
+interval of the ratio is narrower than MAX_INTERVAL_WIDTH, or at the largest number of rounds. A round that has taken
+MAX_ROUND_SECONDS ends with the next counted step, and then MIN_ROUNDS rounds suffice. Where a single step takes that
+long, the number of iterations per step is reduced. This limits the time of the slowest solvers to minutes.
 
 No iteration can read the effect's own numbers faster than a dot product, nor multiply and add them faster than a matrix
 product. The slower of the two is the lower bound of each ratio. An element that couples k vertices counts as 12 k
@@ -239,7 +239,7 @@ def _limit_iterations(baseline: PreparedScene, stop_rule: StopCriterion) -> Stop
     The reduced number of iterations takes a quarter of that time.
     """
     run = _TimedRun(iter(simulate_scene(*baseline, stop_rule, initial_guess="previous", frames=NUM_WARMUP_STEPS)))
-    for k in range(NUM_WARMUP_STEPS):  # what the first compiles does not count
+    for k in range(NUM_WARMUP_STEPS):  # only the last step counts, since the first one compiles
         run.run_step(is_counted=k == NUM_WARMUP_STEPS - 1)
     return (
         replace(stop_rule, max_iterations=max(1, int(MAX_ROUND_SECONDS / 4.0 / run.seconds_per_iteration)))
@@ -275,7 +275,7 @@ def _measure_min_seconds(work: Callable[[], object]) -> float:
 
 
 class _EnergyWork(NamedTuple):
-    """Bytes that an energy reads, and flops that are linear in them."""
+    """Bytes that an energy reads, and flops of its linear operations."""
 
     memory_bytes: int = 0
     flops: int = 0
@@ -284,7 +284,7 @@ class _EnergyWork(NamedTuple):
 def _count_energy_work(energy: Any, n: int) -> _EnergyWork:
     """Count the work of an energy's elements, or of its entries of Q.
 
-    Data known only in steps is not counted.
+    No work is counted for other energies, whose data are known only within a step.
     """
     if hasattr(energy, "elements"):
         return _EnergyWork(sum(x.nbytes for x in energy.elements), 12 * energy.elements.vertices.size)

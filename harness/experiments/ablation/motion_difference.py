@@ -35,7 +35,10 @@ def compute_motion_difference(scene: Scene, a: MotionStates, b: MotionStates) ->
 
 
 def compute_mean_rest_length(scene: Scene) -> float:
-    """Return the mean rest length of the scene's springs; the mesh spacing without springs [m]."""
+    """Return the mean rest length of the scene's springs [m].
+
+    It is the mesh spacing if there are no springs, or if all rest lengths are zero.
+    """
     lengths = scene.all_springs.rest_length
     return float(lengths.mean()) if lengths.any() else scene.mesh.spacing
 
