@@ -1,8 +1,7 @@
 """Execute the missing units of an accuracy config.
 
-Step snapshots come first, then curves on them, and simulations.
-
-A unit is executed again if the config now requests it with other settings, or of another step snapshot.
+Step snapshots come first, then curves on them, and simulations. A unit is executed again if the config requests it with
+other settings, or on another step snapshot.
 """
 
 from __future__ import annotations
@@ -94,7 +93,7 @@ def run_accuracy_study(
     with folder_locks.lock_folder_exclusive(folder):
         execute_units(
             _build_snapshot_units(accuracy.curves, home), display, isolated=isolated
-        )  # quick where they were found before
+        )  # fast for snapshots that are stored already
         planned = _plan_units(
             [*_build_curve_units(accuracy.curves, home), *_build_work_units(accuracy.work, home)], home
         )
@@ -105,7 +104,7 @@ def run_accuracy_study(
 
 
 def _report_contact(cases: Mapping[str, BenchmarkCase], print_message: Callable[[str], None]) -> None:
-    """Report the scenes by name whose contact has no certified reference; binds their user code."""
+    """Report the scenes with contact, for which no certified reference exists; this imports user code."""
     for name, case in cases.items():
         if has_contact(build_exact_scene(case.scene, case.size).system):
             print_message(describe_self_convergence(name))
@@ -142,7 +141,7 @@ def open_measurement(
         return parquet_rows.read_rows([home.rows_path(spec.build_file_stem())], ACCURACY_SCHEMA).to_pylist()[0]
 
     with folder_locks.lock_folder_exclusive(folder):
-        # No run ends with this kind, so no remaining time is estimated: most of these are omitted in the end.
+        # No run ends with this kind of cost, so no remaining time is estimated: the search omits most simulations.
         display.start_sweep([RunCost("omitted")] * len(work))
         try:
             yield measure
@@ -188,7 +187,7 @@ def _format_case(spec: CurveSpec) -> str:
 def _build_curve_units(curves: Sequence[CurveSpec], results: AccuracyResults) -> Iterator[CurveUnit]:
     """Yield the units for the curves of each step.
 
-    A step is used once where two snapshots of a case are one step.
+    Where two snapshots of a case are the same step, only the first one yields units.
     """
     paths = dict.fromkeys(results.rows_path(spec.build_problem_stem()) for spec in curves)
     steps = parquet_rows.read_first_rows(

@@ -1,8 +1,7 @@
 """Step snapshots, curves and simulations as units of an accuracy config.
 
 Each is a `springbench.harness.experiments.experiment_units.ExperimentUnit`. It writes a Parquet file under
-`<folder>/accuracy` once
-the whole unit is measured.
+`<folder>/accuracy` once the whole unit is measured.
 """
 
 from __future__ import annotations
@@ -66,12 +65,10 @@ def open_reference_store(results: Path) -> ReferenceStore:
 
 @dataclass(frozen=True, slots=True)
 class SnapshotUnit:
-    """Unit that finds the step snapshots of a case and their minima, one per spec.
+    """Unit that finds the step snapshots of a case, and their minima.
 
-    Specs differ in the snapshot.
-
-    A snapshot that could not be found has one row, without a problem. A snapshot that equals another one has no row, so
-    that the step is measured once.
+    Each of the specs names another snapshot. A snapshot that could not be found has one row, without a problem. A
+    snapshot that equals another one has no row, so that the step is measured once.
     """
 
     curve_specs: tuple[CurveSpec, ...]
@@ -109,7 +106,7 @@ class SnapshotUnit:
                 found = step.build_rows()
             except InputError:
                 raise
-            except Exception as error:  # no solver can be graded here; the other steps go on
+            except Exception as error:  # no solver can be graded on this step; the other steps continue
                 found = [_build_missing_snapshot_row(spec, ended(error))]
                 messages.append(f"{spec.snapshot}: {found[0]['status']}: {found[0]['reason']}")
             else:
@@ -221,7 +218,7 @@ class CurveUnit:
 
 
 _ITERATIONS_TO_TOLERANCE = 10
-"""Iterations by which the cost of a step to a tolerance is estimated, whatever their limit."""
+"""Estimated number of iterations of a step that is solved to a tolerance, independent of the limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,11 +335,14 @@ def _load_trajectory(request: _ReferenceRequest) -> ReferenceTrajectory | Except
 def load_reference_trajectory(spec: WorkSpec, reference_store: ReferenceStore) -> ReferenceTrajectory | Exception:
     """Return the reference trajectory up to a simulation's horizon, or the error that prevents it.
 
-    Each row checks which errors the reference can resolve. Raises InputError.
+    The trajectory may be inaccurate: `build_work_rows` checks for each row whether it resolves the error.
 
     Args:
         spec: the simulation.
         reference_store: store of the reference solutions.
+
+    Raises:
+        InputError: the scene is invalid.
     """
     try:
         return reference_store.load_trajectory(

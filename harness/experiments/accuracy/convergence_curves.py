@@ -110,6 +110,9 @@ def measure_convergence(
         time_limit: limit on the solver's own time [s].
         num_rounds: number of timed passes.
 
+    Returns:
+        The scored iterates, with the times of all passes.
+
     Raises:
         RunFailed: a timed pass ends at other positions, or another clock disagrees.
     """
@@ -157,7 +160,7 @@ class _ConvergenceMonitor:
         )
         self._lowest_energy = (
             np.nan if lowest_energy is None else lowest_energy
-        )  # then no gap is small, and none is large
+        )  # NaN: every comparison with a gap is then false
         self._energy_scale = max(
             problem.value(problem.current_positions) - self._lowest_energy, compute_energy_roundoff(problem)
         )
@@ -169,7 +172,7 @@ class _ConvergenceMonitor:
 
     def add_iterate(self, number: int, p: Positions) -> None:
         finite = bool(np.isfinite(p).all())
-        with np.errstate(over="ignore", invalid="ignore"):  # what explodes may overflow before it is not finite
+        with np.errstate(over="ignore", invalid="ignore"):  # terms may overflow while positions are finite
             self.g.append(self._problem.value(p) if finite else np.nan)
             self.stationarity.append(
                 self._evaluator.measure_stationarity(self._problem, p).stationarity if finite else np.nan
@@ -225,7 +228,7 @@ def _time_iterates(
     """
     stamps, watch = np.zeros(num_iterates + 1), PhaseWatch(numba.get_num_threads())
     p, copied = problem.initial_guess, None
-    gc.disable()  # a collection in the middle would be counted as the solver's
+    gc.disable()  # a garbage collection would count as the solver's time
     try:
         with watch:
             began = perf_counter()

@@ -1,7 +1,7 @@
 """Find the cheapest method for an error, or the most accurate one for a wall time.
 
-It is selected from stored rows or new measurements, by one search: for a wall time no error is small enough, and only
-the cost ends it.
+The method is selected from stored rows or new measurements. One search serves both goals: where a wall time is given,
+its target error is zero, and only the cost ends it.
 
 An error is that of a whole simulation up to a horizon (`springbench.harness.experiments.accuracy.work_precision`). A
 cost is the wall time per simulated second. The result is the cheapest measured method that meets the error, or the
@@ -83,11 +83,11 @@ SEARCH_TIME = 60.0
 BUDGET_REFERENCE_ERROR = 1e-3
 """Relative error that the reference must resolve where a wall time is given: a percent suffices there."""
 CONTACT_BUDGET_ERROR = 0.02
-"""The same with contact, whose errors at a frame's time step are some percent, and whose reference is less accurate."""
+"""BUDGET_REFERENCE_ERROR with contact: errors at a frame's time step are some percent, and references less accurate."""
 BUDGET_RANGE = 2.0
 """Multiple of a given wall time up to which methods are measured, to show what more time would yield."""
 FIXED_ITERATIONS, FEWER_ITERATIONS = 50, [2, 5, 10, 20]
-"""Iterations of methods without a tolerance; those that are tried too where a wall time is given."""
+"""Iterations of methods without a tolerance; smaller numbers that are also tried where a wall time is given."""
 ENGINE_SUBSTEPS = [1, 2, 4, 8, 16, 32, 64, 128]
 """Substeps of outside engines in a frame."""
 ENGINE_ITERATIONS = [1, 4, 16]
@@ -113,8 +113,7 @@ def build_candidate_grid() -> list[dict[str, Any]]:
     """Return the grid that is measured where no rows exist.
 
     The first solver of each family runs with steps solved to a tolerance, or with 50 iterations or substeps. All
-    adaptive
-    solvers with their own integrator are included.
+    adaptive solvers with their own integrator are included.
     """
     made = {name: load_target(target) for name, target in SOLVERS.items()}
     infos = {name: find_solver_info(solver, name) for name, solver in made.items()}
@@ -124,7 +123,7 @@ def build_candidate_grid() -> list[dict[str, Any]]:
     fixed = [
         name for name, solver in first.items() if not is_minimiser(solver) or infos[name].family == LOCAL_GLOBAL_FAMILY
     ]
-    return [  # those with the fewest kernels first, for their cost limits the time of all others
+    return [  # solvers with the fewest kernels first, because their cost limits the time of all others
         {"solver": own, "max_iterations": 1, "integrator": ["substepping"]},
         {"solver": fixed, "max_iterations": FIXED_ITERATIONS},
         {"solver": implicit, "rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
@@ -154,7 +153,10 @@ def build_solver_grid(name: str) -> list[dict[str, Any]]:
 
 
 def list_solver_variants(name: str) -> list[dict[str, Any]]:
-    """Return the parameters of a solver that are tried: those of outside engines vary, others have their defaults."""
+    """Return the sets of parameters with which a solver is tried.
+
+    Parameters of outside engines vary; other solvers have their defaults.
+    """
     solver = _load_solver(name)
     values: dict[str, Sequence[Any]] = {}
     for parameter in fields(solver) if is_engine(solver) else ():
@@ -166,7 +168,11 @@ def list_solver_variants(name: str) -> list[dict[str, Any]]:
 
 
 def find_engine_integrator(solver: Any) -> str:
-    """Return the integrator by which an engine steps frames: with damping of its own, or done before each frame."""
+    """Return the name of the integrator with which an engine steps frames.
+
+    It is `substepping` if the engine supports damping. Otherwise it is `implicit-euler`, whose damping acts before each
+    frame.
+    """
     return "substepping" if solver.supports_damping else "implicit-euler"
 
 
@@ -197,7 +203,7 @@ class RecommendationGoal:
         return self.budget_error if self.max_error is None else self.max_error
 
     def loosen_for_contact(self) -> RecommendationGoal:
-        """Return the goal for a scene with contact, where a wall time resolves larger errors only."""
+        """Return the goal for a scene with contact, whose reference resolves larger errors only."""
         return replace(self, budget_error=CONTACT_BUDGET_ERROR)
 
     def select_methods(
@@ -252,7 +258,7 @@ class MeasuredMethod:
 
     @property
     def kind(self) -> tuple[object, ...]:
-        """What distinguishes methods, without time step, iterations and tolerance."""
+        """Solver, integrator and parameters, which identify the method at any setting."""
         spec = self.work_spec
         return spec.solver.name, spec.case.integrator, *sorted(spec.solver.parameters.items())
 
@@ -293,12 +299,19 @@ class MethodRecommendation:
         return None if self.goal.frame_seconds is None else self.goal.frame_seconds / self.frame
 
     def find_runner_up(self) -> MeasuredMethod | None:
-        """Return the best method within the goal by another solver, integrator or method of an engine."""
+        """Return the best method within the goal that differs in solver, integrator or parameters."""
         within = self.goal.select_methods(self.measured_methods, self.frame)
         return next((method for method in within if method.kind != self.best_method.kind), None)
 
     def select_best(self, factor: float) -> MeasuredMethod | None:
-        """Return the most accurate method within a multiple of the given wall time; None if none is as cheap."""
+        """Return the most accurate method within a multiple of the given wall time.
+
+        Args:
+            factor: multiple of the wall time.
+
+        Returns:
+            The method; None if none is cheap enough.
+        """
         return next(iter(self.goal.select_methods(self.measured_methods, self.frame, factor)), None)
 
     @property
@@ -332,7 +345,9 @@ def recommend_method(
     engine: str | None = None,
     search_time: float = SEARCH_TIME,
 ) -> MethodRecommendation:
-    """Return the cheapest method for a relative error at `t_end`, or the most accurate one for a wall time.
+    """Recommend the cheapest method for an error, or the most accurate for a wall time.
+
+    The error is relative, at `t_end`. A repeated measurement checks the method.
 
     Args:
         path: file of the scene.
@@ -346,6 +361,9 @@ def recommend_method(
         print_message: prints a remark.
         engine: name of the only solver or engine to consider; None for all.
         search_time: limit for the wall time of all measurements together [s].
+
+    Returns:
+        The recommended method, its repeated measurement, and all measured methods.
 
     Raises:
         InputError: an option is invalid.
@@ -494,7 +512,7 @@ def _build_valid_study(
     """Build the study; its mistakes are those of options. Raises InputError."""
     try:
         return build_study(path, scene, size, candidates, t_end, time_limit)
-    except InputError as refused:  # the studies are ours; the mistake is in an option
+    except InputError as refused:  # the study is generated, so the mistake is in an option
         raise InputError(list(dict.fromkeys(map(_convert_to_option, refused.mistakes)))) from refused
 
 
@@ -570,7 +588,7 @@ def _compute_reference(
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
 ) -> ReferenceTrajectory:
-    """Return the reference, or report without delay why there is none. Raises RunFailed."""
+    """Compute the reference trajectory and report progress. Raises RunFailed if there is none."""
     print_message(f"the reference first, the motion up to {t_end:g} s, which is made once")
     last = [monotonic()]
 
@@ -630,9 +648,10 @@ def _tune_time_steps(
     print_message: Callable[[str], None],
     search_time: float,
 ) -> None:
-    """Measure step sizes between powers of two that use up a wall time, of the methods that gain most by it.
+    """Measure step sizes between powers of two that use up a wall time.
 
-    The cost is proportional to the number of steps, the error to its power -1 at least.
+    Only methods with the smallest predicted errors are measured. The prediction assumes that the cost is proportional
+    to the number of steps, and the error inversely proportional.
     """
     end, done = monotonic() + search_time, set[str]()
     for _ in range(_TUNING_ROUNDS):
@@ -732,7 +751,7 @@ def _read_measured_methods(
         row = parquet_rows.read_rows([path], ACCURACY_SCHEMA).to_pylist()[0]
         spec = _build_work_spec(row, name, scene)
         if path.stem != spec.build_file_stem() or row["machine_id"] != here or row["t_end"] != t_end:
-            continue  # the scene was another then, or the machine, or the question
+            continue  # measured for another scene, machine or end time
         if is_measured(row):
             methods.append(_build_measured_method(spec, row, reference_error))
         else:
@@ -760,7 +779,10 @@ def _check_method(
 
 
 def _build_measured_method(spec: WorkSpec, row: dict[str, Any], reference_error: float) -> MeasuredMethod:
-    """Build the method of a row; an error that is too small for the reference is at most the one that it resolves."""
+    """Build the method of a row.
+
+    Where the error is too small for the reference, its upper bound is the error that the reference must resolve.
+    """
     return MeasuredMethod(
         spec,
         row["error"] if row["status"] == "ok" else reference_error,

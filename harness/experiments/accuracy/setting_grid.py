@@ -1,7 +1,8 @@
-"""Settings of a study, searched best first for the cheapest that meets an error, or the most accurate within a cost.
+"""Best-first search of a study's settings.
 
-A method is a solver with an integrator; its settings are a grid of time steps and tolerances. Shorter steps and smaller
-tolerances are assumed to cost more. A method's last cost is therefore a lower bound of those that follow, by which
+It finds the cheapest setting that meets an error, or the most accurate one within a cost. A method is a solver with an
+integrator; its settings are a grid of time steps and tolerances. Shorter steps and smaller tolerances are assumed to
+cost more. A method's last cost is therefore a lower bound of those that follow, by which
 `springbench.harness.experiments.best_first_search` orders the methods. The search omits
 
     smaller tolerances at a time step    once one meets the error, or smaller ones no longer change it
@@ -57,6 +58,9 @@ def search_grid(
         best: wall seconds per simulated second of the best known setting, infinite without one.
         measure: measures a setting within the time limit of its specification, and returns the row.
         search_time: wall time after which no simulation starts [s].
+
+    Returns:
+        The numbers of measured and of omitted settings.
     """
     specs, omitted = list(work), Counter[str]()
     t_end = max((spec.t_end for spec in specs), default=1.0)
@@ -112,6 +116,7 @@ def _propose_settings(
             omitted[reason] += following
             remaining -= following
             break
+        # A shorter step is assumed to cost at least as much as this one at the largest tolerance.
         bound = max(bound, loosest)
     return None
 
@@ -119,7 +124,7 @@ def _propose_settings(
 def compute_setting_cost(spec: WorkSpec, row: Mapping[str, Any]) -> float:
     """Return the wall time per simulated second of a simulation, on an otherwise idle machine.
 
-    Where other programs interrupted a single thread of ours, its processor time is what it takes alone.
+    Where other programs interrupted a simulation on one thread, its CPU time estimates its wall time without them.
 
     Args:
         spec: specification of the simulation.
@@ -144,7 +149,10 @@ def _slow(error: float) -> str:
 
 
 def _build_outcome(spec: WorkSpec, row: Mapping[str, Any]) -> TrialOutcome[Mapping[str, Any]]:
-    """Return the error and the cost of a row, infinite if there are none; an unmeasurably small error is almost 0."""
+    """Return the error and the cost of a row, infinite if there are none.
+
+    An error that is too small for the reference becomes the smallest positive number.
+    """
     cost = compute_setting_cost(spec, row) if is_measured(row) else inf
     error = row["error"] if row["status"] == "ok" else inf if cost == inf else float_info.min
     return TrialOutcome(error, cost, is_late=row["status"] == "time-limit", result=row)

@@ -56,12 +56,16 @@ class SnapshotEvaluation:
     def load_snapshot(
         cls, case: BenchmarkCase, snapshot_name: str | int, reference_store: ReferenceStore
     ) -> SnapshotEvaluation:
-        """Load a step snapshot and find its minima. Raises InputError, RunFailed.
+        """Load a step snapshot, or compute it if it is not stored.
 
         Args:
             case: scene, size and integrator.
             snapshot_name: name of the snapshot, or number of the frame.
             reference_store: store of the reference solutions.
+
+        Raises:
+            InputError: the scene cannot be built.
+            RunFailed: a step of the reference run does not converge.
         """
         scene, size, integrator = case.scene, case.size, case.integrator
         if isinstance(snapshot_name, int):
@@ -182,7 +186,7 @@ def build_curve_rows(
             for first_guess in spec.initial_guesses:
                 found += [shared | row for row in _measure_curve(spec, prepared, step, first_guess, results_folder)]
                 tick()
-    except Exception as error:  # whatever a solver raises, the others go on
+    except Exception as error:  # a solver may raise any exception; the other solvers continue
         return [
             shared | build_accuracy_failure_columns(error) | {"kind": "curve", "initial_guess": guess}
             for guess in spec.initial_guesses

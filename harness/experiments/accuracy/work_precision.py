@@ -51,7 +51,7 @@ def build_work_rows(
             raise trajectory
         with machine_info.limit_threads(spec.measurement.threads):
             return [shared | _measure_simulation(spec, trajectory, tick)]
-    except Exception as error:  # whatever a solver raises, the others go on
+    except Exception as error:  # a solver may raise any exception; the other solvers continue
         return [shared | build_accuracy_failure_columns(error)]
 
 
@@ -102,11 +102,10 @@ def _measure_simulation(spec: WorkSpec, trajectory: ReferenceTrajectory, tick: C
 def _simulate_timed(
     spec: WorkSpec, scene: Scene, prepared: PreparedSolver, frames: int, *, time_limit: float | None = None
 ) -> tuple[Positions, int, ResultRow]:
-    """Simulate under a clock.
+    """Simulate under a clock; return the last positions, the number of iterations and timing columns.
 
-    Return the last positions (n, 3) [m], the number of iterations and timing columns.
-
-    `time_limit` is in seconds; that of the spec if left out. Raises RunFailed where another clock disagrees.
+    The positions are (n, 3) [m]. `time_limit` is in seconds; that of the spec if left out. Raises RunFailed if a second
+    clock disagrees.
     """
     seconds, iterations, p, watch = 0.0, 0, scene.mesh.rest_positions, PhaseWatch(spec.measurement.threads)
     clock = Stopwatch(watch)
