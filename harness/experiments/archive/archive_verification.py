@@ -1,13 +1,12 @@
 """Verify that an archive is unchanged, and that its numbers are reproducible.
 
 All checksums are compared, and the names and options of all runs with those of their configs. Then a random tenth of
-the runs is repeated here, each with another solver's run on the same scene and size. Positions after every step, and
-all columns except IRREPRODUCIBLE_COLUMNS, must be bitwise identical. A step's time must match the published one within
-a factor of MAX_SECONDS_RATIO. The ratio of the two solvers' times is compared step by step
-(`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). It must match within MAX_RATIO_SAME_MACHINE
-on the published
-machine type, within OTHER_MACHINE_FACTOR on others. With another machine, other libraries or other source code, a
-difference is inconclusive. So is a run that no config requests.
+the runs is repeated on this machine, each with another solver's run on the same scene and size. Positions after every
+step, and all columns except IRREPRODUCIBLE_COLUMNS, must be bitwise identical. A step's time must match the published
+one within a factor of MAX_SECONDS_RATIO. The ratio of the two solvers' times is compared step by step
+(`springbench.harness.results.bootstrap_statistics.estimate_slowdown`). It must match within MAX_RATIO_SAME_MACHINE on
+the published machine type, and within OTHER_MACHINE_FACTOR on others. With another machine, or other libraries, source
+code or numbers of threads, a difference is inconclusive. So is a run that no config requests.
 """
 
 from __future__ import annotations
@@ -289,9 +288,7 @@ def _read_rows(sweep: Path) -> list[ResultRow]:
 def _find_run_spec(config: Path, run_rows: Sequence[ResultRow], *, with_user_code: bool) -> RunSpec | None:
     """Find the run specification that produced these rows.
 
-    The run id is a hash of its content.
-
-    The result is None where the config requests no such run.
+    The run id is a hash of its content. The result is None where the config requests no such run.
     """
     steps = [row for row in run_rows if row["phase"] == "step"]
     first = (steps or run_rows)[0]
@@ -305,6 +302,7 @@ def _find_run_spec(config: Path, run_rows: Sequence[ResultRow], *, with_user_cod
         }
     sizes = [first["size"]] if first["size"] else []
     scene = {"solvers": [first["solver"]], "sizes": sizes, **options}
+    # The config as it is, then with the options of the rows, which the command line may have set.
     for given in ({}, scene | {"threads": "auto"}, scene | {"threads": first["threads"]}):
         for opens in (False, True) if with_user_code else (False,):
             for run in _load_runs(config, json.dumps(given, sort_keys=True), opens):
@@ -322,9 +320,7 @@ def _find_max(steps: Sequence[ResultRow], name: str) -> int:
 def _load_runs(config: Path, options_json: str, imports_code: bool) -> list[RunSpec]:
     """Load the runs of a config with options, given as JSON.
 
-    The result is empty if they are invalid.
-
-    `imports_code` states whether code that the config names is imported.
+    The result is empty if they are invalid. `imports_code` states whether code that the config names is imported.
     """
     key = config, options_json, imports_code
     if key not in _LOADED_RUNS:
@@ -342,9 +338,9 @@ _LOADED_RUNS: dict[tuple[Path, str, bool], list[RunSpec]] = {}
 
 def _verify_options(published_run: PublishedRun) -> VerifiedClaim | None:
     """Return a failed claim if a run's names or options differ from its config."""
-    left_out = {"threads", *read_solver_metadata(published_run.run.solver.name)}  # of the machine, and of the code
+    left_out = {"threads", *read_solver_metadata(published_run.run.solver.name)}  # of the machine and the code
     if published_run.run.error_target is not None:
-        left_out |= {"integrator", "time_step", "residual_rtol", "max_iterations", "initial_guess"}  # are chosen
+        left_out |= {"integrator", "time_step", "residual_rtol", "max_iterations", "initial_guess"}  # found by a search
     requested = {
         name: value for name, value in build_specification_columns(published_run.run).items() if name not in left_out
     }
@@ -447,7 +443,7 @@ def _verify_positions(original: PublishedRun, rerun_rows: list[ResultRow]) -> Ve
 
 
 def _verify_columns(original: PublishedRun, rerun_rows: list[ResultRow]) -> VerifiedClaim:
-    """Verify the columns that a repetition determines; an empty published column claims nothing."""
+    """Verify the columns that a repetition determines; null published values are not compared."""
     what = f"{original.title}, other columns"
     of_place = {_row_key(row): row for row in rerun_rows}
     if lost := [_row_key(row) for row in original.rows if _row_key(row) not in of_place]:
@@ -480,7 +476,7 @@ def _find_differences(
     for row, here in pairs:
         for name in names:
             was, now = row[name], here[name]
-            if was is not None and was != now and not (was != was and now != now):  # what is no number equals itself
+            if was is not None and was != now and not (was != was and now != now):  # NaN equals NaN here
                 wrong.setdefault(name, (row, was, now))
     return wrong
 
@@ -496,7 +492,8 @@ def _build_failed_claim(
 ) -> VerifiedClaim:
     """Build the claim for a difference.
 
-    It is a failure only with the same source code on such a machine.
+    It is a failure only with the same machine type, libraries, source code and number of threads. Otherwise it is
+    inconclusive.
     """
     if elsewhere := _describe_environment_change(original.rows[0], rerun_rows[0]):
         return VerifiedClaim(subject, ClaimVerdict.INCONCLUSIVE, f"{explanation}; {elsewhere}")

@@ -2,14 +2,11 @@
 # pyarrow's stubs are incomplete for columns, and for file objects that Parquet is read from.
 """Pack the rows of many units into one file next to their folder.
 
-Readers get the same rows before and after.
-
-The packed file is written under a partial name, including the rows that were packed before. It is compared with the
-originals, which an independent reader reads file by file, and renamed. Then the units' own files are removed. Readers
-prefer a unit's own file to its packed rows (`springbench.harness.results.row_store`). An interruption therefore
-leaves, at any
-moment,
-all rows visible exactly once, and the next call completes the work.
+Readers get the same rows before and after. The packed file is written under a partial name, including the rows that
+were packed before. It is compared with the originals, which an independent reader reads file by file, and renamed. Then
+the units' own files are removed. Readers prefer a unit's own file to its packed rows
+(`springbench.harness.results.row_store`). After an interruption at any moment, all rows are therefore visible exactly
+once, and the next call completes the work.
 """
 
 from __future__ import annotations
@@ -148,11 +145,8 @@ def _check_compacted_rows(written: BinaryIO, units: Sequence[Path], schema: pa.S
 
 
 def _sync_folder(folder: Path) -> None:
-    """Flush a folder to the disk.
-
-    A rename is then durable before the replaced files are removed.
-    """
-    if not hasattr(os, "O_DIRECTORY"):  # Windows opens no folders
+    """Flush a folder to the disk, so that a rename is durable before the replaced files are removed."""
+    if not hasattr(os, "O_DIRECTORY"):  # Windows cannot open folders
         return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:

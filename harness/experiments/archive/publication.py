@@ -8,8 +8,8 @@
     CITATION.cff, ro-crate-metadata.json, SHA256SUMS
 
 Only files in the folder of results, or in a config's folder, are included. Any other file to which a link or a config
-points is an error that names it. The archive unpacks to a folder of results on which `springbench list`, `query` and
-`gate` work. The metadata follow RO-Crate 1.1 (https://w3id.org/ro/crate/1.1); the checksums are for `sha256sum -c`.
+points is an error that names it. The archive unpacks to a folder of results on which `springbench list` and `query`
+work. The metadata follow RO-Crate 1.1 (https://w3id.org/ro/crate/1.1); the checksums are for `sha256sum -c`.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def publish_results(
     if refused:
         raise InputError(refused)
     for folder in list_sweep_folders(results):
-        parquet_rows.read_rows(row_store.list_units(folder / "rows"))  # names what is damaged
+        parquet_rows.read_rows(row_store.list_units(folder / "rows"))  # raises an error that names damaged files
     content |= {
         "environment/machine.json": _describe_environment(),
         "environment/requirements.txt": _list_requirements(),
@@ -108,7 +108,7 @@ def publish_results(
         content[CITATION_FILE] = citation
     with atomic_write(archive) as partial:
         _write_archive(partial, content, results.resolve().name, license_text)
-    return len(content) + 2
+    return len(content) + 2  # with the metadata and the checksums
 
 
 def _list_published_files(folder: Path) -> Iterator[Path]:
@@ -121,10 +121,7 @@ def _list_published_files(folder: Path) -> Iterator[Path]:
 
 
 def _explain_exclusion(path: Path, folder: Path) -> str:
-    """Return why a file is excluded.
-
-    The result is empty if it lies in the folder after resolving all links.
-    """
+    """Return why a file is excluded; empty if it lies in the folder after all links are resolved."""
     place = path.resolve()
     if not place.is_relative_to(folder.resolve()):
         leads = f"leads to {place}, which lies" if path.is_symlink() else "lies"
@@ -148,7 +145,7 @@ def _is_config(path: Path) -> bool:
 def _list_required_files(config: Path) -> list[Path]:
     """Return a config and the files that it names, without running its code."""
     files = {config}
-    with suppress(InputError):  # a config of another kind, or one that was changed; it is published all the same
+    with suppress(InputError):  # a config of another kind, or an invalid one, is published without what it names
         sweep = load_config(config, imports_code=False)
         plugins = select_plugins(sweep.reports)
         for run in sweep.list_runs():
@@ -159,7 +156,7 @@ def _list_required_files(config: Path) -> list[Path]:
             for part in (scene.mesh, *scene.effects):
                 if isinstance(part, ConfigModel):  # the configuration of user code is not inspected
                     files |= {value for value in vars(part).values() if isinstance(value, Path)}
-            for _, given in scene.plugins.values():  # names of files come with their digests there
+            for _, given in scene.plugins.values():  # a plug-in's file is a pair of name and digest
                 there = scene.path.parent
                 files |= {there / value[0] for value in given.values() if _is_file(value, there)}
             plugins += run.find_plugins()

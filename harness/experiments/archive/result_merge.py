@@ -2,12 +2,10 @@
 # pyarrow's stubs are incomplete for columns, and for file objects that Parquet is read from.
 """Merge results of several folders.
 
-Units are identified by content, so that none is lost or duplicated.
-
-A run on two machines has two ids, so the rows of both remain. Where a unit was measured twice with different rows, the
-newer rows have its name. The others are named by their content, `<unit>~<digest>`. Rows are copied file by file with
-pyarrow, and compared with the original before they replace a file. Runs that should have ended at the same positions
-and did not are reported.
+Units are identified by content, so that none is lost or duplicated. A run on two machines has two ids, so the rows of
+both remain. Where a unit was measured twice with different rows, the newer rows have its name. The others are named by
+their content, `<unit>~<digest>`. Rows are copied file by file with pyarrow, and compared with the original before they
+replace a file. Runs that should have ended at the same positions and did not are reported.
 """
 
 from __future__ import annotations
@@ -60,7 +58,8 @@ class MergeReport:
 def list_sweep_folders(results: Path) -> list[Path]:
     """Return the folders that contain rows, or `results` itself if it does.
 
-    Raises InputError for none.
+    Raises:
+        InputError: there are no rows.
     """
     found = {folder.parent for table in TABLE_FOLDERS for folder in row_store.find_row_folders(results, table)}
     found = {folder for folder in found if not any(part.startswith(".") for part in folder.relative_to(results).parts)}
@@ -92,7 +91,7 @@ def merge_results(sources: Sequence[Path], target: Path, print_message: Callable
     if len({place == Path() for _, place in places}) > 1:
         raise InputError("merge: one folder is that of a sweep, another contains several; expected folders of one kind")
     written = known = 0
-    for place in {place for _, place in places}:  # all that do not fit are refused before anything is written
+    for place in {place for _, place in places}:  # schemas that do not match are refused before anything is written
         for table in TABLE_FOLDERS:
             folders = [folder / place / table for folder in (target, *sources)]
             schema = run_schema.RUN_SCHEMA if table == "rows" else _EMPTY_SCHEMA
@@ -132,7 +131,7 @@ def _merge_table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
         tables = [(unit, parquet_rows.read_rows_by_file([unit], _EMPTY_SCHEMA)) for unit in units]
         newest = sorted(
             tables, key=lambda pair: _read_start_time(heads[pair[0]]), reverse=True
-        )  # the first where they tie
+        )  # stable: among equals the target's unit comes first
         merged = list[pa.Table]()
         named = list[tuple[Path, pa.Table, Path]]()
         for unit, table in newest:
@@ -147,7 +146,8 @@ def _merge_table(folders: Sequence[Path], home: Path) -> tuple[int, int]:
                 )
             )
             merged.append(table)
-        for unit, table, target in reversed(named):  # what gives its name to a newer one is there under another first
+        # Oldest first: an older unit is stored by its content's name before a newer one replaces its file.
+        for unit, table, target in reversed(named):
             if not row_store.has_rows(target) or not parquet_rows.is_bitwise_equal(
                 parquet_rows.read_rows_by_file([target], _EMPTY_SCHEMA), table
             ):
@@ -218,7 +218,8 @@ def _copy_ownership(source: Path, home: Path) -> None:
 def _find_conflicts(folders: Sequence[Path]) -> tuple[list[str], list[str], list[str]]:
     """Find runs with equal specifications whose steps ended at different positions.
 
-    Returns those of one machine and source code, those across several, and the machines.
+    Returns:
+        Descriptions of those of one machine and source code, of those across several, and of the machines.
     """
     units = [unit for folder in folders for unit in row_store.list_units(folder)]
     try:

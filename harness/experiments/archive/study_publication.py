@@ -2,7 +2,7 @@
 # pyarrow's stubs are incomplete for columns.
 """Write the results of a study to the published set (`springbench.harness.results.published_set`).
 
-Columns that no page uses and no repeat confirms are left out, and so are all times of studies that time nothing.
+Columns that no page uses and no repetition confirms are left out, and so are all times of studies that time nothing.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ DROPPED_COLUMNS = frozenset(
 """
 
 _TIME_COLUMNS = frozenset(("seconds", "cpu_seconds", "preempted", "load_average", "cold_seconds", "search_seconds"))
-"""Columns that mean nothing where the steps were not timed, and several runs shared the machine."""
+"""Columns without meaning where the steps were not timed, and several runs shared the machine."""
 
 _TABLES = ("rows", "accuracy", "ablation")
 
@@ -59,8 +59,8 @@ def write_study(
     """Write the study of folders of results to the published set, and return it.
 
     Args:
-        parts: results of one config, of which each folder was written by one command; a published study gains the
-            runs of the others. Or one Parquet file of measurements by a script.
+        parts: folders of results of one config, one for each command. A published study may be one of them, to which
+            the runs of the others are added. Or one Parquet file of measurements that a script wrote.
         config: the config; its stem is the name of the study.
         published: folder of the published set.
         print_message: prints a remark.
@@ -110,7 +110,7 @@ def write_study(
         ),
     }
     durations = [_measure_duration(_select_provenance(rows)) for tables in by_part for rows in tables.values()]
-    # Parts of a single run each state no time: that from the first to the last start is the best estimate.
+    # Parts of one run each have no duration; the time from the first start to the last one is then the best estimate.
     metadata["duration_seconds"] = round(sum(durations)) or metadata["duration_seconds"]
     if made:
         metadata |= {"runs": sum(map(len, found.values())), "duration_seconds": None}
@@ -173,7 +173,10 @@ def summarise_provenance(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _read_part(part: Path) -> dict[str, pa.Table]:
-    """Read the tables of a part of a study by name: a folder of results, a published study, or a file."""
+    """Read the tables of a part of a study, by their names.
+
+    The part is a folder of results, a published study, or a file of measurements.
+    """
     if part.suffix == ".parquet":
         return {"measurements": _read_measurements(part)}
     if (part / published_set.STUDY_FILE).is_file():
@@ -183,10 +186,10 @@ def _read_part(part: Path) -> dict[str, pa.Table]:
 
 
 def _join_newest_runs(parts: Sequence[pa.Table]) -> pa.Table:
-    """Join tables, with the newest execution alone of each run or unit; of equal ones the last.
+    """Join tables, with only the newest execution of each run or unit.
 
-    A run is identified by its key on any machine, a unit of another table by the name of its file. Measurements have
-    neither: all are joined.
+    Of equal ones, that of the last table is selected. A run is identified by its key on any machine, a unit of another
+    table by the name of its file. Measurements have neither: all are joined.
     """
     names = [*published_set.RUN_KEYS, "run_id", "started_at", row_store.FILE_COLUMN]
     newest: dict[tuple[Any, ...], tuple[str, str, int]] = {}
@@ -228,7 +231,7 @@ def _read_measurements(path: Path) -> pa.Table:
 
 
 def _drop_missing_software(rows: pa.Table) -> pa.Table:
-    """Drop solvers that no run supports: they need software that is not installed here."""
+    """Drop the rows of solvers that support no run, because their software is not installed here."""
     if "status" not in rows.column_names or "solver" not in rows.column_names:
         return rows
     supported = pc.unique(rows.filter(pc.field("status") != "unsupported")["solver"])
@@ -260,7 +263,7 @@ def _select_provenance(rows: pa.Table) -> list[dict[str, Any]]:
 
 
 def _count_requested_runs(config: Path) -> int:
-    """Count the runs that a sweep requests: more than are published if software is missing or runs are."""
+    """Count the runs that a sweep requests; fewer are published if software or runs are missing."""
     return len(load_config(config, imports_code=False).list_runs())
 
 

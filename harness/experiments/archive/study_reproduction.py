@@ -1,9 +1,9 @@
 """Repeat a published study on this machine (`springbench reproduce`).
 
-All of its runs, or a tenth that is drawn at random, are executed in a folder of their own, without recordings and
-pictures. The tenth of an accuracy study is drawn from few frozen steps and motions: their references take most of the
-time, and times to an error have ratios within them. Steps of studies that publish no times are not timed. Runs that are
-complete there are not executed again.
+All of its runs, or a random tenth of them, are executed in a separate folder, without recordings and pictures. The
+tenth of an accuracy study is drawn from few step snapshots and motions. Their references take most of the time, and
+only times on the same snapshot or motion have ratios. Steps of studies that publish no times are not timed. Runs that
+are complete in the folder are not executed again.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _UNPUBLISHED = "requests none of the published runs; publish the study again"
 
 
 class StudyRepetition(NamedTuple):
-    """What a repetition found.
+    """Result of a repetition.
 
     Attributes:
         runs: agreement of each repeated run.
@@ -84,6 +84,9 @@ def reproduce_study(
         print_message: prints a remark.
         seed: seed that draws a tenth of the runs; None repeats all.
         num_workers: number of worker processes; chosen by cores and memory if left out.
+
+    Returns:
+        The agreement of the repeated runs, and of the ratios of times.
 
     Raises:
         InputError: the config of the study is missing, or requests none of its runs.
@@ -179,7 +182,8 @@ def _reproduce_sweep(
 def omit_missing_software(pairs: Sequence[RowPair], print_message: Callable[[str], None]) -> list[RowPair]:
     """Return the pairs of rows of solvers whose software is installed here.
 
-    A missing solver is optional, and supports no repeated run, but a published one of them.
+    The software of an optional solver counts as missing if the solver supports none of the repeated runs here, but at
+    least one of them as published.
 
     Args:
         pairs: published and repeated rows of each run.
