@@ -1,10 +1,10 @@
 """Best-first search for the cheapest method that meets an error.
 
-`springbench recommend` and `springbench run --error` search by it. A candidate is a method. It proposes one setting
-after the other, a step size or a tolerance, with the cost that it expects. The candidate with the smallest expected
-cost is tried next, and learns the error and the cost of the trial before it proposes again. It is given up once it
-expects more than a multiple of the best cost known, which is also the limit of each trial. A trial that exceeds the
-limit may be repeated with a larger one after all others, while nothing meets the error.
+`springbench recommend` and `springbench run --error` use it. A candidate is a method. It proposes one setting after the
+other, a step size or a tolerance, with its expected cost. The candidate with the smallest expected cost is tried next,
+and receives the error and the cost of the trial before it proposes again. It is given up once its expected cost exceeds
+a multiple of the best cost known, which is also the limit of each trial. A trial that exceeds the limit may be repeated
+with a larger one after all others, while nothing meets the error.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class TrialOutcome(Generic[Result]):
         error: relative error; infinite where it is unknown.
         cost: time, in the unit of the search; infinite where there is no result.
         is_late: whether it was ended by its limit.
-        is_slow: whether it was, or costs more than a candidate may that is not given up; set by the search.
+        is_slow: whether it was ended by its limit, or costs more than the give-up rule permits; set by the search.
         limits_others: whether its cost limits that of others, if it meets the error.
         result: what was computed.
     """
@@ -64,12 +64,12 @@ class SettingProposal(Generic[Setting]):
 
 
 SettingProposals = Generator[SettingProposal[Setting], TrialOutcome[Result], TrialOutcome[Result] | None]
-"""Settings of a candidate: receives the outcome of each trial, and returns the outcome that it settles on, if any."""
+"""Generator of a candidate's settings: receives the outcome of each trial, and returns its final outcome, if any."""
 
 
 @dataclass(frozen=True, slots=True)
 class GiveUpRule:
-    """When a candidate costs too much.
+    """Rule by which a candidate is given up because of its cost.
 
     Attributes:
         max_cost_ratio: multiple of the best cost.
@@ -107,7 +107,7 @@ class SearchSummary(Generic[Result]):
     Attributes:
         num_trials: number of settings that were tried or known.
         reasons: number of omitted settings by reason.
-        answer: the outcome on which the search ended, where it ends at the first one that meets the error.
+        answer: the outcome at which the search ended, where it ends at the first one that meets the error.
     """
 
     num_trials: int
@@ -145,11 +145,15 @@ def search_best_first(
         best_cost: cost of the best known setting, infinite without one.
         search_time: wall time after which no trial starts [s].
         omitted: number of settings by the reasons for which candidates omit them; more are added.
-        ends_at_answer: whether the first candidate that settles on an outcome that meets the error ends the search.
+        ends_at_answer: whether the search ends at the first candidate whose final outcome meets the error.
+
+    Returns:
+        The numbers of trials and of omitted settings, and the outcome at which the search ended.
     """
     omitted = Counter[str]() if omitted is None else omitted
     num_trials, has_answer, deadline = 0, best_cost < inf, monotonic() + search_time
     every = list(candidates)
+    # Ordered by attempts, then expected cost; the unique index prevents a comparison of proposals.
     waiting: list[tuple[int, float, int, SettingProposal[Setting] | None]] = [
         (0, cost, number, None) for number, (cost, _) in enumerate(every)
     ]

@@ -54,7 +54,7 @@ def read_completion_statuses(
     """Return the completion status of units, by the path of their rows.
 
     Args:
-        matches_request: for each path, a predicate on the columns of the unit's first row; whether they match the
+        matches_request: for each path, a predicate that states whether the columns of the unit's first row match the
             request.
         columns: columns that the predicates need; `source_fingerprint` is added.
         schema: schema of the rows.

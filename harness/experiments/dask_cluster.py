@@ -3,14 +3,11 @@
 # Dask has no type annotations.
 """Execute runs on many machines with Dask.
 
-Each run is a task in a separate process of a free worker.
-
-A worker executes one run at a time. Workers of one machine wait for each other while one is timed
-(`springbench.harness.execution.timing_lock`). A run that crashes ends its process and not Dask's worker, so failed
-runs do not use
-up the workers. The files of a run return with its outcome, except where the worker shares the client's folder. If a
-worker is lost, its current run is repeated on another. A worker that cannot write or has other source code gets no more
-runs.
+Each run is a task, in a separate process of a free worker. A worker executes one run at a time. Workers of one machine
+wait for each other while one is timed (`springbench.harness.execution.timing_lock`). A run that crashes ends its
+process and not Dask's worker, so failed runs do not use up the workers. The files of a run return with its outcome,
+except where the worker shares the client's folder. If a worker is lost, its current run is repeated on another. A
+worker that cannot write or has other source code gets no more runs.
 """
 
 from __future__ import annotations
@@ -206,6 +203,7 @@ def check_workers(client: Client, runs: Sequence[RunSpec], print_message: Callab
             if theirs != ours:
                 problems.append(f"the worker {worker} has another version: {title} {theirs}, here {ours}")
         problems += [f"the worker {worker} has no {name}: {why}" for name, why in missing.items()]
+        # The offset is zero if the worker's clock lies between the start of the query and now.
         off = about.clock_seconds - min(max(about.clock_seconds, before), time())
         if abs(off) > MAX_CLOCK_OFFSET:
             print_message(
@@ -247,7 +245,7 @@ def _find_missing_plugins(plugins: Sequence[PluginName], tick: ProgressCallback)
 
 
 def _allow_child_processes() -> None:
-    """Allow child processes: Dask's nannies start workers as daemons, which may have none.
+    """Allow child processes: Dask's nannies start workers as daemons, which may not have any.
 
     The children end with their parent.
     """
@@ -275,7 +273,7 @@ def execute_on_cluster(
         WriteError: no worker can write any more.
         RunFailed: the connection to the scheduler is lost.
     """
-    # A worker that sees this file shares the folder. It is removed as partial files are.
+    # A worker that sees this file shares the folder. Its suffix lets a later command remove it after a crash.
     token = folder / "rows" / f".{uuid4().hex}.partial"
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
     threads, last_query_time = dict[str, int](), 0.0

@@ -2,7 +2,7 @@
 
 A unit is a file of rows, written once the whole unit has finished. A unit that crashes, hangs or exceeds its memory
 costs its worker, and still yields a row. While one unit is timed the others wait; untimed work runs in parallel. A full
-disk ends the experiment, and so do errors of the user.
+disk or invalid input ends the experiment.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class PluginUnit(Protocol):
 
 
 class StoredUnit(ExperimentUnit, Protocol):
-    """Unit that several commands may be about to execute."""
+    """Unit that several commands may try to execute at the same time."""
 
     @property
     def rows_path(self) -> Path:
@@ -119,8 +119,7 @@ def execute_unclaimed(
         todo: units to execute.
         claims: ownership of the row files in the results folder.
         execute_batch: executes units; calls its second argument for each unit, immediately before it starts. That
-            function
-            returns why another command has the unit, or an empty string.
+            function returns why another command has the unit, or an empty string.
         print_message: prints a remark.
     """
     remarks = ThrottledMessages(print_message)

@@ -30,9 +30,9 @@ def build_failure_columns(error: BaseException, solver_files: Collection[Path] =
         solver_files: source files of the solver; the reported error location is in these where possible.
 
     Raises:
-        WriteError: if this is the error.
+        WriteError: `error`, if it is one.
     """
-    if isinstance(error, WriteError):  # that is no outcome: a row of it would prevent its repetition
+    if isinstance(error, WriteError):  # no outcome: a row would prevent a repetition
         raise error
     if isinstance(error, StepError) and error.__cause__:
         return build_failure_columns(error.__cause__, solver_files) | {"frame": error.frame}

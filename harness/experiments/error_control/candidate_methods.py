@@ -116,10 +116,8 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
     """Return the integrators (by name) and solvers that a search tries by default.
 
     Solvers with their own adaptive integrator come first. The others are solvers that minimise the step's objective.
-    They
-    are combined with the embedded Runge-Kutta integrator of the highest order, and among equals of the highest stage
-    order.
-    They are also combined with the one-step integrator of fixed step size that has the highest order.
+    They are combined with the embedded Runge-Kutta integrator of the highest order, and among equals of the highest
+    stage order. They are also combined with the one-step integrator of fixed step size that has the highest order.
     """
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order}
     best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].needs_start_acceleration))

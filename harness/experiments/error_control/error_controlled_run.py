@@ -1,6 +1,6 @@
 """Error-controlled run of a sweep (`error_target`) with a given solver.
 
-Integrator and step size are chosen.
+A search selects the integrator and the step size.
 """
 
 from __future__ import annotations
@@ -108,15 +108,16 @@ class ErrorControlledRun:
 
 
 def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback, results: Path) -> ErrorControlledRun:
-    """Find the cheapest method of the run's solver, and repeat it.
-
-    It is repeated for all rounds of the run.
+    """Find the cheapest method of the run's solver, and time it in each round of the run.
 
     Args:
         run: specification of the run.
         error: relative error at the end of the run.
         tick: called with the name of the phase as the run progresses.
         results: folder of results, with the stored references by which errors with contact are measured.
+
+    Returns:
+        The method with its timed motions, from which rows are built.
 
     Raises:
         RunFailed: no setting reaches the error, or a round ends at positions that are not bitwise identical.

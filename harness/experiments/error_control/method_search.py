@@ -59,7 +59,7 @@ from springbench.solvers.model.step_problem import Positions
 ERROR_AIM = 0.65
 """Fraction of the target error at which a setting aims, because estimates scatter."""
 _ERROR_AIM_FIXED_STEPS = 0.85
-"""The same fraction for fixed step sizes, whose error follows their order."""
+"""ERROR_AIM for fixed step sizes, whose error follows their order."""
 MIN_ERROR_FRACTION = 1 / 3
 """Smallest fraction of the target error that is accepted if a cheaper setting is stable.
 
@@ -81,7 +81,7 @@ _MIN_TIMED_SECONDS = 0.05
 _INITIAL_TIME_LIMIT, _TIME_LIMIT_GROWTH = 1.0, 4.0
 """Time limit of a method until one has finished [s of CPU time], and its growth if none has."""
 _MIN_TIME_LIMIT, _TIME_LIMIT_FACTOR = 0.02, 3.0
-"""Least time limit of the other methods [s of CPU time]: a few interruptions; and its factor on the cheapest time."""
+"""Smallest time limit of the other methods [s of CPU time], a few interruptions; its ratio to the cheapest time."""
 _MAX_COST_RATIO = 2.0
 """Factor on the predicted cost of the next method, above which that method is tried first."""
 _MIN_ORDER = 0.5
@@ -156,13 +156,20 @@ class SearchResult:
     note: str
 
     def compute_balances(self, scene: Scene) -> dict[int, EnergyGain]:
-        """Return the energy balance after each frame; `scene` has the integrator `substepping` and frames as steps."""
+        """Return the energy balance after each frame, by frame.
+
+        Args:
+            scene: the scene with the integrator `substepping`, whose time step is a frame.
+        """
         path = self.best_trial.trajectory
         motions = map(Motion, path.positions[1:], path.velocities[1:])
         return dict(enumerate(compute_frame_balances(scene, motions), start=1))
 
     def build_status_columns(self, balances: Mapping[int, EnergyGain]) -> dict[str, str | None]:
-        """Return `status` and `reason` of the best trial, whose energy may have grown without a source."""
+        """Return `status` and `reason` of the best trial.
+
+        The status is `energy-growth` if the energy has grown without a source.
+        """
         if growth := EnergyGrowth.from_balances(balances):
             reason = f"{growth}: {self.best_trial.method} does not follow the motion; use a smaller error"
             return {"status": "energy-growth", "reason": reason}
@@ -252,7 +259,7 @@ def search_cheapest_contact_method(
     Raises:
         RunFailed: no method reaches the error, or the reference does not resolve it at the end time.
     """
-    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store  # for contact alone
+    from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store  # only with contact
 
     reference = open_reference_store(results).require_contact_horizon(
         error_target.scene, error_target.size, error_target.t_end, error=max_error
@@ -266,6 +273,8 @@ _MethodSetting = tuple[Method, float]
 
 
 class _MethodSearch:
+    """Search for the cheapest method of one target."""
+
     def __init__(
         self,
         error_target: ErrorTarget,
@@ -505,7 +514,8 @@ class _MethodSearch:
     ) -> Generator[SettingProposal[_MethodSetting], TrialOutcome[Trial], tuple[Trial, str] | None]:
         """Tune the setting of a method towards the target error, and return the nearest trial.
 
-        The second result says why the trial is much more accurate. Returns None beyond a limit of CPU seconds.
+        The second result states why the trial is much more accurate than requested, if it is. The result is None if a
+        trial takes longer than the limit of CPU seconds.
         """
         best, above = None if trial.error_estimated > self._max_error else trial, None
         nearest, stalled = trial, 0

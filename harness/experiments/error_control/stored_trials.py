@@ -23,9 +23,7 @@ ResultRow = dict[str, Any]
 _MAX_ERROR_RATIO = 10.0
 """Largest ratio of two errors for which a stored prediction is used; for others it has little value."""
 _MAX_COST_RATIO = 2.0
-"""Largest ratio to the smallest predicted cost of a method that is run again; predictions are no more accurate than
-that.
-"""
+"""Largest ratio to the smallest predicted cost at which a method is run again: the accuracy of predictions."""
 
 
 def format_problem_id(error_target: ErrorTarget) -> str:
@@ -59,7 +57,7 @@ def read_stored_trials(folder: Path, error_target: ErrorTarget) -> list[ResultRo
 def select_best_predicted(
     stored_trials: Sequence[ResultRow], error: float
 ) -> tuple[float, list[tuple[str, SolverSpec]]]:
-    """Return the stored error nearest to `error`, and the methods cheap at it.
+    """Return the stored error nearest to `error`, and the methods that are cheap at it.
 
     Args:
         stored_trials: rows of earlier trials.

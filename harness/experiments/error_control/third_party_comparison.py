@@ -48,7 +48,6 @@ class ThirdPartyResult:
     cpu_time_ratio: float
     reason: str = ""
     cpu_seconds: float = inf
-    """CPU time [s]."""
 
 
 def compare_third_party(
@@ -88,9 +87,8 @@ class _ThirdPartyComparison:
     def measure_integrator(self, name: str) -> ThirdPartyResult:
         """Measure one integrator.
 
-        Its tolerance is adjusted until the error is below the target, but not far below.
-
-        Where no tolerance does both, the cheapest one that meets the error counts.
+        Its tolerance is adjusted until the error is below the target, but not far below. Where no tolerance does both,
+        the cheapest one that meets the error counts.
         """
         order, tolerance = THIRD_PARTY_INTEGRATORS[name].order, 0.2 * self.search_result.step_atol
         if missing := THIRD_PARTY_INTEGRATORS[name].missing_reason:
@@ -139,10 +137,7 @@ class _ThirdPartyComparison:
 
 
 def _limit_cpu_time(vector_field: OdeField, deadline: float) -> Callable[[float, OdeState], OdeState]:
-    """Return the vector field with a deadline on the CPU clock [s].
-
-    It raises TimeBudgetExceeded afterwards.
-    """
+    """Return the vector field with a deadline on the CPU clock [s], after which it raises TimeBudgetExceeded."""
 
     def rate(t: float, y: OdeState) -> OdeState:
         if thread_time() > deadline:

@@ -1,8 +1,7 @@
 """Third-party integrators with error control: those of SciPy and CVODE of SUNDIALS.
 
-CVODE is available if it is installed.
-
-Radau, BDF and CVODE's BDF use the sparsity of the Jacobian; CVODE's Adams method uses matrix-free GMRES.
+CVODE is available if it is installed. Radau, BDF and CVODE's BDF use the sparsity of the Jacobian; CVODE's Adams method
+uses matrix-free GMRES.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ class ThirdPartyIntegrator:
 
 def _build_scipy_integrator(method: str) -> Callable[[InitialValueProblem], OdeState]:
     def end(motion: InitialValueProblem) -> OdeState:
-        solve: Any = solve_ivp  # its stubs say little of what it answers
+        solve: Any = solve_ivp  # its stubs leave the result untyped
         more: dict[str, Any] = (
             {"jac_sparsity": build_jacobian_sparsity(motion.scene)} if method in ("Radau", "BDF") else {}
         )
@@ -120,7 +119,7 @@ THIRD_PARTY_INTEGRATORS = {
 
 
 def build_jacobian_sparsity(scene: Scene) -> csr_array:
-    """Return the sparsity pattern of F's Jacobian, (6 f, 6 f).
+    """Return the sparsity pattern of F's Jacobian, (6 f, 6 f) for f free vertices.
 
     An entry is 1 where the Jacobian may differ from zero.
     """
