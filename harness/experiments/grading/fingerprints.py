@@ -49,11 +49,11 @@ MIN_MISTAKEN_ITERATIONS = 10
 MAX_COMPARED_STEPS = 8
 """Number of steps that are predicted."""
 NUM_FINALISTS = 8
-"""Number of programs that are compared on all of them; all programs are compared on three."""
+"""Number of programs that are compared on all of these steps; all programs are compared on three."""
 CLEAR_FACTOR = 1e3
 """Least ratio of a step to the rounding errors of its positions."""
 FINISHED = 1e-15
-"""Change of iterates relative to the scale from which on further ones are not computed."""
+"""Change of iterates, relative to the scale, below which no further ones are computed."""
 SAME_TIME_STEP = 1e-3
 """Relative difference from the scene's time step up to which a fitted one is the same."""
 TIME_STEP_RANGE = 40.0
@@ -338,7 +338,7 @@ class FingerprintFinder:
         few = compared.select_steps(range(min(3, len(compared.scales))))
         correct = next(islice(self._correct.iterate_steps(few.steps), 4, None))
         tiny = np.finfo(float).eps * np.abs(few.steps.current).max(axis=(1, 2)) + np.finfo(float).tiny
-        few = few._replace(scales=_distances(correct, few.steps.current) + tiny)  # what a submission moves may be huge
+        few = few._replace(scales=_distances(correct, few.steps.current) + tiny)  # steps of the submission may be huge
         pairs = [(mistake, program) for mistake in MISTAKES for program in self._programs[mistake.name]]
         return [(mistake, program) for mistake, program in pairs if not self._is_alike(program, correct, few)]
 

@@ -27,12 +27,12 @@ from springbench.solvers.model.step_problem import Positions, StepProblem
 CORRECT, UNCONVERGED, MISTAKEN, UNEXPLAINED = "correct", "not converged", "mistake", "unexplained"
 """Kinds of verdicts."""
 LOOSE_RESIDUAL = 1e-2
-"""Median residual above which a scene's steps count as not converged, where no number of iterations is required."""
+"""Median residual up to which steps that no known program explains count as not converged, else as unexplained."""
 
 
 @dataclass(frozen=True, slots=True)
 class GradeRequest:
-    """What is graded against.
+    """Scene and settings that submissions are graded against.
 
     Attributes:
         spec: the scene.
@@ -64,8 +64,8 @@ class PositionGrade:
         shares: errors against the integrated motion.
         shares_note: why errors are missing; empty if none are.
         fingerprint: the closest programs; None for scenes with other terms.
-        fingerprint_note: why there is none.
-        kind: one of the kinds above.
+        fingerprint_note: why there is no fingerprint; empty if there is one.
+        kind: kind of the verdict, such as CORRECT.
         verdict: the verdict in words.
     """
 
@@ -96,7 +96,7 @@ class PositionGrade:
 
     @property
     def median_gap(self) -> float | None:
-        """Median energy gap of the same."""
+        """Median energy gap of the steps whose minimum was computed."""
         gaps = [one.gap for one in self.steps if one.gap is not None]
         return float(np.median(gaps)) if gaps else None
 
@@ -111,7 +111,7 @@ class SceneGrader:
     """Grades submissions of one scene; references are computed once.
 
     Attributes:
-        request: what is graded against.
+        request: scene and settings that submissions are graded against.
         scene: the scene, built.
     """
 
@@ -209,5 +209,5 @@ class SceneGrader:
 
 
 def format_fit(fit: float) -> str:
-    """Format a part of 1 in percent, with as many nines as there are up to four decimals."""
+    """Format a fraction in percent, with up to four decimals and at most 99.9999 %."""
     return f"{min(100.0 * fit, 99.9999):.4f}".rstrip("0").rstrip(".") + " %"

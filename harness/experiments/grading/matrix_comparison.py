@@ -16,7 +16,7 @@ from springbench.harness.execution import sandbox
 from springbench.harness.experiments.grading.local_global_matrices import LocalGlobalMatrices
 
 MATRIX_RTOL = 1e-6
-"""Difference relative to the entry and the median one up to which entries are equal: six digits are stored."""
+"""Largest difference of equal entries, relative to the entry plus the median magnitude: files may have six digits."""
 _LIMITS = sandbox.CallLimits(30.0, 2**31)
 _NAMES = ("A", "C", "M", "Q", "y", "d", "b")
 

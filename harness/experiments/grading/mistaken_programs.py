@@ -6,8 +6,8 @@
     b = A' K_b d + M_y target/dt_y^2 + F f_ext + w_b C'C p_rest
 
 The correct program has K_Q = K_b = K, M_Q = M_y = M, dt_Q = dt_y = dt, w_Q = w_b = w, F = 1,
-target = 2 p^t - p^(t-dt) and d_e = r_e v_e/|v_e|. A mistake replaces some of these. Exact pins are penalties with a
-weight of EXACT_PIN_FACTOR times the stiffness.
+target = 2 p^t - p^(t-dt) and d_e = r_e v_e/|v_e|. A mistake replaces some of these. Exact pins are penalties whose
+weight is EXACT_PIN_FACTOR times the largest diagonal entry of Q.
 """
 
 from __future__ import annotations
@@ -416,4 +416,4 @@ MISTAKES: tuple[ProgramMistake, ...] = (
         is_late=True,
     ),
 )
-"""Mistakes that are the same program with other terms. The wrong time step and the number of iterations are fitted."""
+"""Known mistakes. A wrong time step and a wrong number of iterations are fitted instead."""

@@ -5,8 +5,7 @@
     folder       one OBJ or PLY file a frame, in the order of the numbers in their names
     .rrd         recording of springbench
 
-What is in the file decides nothing about its frame numbers and vertex order: see
-`springbench.harness.experiments.grading.submission`.
+The readers decide neither frame numbers nor vertex order; `springbench.harness.experiments.grading.submission` does.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ MAX_MESH_FILES = 100_000
 _PLY_LIMITS = sandbox.CallLimits(60.0, 2**31)
 _LONG_COLUMNS = ("x", "y", "z")
 _MAX_CELL_LENGTH = 64
-"""Characters of a number in a table, with its separators."""
+"""Largest number of characters of a number in a table, with its separators."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""The terms of a scene that the local-global method of the assignment has matrices for.
+"""Terms of a scene for which the assignment's local-global method has matrices.
 
     springs (A, K, r), masses (M), pins (C, w), external forces (f)
 
@@ -151,7 +151,7 @@ def build_step_problem(
         current: p^t (n, 3) [m].
         previous: p^(t-dt) (n, 3) [m].
         index: number of the last step, 0 at the start.
-        initial_guess: a key of `INITIAL_GUESSES`.
+        initial_guess: a key of `INITIAL_GUESSES`; any other name means `previous`.
     """
     if initial_guess not in INITIAL_GUESSES:
         initial_guess = "previous"

@@ -10,11 +10,11 @@ positions rounded as those of the file, `gap_floor` its gap. Pins by penalty are
 the difference is round-off of the file.
 
 A small residual does not make a minimum: at a saddle it is zero, and where springs have collapsed to a point it is
-round-off of any size. A minimum has a small gap as well. Steps whose residual is excused by the digits, and these are
-too few to show anything, are the first whose gap is computed; without it they are no minima.
+round-off of any size. A minimum has a small gap as well. Where a file stores too few digits for a residual to show
+anything, gaps are computed first; a step without a gap then does not count as a minimum.
 
-Friction has the normal forces at p itself, which is what lagged friction converges to. An iteration that ends as ours
-does (`springbench.solvers.contact.lagged_friction`) leaves a residual of FRICTION_RTOL times that of friction.
+Friction uses the normal forces at p itself, to which lagged friction converges. The iteration of
+`springbench.solvers.contact.lagged_friction` leaves a residual of FRICTION_RTOL times that of friction.
 """
 
 from __future__ import annotations

@@ -31,9 +31,9 @@ IMPLAUSIBLE_STRETCH = 1.5
 MATCH_FRACTION = 1e-3
 """Largest distance of two rest positions that are matched, relative to the diagonal of the bounding box."""
 START_FRACTION = 1e-9
-"""Largest distance of a start from the scene's, relative to the same, beyond the digits that the file stores."""
+"""Largest distance of a start from the scene's, relative to that diagonal, in addition to twice the file's rounding."""
 TIME_TOLERANCE = 1e-3
-"""Largest difference of a stated time from that of its step, in time steps."""
+"""Largest difference of a stated time from that of its step, in time steps, for each step since the first frame."""
 MAX_POSITION = 1e100
 """Largest coordinate [m] that counts as finite: its square can be summed."""
 _SAMPLES = 4000
@@ -94,8 +94,8 @@ class VertexMatch(NamedTuple):
     """Order of a submission's vertices and axes.
 
     Attributes:
-        vertices: for each vertex of the scene that of the submission (n,).
-        axes: for each axis of the scene that of the submission.
+        vertices: for each vertex of the scene, the number of that of the submission (n,).
+        axes: for each axis of the scene, the index of that of the submission.
     """
 
     vertices: NDArray[np.int64]
