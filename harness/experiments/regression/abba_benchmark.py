@@ -63,8 +63,10 @@ TimedCall = Callable[[], float]
 class ProgramPair:
     """Two programs after warm-up.
 
-    a, b: perform the work `num_calls` times and return the time [s] of all calls.
-    rebuild_work: rebuilds the work of both at other addresses and warms it up; None if that is impossible.
+    Attributes:
+        a, b: perform the work `num_calls` times and return the time [s] of all calls.
+        rebuild_work: rebuilds the work of both at other addresses and warms it up; None if that is impossible.
+        num_calls: number of times that a call of `a` or `b` performs the work.
     """
 
     a: TimedCall
@@ -87,7 +89,8 @@ class LayoutRandomiser:
     def rebuild_after(self, seconds: float) -> None:
         """Rebuild the work after a block, if the share of the time permits.
 
-        seconds: duration of the block.
+        Args:
+            seconds: duration of the block [s].
         """
         self._earned_seconds += REBUILD_TIME_SHARE / (1.0 - REBUILD_TIME_SHARE) * seconds
         if self.rebuild_work and self._earned_seconds >= 0.0:
@@ -117,13 +120,14 @@ class TimedBlock:
 class BenchmarkResult:
     """Result of a performance test.
 
-    verdict: decision of the sequential test.
-    sequential_test: the test, with its limit and error probability.
-    interval: estimated ratio of times, with its confidence interval.
-    blocks: all timed blocks.
-    elapsed_seconds: duration of the blocks [s].
-    load_average: load average of the machine at the end.
-    num_process_pairs: number of pairs of started programs, one every RESTART_SECONDS and those of the confirmation.
+    Attributes:
+        verdict: decision of the sequential test.
+        sequential_test: the test, with its limit and error probability.
+        interval: estimated ratio of times, with its confidence interval.
+        blocks: all timed blocks.
+        elapsed_seconds: duration of the blocks [s].
+        load_average: load average of the machine at the end.
+        num_process_pairs: number of pairs of started programs, one every RESTART_SECONDS and those of the confirmation.
     """
 
     verdict: RegressionVerdict
@@ -163,8 +167,8 @@ def run_paired_benchmark(
     Args:
         programs: the two programs.
         sequential_test: test on the ratio A / B.
-        time_budget: seconds.
-        rng: chooses the orders; by default the system's random source, which no other program can follow.
+        time_budget: time limit [s].
+        rng: chooses the orders; by default the system's random source, which no other program can predict.
         earlier_blocks: blocks of earlier processes of the same programs, which count too.
     """
     blocks = iterate_paired_benchmark(
@@ -199,7 +203,7 @@ def iterate_paired_benchmark(
     Args:
         b: times one call of B.
         sequential_test: test on the ratio A / B.
-        time_budget: seconds.
+        time_budget: time limit [s].
         rng: chooses the orders.
         rebuild_work: rebuilds the work of both programs.
         earlier_blocks: blocks of earlier processes of the same programs, which count too.
@@ -254,7 +258,7 @@ def run_confirmed_benchmark(
     Args:
         start_programs: starts both programs.
         sequential_test: test on the ratio A / B.
-        time_budget: seconds of both benchmarks together, without the starts of programs.
+        time_budget: time limit of both benchmarks together, without the starts of programs [s].
     """
     first = _run_restarted_benchmark(start_programs, sequential_test, time_budget)
     if first.verdict is not RegressionVerdict.FAIL:

@@ -55,10 +55,11 @@ class RatioInterval:
 class SequentialTest:
     """Sequential test of whether a ratio of times exceeds a limit.
 
-    It stops when the ratio lies entirely above `max_ratio` (fail) or below it (pass).
+    It stops when the confidence interval lies entirely above `max_ratio` (fail) or below it (pass).
 
-    max_ratio: limit of the ratio of times.
-    alpha: probability of a wrong decision.
+    Attributes:
+        max_ratio: limit of the ratio of times.
+        alpha: upper bound on the probability of a wrong decision.
 
     Raises:
         ValueError: for an invalid max_ratio or alpha.
@@ -110,9 +111,9 @@ def compute_interval(log_ratios: ArrayLike, alpha: float = DEFAULT_ALPHA) -> Rat
 
 @lru_cache(maxsize=4096)
 def compute_critical_count(n: int, alpha: float) -> int:
-    """Compute how many blocks on one side of m reject it.
+    """Compute the least number of blocks on one side of m that rejects m.
 
-    It is the least such number, or n + 1 if all n are too few.
+    It is n + 1 if all n blocks are too few.
 
     Args:
         n: number of blocks.

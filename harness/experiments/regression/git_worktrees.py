@@ -1,4 +1,4 @@
-"""Git worktrees of revisions, with an own environment if the required libraries differ.
+"""Git worktrees of revisions, with separate environments if the required libraries differ.
 
 Worktrees stay in the user's cache, so that a revision is compiled once. Only the most recently used ones remain.
 """
@@ -55,7 +55,7 @@ def resolve_commit(checkout: Path, revision: str) -> str:
 
 
 def open_revisions(checkout: Path, revision: str) -> tuple[GitRevision, GitRevision]:
-    """Open the checkout with its uncommitted changes, and a revision; raise InputError on failure.
+    """Open the checkout with its uncommitted changes, and a revision.
 
     Args:
         checkout: folder of the checkout.
@@ -63,6 +63,9 @@ def open_revisions(checkout: Path, revision: str) -> tuple[GitRevision, GitRevis
 
     Returns:
         The checkout and the revision.
+
+    Raises:
+        InputError: the revision is unknown, too old, or cannot be installed.
     """
     commit = resolve_commit(checkout, revision)
     tree = prepare_worktree(checkout, commit)
@@ -85,7 +88,7 @@ def prepare_worktree(checkout: Path, commit: str) -> Path:
         commit: full hash of the commit.
 
     Raises:
-        InputError: on failure.
+        InputError: git cannot create the worktree.
     """
     tree = worktree_cache() / commit[:16]
     with _lock_exclusive(worktree_cache()):
@@ -97,7 +100,7 @@ def prepare_worktree(checkout: Path, commit: str) -> Path:
                 and not clean.returncode
                 and not clean.stdout
             ):
-                os.utime(tree)
+                os.utime(tree)  # most recently used
                 return tree
             shutil.rmtree(tree)
             _run_git(checkout, "worktree", "prune")

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable
 
 _SYSTEM_CALL_NUMBERS = {"x86_64": 298, "aarch64": 241}
-"""Number of the system call, by architecture."""
+"""Number of the system call `perf_event_open`, by architecture."""
 _ATTRIBUTE_BYTES = 128
 """Size of `perf_event_attr` [bytes]; fields not given here are zero."""
 _EXCLUDE_FLAGS = 1 << 5 | 1 << 6
@@ -62,9 +62,10 @@ def _open_counter(event: tuple[int, int]) -> tuple[int | None, str]:
         return None, f"instructions cannot be counted on {platform.system()} {platform.machine()}"
     attributes = bytearray(_ATTRIBUTE_BYTES)
     struct.pack_into("=IIQ", attributes, 0, event[0], _ATTRIBUTE_BYTES, event[1])
-    struct.pack_into("=Q", attributes, 40, _EXCLUDE_FLAGS)
+    struct.pack_into("=Q", attributes, 40, _EXCLUDE_FLAGS)  # offset of the flags in the structure
     libc = ctypes.CDLL(None, use_errno=True)
     given = (ctypes.c_char * _ATTRIBUTE_BYTES).from_buffer(attributes)
+    # pid 0 and cpu -1: this thread on any core; group -1: a counter without a group.
     handle = libc.syscall(ctypes.c_long(number), given, 0, -1, ctypes.c_long(-1), ctypes.c_ulong(0))
     if handle >= 0:
         return handle, ""

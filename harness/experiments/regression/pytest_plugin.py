@@ -58,9 +58,7 @@ class PairedBenchmark:
         alpha: float | None = None,
         **extra_info: Any,
     ) -> BenchmarkResult | None:
-        """Fail the test if the candidate is too slow compared with the baseline.
-
-        It may take at most max_ratio times as long.
+        """Fail the test if the candidate takes more than `max_ratio` times as long as the baseline.
 
         Args:
             candidate: function without arguments.

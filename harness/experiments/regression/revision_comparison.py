@@ -39,16 +39,18 @@ DEFAULT_MAX_RATIO = 1.03
 """Default of the ratio of times from which a program counts as slower."""
 
 FIRST_PASS_SHARE = 1 / 6
-"""Part of the time budget that each of several tests has at first; equal code is clear in less (gate statistics)."""
+"""Fraction of the time budget in the first pass of several tests, in which equal code is usually decided."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkRequest:
     """Work that both revisions prepare.
 
-    title: description in messages.
-    command: request of `revision_worker.py`, with its arguments.
-    config: file of the run, in each revision's version; None for a gate of the checkout.
+    Attributes:
+        title: description in messages.
+        command: name of a request of `revision_worker.py`.
+        arguments: arguments of the request.
+        config: file of the run, in each revision's version; None for a gate of the checkout.
     """
 
     title: str
@@ -61,10 +63,11 @@ class WorkRequest:
 class ComparisonOptions:
     """Options of a comparison.
 
-    budget: seconds per test.
-    max_ratio: ratio of times from which the checkout counts as slower.
-    alpha: error probability of all tests of a command together.
-    clock: cpu or wall; None selects it by the work.
+    Attributes:
+        budget: time limit of a test [s].
+        max_ratio: ratio of times from which the checkout counts as slower.
+        alpha: error probability of all tests of a command together.
+        clock: cpu or wall; None selects it by the work.
     """
 
     budget: float
@@ -143,13 +146,16 @@ def compare_revisions(
         options: limits of the comparison.
         print_message: receives one line per result, and estimates of the remaining time.
 
+    Returns:
+        The requests in their order, with their results.
+
     Raises:
         InputError: if the work fails, or if the answers differ.
     """
     budgets = [options.budget] if len(requests) == 1 else [FIRST_PASS_SHARE * options.budget, options.budget]
     rule = SequentialTest(options.max_ratio, options.alpha / (len(requests) * len(budgets)))
     found: dict[int, BenchmarkResult] = {}
-    print_once = cache(print_message)  # differences are found at each start
+    print_once = cache(print_message)  # each start finds the same differences again
     todo = list(range(len(requests)))
     for budget in budgets:
         most = _format_minutes(len(todo) * budget)

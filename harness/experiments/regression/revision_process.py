@@ -29,11 +29,12 @@ PACKAGE_FOLDER = ".src"
 class GitRevision:
     """A git revision that can be run.
 
-    name: name in messages.
-    worktree: folder of its files.
-    interpreter: its Python interpreter.
-    checkout: folder that the revision belongs to.
-    injected_slowdown: artificial extra work, as a fraction of its own.
+    Attributes:
+        name: name in messages.
+        worktree: folder of its files.
+        interpreter: its Python interpreter.
+        checkout: checkout that the revision belongs to; None for the checkout itself.
+        injected_slowdown: artificial extra work, as a fraction of the revision's work.
     """
 
     name: str
@@ -57,10 +58,11 @@ class GitRevision:
 class PreparedWork:
     """Work that a process has prepared.
 
-    answer: result of the work.
-    stats: deterministic counts.
-    clock: clock that suits the work.
-    num_frames: number of steps, 0 if the work has none.
+    Attributes:
+        answer: result of the work.
+        stats: deterministic counts.
+        clock: clock that suits the work.
+        num_frames: number of steps, 0 if the work has none.
     """
 
     answer: NDArray[np.float64]
@@ -137,7 +139,7 @@ class RevisionProcess:
             clock: cpu or wall.
 
         Returns:
-            seconds.
+            Total time of the calls [s].
         """
         return self.send_request("time_calls", num_calls=num_calls, clock=clock)["seconds"]
 

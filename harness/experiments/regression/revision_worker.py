@@ -72,7 +72,7 @@ class RevisionWorker:
             index: index of the run.
             num_frames: maximum number of steps.
             injected_slowdown: extra work, as a fraction of the run's iterations.
-            positions: path of the file.
+            positions: path of the file that receives the positions.
 
         Returns:
             Deterministic counts, suitable clock and number of steps.
@@ -222,13 +222,13 @@ def _describe_error(error: Exception) -> str:
 def main() -> None:
     """Answer requests until standard input ends."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # the work may print; that is no answer
+    os.dup2(2, 1)  # what the work prints goes to standard error
     worker = RevisionWorker()
     for line in sys.stdin:
         request = json.loads(line)
         try:
             answer = getattr(worker, request.pop("command"))(**request)
-        except Exception as error:  # of any class: the other process reports it in one message
+        except Exception as error:  # of any class: the parent process reports it
             traceback.print_exc()
             answer = {"error": _describe_error(error)}
         answers.write(json.dumps(answer) + "\n")

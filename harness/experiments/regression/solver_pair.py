@@ -56,8 +56,13 @@ def prepare_solver_pair(
         size: mesh size; the scene's default if omitted.
         options: options of a run, such as max_iterations and rtol.
 
+    Returns:
+        The steps with the candidate, and those with the baseline.
+
     Raises:
-        InputError, Unsupported, NotPositiveDefinite.
+        InputError: for a mistake in the scene, a solver or an option.
+        Unsupported: a solver does not support the scene.
+        NotPositiveDefinite: a system matrix is not positive definite.
     """
     first, second = (_prepare_steps(scene, given, size, options) for given in (solver, baseline))
     for steps in (first, second):
