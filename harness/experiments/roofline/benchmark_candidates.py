@@ -54,7 +54,7 @@ class BenchmarkCandidate(Protocol):
         ...
 
     def time_phases(self) -> list[CandidateTiming]:
-        """Time every phase once."""
+        """Time every phase in one round."""
         ...
 
     def close(self) -> Positions | None:

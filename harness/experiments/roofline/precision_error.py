@@ -1,7 +1,7 @@
 """Measure whether a factor of lower precision changes the solution, starting from a converged step.
 
-Local-global iterations take tens of thousands of steps to the minimum of a stiff scene. Newton's method therefore finds
-it. Then a candidate and a float64 solver iterate from the minimum. Their difference is the effect of the precision on a
+Local-global solvers need tens of thousands of iterations to the minimum of a stiff scene. Newton's method therefore
+finds it. Then a candidate and a float64 solver iterate from the minimum. Their difference is the effect of the precision on a
 converged step.
 """
 

@@ -55,19 +55,19 @@ MALLOC_SETTINGS = {"default": "", "cheap": cpp_baseline.MALLOC_TUNABLES}
 
 
 EXTRA_WALL_SECONDS = 3600.0
-"""Wall time of a size in addition to four times the budget of each candidate, for compiling, preparing, checking [s].
-"""
+"""Wall time of a size, in addition to four times the budgets, for compiling, preparing and checking [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class RooflineUnit:
-    """Runs of one scene and size with their baselines
-    (`springbench.harness.experiments.experiment_units.ExperimentUnit`).
+    """Unit that times the runs of one scene and size, and their baselines.
+
+    It implements `springbench.harness.experiments.experiment_units.ExperimentUnit`.
 
     Attributes:
         candidate_runs: the runs, and those of the baselines.
         folder: folder of the results.
-        smaller_rows: name and file of rows of each candidate of a smaller size, smallest first.
+        smaller_rows: name and file of rows of each candidate at the smaller sizes, smallest first.
         budget: time limit of a candidate, as predicted from its smaller sizes [s].
     """
 

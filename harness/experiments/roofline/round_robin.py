@@ -1,10 +1,8 @@
 """Time candidates of one mesh size in round-robin order, A B C A B C.
 
-Disturbances thus affect all candidates alike.
-
-Each candidate is first prepared (round 0, cold), then prepared again, then timed in the sweep's number of rounds. Final
-positions are compared, and only candidates that agree get times. A candidate that would take too long, as
-predicted from its smaller sizes, is skipped with a row that states so.
+Disturbances thus affect all candidates alike. Each candidate is first prepared (round 0, cold), then prepared again,
+then timed in the sweep's number of rounds. Final positions are compared, and only candidates that agree get times. A
+candidate that would take too long, as predicted from its smaller sizes, is skipped with a row that states so.
 """
 
 from __future__ import annotations
@@ -110,7 +108,7 @@ def format_candidate_name(run: RunSpec) -> str:
 def predict_seconds(past_timings: Sequence[PastTiming], vertices: int, run: RunSpec) -> float:
     """Predict the seconds of a run from its smaller sizes; 0 without any.
 
-    A power law passes through the last two of them.
+    A power law, with an exponent of at least 1, passes through the last two of them.
 
     Args:
         past_timings: timings at other sizes, in ascending order.
@@ -143,7 +141,7 @@ def _catch_failure(
     try:
         with machine_info.limit_threads(machine_info.choose_threads(candidate.run.threads).count):
             yield
-    except Exception as error:  # whatever one of them raises, the others go on
+    except Exception as error:  # a candidate may raise any exception; the others continue
         rows[:] = [build_failure_columns(error)]
         alive.remove(candidate)
 

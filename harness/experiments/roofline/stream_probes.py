@@ -90,7 +90,7 @@ def _sum_repeatedly(a: NDArray[Any], repeats: int) -> float:
         part = 0.0
         for i in range(len(a)):
             part += a[i]
-        a[k % len(a)] = 1.0  # or the compiler would go through the array once
+        a[k % len(a)] = 1.0  # prevents the compiler from merging the passes
         total += part
     return total
 
