@@ -47,7 +47,7 @@ _TAUT = EtherDragEffect(decay_rate=2.0)
 SAFETY_FACTOR = 1.25
 """Factor on the error estimated from two refinements of known order (Roache 1994, grid convergence index)."""
 ROUNDOFF_FRACTION = 1e-7
-"""Error relative to the largest value that the tolerance of steps and of rest explains."""
+"""Error, relative to the largest value, that the tolerances of steps and of rest explain."""
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def solve_elastica(length: float, weight_to_rigidity: float) -> tuple[float, flo
 def hang_strip(
     length: float, num_cells: int, rigidity: float, density: float, stretch: Any, solver: Solver, *, clamped: bool
 ) -> Positions:
-    """Return the rest state (n, 3) [m] of a strip along x that is clamped, or hinged, at x = 0.
+    """Simulate a strip along x, clamped or hinged at x = 0, until it is at rest.
 
     The strip is one cell wide; a clamp extends by a cell to x < 0. Vertices are ordered along x.
 
@@ -259,7 +259,10 @@ def hang_strip(
         density: mass per area [kg/m^2].
         stretch: membrane stiffness, in the unit of `springs`.
         solver: the solver.
-        clamped: whether the strip is clamped or hinged.
+        clamped: whether the strip is clamped; otherwise it is hinged.
+
+    Returns:
+        The positions at rest (n, 3) [m].
     """
     h = length / num_cells
     x = h * np.arange(-1 if clamped else 0, num_cells + 1)
@@ -326,7 +329,10 @@ def _build_slope(name: str, friction: float, angle: float = np.deg2rad(27.0), du
 
 
 def _build_membrane(side: float = 1.0, pressure: float = 10.0, tension: float = 200.0) -> ClosedForm:
-    """A square soap film: springs of rest length 0 and stiffness T are the five-point Laplacian of its tension T."""
+    """Build the case of a square soap film.
+
+    Springs of rest length 0 and stiffness T are the five-point Laplacian of a film of tension T.
+    """
 
     def inflate(num_cells: int, solver: Solver) -> float:
         n, h = num_cells + 1, side / num_cells

@@ -82,7 +82,7 @@ def measure_bending_length(fabric: PublishedFabric, solver: Solver) -> MeasuredB
 
     def compute_excess(overhang: float) -> float:
         p = hang_strip(overhang, STRIP_CELLS, fabric.rigidity, fabric.density, stretch, solver, clamped=True)
-        # A clamp acts to the middle of its first free cell.
+        # The tip is the pair of vertices that are farthest from the edge.
         tip = p[np.argsort(np.hypot(p[:, 0], p[:, 1]))[-2:]].mean(axis=0)
         return float(np.arctan2(-tip[1], tip[0]) - TEST_ANGLE)
 
@@ -96,12 +96,15 @@ def measure_bending_length(fabric: PublishedFabric, solver: Solver) -> MeasuredB
 def measure_drape(
     fabric: PublishedFabric, solver: Solver, spacing: float = DISC_SPACING
 ) -> tuple[MeasuredBand, Positions, NDArray[np.int64]]:
-    """Simulate the drape test; drape coefficient and band in percent, with positions and triangles of the specimen.
+    """Simulate the drape test of a fabric.
 
     Args:
         fabric: the fabric.
         solver: the solver.
         spacing: spacing of the disc's lines [m].
+
+    Returns:
+        Drape coefficient and its band [%], positions (n, 3) [m] of the specimen at rest, and its triangles (t, 3).
     """
     half = round(DISC_RADIUS / spacing) * spacing
     lines = np.linspace(-half, half, 2 * round(half / spacing) + 1)
@@ -115,7 +118,7 @@ def measure_drape(
         EtherDragEffect(decay_rate=5.0),
         PinsEffect(indices=tuple(np.flatnonzero(distance <= SUPPORT_RADIUS).tolist()), weight="exact"),
     ]
-    # A random perturbation lets the folds choose their number.
+    # A random perturbation breaks the symmetry, so that folds form.
     start = PerturbedStart(standard_deviation=1e-4, seed=1)
     mass = fabric.density * float(lump_areas(mesh.rest_positions, mesh.triangles).sum())
     scene = build_validation_scene(mesh, effects, time_step=DRAPE_STEP, mass=mass, start=start)

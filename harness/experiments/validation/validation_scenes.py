@@ -51,7 +51,7 @@ def build_validation_scene(
     Args:
         mesh: the mesh.
         effects: its effects.
-        time_step: [s].
+        time_step: time step [s].
         mass: total mass [kg]; None for that of the mesh.
         start: deviation from the rest shape.
     """

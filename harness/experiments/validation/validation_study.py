@@ -39,7 +39,7 @@ def list_case_names() -> list[str]:
 def validate_solver(
     solver: Solver, names: Iterable[str], on_case: Callable[[str], None] = lambda name: None
 ) -> list[dict[str, Any]]:
-    """Run cases with a solver; return a row for each, of plain data.
+    """Run cases with a solver, and return a row of plain data for each.
 
     Args:
         solver: the solver.
@@ -55,7 +55,7 @@ def validate_solver(
 
 
 def grade_closed_form(case: ClosedForm, solver: Solver) -> dict[str, Any]:
-    """Simulate a closed form on its levels; return its row with the verdict.
+    """Simulate a closed form on its levels, and return its row with the verdict.
 
     Args:
         case: the closed form.
