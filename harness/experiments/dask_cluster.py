@@ -273,7 +273,7 @@ def execute_on_cluster(
         WriteError: no worker can write any more.
         RunFailed: the connection to the scheduler is lost.
     """
-    # A worker that sees this file shares the folder. Its suffix lets a later command remove it after a crash.
+    # A worker that sees this file shares the folder. A leftover is removed like other partial files.
     token = folder / "rows" / f".{uuid4().hex}.partial"
     left, tries, excluded = list(enumerate(units))[::-1], dict[int, int](), set[str]()
     threads, last_query_time = dict[str, int](), 0.0

@@ -1,8 +1,8 @@
 """Compile the kernels of runs on all cores, before the first run starts.
 
-A run compiles a kernel when it first calls it, one after the other on one core. kernel_signatures.json states which
-kernels each solver calls, so that several processes can compile them, and end before anything is timed. What the file
-does not state is compiled when it is called. `python -m tests.record_kernels` writes the file.
+A run compiles each kernel at its first call, one after the other on one core. kernel_signatures.json states which
+kernels each solver calls, so that several processes can compile them, and end before anything is timed. Kernels that
+are not in the file are compiled when they are called. `python -m tests.record_kernels` writes the file.
 """
 
 from __future__ import annotations
@@ -57,8 +57,8 @@ class _SignatureTable(NamedTuple):
 def compile_missing_kernels(solvers: Iterable[str], print_message: Callable[[str], None]) -> None:
     """Compile the kernels of solvers that are not in the cache yet, and wait for it.
 
-    Nothing is done where one kernel of each solver is there. A kernel that cannot be compiled raises its error where it
-    is called.
+    Nothing is done if the cache contains the marker kernel of each solver. A kernel that cannot be compiled raises its
+    error when it is called.
 
     Args:
         solvers: names of solvers.

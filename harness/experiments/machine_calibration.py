@@ -2,9 +2,9 @@
 # SciPy's stubs are incomplete for sparse matrices.
 """Calibrate a machine by three figures, which make the times of different machines comparable.
 
-    machine_bandwidth   bytes read and written per second when copying an array larger than a cache
-    machine_flops       additions and multiplications per second in a product of two matrices, 2 n^3 (BLAS, float64)
-    machine_step        seconds of a fixed step: ten local-global iterations on a sheet of 32 x 32 vertices
+    machine_bandwidth          bytes read and written per second when copying an array of 64 MiB
+    machine_flops_per_second   additions and multiplications in a product of two matrices, 2 n^3 (BLAS, float64)
+    machine_step_seconds       seconds of a fixed step: ten local-global iterations on a sheet of 32 x 32 vertices
 
 One thread is measured in its own CPU time; the best of five repetitions counts. NumPy and SciPy do the work, so nothing
 is compiled. The figures are cached for a day in the user's cache, per computer and library versions. They are not
@@ -47,7 +47,7 @@ def calibrate_machine(tick: ProgressCallback) -> dict[str, float]:
         tick: called while this waits for the timing lock.
     """
     if not _CALIBRATION_CACHE:
-        with suppress(MemoryError):  # within a run's limit
+        with suppress(MemoryError):  # the run may limit its memory
             _CALIBRATION_CACHE.update(
                 _load_or_measure(user_cache_dir("machine") / f"{machine_info.compute_node_id()}.json", tick)
             )
@@ -98,9 +98,8 @@ def measure_flops() -> float:
 def measure_step_seconds() -> float:
     """Measure the CPU seconds of a fixed local-global step.
 
-    The sheet hangs by one side.
-
-    d_e = r_e (A p)_e / |(A p)_e|, then Q p = A' K d + y.
+    The sheet has no pins. Its rest lengths are 1, and it starts stretched by 10 %. An iteration computes
+    d_e = (A p)_e / |(A p)_e|, then solves Q p = A' K d + y.
     """
     from scipy.sparse import csr_array, identity
     from scipy.sparse.linalg import splu

@@ -1,7 +1,4 @@
-"""Columns common to the rows of all experiments.
-
-They state specification, machine, time and source code of a measurement.
-"""
+"""Columns common to the rows of all experiments: specification, machine, time and source code."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ class TimedRounds:
 
     Attributes:
         measured: the measurement.
-        rows: its rows; None without timed passes, whose times the observed run then adds.
+        rows: its rows; None without timed passes, where the rows are built after the instrumentation pass.
         columns: columns of the device and of the timing lock.
     """
 
@@ -213,7 +213,7 @@ def execute_run(
 def _run_passes(job: RunJob, session: TimingSession) -> list[dict[str, Any]]:
     """Run all passes and return the rows.
 
-    The timing session is checked for disturbances at the end.
+    The session's priority for timing ends after the timed passes.
     """
     if job.run.error_target is not None:
         return _run_error_controlled(job, job.run.error_target, session)
@@ -253,10 +253,7 @@ def _build_rows(run: RunSpec, setup: RunSetup, timed: TimedRounds, observed: Obs
 
 
 def _find_modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
-    """Return how the spring stiffness scales with mesh size.
-
-    The result is None without springs or with several rules.
-    """
+    """Return how the spring stiffness scales with mesh size; None without springs or with several rules."""
     rules = {effect.scaling_rule for effect in run.scene.effects if isinstance(effect, SpringsEffect)}
     found = {compute_modulus_exponent(rule, scene.mesh.dimension) for rule in rules}
     return found.pop() if len(found) == 1 else None
@@ -311,7 +308,7 @@ def _run_error_controlled(job: RunJob, max_error: float, session: TimingSession)
 
 @contextmanager
 def _acquire_timing_lock(run: RunSpec, tick: ProgressCallback) -> Generator[dict[str, Any]]:
-    """Hold the run's timing lock (exclusive, shared, own cores), and yield its columns."""
+    """Acquire the run's timing lock (exclusive, shared, or reserved cores), and yield its columns."""
     if run.timing != "shared":
         with (lock_timing_exclusive if run.timing == "exclusive" else lock_timing_shared)(tick):
             yield {}
@@ -375,7 +372,7 @@ def _build_failure_row(job: RunJob, error: Exception) -> dict[str, Any]:
     for earlier in (
         job.files.recording_path,
         job.files.picture_path,
-    ):  # of a time when it did not fail; they would hide this
+    ):  # of an earlier execution; they would hide the failure
         earlier.unlink(missing_ok=True)
     if job.run.record and "frame" in row:
         _record_before_failure(job, row)
@@ -401,10 +398,7 @@ def _find_first_diverged_frame(
 
 
 def _record_before_failure(job: RunJob, failure_row: dict[str, Any]) -> None:
-    """Record the frames before the failed one and mark the recording.
-
-    Nothing is recorded if they fail too.
-    """
+    """Record the frames before the failed one and mark the recording; do nothing if they fail, too."""
     facts = {"status": failure_row["status"], "reason": failure_row["reason"], "failed_frame": failure_row["frame"]}
     with ExitStack() as cleanup, suppress(Exception):  # the first error is already reported
         setup = RunSetup.from_run(job.run)
@@ -441,7 +435,7 @@ def _build_verifier(run: RunSpec, setup: RunSetup) -> StepVerifier | None:
 def _compute_reference(motion: _MotionKey) -> NDArray[np.float64] | None:
     """Return the reference motion of a scene; None where Newton's method fails.
 
-    One entry is cached, for the runs of a scene are consecutive.
+    One entry is cached, because the runs of a scene are consecutive.
     """
     run = motion.run
     scene = build_scene(run.scene, run.size, run.integrator)
@@ -456,7 +450,8 @@ def _compute_reference(motion: _MotionKey) -> NDArray[np.float64] | None:
 def _open_recorder(job: RunJob, scene: Scene, outcome: Mapping[str, Any], *final_positions: Positions) -> RerunRecorder:
     """Open the recording of a run.
 
-    `outcome` is how the run ended, stored among the recording's properties. `final_positions` set the colour scale.
+    `outcome` contains columns that state how the run ended; they become properties of the recording. `final_positions`
+    set the colour scale.
     """
     from springbench.harness.recording.rerun_recorder import (
         RerunRecorder,  # with Rerun, which a light installation lacks

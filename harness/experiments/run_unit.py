@@ -82,10 +82,10 @@ class RunUnit:
     def execute_unit(self, tick: ProgressCallback) -> str:
         """Execute the run and return its outcome as text."""
         from springbench.harness.experiments.run_pipeline import (
-            execute_run,  # brings along all that simulates and records
+            execute_run,  # imports everything that simulates and records
         )
 
-        files = self.files.to_absolute()  # code of others may change the folder
+        files = self.files.to_absolute()  # user code may change the working folder
         positions = self.positions_path and self.positions_path.absolute()
         return _format_outcome(
             execute_run(self.run, files, tick, positions=positions, num_concurrent_runs=self.num_concurrent_runs)

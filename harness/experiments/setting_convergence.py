@@ -5,10 +5,10 @@
     drift   = (E(T) - E_q(T)) / max_k kinetic energy of q             E: kinetic energy and potentials
 
 A frame is a time step of the scene. A setting divides it into substeps, each with a number of iterations: for a solver
-of ours the substep is its time step, for an outside engine both are its own. Solvers that choose steps or have no
-iterations get a row of settings. The reference is that of accuracy studies: an independent integration, or with contact
-a self-converged motion, up to the time until which it is known accurately enough. A scene without equations of motion
-is compared with the finest setting.
+of this package the substep is its time step; an outside engine takes the substeps itself. For solvers without
+iterations in a substep, the settings differ in the number of substeps only. The reference is that of accuracy studies:
+an independent integration, or with contact a self-converged motion, up to the time until which it is known accurately
+enough. A scene without equations of motion is compared with the finest setting.
 
 Effective stiffness: the mesh is hung by its highest vertices along its longest side, with its own material and a drag
 that lets it come to rest. The ratio of the true sag to that of the setting is how stiff the material seems: unconverged
@@ -74,19 +74,20 @@ NUM_SAMPLES = 8
 """Number of times at which motions are compared."""
 
 MATERIAL_EFFECTS = (SpringsEffect, BendingEffect, StrainLimitsEffect)
-"""Effects that belong to the material, which hangs with them."""
+"""Effects that belong to the material: the hung mesh has them, too."""
 
 HANG_SECONDS, HANG_DECAY = 1.0, 5.0
 """Time for which the mesh hangs [s], and the decay rate of its velocity [1/s]: swings fade to a tenth."""
 
 TRUE_SOLVER = "hybrid"
-"""Solver of the true sag, to its tolerance."""
+"""Solver of the true sag, by _TRUE_STOP_RULE."""
 
 _PROJECTION_FRAMES, _PROJECTION_MARGIN = 3, 1.3
 """Frames after which the time of a simulation is projected, and how far that may exceed the limit."""
 
 _TRUE_STOP_RULE = StopRule(300, 1e-8)
 _TOP_RTOL = 1e-6
+"""Height difference up to which vertices belong to the top or the bottom, relative to the height of the mesh."""
 
 
 def has_iterations_in_substep(solver: Any, name: str) -> bool:
@@ -151,7 +152,11 @@ class SettingSimulator:
         self.sample_frames = sorted({round(self.num_frames * (k + 1) / count) for k in range(count)})
 
     def shorten_motion(self, num_samples: int) -> None:
-        """Simulate up to one of the sampled times only."""
+        """Shorten the motion to its first sampled times.
+
+        Args:
+            num_samples: number of these times, at least 1.
+        """
         self.sample_frames = self.sample_frames[:num_samples]
         self.num_frames = self.sample_frames[-1]
 
@@ -161,7 +166,7 @@ class SettingSimulator:
         return [frame * self.spec.time_step for frame in self.sample_frames]
 
     def build_step(self, spec: SceneSpec, setting: StepSetting) -> tuple[Scene, Any, StopRule, int]:
-        """Return what simulates a setting.
+        """Build the scene, the solver and the stop rule that simulate a setting.
 
         Args:
             spec: scene whose time step is a frame.
@@ -228,7 +233,11 @@ class SettingSimulator:
         return samples, strains, seconds, velocity
 
     def measure_sag(self, setting: StepSetting | None) -> float:
-        """Return the sag of the hung mesh [m], by a setting, or the true one."""
+        """Return the sag of the hung mesh [m].
+
+        Args:
+            setting: substeps and iterations; None for the true sag.
+        """
         hung, bottom = build_hanging_scene(self.spec, self.size)
         frames = max(1, round(HANG_SECONDS / hung.time_step))
         if setting is None:
@@ -283,7 +292,11 @@ class SampledReference:
         return cls(words, trajectory.free_vertices, start, trajectory.positions, energy, max(kinetic), smallest)
 
     def measure_distance(self, positions: Positions) -> float:
-        """Return the largest distance (k, n, 3) from the reference, relative to its largest displacement."""
+        """Return the largest distance of a motion from the reference, relative to the reference's largest displacement.
+
+        Args:
+            positions: positions at the times of the reference (k, n, 3) [m].
+        """
         return self.measure_change(positions, self.positions)
 
     def measure_change(self, p: Positions, q: Positions) -> float:
@@ -343,6 +356,9 @@ def study_convergence(
         num_doublings: how often numbers are doubled and halved.
         limits: limits of times.
         print_message: prints a remark.
+
+    Returns:
+        Results of all settings, and assessments of the given ones.
 
     Raises:
         RunFailed: the motion is unpredictable, or a given setting is not supported.
@@ -408,7 +424,10 @@ class StudyLimits(NamedTuple):
 
 
 def _order_settings(settings: Sequence[StepSetting], given: Sequence[StepSetting]) -> list[StepSetting]:
-    """Order settings: the given ones, since what they cannot do ends the study, those that they need, and others."""
+    """Order settings: the given ones, those with a doubled number, and the others.
+
+    The given ones are first, because a failure of one ends the study.
+    """
     doubled = [find_doubled(settings, one, name) for one in given for name in ("substeps", "iterations")]
     return list(dict.fromkeys([*given, *filter(None, doubled), *settings]))
 
@@ -491,7 +510,9 @@ def _find_reference(
     limits: StudyLimits,
     print_message: Callable[[str], None],
 ) -> SampledReference | None:
-    """Return the reference of the motion, to which the simulation may be shortened; None, with a message, without one.
+    """Return the reference of the motion; None, with a message, if there is none.
+
+    With contact, the simulated motion may be shortened to the time until which the reference is accurate enough.
 
     Raises:
         RunFailed: the motion is unpredictable.
@@ -528,7 +549,10 @@ def _find_reference(
 def _compare_with_finest(
     simulator: SettingSimulator, results: Sequence[SettingResult]
 ) -> tuple[SampledReference, list[SettingResult]]:
-    """Return the finest setting as reference, and the results with their errors against it; its own is unknown."""
+    """Return the finest setting as reference, and the results with their errors against it.
+
+    The error of the finest setting itself is infinite, because it is unknown.
+    """
     known = (result for result in results if not result.reason)
     fine = max(known, key=lambda one: (one.setting.total_iterations, one.setting), default=None)
     if fine is None:
@@ -544,7 +568,10 @@ def _compare_with_finest(
 def _measure_stiffness(
     simulator: SettingSimulator, settings: Sequence[StepSetting], print_message: Callable[[str], None]
 ) -> dict[StepSetting, float]:
-    """Return the ratio of the true sag to that of each setting; none, with a message, where it cannot be measured."""
+    """Return the ratio of the true sag to that of each setting.
+
+    The result is empty, with a message, where a sag cannot be measured.
+    """
     if not settings:
         return {}
     try:

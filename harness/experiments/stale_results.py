@@ -1,6 +1,6 @@
 """Find stale results: rows of a folder that other source code produced.
 
-The folder's config determines the current source code.
+The folder's config determines which source files count.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from springbench.harness.results.folder_ownership import OWNER_FILE
 def find_stale_runs(folder: Path, table: pa.Table) -> Collection[str]:
     """Return the ids of stale runs in a table of the folder's rows.
 
-    The result is empty where the config is missing or has changed. Plug-ins of the config are not imported.
+    The result is empty where the config is missing or invalid, and omits runs that the config does not request.
+    Plug-ins of the config are not imported.
 
     Args:
         folder: folder of a sweep.

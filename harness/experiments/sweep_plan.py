@@ -1,9 +1,8 @@
 """Plan a sweep: find its complete and missing runs from their files.
 
-Nothing is simulated or drawn.
-
-A run is complete when its rows, its recording and its picture exist. Rows are written after the recording, and a
-picture is drawn from the recording alone. The files therefore show what an interrupted command has left undone.
+Nothing is simulated or drawn. A run is complete when its rows exist, and its recording if it has one. Rows are written
+after the recording, and a missing picture is drawn from the recording alone. The files therefore show what an
+interrupted command has left undone.
 """
 
 from __future__ import annotations
@@ -64,10 +63,7 @@ class RunFiles:
         return self.rows_path.parents[2]
 
     def to_absolute(self) -> RunFiles:
-        """Return the files as absolute paths.
-
-        A change of the working folder does not affect them.
-        """
+        """Return the files as absolute paths, which a change of the working folder does not affect."""
         return RunFiles(self.rows_path.absolute(), self.recording_path.absolute(), self.picture_path.absolute())
 
 
@@ -108,7 +104,7 @@ def plan_runs(runs: Iterable[RunSpec], folder: Path, machine_ids: Sequence[str |
             state = COMPLETED if there["status"] == "ok" else there["status"]
             limits = there["time_limit"], there["memory_limit"]
             if state in _LIMIT_STATUSES and limits != (run.time_limit, run.memory_limit):
-                state = NOT_STARTED  # a failure within other limits says nothing of these
+                state = NOT_STARTED  # a failure within other limits is no result for these
             older = there["source_fingerprint"] != code_of(run)
         if state == COMPLETED and run.record:
             damage = _describe_damage(files.recording_path)
@@ -120,16 +116,13 @@ def plan_runs(runs: Iterable[RunSpec], folder: Path, machine_ids: Sequence[str |
 def _read_row_heads(paths: Sequence[Path]) -> dict[Path, dict[str, Any] | str]:
     if not any(map(row_store.has_rows, paths)):
         return {}
-    from springbench.harness.results import parquet_rows  # brings pyarrow along
+    from springbench.harness.results import parquet_rows  # imports pyarrow
 
     return parquet_rows.read_first_rows(paths, _STATUS_COLUMNS, required_columns=REQUIRED_COLUMNS)
 
 
 def _describe_damage(recording: Path) -> str:
-    """Return why a recording is damaged, without reading all of it.
-
-    The result is empty if it is intact or missing.
-    """
+    """Return why a recording is damaged, without reading all of it; empty if it is intact or missing."""
     if not recording.exists():
         return ""
     whole = recording.is_file() and scan_messages(recording)[0]

@@ -36,8 +36,7 @@ if TYPE_CHECKING:
 
 
 _MAX_RUNS_TO_PRELOAD = 100
-"""Largest number of runs for which the start-up time of the drawing code matters and the rows are small enough to send.
-"""
+"""Largest number of runs for which the drawing code is preloaded: its start-up matters, and the rows are small."""
 
 
 def _connect_cluster(
@@ -92,8 +91,12 @@ def run_sweep(
         positions: where to store the positions of the sweep's only run.
         isolated: whether runs are executed in worker processes with limits, or in this process.
         num_workers: number of worker processes; chosen by cores and memory if left out.
-        scheduler_address: where else to execute the runs (`springbench.harness.experiments.dask_cluster`).
+        scheduler_address: scheduler of other machines that execute the runs; None for this machine
+            (`springbench.harness.experiments.dask_cluster`).
         background_call: called while another process draws.
+
+    Returns:
+        The rows of all runs, and the ids of the stale ones.
 
     Raises:
         InputError: the options contradict each other, or the input is invalid.
@@ -129,7 +132,7 @@ def run_sweep(
         if todo and not away:
             import_module(
                 "springbench.harness.experiments.run_pipeline"
-            )  # here, for workers that are forks of this process
+            )  # imported before workers fork, so that they inherit it
             for solver in {p.run.solver.name: None for p in todo if not isinstance(p.run.solver.name, PluginName)}:
                 load_target(SOLVER_TABLE[solver])
             if isolated:
@@ -176,10 +179,7 @@ def run_sweep(
 
 
 def _preload_drawing() -> None:
-    """In the drawing process of a small sweep: load the drawing code.
-
-    This takes 1 to 2 s, during the runs.
-    """
+    """In the drawing process of a small sweep: load the drawing code, which takes 1 to 2 s, during the runs."""
     from springbench.harness.report.sweep_pictures import preload_drawing
 
     preload_drawing()
@@ -190,4 +190,4 @@ def list_failed_runs(table: pa.Table) -> list[str]:
     ended = table.select(["scene", "size", "solver", "status", "reason"]).to_pylist()
     failed = [row for row in ended if row["status"] != "ok"]
     lines = [f"{r['scene']} {r['size']} {r['solver']}: {r['status']}: {r['reason']}" for r in failed]
-    return list(dict.fromkeys(lines))  # a run that was done to its end has a row for each step
+    return list(dict.fromkeys(lines))  # a finished run has a row for each step

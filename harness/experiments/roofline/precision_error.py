@@ -1,8 +1,8 @@
 """Measure whether a factor of lower precision changes the solution, starting from a converged step.
 
 Local-global solvers need tens of thousands of iterations to the minimum of a stiff scene. Newton's method therefore
-finds it. Then a candidate and a float64 solver iterate from the minimum. Their difference is the effect of the precision on a
-converged step.
+finds it. Then a candidate and a float64 solver iterate from the minimum. Their difference is the effect of the
+precision on a converged step.
 """
 
 from __future__ import annotations
