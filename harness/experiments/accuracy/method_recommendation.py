@@ -1,6 +1,6 @@
 """Find the cheapest method for an error, or the most accurate one for a wall time.
 
-The method is selected from stored rows or new measurements. One search serves both goals: where a wall time is given,
+The method is selected from stored rows or new measurements. One search serves both cases: where a wall time is given,
 its target error is zero, and only the cost ends it.
 
 An error is that of a whole simulation up to a horizon (`springbench.harness.experiments.accuracy.work_precision`). A
