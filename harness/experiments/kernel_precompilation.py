@@ -30,7 +30,10 @@ _MAX_PROCESSES = 4
 
 
 class _SignatureTable(NamedTuple):
-    """Content of SIGNATURES_PATH: kernels, those with the most machine code first, and those that each solver calls."""
+    """Content of SIGNATURES_PATH: all kernels, and the numbers of those that each solver calls.
+
+    Kernels with the most machine code are first.
+    """
 
     kernels: list[KernelSignature]
     numbers: dict[str, list[int]]
@@ -55,7 +58,7 @@ class _SignatureTable(NamedTuple):
 
 
 def compile_missing_kernels(solvers: Iterable[str], print_message: Callable[[str], None]) -> None:
-    """Compile the kernels of solvers that are not in the cache yet, and wait for it.
+    """Compile the kernels of solvers that the cache lacks, and wait for it.
 
     Nothing is done if the cache contains the marker kernel of each solver. A kernel that cannot be compiled raises its
     error when it is called.

@@ -105,7 +105,7 @@ class RunSetup:
 
     @classmethod
     def from_run(cls, run: RunSpec) -> RunSetup:
-        """Build the scene of a run and load its solver; raises the errors of user code unchanged."""
+        """Build the scene of a run and load its solver; errors of user code are unchanged."""
         scene = build_scene(run.scene, run.size, run.integrator)
         stop = build_stop_rule(run.max_iterations, run.rtol)
         settings = SteppingSettings(stop, run.initial_guess, run.frames, run.rounds)
@@ -155,7 +155,7 @@ class TimedRounds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedRun:
-    """What the instrumentation pass has found: columns of each frame, and columns of the run's status."""
+    """Results of the instrumentation pass: columns of each frame, and columns of the status."""
 
     columns_by_frame: dict[int, dict[str, Any]]
     status_columns: dict[str, str]
@@ -236,7 +236,7 @@ def _time_rounds(job: RunJob, setup: RunSetup) -> TimedRounds:
 
 
 def _build_rows(run: RunSpec, setup: RunSetup, timed: TimedRounds, observed: ObservedRun) -> list[dict[str, Any]]:
-    """Build the rows of a finished run; raises StepError for a column that is not finite."""
+    """Build the rows of a finished run; raises StepError for values that are not finite."""
     prepared, by_frame = timed.measured.prepared, observed.columns_by_frame
     rows = timed.rows or build_timing_rows(timed.measured)
     require_finite(by_frame, is_minimiser=setup.is_minimiser, has_rtol=isinstance(run.rtol, float))
@@ -253,7 +253,10 @@ def _build_rows(run: RunSpec, setup: RunSetup, timed: TimedRounds, observed: Obs
 
 
 def _find_modulus_exponent(run: RunSpec, scene: Scene) -> int | None:
-    """Return how the spring stiffness scales with mesh size; None without springs or with several rules."""
+    """Return how the spring stiffness scales with mesh size.
+
+    The result is None without springs or with several rules.
+    """
     rules = {effect.scaling_rule for effect in run.scene.effects if isinstance(effect, SpringsEffect)}
     found = {compute_modulus_exponent(rule, scene.mesh.dimension) for rule in rules}
     return found.pop() if len(found) == 1 else None
@@ -398,7 +401,10 @@ def _find_first_diverged_frame(
 
 
 def _record_before_failure(job: RunJob, failure_row: dict[str, Any]) -> None:
-    """Record the frames before the failed one and mark the recording; do nothing if they fail, too."""
+    """Record the frames before the failed one and mark the recording.
+
+    Nothing is recorded if these frames fail, too.
+    """
     facts = {"status": failure_row["status"], "reason": failure_row["reason"], "failed_frame": failure_row["frame"]}
     with ExitStack() as cleanup, suppress(Exception):  # the first error is already reported
         setup = RunSetup.from_run(job.run)

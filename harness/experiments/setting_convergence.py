@@ -292,7 +292,7 @@ class SampledReference:
         return cls(words, trajectory.free_vertices, start, trajectory.positions, energy, max(kinetic), smallest)
 
     def measure_distance(self, positions: Positions) -> float:
-        """Return the largest distance of a motion from the reference, relative to the reference's largest displacement.
+        """Return the largest distance from the reference, relative to its largest displacement.
 
         Args:
             positions: positions at the times of the reference (k, n, 3) [m].
@@ -439,7 +439,10 @@ def _assess_settings(
     reference: SampledReference,
     print_message: Callable[[str], None],
 ) -> tuple[SettingAssessment, ...]:
-    """Assess the given settings: what changes with more substeps or iterations, and how stiff the material seems."""
+    """Assess the given settings.
+
+    An assessment states what changes with more substeps or iterations, and how stiff the material seems.
+    """
     known = {result.setting: result for result in results if not result.reason}
 
     def change(one: StepSetting, name: str) -> SettingChange | None:
@@ -456,7 +459,9 @@ def _assess_settings(
 
 
 def build_hanging_scene(spec: SceneSpec, size: int) -> tuple[SceneSpec, NDArray[np.bool_]]:
-    """Build the scene that hangs a mesh by one end of its longest side, which is turned upright.
+    """Build the scene that hangs a mesh by one end of its longest side.
+
+    That side is turned upright.
 
     Args:
         spec: scene with the mesh and its material.
@@ -484,7 +489,7 @@ def build_hanging_scene(spec: SceneSpec, size: int) -> tuple[SceneSpec, NDArray[
 
 
 def _turn_upright(effect: SceneEffect, axis: int) -> SceneEffect:
-    """Return an effect with the warp of its woven cloth turned as the axes of `_UprightMesh` are."""
+    """Return an effect with its warp direction turned as the axes of `_UprightMesh`."""
     if not (isinstance(effect, SpringsEffect) and isinstance(effect.stretch, OrthotropicStiffness)):
         return effect
     direction = tuple(np.roll(effect.stretch.direction, 1 - axis).tolist())
@@ -493,7 +498,7 @@ def _turn_upright(effect: SceneEffect, axis: int) -> SceneEffect:
 
 @dataclass(frozen=True, slots=True)
 class _UprightMesh:
-    """A mesh whose axes are exchanged in cyclic order, so that one of them becomes y."""
+    """Mesh whose axes are exchanged in cyclic order, so that one becomes y."""
 
     source: MeshSource
     axis: int
@@ -584,7 +589,10 @@ def _measure_stiffness(
 
 
 def _compute_energy(scene: Scene, p: Positions, v: Positions) -> float:
-    """Return kinetic energy and potentials [J] of energies that depend on positions only, and of constant loads."""
+    """Return the kinetic energy plus the potentials [J].
+
+    Potentials are those of energies that depend on positions only, and of constant forces.
+    """
     stored = sum(energy.value(p) for energy in scene.system.energies if not is_lagged(energy))
     return _kinetic_energy(scene, v) + stored - float(np.einsum("ij,ij->", scene.constant_force, p))
 
@@ -595,5 +603,8 @@ def _kinetic_energy(scene: Scene, v: Positions) -> float:
 
 
 def _measure_scene_scale(scene: Scene) -> float:
-    """Return a length [m] of the scale of a scene; coordinates a thousand times as large mean divergence."""
+    """Return a length [m] of the scale of a scene.
+
+    Coordinates a thousand times as large mean divergence.
+    """
     return 1.0 + float(np.abs(scene.mesh.rest_positions).max()) + scene.mesh.bounding_box_diagonal

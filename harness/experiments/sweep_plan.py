@@ -63,7 +63,10 @@ class RunFiles:
         return self.rows_path.parents[2]
 
     def to_absolute(self) -> RunFiles:
-        """Return the files as absolute paths, which a change of the working folder does not affect."""
+        """Return the files as absolute paths.
+
+        A change of the working folder does not affect them.
+        """
         return RunFiles(self.rows_path.absolute(), self.recording_path.absolute(), self.picture_path.absolute())
 
 
@@ -122,7 +125,10 @@ def _read_row_heads(paths: Sequence[Path]) -> dict[Path, dict[str, Any] | str]:
 
 
 def _describe_damage(recording: Path) -> str:
-    """Return why a recording is damaged, without reading all of it; empty if it is intact or missing."""
+    """Return why a recording is damaged, without reading all of it.
+
+    The result is empty if it is intact or missing.
+    """
     if not recording.exists():
         return ""
     whole = recording.is_file() and scan_messages(recording)[0]

@@ -179,7 +179,10 @@ def run_sweep(
 
 
 def _preload_drawing() -> None:
-    """In the drawing process of a small sweep: load the drawing code, which takes 1 to 2 s, during the runs."""
+    """In the drawing process of a small sweep: load the drawing code.
+
+    This takes 1 to 2 s, during the runs.
+    """
     from springbench.harness.report.sweep_pictures import preload_drawing
 
     preload_drawing()

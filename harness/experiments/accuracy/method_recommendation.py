@@ -1,4 +1,4 @@
-"""Find the cheapest method for an error, or the most accurate one for a wall time.
+"""Find the cheapest method for an error, or the most accurate for a wall time.
 
 The method is selected from stored rows or new measurements. One search serves both cases: where a wall time is given,
 its target error is zero, and only the cost ends it.
@@ -295,7 +295,7 @@ class MethodRecommendation:
 
     @property
     def cost_limit(self) -> float | None:
-        """Largest wall time per simulated second that the goal allows; None where it is an error."""
+        """Largest wall time per simulated second that the goal allows; None for an error."""
         return None if self.goal.frame_seconds is None else self.goal.frame_seconds / self.frame
 
     def find_runner_up(self) -> MeasuredMethod | None:
@@ -425,7 +425,7 @@ def recommend_method(
 
 @dataclass(frozen=True, slots=True)
 class StudyCandidates:
-    """Solvers of a study with their parameters, its grid, and its refinements of the time step."""
+    """Solvers of a study with their parameters, its grid, and refinements of the time step."""
 
     solvers: Sequence[dict[str, Any]]
     grid: Sequence[dict[str, Any]]
@@ -524,7 +524,11 @@ def _find_contact_t_end(
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
 ) -> float:
-    """Return the given end time [s], or the horizon up to that of the scene. Raises NotConverged."""
+    """Return the end time [s] of a motion with contact.
+
+    It is the given one, or else the longest at which the error can be measured, up to that of the scene. Raises
+    NotConverged.
+    """
     if t_end is not None:
         reference_store.require_contact_horizon(scene, size, t_end, error=max_error)
         return t_end

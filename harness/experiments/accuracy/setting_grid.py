@@ -137,7 +137,7 @@ def compute_setting_cost(spec: WorkSpec, row: Mapping[str, Any]) -> float:
 
 
 def is_measured(row: Mapping[str, Any]) -> bool:
-    """Return whether a simulation ended well: its error is known, or too small for the reference."""
+    """Return whether the error of a simulation is known, or too small for the reference."""
     has_time = row.get("seconds_per_simulated_second") is not None
     return row["status"] == "ok" or (row["status"] == "uncertified" and has_time)
 

@@ -145,7 +145,10 @@ def _check_compacted_rows(written: BinaryIO, units: Sequence[Path], schema: pa.S
 
 
 def _sync_folder(folder: Path) -> None:
-    """Flush a folder to the disk, so that a rename is durable before the replaced files are removed."""
+    """Flush a folder to the disk.
+
+    A rename is then durable before the replaced files are removed.
+    """
     if not hasattr(os, "O_DIRECTORY"):  # Windows cannot open folders
         return
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

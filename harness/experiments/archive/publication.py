@@ -121,7 +121,10 @@ def _list_published_files(folder: Path) -> Iterator[Path]:
 
 
 def _explain_exclusion(path: Path, folder: Path) -> str:
-    """Return why a file is excluded; empty if it lies in the folder after all links are resolved."""
+    """Return why a file is excluded.
+
+    The result is empty if the file lies in the folder after all links are resolved.
+    """
     place = path.resolve()
     if not place.is_relative_to(folder.resolve()):
         leads = f"leads to {place}, which lies" if path.is_symlink() else "lies"

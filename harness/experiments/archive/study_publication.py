@@ -212,7 +212,7 @@ def _join_newest_runs(parts: Sequence[pa.Table]) -> pa.Table:
 
 
 def _read_table(folder: Path) -> pa.Table | None:
-    """Read the rows of a folder with the names of their units, or None if there are none."""
+    """Read the rows of a folder with the names of their units; None without rows."""
     units = row_store.list_units(folder)
     if not units:
         return None
@@ -221,7 +221,10 @@ def _read_table(folder: Path) -> pa.Table | None:
 
 
 def _read_measurements(path: Path) -> pa.Table:
-    """Read a table that a script wrote; a column that names files of its machine is left out."""
+    """Read a table that a script wrote.
+
+    A column that names files of the script's machine is left out.
+    """
     try:
         table = pq.read_table(path, partitioning=None)
     except (pa.ArrowException, OSError) as error:
@@ -231,7 +234,7 @@ def _read_measurements(path: Path) -> pa.Table:
 
 
 def _drop_missing_software(rows: pa.Table) -> pa.Table:
-    """Drop the rows of solvers that support no run, because their software is not installed here."""
+    """Drop the rows of solvers that support no run, because their software is not installed."""
     if "status" not in rows.column_names or "solver" not in rows.column_names:
         return rows
     supported = pc.unique(rows.filter(pc.field("status") != "unsupported")["solver"])
@@ -263,7 +266,7 @@ def _select_provenance(rows: pa.Table) -> list[dict[str, Any]]:
 
 
 def _count_requested_runs(config: Path) -> int:
-    """Count the runs that a sweep requests; fewer are published if software or runs are missing."""
+    """Count the runs that a sweep requests; fewer are published if software is missing."""
     return len(load_config(config, imports_code=False).list_runs())
 
 
@@ -278,9 +281,10 @@ _COMMANDS = {"accuracy": "accuracy", "ablation": "ablate", "rows": "run"}
 
 
 def _measure_duration(rows: Sequence[Mapping[str, Any]]) -> float:
-    """Return the wall time of the study [s], from which the time of a repetition is predicted.
+    """Return the wall time of the study [s].
 
-    It is the sum of the times between successive starts of runs. Longer pauses than MAX_PAUSE count as interruptions.
+    The time of a repetition is predicted from it. It is the sum of the times between successive starts of runs. Longer
+    pauses than MAX_PAUSE count as interruptions.
     """
     starts = sorted({datetime.fromisoformat(row["started_at"]) for row in rows if row.get("started_at")})
     pauses = ((later - earlier).total_seconds() for earlier, later in pairwise(starts))

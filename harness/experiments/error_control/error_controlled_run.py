@@ -108,7 +108,7 @@ class ErrorControlledRun:
 
 
 def run_error_controlled(run: RunSpec, error: float, tick: ProgressCallback, results: Path) -> ErrorControlledRun:
-    """Find the cheapest method of the run's solver, and time it in each round of the run.
+    """Find the cheapest method of the run's solver, and time it in each round.
 
     Args:
         run: specification of the run.

@@ -328,7 +328,7 @@ class _MethodSearch:
     def _run_trial(
         self, method: Method, setting: float, time_limit: float, reference_trial: Trial | None = None
     ) -> TrialOutcome[Trial]:
-        """Run a method at a setting, and estimate its error where there is a reference trial."""
+        """Run a method at a setting, and estimate its error if a reference trial exists."""
         try:
             trial = self._integrate_motion(method, setting, time_limit)
         except TimeBudgetExceeded:

@@ -137,7 +137,10 @@ class _ThirdPartyComparison:
 
 
 def _limit_cpu_time(vector_field: OdeField, deadline: float) -> Callable[[float, OdeState], OdeState]:
-    """Return the vector field with a deadline on the CPU clock [s], after which it raises TimeBudgetExceeded."""
+    """Return the vector field with a deadline on the CPU clock [s].
+
+    After the deadline it raises TimeBudgetExceeded.
+    """
 
     def rate(t: float, y: OdeState) -> OdeState:
         if thread_time() > deadline:

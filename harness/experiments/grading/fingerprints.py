@@ -1,6 +1,8 @@
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 # SciPy's and NumPy's stubs leave the types of some results unknown.
-"""Fingerprints of mistakes: which program predicts each step of a submission from its two positions before it.
+"""Fingerprints of mistakes: which program predicts each step of a submission.
+
+A step is predicted from the two positions before it.
 
     D = rms over steps of |predicted - p|_F / scale,   scale = |p - p^t|_F + |predicted by the correct program - p^t|_F
     fit of a mistake = 1 - D(mistake)/D(correct program)
@@ -253,7 +255,10 @@ class FingerprintFinder:
         return _distances(steps.after, steps.current) + _distances(predicted, steps.current) + tiny
 
     def _compare_correct(self, compared: _Comparison) -> NDArray[np.float64]:
-        """Return D of the correct program after each number of iterations, the smaller of two initial guesses."""
+        """Return D of the correct program after each number of iterations.
+
+        It is the smaller value of two initial guesses.
+        """
         guesses = (self._correct, replace(self._correct, initial_guess="target"))
         return np.min([self._compare(program, compared) for program in guesses], axis=0)
 
@@ -278,7 +283,10 @@ class FingerprintFinder:
         compared: _Comparison,
         visible: Sequence[tuple[ProgramMistake, AssignmentProgram]],
     ) -> list[tuple[ProgramMistake, float]]:
-        """Return D of all mistakes; those that are far off on some steps are not compared on the others."""
+        """Return D of all mistakes.
+
+        Those with large deviations on some steps are not compared on the others.
+        """
         count = len(compared.scales)
         screening = compared.select_steps(sorted({0, min(1, count - 1), count // 2}))
         others = list[tuple[ProgramMistake, float]]()
@@ -305,7 +313,7 @@ class FingerprintFinder:
         return float(self._compare(program, compared)[first:].min())
 
     def _compare_output(self, undone: NDArray[np.float64], precision: StoredPrecision) -> float:
-        """Return D of the correct program on positions of which a mistake of the output is undone.
+        """Return D of the correct program on positions with an output mistake undone.
 
         Their start counts as a step.
         """

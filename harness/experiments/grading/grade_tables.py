@@ -54,7 +54,7 @@ CLASS_COLUMNS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClassRow:
-    """One line of a folder of submissions: its name, and its grade or the reason why there is none."""
+    """Grade of one submission in a folder, or the reason why there is none."""
 
     name: str
     grade: PositionGrade | None

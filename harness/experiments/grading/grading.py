@@ -173,7 +173,10 @@ class SceneGrader:
         return PositionGrade(submission, steps, quantities, shares, note, fingerprint, self._finder_note, kind, verdict)
 
     def find_fingerprint(self, submission: SubmittedMotion) -> ProgramFingerprint | None:
-        """Find the closest programs; None for scenes with other terms than springs, masses, forces and pins."""
+        """Find the closest programs.
+
+        The result is None for scenes with other terms than springs, masses, forces and pins.
+        """
         return self._finder.find_fingerprint(submission, self._find_minimum) if self._finder else None
 
     def _find_minimum(self, problem: StepProblem, p: Positions) -> Positions | None:

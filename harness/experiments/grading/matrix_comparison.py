@@ -1,6 +1,9 @@
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 # SciPy's and NumPy's stubs leave the types of some results unknown.
-"""Compare matrices of others, in Matrix Market files, with those of a scene: values, and zeros that are stored."""
+"""Compare matrices of others, in Matrix Market files, with those of a scene.
+
+Values and explicitly stored zeros are compared.
+"""
 
 from __future__ import annotations
 
@@ -92,7 +95,7 @@ def _list_mistakes(matrices: LocalGlobalMatrices, name: str) -> dict[str, Any]:
 
 
 def _read_matrix(path: Path) -> Any:
-    """Read a Matrix Market file of finite real numbers in the sandbox, with its stored zeros."""
+    """Read a Matrix Market file of finite numbers in the sandbox, with its stored zeros."""
     found: Any = mmread(path)
     found = found if isinstance(found, np.ndarray) else coo_array(found)
     values: Any = found if isinstance(found, np.ndarray) else found.data

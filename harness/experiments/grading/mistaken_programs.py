@@ -41,7 +41,9 @@ def _project(v: RealArray, unit: RealArray, rest: RealArray, current: RealArray)
 
 
 class StepBatch(NamedTuple):
-    """Some steps of a submission, all arrays (s, n, 3) [m], and forces and pins of the scene's problems.
+    """Some steps of a submission, with the forces and pins of the scene's problems.
+
+    Arrays are (s, n, 3) [m] unless stated.
 
     Attributes:
         previous: p^(t-dt).
@@ -145,7 +147,10 @@ class AssignmentProgram:
         return splu(Q.tocsc())
 
     def iterate_steps(self, steps: StepBatch) -> Iterator[Positions]:
-        """Yield the iterates (s, n, 3) [m] of some steps, without end; raises RuntimeError where Q is singular."""
+        """Yield the iterates (s, n, 3) [m] of some steps, without end.
+
+        Raises RuntimeError where Q is singular.
+        """
         force = self.map_force(steps.force)
         target = self.map_target(steps.target, steps.current, steps.previous)
         if self.explicit_at:

@@ -1,4 +1,4 @@
-"""Error of a motion against the integrated one, split into the share of the time step and that of the solver.
+"""Error of a motion against the integrated one, by shares of time step and solver.
 
     total     = |p - q| / |q - p^0|       q: integrated equations of motion
     time step = |p~ - q| / |q - p^0|      p~: implicit Euler at the same time step, each step solved to round-off
@@ -86,7 +86,7 @@ class MotionReference:
         self._known: dict[int, tuple[tuple[int, ...], ReferenceTrajectory | None, str]] = {}
 
     def measure_shares(self, submission: SubmittedMotion) -> tuple[list[ErrorShares], str]:
-        """Measure the errors at some steps, and return a sentence on what could not be measured."""
+        """Measure the errors at some steps; a sentence states what could not be measured."""
         if submission.num_steps not in self._known:
             load = self._converge_trajectory if self._has_contact else self._integrate_trajectory
             self._known[submission.num_steps] = load(submission.num_steps)
@@ -116,7 +116,10 @@ class MotionReference:
         return shares, note
 
     def _integrate_trajectory(self, num_steps: int) -> tuple[tuple[int, ...], ReferenceTrajectory | None, str]:
-        """Integrate up to a step, or to the last one that can be predicted, and return the steps measured."""
+        """Integrate up to a step, or to the last one that can be predicted.
+
+        Returns the measured steps, the trajectory, and a note.
+        """
         last, note, found = num_steps, "", None
         until = time.monotonic() + self._seconds
         steps: tuple[int, ...] = ()
@@ -134,7 +137,11 @@ class MotionReference:
         return steps, found, note
 
     def _converge_trajectory(self, num_steps: int) -> tuple[tuple[int, ...], ReferenceTrajectory | None, str]:
-        """Halve the steps of a motion with contact, up to a step or to the last one at which it is known."""
+        """Halve the steps of a motion with contact until it is known.
+
+        It is computed up to a step, or to the last one at which it is known. The result is of the form of
+        `_integrate_trajectory`.
+        """
         last, left, reason = num_steps, self._seconds, "--budget allows no time for it"
         while last >= 1 and left >= SHORTEST_REFINEMENT:
             steps, times = self._choose_steps(last)
@@ -161,7 +168,7 @@ class MotionReference:
         return build_exact_scene(spec, self._size, integrator, show_warnings=False)
 
     def _choose_steps(self, last: int) -> tuple[tuple[int, ...], list[float]]:
-        """Choose the steps up to a last one at which errors are measured, and return their times [s] too."""
+        """Choose the steps at which errors are measured; return them and their times [s]."""
         steps = tuple(sorted({max(1, round(last * part)) for part in (0.25, 0.5, 0.75, 1.0)}))
         return steps, [self._scene.compute_time(step) for step in steps]
 
@@ -190,7 +197,7 @@ def _describe_uncertainty(trajectory: SelfConvergedTrajectory, k: int) -> str:
 
 
 def _make_deadline(until: float) -> Any:
-    """Return a progress callback that ends an integration at a time of the monotonic clock [s]."""
+    """Return a progress callback that ends an integration at a monotonic time [s]."""
 
     def check(motion: int, reached: float) -> None:
         if time.monotonic() > until:

@@ -26,7 +26,9 @@ MAX_CHECKED_FRAMES = 6
 
 
 class MotionQuantities(NamedTuple):
-    """Quantities after each step, arrays (k,), with the start first (k + 1,) for energies and strains.
+    """Quantities after each step.
+
+    Arrays are (k,); those of energies and strains are (k + 1,), with the start first.
 
     Attributes:
         energy: kinetic and potential energy less the work of constant forces [J].
@@ -79,7 +81,10 @@ def measure_motion(scene: Scene, submission: SubmittedMotion) -> MotionQuantitie
 
 
 def _measure_momentum(scene: Scene, velocities: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Measure the violation of the balance of linear momentum; None with forces that change, filters or contact."""
+    """Measure the violation of the balance of linear momentum.
+
+    The result is None with forces that change, velocity filters or contact.
+    """
     if scene.varying_forces or scene.velocity_filters or has_contact(scene.system):
         return None
     mass, dt = scene.system.mass, scene.system.time_step
@@ -91,7 +96,10 @@ def _measure_momentum(scene: Scene, velocities: NDArray[np.float64]) -> NDArray[
 
 
 def _count_intersections(scene: Scene, submission: SubmittedMotion) -> dict[int, int]:
-    """Count intersections in some frames: those that an effect prevents, or those of the mesh with itself."""
+    """Count intersections in some frames.
+
+    These are those that an effect prevents, or else those of the mesh with itself.
+    """
     triangles, steps = scene.mesh.triangles, submission.num_steps
     if not scene.intersection_checks and not len(triangles):
         return {}

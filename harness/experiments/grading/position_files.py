@@ -111,7 +111,10 @@ def read_rest_positions(path: Path, num_vertices: int) -> NDArray[np.float64]:
 
 
 def is_submission(path: Path) -> bool:
-    """Return whether a path can be a file of positions or a folder of mesh files, by its name and its entries."""
+    """Return whether a path can be a file of positions or a folder of mesh files.
+
+    Only its name and its entries are read.
+    """
     if path.is_dir():
         return any(one.suffix.lower() in MESH_SUFFIXES for one in path.iterdir())
     return path.suffix.lower() in POSITION_SUFFIXES
@@ -129,7 +132,10 @@ def _read_npz(path: Path, n: int, array: str) -> PositionSequence:
 
 
 def _find_only_array(path: Path) -> str | None:
-    """Return the name of the only array in an .npz file; None where there are others, or none can be listed."""
+    """Return the name of the only array in an .npz file.
+
+    The result is None if there are several, or if they cannot be listed.
+    """
     try:
         with ZipFile(path) as archive:
             names = archive.namelist()

@@ -83,7 +83,7 @@ class SpringTerms:
         )
 
     def project_springs(self, p: Positions) -> Positions:
-        """Compute d (m, 3) [m] at p (n, 3) [m], the directions of the springs times their rest lengths."""
+        """Compute d (m, 3) [m] at p (n, 3) [m]: spring directions times rest lengths."""
         i, j = self.edges.T
         _, unit = unit_directions(p[i] - p[j], self.rest_direction)
         return self.rest_length[:, None] * unit

@@ -74,7 +74,7 @@ class StepVerdict:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the step is stationary only because its digits show nothing, and its energy gap is unknown."""
+        """Whether the stored digits are too few to show a residual, without a known gap."""
         shown = self.residual <= max(CONVERGED_RESIDUAL, FLOOR_FACTOR * min(self.residual_floor, LARGEST_FLOOR))
         return self.gap is None and self.is_stationary and not shown
 
@@ -111,7 +111,7 @@ class StepJudge:
     def judge_steps(
         self, submission: SubmittedMotion, seconds: float, report_progress: ProgressCallback = lambda line: None
     ) -> list[StepVerdict]:
-        """Judge all steps; certified minima are computed for as many of them as the time allows.
+        """Judge all steps, with certified minima of as many as the time allows.
 
         Args:
             submission: the positions.
@@ -179,7 +179,10 @@ class StepJudge:
         )
 
     def _measure_gap_floor(self, problem: StepProblem, p: Positions, error: float) -> float:
-        """Measure the gap [J] of a minimum p (n, 3) [m] by rounding errors [m] of free vertices, and by friction."""
+        """Measure the gap [J] of a minimum p (n, 3) [m] that rounding and friction cause.
+
+        Only free vertices have rounding errors [m].
+        """
         first, second = _draw_rounding(p, error)
         moved = first + _PREVIOUS_ERRORS * second
         moved[problem.system.pins.vertices] = 0.0
@@ -210,12 +213,15 @@ _PREVIOUS_ERRORS = 2.24
 
 
 def _draw_rounding(p: Positions, error: float) -> Positions:
-    """Draw rounding errors (2, n, 3) [m] of at most `error` [m] for positions (n, 3), the same in each call."""
+    """Draw rounding errors (2, n, 3) [m] for positions (n, 3), the same in each call.
+
+    They are at most `error` [m].
+    """
     return np.random.default_rng(0).uniform(-1.0, 1.0, (2, *p.shape)) * error
 
 
 def _snap_pins(problem: StepProblem, p: Positions, there: Positions, tolerance: float) -> Positions:
-    """Return p with the pinned vertices placed as those of `there`, where they are within a tolerance [m]."""
+    """Return p with pinned vertices placed as in `there`, where a tolerance [m] permits."""
     pinned, out = problem.system.pins.vertices, p.copy()
     near = (np.abs(p[pinned] - there[pinned]) <= tolerance).all(axis=1)
     out[pinned[near]] = there[pinned[near]]

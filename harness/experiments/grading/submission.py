@@ -1,6 +1,6 @@
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false, reportUnknownLambdaType=false
 # SciPy's and NumPy's stubs leave the types of some results unknown.
-"""A submission: positions of others, with the frame numbers and the vertex order of a scene.
+"""A submission: positions of others, with a scene's frame numbers and vertex order.
 
 Nothing is matched silently: each decision is a sentence in `notes`. The number of the first frame is stated by the
 caller or the file; otherwise it is 0 where the first positions are the scene's start, and 1 where they are not. The
@@ -86,7 +86,10 @@ class SubmittedMotion:
         return self.precision.bound_error(*self.positions[step - 1 : step + 2])
 
     def position_after(self, step: int) -> Positions:
-        """Return the positions (n, 3) [m] after a step; 0 is the start, -1 one step before it."""
+        """Return the positions (n, 3) [m] after a step.
+
+        Step 0 is the start, and -1 is one step before it.
+        """
         return self.positions[step + 1]
 
 
@@ -230,7 +233,10 @@ def _choose_match(
 
 
 def _measure_stretch(scene: Scene, p: Positions) -> float:
-    """Measure the median length of springs at p (n, 3) [m], relative to their lengths at rest; 0 without springs."""
+    """Measure the median length of springs at p (n, 3) [m], over their rest lengths.
+
+    It is 0 without springs.
+    """
     springs = scene.all_springs
     i, j = springs.edges[springs.rest_length > 0.0].T
     rest = springs.rest_length[springs.rest_length > 0.0]
@@ -245,9 +251,10 @@ def _describe_match(match: VertexMatch) -> str:
 
 
 def _match_vertices(expected: Positions, submitted: Positions, tolerance: float) -> VertexMatch | None:
-    """Match vertices by position, one to one, within a tolerance [m]; None where that is impossible.
+    """Match vertices one to one by position, within a tolerance [m].
 
-    The scene's order and usual axes are preferred, then other orders, then other axes.
+    The result is None where that is impossible. The scene's order and usual axes are preferred, then other orders, then
+    other axes.
     """
     n = len(expected)
     if not np.isfinite(submitted).all():

@@ -13,9 +13,9 @@ mixture martingale (Robbins 1970)
 
     M_n(k) = 2^n B(a + k, a + n - k) / B(a, a),        P(some n has M_n >= 1/alpha) <= alpha        (Ville 1939)
 
-the m that are not rejected form a confidence sequence. It is an interval on the median of x, between two order
-statistics, which covers exp(m) at all n at once with probability 1 - alpha at least (Howard and Ramdas 2022,
-"Sequential estimation of quantiles with applications to A/B testing and best-arm identification").
+the m that are not rejected form a confidence sequence: an interval on the median of x, between two order statistics. It
+covers m at all n at once with a probability of at least 1 - alpha. Source: Howard and Ramdas 2022, "Sequential
+estimation of quantiles with applications to A/B testing and best-arm identification".
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Two functions of one process as a pair of programs: their answers are compared, then they can be timed."""
+"""Pair of two functions of one process, which are compared, then timed."""
 
 from __future__ import annotations
 

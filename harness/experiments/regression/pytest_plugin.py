@@ -58,7 +58,7 @@ class PairedBenchmark:
         alpha: float | None = None,
         **extra_info: Any,
     ) -> BenchmarkResult | None:
-        """Fail the test if the candidate takes more than `max_ratio` times as long as the baseline.
+        """Fail the test if the ratio of times, candidate over baseline, exceeds `max_ratio`.
 
         Args:
             candidate: function without arguments.

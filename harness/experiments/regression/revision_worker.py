@@ -208,7 +208,10 @@ def _load_gates() -> dict[str, Any]:
 
 
 def _describe_error(error: Exception) -> str:
-    """Describe an error of the worktree's code, or a name that this script expects and the worktree lacks."""
+    """Describe an error of the worktree's code.
+
+    It may be a name that this script expects and the worktree lacks.
+    """
     if any(base.__name__ == "SpringbenchError" for base in type(error).__mro__):
         return str(error)
     if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith("tests"):

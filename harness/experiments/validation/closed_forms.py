@@ -1,6 +1,6 @@
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 # SciPy's and NumPy's stubs leave the types of some results unknown.
-"""Cases with a closed form: each returns a simulated value on a series of refinements, and the exact one.
+"""Cases with a closed form: simulated values on a series of refinements, and exact ones.
 
 free fall            y = -g t^2/2
 pendulum             angle by Jacobi's elliptic functions: sin(a/2) = k cd(sqrt(g/l) t, k), k = sin(a0/2)
@@ -158,7 +158,10 @@ def _build_oscillator(k: float = 100.0, c: float = 2.0, stretch: float = 0.1, du
 
 
 def _hang_cable(num_springs: int, axial_stiffness: float, span: float, solver: Solver) -> Positions:
-    """Return the rest state (n, 3) [m] of a cable of 10 m and 10 kg between two supports."""
+    """Return the rest state (n, 3) [m] of a cable between two supports.
+
+    Its length is 10 m, its mass 10 kg.
+    """
     x = np.linspace(0.0, span, num_springs + 1)
     sag = 2.0 * np.sin(np.pi * x / span)
     weights = np.full(num_springs + 1, 10.0 / num_springs)
@@ -225,7 +228,7 @@ def _build_hanging_chain(length: float = 2.0, mass: float = 4.0, axial_stiffness
 
 
 def solve_elastica(length: float, weight_to_rigidity: float) -> tuple[float, float]:
-    """Return drop and horizontal reach [m] of the tip of a clamped strip under its weight.
+    """Return drop and horizontal reach [m] of a clamped strip's tip under its weight.
 
     Args:
         length: free length [m].
@@ -248,9 +251,10 @@ def solve_elastica(length: float, weight_to_rigidity: float) -> tuple[float, flo
 def hang_strip(
     length: float, num_cells: int, rigidity: float, density: float, stretch: Any, solver: Solver, *, clamped: bool
 ) -> Positions:
-    """Simulate a strip along x, clamped or hinged at x = 0, until it is at rest.
+    """Simulate a strip that is clamped or hinged at one end, until it rests.
 
-    The strip is one cell wide; a clamp extends by a cell to x < 0. Vertices are ordered along x.
+    The strip extends along x from x = 0, and is one cell wide; a clamp extends by a cell to x < 0. Vertices are ordered
+    along x.
 
     Args:
         length: free length [m].

@@ -1,4 +1,4 @@
-"""Scenes of the validation: their simulation to a time or to rest, and flat sheets with warp, weft and diagonals."""
+"""Scenes and flat sheets of the validation, and their simulation to a time or to rest."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def simulate_to_rest(scene: Scene, solver: Solver) -> Positions:
 
 
 def build_sheet(x: NDArray[np.float64], z: NDArray[np.float64], radius: float = np.inf) -> Mesh:
-    """Build a flat sheet of square cells with both diagonals, in the plane y = 0.
+    """Build a flat sheet of square cells with both diagonals at y = 0.
 
     Args:
         x, z: coordinates [m] of its lines.
