@@ -105,7 +105,7 @@ class RunSetup:
 
     @classmethod
     def from_run(cls, run: RunSpec) -> RunSetup:
-        """Build the scene of a run and load its solver; errors of user code are unchanged."""
+        """Build the scene of a run and load its solver; errors of user code propagate."""
         scene = build_scene(run.scene, run.size, run.integrator)
         stop = build_stop_rule(run.max_iterations, run.rtol)
         settings = SteppingSettings(stop, run.initial_guess, run.frames, run.rounds)

@@ -74,7 +74,7 @@ class StepVerdict:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether the stored digits are too few to show a residual, without a known gap."""
+        """Whether the step is stationary only because of too few digits, without a known gap."""
         shown = self.residual <= max(CONVERGED_RESIDUAL, FLOOR_FACTOR * min(self.residual_floor, LARGEST_FLOOR))
         return self.gap is None and self.is_stationary and not shown
 

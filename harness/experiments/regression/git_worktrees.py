@@ -100,7 +100,7 @@ def prepare_worktree(checkout: Path, commit: str) -> Path:
                 and not clean.returncode
                 and not clean.stdout
             ):
-                os.utime(tree)  # most recently used
+                os.utime(tree)  # marks it as used most recently
                 return tree
             shutil.rmtree(tree)
             _run_git(checkout, "worktree", "prune")

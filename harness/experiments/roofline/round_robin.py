@@ -108,7 +108,7 @@ def format_candidate_name(run: RunSpec) -> str:
 def predict_seconds(past_timings: Sequence[PastTiming], vertices: int, run: RunSpec) -> float:
     """Predict the seconds of a run from its smaller sizes; 0 without any.
 
-    A power law, with an exponent of at least 1, passes through the last two of them.
+    The last of them is extrapolated by a power law, whose exponent follows from the last two and is at least 1.
 
     Args:
         past_timings: timings at other sizes, in ascending order.
