@@ -77,12 +77,15 @@ class GridExpansion:
         for size, solver, values in product(sizes, solvers, product(*options.values())):
             chosen: dict[str, Any] = dict(zip(options, values, strict=True))
             if chosen["error_target"] is not None:
-                # The last of these options, the initial guess, has no default here: None selects that of the scene.
-                chosen |= {name: RunOptions.model_fields[name].default for name in ERROR_TARGET_OPTIONS[:-1]} | {
-                    "initial_guess": None
+                chosen |= {
+                    name: None if name in SCENE_OPTIONS else RunOptions.model_fields[name].default
+                    for name in ERROR_TARGET_OPTIONS
                 }
-            chosen["initial_guess"] = chosen["initial_guess"] or scene.choose_initial_guess(chosen["integrator"])
-            chosen |= {name: getattr(scene, name) for name in SCENE_OPTIONS if chosen[name] is None}
+            chosen |= {
+                name: _find_scene_value(name, scene, chosen["integrator"])
+                for name in SCENE_OPTIONS
+                if chosen[name] is None
+            }
             yield RunSpec.model_construct(
                 sweep=self.name,
                 scene_name=scene_name,
@@ -125,10 +128,24 @@ class GridExpansion:
         """Return the grid points that no entry of `exclude` matches."""
         remaining = list(grid)
         for i, entry in enumerate(self.fields.exclude):
-            if not any(_is_match(entry, run) for run in grid):
+            if not any(self._is_match(entry, run) for run in grid):
                 self.document.add_mistake("matches no run of the grid; correct or remove it", ("exclude", i))
-            remaining = [run for run in remaining if not _is_match(entry, run)]
+            remaining = [run for run in remaining if not self._is_match(entry, run)]
         return remaining
+
+    def _is_match(self, entry: ExcludeEntry, run: RunSpec) -> bool:
+        """Return whether a run matches all keys of an entry; null matches the value of the scene."""
+        named = {"scene": run.scene_name, "size": run.size, "solver": run.solver.name}
+        allowed = {key: entry.get_values(key) for key in (*named, *RUN_OPTIONS)}
+        for name in SCENE_OPTIONS:
+            if None in allowed[name]:
+                allowed[name] += (_find_scene_value(name, self.scenes[run.scene_name], run.integrator),)
+        values = named | {key: getattr(run, key) for key in RUN_OPTIONS}
+        return (
+            all(not allowed[key] or value in allowed[key] for key, value in values.items())
+            and (entry.size_above is None or run.size > entry.size_above)
+            and (entry.size_below is None or run.size < entry.size_below)
+        )
 
     def _check_names(self) -> None:
         known = {"scene": list(self.scenes), "solver": [solver.name for solver in self.solvers]}
@@ -182,11 +199,6 @@ def check_mesh_size(document: ConfigDocument, scene_name: str, scene: SceneSpec,
         document.add_mistake(f"{size} {excess} (scene {scene_name})", at)
 
 
-def _is_match(entry: ExcludeEntry, run: RunSpec) -> bool:
-    named = {"scene": run.scene_name, "size": run.size, "solver": run.solver.name}
-    values = named | {key: getattr(run, key) for key in RUN_OPTIONS}
-    return (
-        all(not entry.get_values(key) or value in entry.get_values(key) for key, value in values.items())
-        and (entry.size_above is None or run.size > entry.size_above)
-        and (entry.size_below is None or run.size < entry.size_below)
-    )
+def _find_scene_value(name: str, scene: SceneSpec, integrator: str) -> Any:
+    """Return the scene's value of one of SCENE_OPTIONS, which null stands for."""
+    return scene.choose_initial_guess(integrator) if name == "initial_guess" else getattr(scene, name)

@@ -77,6 +77,7 @@ REMAINING_POINTS = {
     "{scene: file}, {max_iterations: 20}": lambda s, n, v, i: s != "file" and i != 20,
     "{rtol: null, max_iterations: 10}": lambda s, n, v, i: i != 10,
     "{initial_guess: previous, frames: 5, solver: sparse}": lambda s, n, v, i: v != "sparse",
+    "{initial_guess: null, frames: null, time_step: null, solver: sparse}": lambda s, n, v, i: v != "sparse",
 }
 
 
