@@ -30,14 +30,13 @@ from springbench.harness.config.config_loader import (
     read_plugin_metadata,
     read_scenes,
 )
-from springbench.harness.config.expand_grid import check_mesh_size
+from springbench.harness.config.expand_grid import select_sizes
 from springbench.harness.config.run_options import STEP_OPTIONS
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS, load_in_sandbox
 from springbench.harness.errors import suggest_name
 from springbench.harness.execution.optional_parts import RECORDINGS
-from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, UserCodePolicy, quote_value
 from springbench.solvers.plugins.plugin_discovery import PluginName
@@ -173,23 +172,11 @@ class _StudyExpansion:
         found: list[BenchmarkCase] = []
         for name in self._select_names("scene", study.scene, list(self.scenes), at):
             scene = self.scenes[name]
+            sizes = select_sizes(self.document, name, scene, study.size, (*at, "size"))
             lists: Any = study.integrator, study.time_step
-            for size, (integrator, time_step) in product(self._select_sizes(name, study, at), product(*lists)):
+            for size, (integrator, time_step) in product(sizes, product(*lists)):
                 found.append(BenchmarkCase(name, scene.with_time_step(time_step or scene.time_step), size, integrator))
         return found
-
-    def _select_sizes(self, name: str, study: AccuracyStudyConfig, at: ConfigKey) -> Sequence[int]:
-        """Return the study's mesh sizes, else the scene's default; 0 for a mesh from a file."""
-        scene = self.scenes[name]
-        if not isinstance(scene.mesh, MeshGenerator):
-            return (0,)
-        sizes = study.size or ((scene.default_size,) if scene.default_size else ())
-        if not sizes:
-            problem = f"is missing; the scene {name} needs a mesh size (or give it a default_size)"
-            self.document.add_mistake(problem, (*at, "size"))
-        for size in sizes:
-            check_mesh_size(self.document, name, scene, size, (*at, "size"))
-        return sizes
 
     def _select_solvers(self, study: AccuracyStudyConfig, at: ConfigKey) -> list[SolverSpec]:
         names = self._select_names("solver", study.solver, [solver.name for solver in self.solvers], at)

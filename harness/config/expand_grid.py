@@ -51,7 +51,10 @@ class GridExpansion:
         self._check_names()
         options = self.fields.options.model_dump(include=set(RUN_OPTIONS))
         self._check_error_target()
-        jobs = [(scene, self._select_sizes(scene), self.solvers, options) for scene in self.scenes]
+        jobs = [
+            (name, select_sizes(self.document, name, scene, self.fields.sizes, ("sizes",)), self.solvers, options)
+            for name, scene in self.scenes.items()
+        ]
         extra = [job for i, entry in enumerate(self.fields.include) for job in self._expand_include(i, entry, options)]
         count = sum(len(s) * len(v) * prod(map(len, o.values())) for _, s, v, o in [*jobs, *extra])
         if count > MAX_RUNS:
@@ -96,19 +99,6 @@ class GridExpansion:
                 **fixed_options,
             )
 
-    def _select_sizes(self, scene_name: str) -> Sequence[int]:
-        """Return the sweep's mesh sizes, else the scene's default; 0 for a mesh from a file."""
-        scene = self.scenes[scene_name]
-        if not isinstance(scene.mesh, MeshGenerator):
-            return (0,)
-        sizes = self.fields.sizes or ((scene.default_size,) if scene.default_size else ())
-        if not sizes:
-            problem = f"is missing; the scene {scene_name} needs a mesh size (or give it a default_size)"
-            self.document.add_mistake(problem, ("sizes",))
-        for i, size in enumerate(sizes):
-            check_mesh_size(self.document, scene_name, self.scenes[scene_name], size, ("sizes", i))
-        return sizes
-
     def _expand_include(self, i: int, entry: IncludeEntry, options: Mapping[str, Sequence[Any]]) -> Iterable[Any]:
         chosen = {key: entry.get_values(key) or values[:1] for key, values in options.items()}
         solvers = [s for s in self.solvers if s.name in (entry.solver or [s.name])]
@@ -119,7 +109,9 @@ class GridExpansion:
             if isinstance(self.scenes[scene_name].mesh, MeshGenerator):
                 sizes = entry.size
                 for k, size in enumerate(sizes):
-                    check_mesh_size(self.document, scene_name, self.scenes[scene_name], size, ("include", i, "size", k))
+                    _check_mesh_size(
+                        self.document, scene_name, self.scenes[scene_name], size, ("include", i, "size", k)
+                    )
                 if not sizes:
                     self.document.add_mistake(f"is missing; the scene {scene_name} has one", ("include", i, "size"))
             yield scene_name, sizes, solvers, chosen
@@ -180,7 +172,30 @@ class GridExpansion:
                 self.document.add_mistake(problem, ("options", "convergence_frames", i))
 
 
-def check_mesh_size(document: ConfigDocument, scene_name: str, scene: SceneSpec, size: int, at: ConfigKey) -> None:
+def select_sizes(
+    document: ConfigDocument, scene_name: str, scene: SceneSpec, requested: Sequence[int], at: ConfigKey
+) -> Sequence[int]:
+    """Return the requested mesh sizes, else the scene's default; 0 for a mesh from a file.
+
+    Args:
+        document: config, which collects mistakes.
+        scene_name: name of the scene in messages.
+        scene: scene with the mesh.
+        requested: sizes that the config lists, if any.
+        at: location of this list in the document.
+    """
+    if not isinstance(scene.mesh, MeshGenerator):
+        return (0,)
+    sizes = requested or ((scene.default_size,) if scene.default_size else ())
+    if not sizes:
+        problem = f"is missing; the scene {scene_name} needs a mesh size (or give it a default_size)"
+        document.add_mistake(problem, at)
+    for i, size in enumerate(sizes):
+        _check_mesh_size(document, scene_name, scene, size, (*at, i))
+    return sizes
+
+
+def _check_mesh_size(document: ConfigDocument, scene_name: str, scene: SceneSpec, size: int, at: ConfigKey) -> None:
     """Add a mistake if a generated mesh does not support a size.
 
     Args:
