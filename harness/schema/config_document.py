@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,7 +86,7 @@ class ConfigDocument:
         """
         for mistake in error.mistakes:
             if mistake.file is None:
-                self.add_mistake(mistake.problem, tuple(mistake.key.split(".")) if mistake.key else ())
+                self.add_mistake(mistake.problem, parse_key(mistake.key))
             else:
                 self.mistakes.append(mistake)
 
@@ -173,6 +174,11 @@ def format_key(at: ConfigKey) -> str:
     """Format a key as users write it: `effects[2].weight`."""
     text = "".join(f"[{k}]" if isinstance(k, int) else f".{k if k.isprintable() else ascii(k)}" for k in at)
     return text.removeprefix(".")[:200]
+
+
+def parse_key(text: str) -> ConfigKey:
+    """Parse a key that `format_key` formatted; its names contain neither dots nor brackets."""
+    return tuple(int(index) if index else name for index, name in re.findall(r"\[(\d+)\]|([^.\[\]]+)", text))
 
 
 def is_mapping(data: object) -> TypeGuard[dict[str, Any]]:

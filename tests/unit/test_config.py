@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 import pytest
 from pydantic import Field
-from springbench.harness.errors import InputError
+from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.schema.base_model import ConfigModel, Vector3
-from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, format_key, quote_value
+from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, format_key, parse_key, quote_value
 from springbench.harness.schema.yaml_loader import read_yaml
 
 VALUES = {
@@ -143,6 +143,17 @@ def test_each_mistake_names_its_key_and_the_nearest_line(case: str) -> None:
     document = ConfigDocument(Path("c.yaml"), {"part": data}, {(): 1, ("part",): 4, **lines})
     assert document.validate_data(Outer, data, ("part",)) is None
     assert list(map(str, document.build_error().mistakes)) == expected
+
+
+@pytest.mark.parametrize("key", ["", "mass", "effects[2]", "effects[2].weight", "options.rtol[0]"])
+def test_a_formatted_key_is_parsed(key: str) -> None:
+    assert format_key(parse_key(key)) == key
+
+
+def test_the_mistake_of_an_error_gets_the_line_of_its_key() -> None:
+    document = ConfigDocument(Path("c.yaml"), {}, {("effects",): 2, ("effects", 0): 3, ("effects", 1): 7})
+    document.add_errors(InputError(InputMistake("is negative", key="effects[1].weight")))
+    assert list(map(str, document.mistakes)) == ["c.yaml:7: effects[1].weight: is negative"]
 
 
 def test_a_valid_mapping_becomes_its_model() -> None:
