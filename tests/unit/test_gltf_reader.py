@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from springbench.harness.errors import InputError
 from springbench.harness.scenes.mesh.file_mesh import FileMesh
+from springbench.harness.scenes.mesh.gltf_reader import read_gltf
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
 QUARTER_TURN = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # a quarter turn about z
@@ -93,6 +94,15 @@ def test_nodes_place_and_mirror_their_meshes(tmp_path):
     a, b, c = (mesh.rest_positions[mesh.triangles[:, k]] for k in range(3))
     assert np.sign(np.cross(b - a, c - a)[:, 2]).tolist() == [1, -1]  # a mirror turns the outside with it
     assert mesh.parts["a"].tolist() == [0, 1, 2]
+
+
+def test_normalised_integers_lie_between_minus_one_and_one(tmp_path):
+    document, _ = gltf(None)
+    points = np.array([[-128, 0, 0], [-127, 0, 0], [127, 0, 0], [0, 127, 0]], np.int8).tobytes()
+    document["accessors"][0] |= {"componentType": 5120, "normalized": True}
+    document["bufferViews"][0]["byteLength"] = document["buffers"][0]["byteLength"] = len(points)
+    read = read_gltf(write(tmp_path / "mesh.glb", document, points))
+    assert read.points.tolist() == [[-1, 0, 0], [-1, 0, 0], [1, 0, 0], [0, 1, 0]]
 
 
 def test_primitives_share_their_points(tmp_path):

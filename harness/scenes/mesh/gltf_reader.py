@@ -178,9 +178,9 @@ class _GltfScene:
         if min(start, count, stride) < 0 or (count and start + (count - 1) * stride + width * item > len(buffer)):
             raise ValueError("its data end beyond the buffer; the file was cut")
         found = np.ndarray((count, width), dtype, buffer, start, (stride, item))
-        return (
-            found / np.iinfo(np.dtype(dtype)).max if accessor.get("normalized") and found.dtype.kind != "f" else found
-        )
+        if not accessor.get("normalized") or found.dtype.kind == "f":
+            return found
+        return np.maximum(found / np.iinfo(np.dtype(dtype)).max, -1.0)  # a signed integer has one more negative value
 
 
 def _read_transform(node: dict[str, Any]) -> FloatArray:
