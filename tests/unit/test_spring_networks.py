@@ -207,6 +207,8 @@ def test_a_table_states_springs_and_their_values(tmp_path: Path, suffix: str):
         ("i,j\n0\n", ["t.csv:2", "1 cells for 2 columns"]),
         ("i,j\n0,1\n0,7\n", ["t.csv:3", "j is 7; the vertices are 0 to 2"]),
         ("i,j\n0,1\n1,0.5\n", ["t.csv:3", "j is 0.5"]),
+        ('i,j,note\n0,1,"of two\nlines"\n1,7,\n', ["t.csv:4", "j is 7"]),
+        ('i,j,note\n0,1,"of two\nlines"\n1,2\n', ["t.csv:4", "2 cells for 3 columns"]),
         ("i,j\n1,1\n", ["t.csv:2", "joins a vertex to itself"]),
         ("i,j\n0,x\n", ["t.csv:2", "j is 'x'"]),
         ("i,j,T\n0,1,1\n", ["names the column 'EA'", "one of T, i, j"]),

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,12 +29,12 @@ class DataTable:
     Attributes:
         path: the file, for messages.
         columns: text of each cell, or numbers with NaN for missing ones, each (rows,).
-        first_line: line of the first row, 0 for a file without lines.
+        row_lines: line at which each row starts, empty for a file without lines.
     """
 
     path: Path
     columns: dict[str, list[str] | NDArray[np.float64]]
-    first_line: int
+    row_lines: Sequence[int] = ()
 
     @property
     def num_rows(self) -> int:
@@ -69,8 +70,8 @@ class DataTable:
             problem: description of the mistake, with its remedy.
             row: number of the row, from 0; the message states its line in the file if the file has lines.
         """
-        if self.first_line:
-            return InputError(InputMistake(problem, self.path, self.first_line + row))
+        if self.row_lines:
+            return InputError(InputMistake(problem, self.path, self.row_lines[row]))
         return InputError(InputMistake(f"row {row} (from 0): {problem}", self.path))
 
     def _convert_column(self, name: str, cells: list[str] | NDArray[np.float64]) -> NDArray[np.float64]:
@@ -104,9 +105,13 @@ def read_data_table(path: Path) -> DataTable:
 
 
 def _read_csv(path: Path) -> DataTable:
+    rows, lines = list[list[str]](), [1]
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = list(csv.reader(file, strict=True))
+            reader = csv.reader(file, strict=True)
+            for row in reader:
+                rows.append(row)
+                lines.append(reader.line_num + 1)  # quoted cells may contain line breaks
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(InputMistake(f"is no table in UTF-8 text with commas ({error})", path)) from None
     while rows and not any(rows[-1]):
@@ -114,10 +119,10 @@ def _read_csv(path: Path) -> DataTable:
     header = [name.strip() for name in rows[0]] if rows else []
     if len(set(header)) < len(header) or not all(header):
         raise InputError(InputMistake("should name each column once", path, 1))
-    for line, row in enumerate(rows[1:], 2):
+    for line, row in zip(lines[1:], rows[1:], strict=False):
         if len(row) != len(header):
             raise InputError(InputMistake(f"has {len(row)} cells for {len(header)} columns", path, line))
-    return DataTable(path, {name: [row[k] for row in rows[1:]] for k, name in enumerate(header)}, 2)
+    return DataTable(path, {name: [row[k] for row in rows[1:]] for k, name in enumerate(header)}, lines[1:])
 
 
 def _read_parquet(path: Path) -> DataTable:
@@ -135,4 +140,4 @@ def _read_parquet(path: Path) -> DataTable:
             columns[name] = np.array([np.nan if x is None else float(x) for x in column.to_pylist()], np.float64)
         else:
             columns[name] = ["" if x is None else str(x) for x in column.to_pylist()]
-    return DataTable(path, columns, 0)
+    return DataTable(path, columns)
