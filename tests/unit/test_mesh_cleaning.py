@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.pins_effect import PinsEffect
 from springbench.harness.scenes.mesh.file_mesh import FileMesh
 from springbench.harness.scenes.mesh.mesh_cleaning import drop_degenerate_cells
 from springbench.harness.scenes.mesh.spring_network import MeshCells
@@ -145,3 +146,44 @@ def test_impossible_values_are_refused(tmp_path, options, words):
 def test_a_scale_that_leaves_the_range_of_positions_is_refused(tmp_path):
     with pytest.raises(InputError, match="scale: gives coordinates above"):
         obj(tmp_path, "v 0 0 0\nv 1e6 0 0\nv 0 1 0\nf 1 2 3\n", scale=1e8).build_mesh()
+
+
+def find_pins(mesh: FileMesh, **selectors) -> list[int]:
+    """The vertices of a file's mesh that pins with these selectors select."""
+    return PinsEffect.model_validate(selectors).select_vertices(mesh.build_mesh(), "pins").tolist()
+
+
+def test_indices_count_the_vertices_that_are_left(tmp_path):
+    spare = f"v 9 9 9\n{SEAM.replace('f 1 2 3', 'f 2 3 4').replace('f 4 5 6', 'f 5 6 7')}"
+    mesh = obj(tmp_path, spare, weld=1e-6, unused="drop")
+    (corner,) = find_pins(mesh, indices=[3])  # the sixth of the file: one before it is unused, one is joined
+    assert mesh.build_mesh().rest_positions[corner].tolist() == [1, 1, 0]
+    with pytest.raises(InputError, match=r"indices: got 4; the mesh has the vertices 0 to 3"):
+        find_pins(mesh, indices=[4])
+
+
+def test_regions_are_in_metres_with_y_up(tmp_path):
+    mesh = obj(tmp_path, "v 0 0 0\nv 1000 0 0\nv 0 0 2000\nf 1 2 3\n", units="mm", up="z")
+    assert find_pins(mesh, box={"low": [-0.1, 1.9, -0.1], "high": [0.1, 2.1, 0.1]}) == [2]
+    assert find_pins(mesh, sphere={"center": [1, 0, 0], "radius": 0.1}) == [1]
+    assert find_pins(mesh, nearest_to=[[0, 2, 0]]) == find_pins(mesh, parts=["top"]) == [2]
+
+
+def test_a_side_of_the_bounding_box_has_only_the_vertices_on_it(tmp_path):
+    mesh = obj(tmp_path, "v 0 0 0\nv 1 0.999 0\nv 0 1 0\nv 1 0.9999999 0\nf 1 2 3\nf 2 4 3\n")
+    assert find_pins(mesh, parts=["top"]) == [2, 3]  # up to a millionth of the diagonal
+
+
+def test_units_scale_coordinates_and_no_lengths_of_springs(tmp_path):
+    (tmp_path / "springs.csv").write_text("i,j,rest_length\n0,1,0.9\n")
+    text = "v 0 0 0\nv 0 0 0\nv 1000 0 0\nl 1 3\nl 2 3\n"
+    mesh = obj(tmp_path, text, units="mm", weld=0, spring_table=tmp_path / "springs.csv", stiffness=5).build_mesh()
+    assert mesh.spring_distances.tolist() == [1.0, 1.0]
+    assert mesh.rest_lengths.tolist() == [0.9, 1.0]  # the row names vertices after welding
+
+
+def test_a_selection_without_selectors_names_those_that_there_are():
+    with pytest.raises(ValidationError, match=r"names no vertices; give parts, .* or stride") as caught:
+        PinsEffect.model_validate({})
+    named = str(caught.value).partition("give ")[2].partition(" [type")[0].replace(" or ", ", ").split(", ")
+    assert set(named) <= set(PinsEffect.model_fields)
