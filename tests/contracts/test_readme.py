@@ -1,12 +1,18 @@
 """The examples of the pages are what they say: a sweep, a scene and an effect that work."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from springbench.harness.config.config_loader import load_config
+from springbench.harness.config.config_loader import GATES, load_config, load_scene, read_config
+from springbench.harness.experiments.regression.gates_file import GatesFile
+from springbench.harness.experiments.regression.program_pair import require_agreement
+from springbench.harness.experiments.regression.solver_pair import prepare_solver_pair
 from springbench.harness.scenes.mesh.chain_mesh import ChainMesh
+from springbench.harness.scenes.scene_builder import build_scene
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -35,6 +41,41 @@ def test_the_scene_of_the_page_is_a_scene(tmp_path: Path):
         "WindEffect",
         "PinsEffect",
     ]
+
+
+def test_the_net_of_the_page_is_a_net_from_a_file(tmp_path: Path):
+    page = (ROOT / "configs" / "howto" / "networks-and-fabrics.md").read_text(encoding="utf-8")
+    section = page.partition("## A net from a file\n")[2].partition("\n## ")[0]
+    scene, net, cables = re.findall(r"```\w+\n(.*?)```", section, re.DOTALL)
+    for name, content in {"scene.yaml": scene, "net.obj": net, "cables.csv": cables}.items():
+        (tmp_path / name).write_text(content)
+    made = build_scene(load_scene(tmp_path / "scene.yaml"), 0)
+    strain = np.array([50.0, 60.0]) / 2000.0  # tensions over EA
+    assert made.all_springs.rest_length == pytest.approx(1.0 / (1.0 + strain))
+    assert made.all_springs.stiffness == pytest.approx(2000.0 * (1.0 + strain))
+    assert made.system.free_vertices.tolist() == [1]
+
+
+@pytest.mark.slow
+def test_the_gates_of_the_page_compare_equal_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    tutorial = (ROOT / "configs" / "tutorials" / "3-your-solver-and-ours.md").read_text(encoding="utf-8")
+    names = {"mine.py": r"'{3}(.*?)'{3}", "cloth.yaml": r'"{3}\n(mesh.*?)"{3}'}
+    for name, pattern in names.items():
+        (content,) = re.findall(pattern, tutorial, re.DOTALL)
+        Path(name).write_text(content)
+    Path("test_gates.py").write_text(example("gates-in-ci.md", "python"))
+    command = [sys.executable, "-m", "pytest", "-q", "--benchmark-disable", "-p", "no:cacheprovider", "test_gates.py"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, "2 passed" in done.stdout) == (0, True), done.stdout
+    Path("gates.yaml").write_text(example("gates-in-ci.md", "yaml"))
+    _, document = read_config(Path("gates.yaml"), GATES)
+    gates = document.validate_data(GatesFile, document.data)
+    assert gates is not None
+    (gate,) = gates.gates
+    options = {"max_iterations": gate.max_iterations, "rtol": gate.rtol}
+    candidate, baseline = prepare_solver_pair(Path(gate.scene), gate.solver, gate.baseline, size=None, **options)
+    require_agreement(candidate(), baseline(), gate.agreement_rtol)
 
 
 def test_the_effect_of_the_page_is_an_effect():
