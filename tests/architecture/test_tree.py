@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 TOP = {"harness", "solvers", "configs", "tests", "results"}
-TOP |= {"pyproject.toml", "README.md", "LICENSE", "CITATION.cff"}
+TOP |= {"pyproject.toml", "README.md", "README.md.j2", "LICENSE", "CITATION.cff"}
 
 
 @pytest.fixture(scope="module")
