@@ -66,7 +66,9 @@ class BendingEffect(ConfigModel):
             return EffectContribution()
         triangles = mesh.triangles
         if not len(triangles):
-            raise InputError("bending: needs triangles, and this mesh has none; take them out, or another mesh")
+            raise InputError(
+                "bending: needs triangles, and this mesh has none; remove `bending`, or use a mesh with triangles"
+            )
         a, b, c = (mesh.rest_positions[corner] for corner in triangles.T)
         sides = np.linalg.norm([b - a, c - b, a - c], axis=2).max(axis=0)
         flat = np.flatnonzero(np.linalg.norm(np.cross(b - a, c - a), axis=1) <= 1e-9 * sides**2)
