@@ -100,12 +100,12 @@ def require_fixed_exact_pins(effect_name: str, start: Positions, pins: Sequence[
         InputError: an exact pin moves, or does not start at its target.
     """
     for pin in pins:
-        moves = pin.motion is not None or not np.array_equal(pin.targets, start[pin.vertices])
-        if np.isinf(pin.weight) and moves:
+        is_away = (pin.targets != start[pin.vertices]).any(axis=1)
+        if np.isinf(pin.weight) and len(is_away) and (pin.motion is not None or is_away.any()):
+            does = "does not start at its target" if pin.motion is None else "moves"
             raise InputError(
-                f"{effect_name}: exact pins that move, or do not start where they "
-                "hold, would carry the mesh through what it "
-                "meets; give these pins a weight"
+                f"{effect_name}: the exact pin of vertex {pin.vertices[is_away.argmax()]} {does}, and would move the "
+                "mesh through obstacles or itself; give its effect a finite `weight` [N/m]"
             )
 
 
