@@ -416,7 +416,7 @@ RUN_COLUMNS = (
         "timing",
         _TEXT,
         "",
-        "exclusive: timed alone on the machine; shared: on cores of its own, concurrently with others; rough: "
+        "exclusive: timed alone on the machine; shared: on cores of its own, concurrently with others; none: "
         "in the instrumentation pass, concurrently with others",
     ),
     ColumnSpec("num_concurrent_runs", _INT, "", "maximum number of runs timed concurrently"),
