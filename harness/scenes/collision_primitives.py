@@ -24,7 +24,7 @@ _MAX_NAMED_PAIRS = 3
 END_OF_STEP_REASON = ("separates the pairs that it finds at the end of a step",)
 
 
-def collision_primitives(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def find_collision_primitives(mesh: Mesh) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the edges (m, 2) and faces (f, 3) of the mesh that can collide.
 
     Edges are the sides of triangles, and stretch springs with an end outside of all triangles. Faces are the triangles,

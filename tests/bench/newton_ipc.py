@@ -32,7 +32,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.sparse import csr_array
 from springbench.harness.execution.machine_info import describe_machine, limit_threads
-from springbench.harness.scenes.collision_primitives import collision_primitives
+from springbench.harness.scenes.collision_primitives import find_collision_primitives
 from springbench.solvers.contact.collision_mesh import CollisionMesh
 from springbench.solvers.contact.contact_potential import SelfContact
 from springbench.solvers.iteration.descent_method import DescentPoint, ResidualMetric, backtracking_line_search
@@ -113,7 +113,7 @@ class Ipctk:
         of: Any = ipctk
         of.set_num_threads(1)
         self._of, self._thickness, self._reach = of, made.min_distance, made.dhat
-        edges, triangles = collision_primitives(made.mesh)[0].astype(np.int32), made.mesh.triangles
+        edges, triangles = find_collision_primitives(made.mesh)[0].astype(np.int32), made.mesh.triangles
         self._surface = of.CollisionMesh(np.asfortranarray(made.mesh.rest_positions), edges, triangles)
         t, r = made.min_distance, made.dhat
         middle, most = (t + 0.5 * r) ** 2 - t**2, (2.0 * t + r) * r
@@ -228,7 +228,7 @@ def measure_size(size: int, num_rounds: int) -> tuple[list[dict[str, Any]], dict
     made = fold_sheet(size)
     mesh, k = made.mesh, np.full(len(made.p), STIFFNESS)
     surface = CollisionMesh.from_rest_shape(
-        mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, made.min_distance, made.dhat
+        mesh.rest_positions, find_collision_primitives(mesh)[0], mesh.triangles, k, made.min_distance, made.dhat
     )
     problem = build_step(made, SelfContact(surface))
     bare = replace(problem, system=without_barriers(problem.system))

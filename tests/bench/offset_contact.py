@@ -33,7 +33,7 @@ from rich.console import Console
 from rich.table import Table
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.execution.machine_info import describe_machine, limit_threads
-from springbench.harness.scenes.collision_primitives import collision_primitives
+from springbench.harness.scenes.collision_primitives import find_collision_primitives
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.simulation.instrumentation_pass import count_intersections
 from springbench.harness.simulation.time_loop import build_problem, prepare, simulate_scene
@@ -124,7 +124,7 @@ def count_rejected_paths(scene: Scene, positions: Sequence[Positions]) -> int:
     """Count the pairs of consecutive frames whose linear path ipctk rejects for the mesh against itself."""
     import ipctk  # an optional extra
 
-    edges, faces = collision_primitives(scene.mesh)
+    edges, faces = find_collision_primitives(scene.mesh)
     mesh = ipctk.CollisionMesh(scene.mesh.rest_positions, edges, faces[faces[:, 1] != faces[:, 2]])
     return sum(not ipctk.is_step_collision_free(mesh, before, after) for before, after in pairwise(positions))
 

@@ -26,7 +26,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 from springbench.harness.execution.machine_info import describe_machine, limit_threads
-from springbench.harness.scenes.collision_primitives import collision_primitives
+from springbench.harness.scenes.collision_primitives import find_collision_primitives
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.solvers.contact.collision_mesh import CollisionMesh
@@ -68,7 +68,7 @@ def build_own_work(made: FoldedSheet) -> tuple[dict[str, Callable[[], object]], 
     k = np.ones(len(p))
     contact = SelfContact(
         CollisionMesh.from_rest_shape(
-            mesh.rest_positions, collision_primitives(mesh)[0], mesh.triangles, k, thickness, reach
+            mesh.rest_positions, find_collision_primitives(mesh)[0], mesh.triangles, k, thickness, reach
         )
     )
 
@@ -107,7 +107,7 @@ def build_ipctk_work(made: FoldedSheet) -> tuple[dict[str, Callable[[], object]]
     mesh, p, d, thickness, reach = made
     V, W = np.asfortranarray(p), np.asfortranarray(p + d)
     surface = of.CollisionMesh(
-        np.asfortranarray(mesh.rest_positions), collision_primitives(mesh)[0].astype(np.int32), mesh.triangles
+        np.asfortranarray(mesh.rest_positions), find_collision_primitives(mesh)[0].astype(np.int32), mesh.triangles
     )
     potential = of.BarrierPotential(reach, 1.0)
     known = of.NormalCollisions()

@@ -27,7 +27,7 @@ from scipy.sparse import csr_array
 from springbench.harness.execution.machine_info import describe_machine, limit_threads
 from springbench.harness.experiments.regression.abba_benchmark import MIN_CALL_SECONDS, TimedBlock, draw_block_orders
 from springbench.harness.experiments.regression.confidence_sequence import compute_interval
-from springbench.harness.scenes.collision_primitives import collision_primitives
+from springbench.harness.scenes.collision_primitives import find_collision_primitives
 from springbench.harness.simulation.time_loop import build_initial_state, build_problem
 from springbench.solvers.contact import collisions
 from springbench.solvers.contact.collision_mesh import CollisionMesh
@@ -248,7 +248,7 @@ def of_eights() -> Iterator[Case]:
     mesh, p = made.mesh, made.p
     surface = CollisionMesh.from_rest_shape(
         mesh.rest_positions,
-        collision_primitives(mesh)[0],
+        find_collision_primitives(mesh)[0],
         mesh.triangles,
         np.ones(len(p)),
         made.min_distance,

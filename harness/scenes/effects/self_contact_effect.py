@@ -11,9 +11,9 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from springbench.harness.errors import InputError
 from springbench.harness.scenes.collision_primitives import (
     END_OF_STEP_REASON,
-    collision_primitives,
     compute_barrier_stiffness,
     describe_intersections,
+    find_collision_primitives,
     require_fixed_exact_pins,
     require_intersection_free,
 )
@@ -72,7 +72,7 @@ class SelfContactEffect(ConfigModel):
         Raises:
             InputError: if the mesh intersects itself at rest.
         """
-        (edges, faces), rest = collision_primitives(mesh), mesh.rest_positions
+        (edges, faces), rest = find_collision_primitives(mesh), mesh.rest_positions
         if not len(edges):
             return EffectContribution()
         reach = self.min_distance if self.dhat is None else self.dhat

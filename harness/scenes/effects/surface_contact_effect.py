@@ -12,9 +12,9 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from springbench.harness.errors import InputError
 from springbench.harness.scenes.collision_primitives import (
     END_OF_STEP_REASON,
-    collision_primitives,
     compute_barrier_stiffness,
     describe_intersections,
+    find_collision_primitives,
     require_fixed_exact_pins,
     require_intersection_free,
 )
@@ -94,7 +94,7 @@ class SurfaceContactEffect(ConfigModel):
             InputError: if an obstacle is invalid.
         """
         (edges, faces), n, shapes = (
-            collision_primitives(mesh),
+            find_collision_primitives(mesh),
             len(mesh.rest_positions),
             self.build_obstacle_surfaces(mesh.rest_positions),
         )
