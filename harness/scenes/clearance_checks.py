@@ -74,7 +74,7 @@ def find_first_violation(
     return (times[-1], distance) if distance.min(initial=np.inf) < min_distance else None
 
 
-def largest_gap_radius(planes: Sequence[ConvexObstacle], time: float) -> float:
+def compute_largest_gap_radius(planes: Sequence[ConvexObstacle], time: float) -> float:
     """Return the radius [m] of the largest ball between half-spaces, at most 1.
 
     Args:
@@ -95,7 +95,7 @@ def largest_gap_radius(planes: Sequence[ConvexObstacle], time: float) -> float:
     return float(found.x[3]) if found.x is not None else -np.inf
 
 
-def sample_times(motions: Sequence[KeyFrameMotion | None]) -> Iterator[float]:
+def find_sample_times(motions: Sequence[KeyFrameMotion | None]) -> Iterator[float]:
     """Yield sample times [s] of motions: their key times, and intermediate times if they rotate."""
     times = merge_key_times(*motions)
     straight = all(motion.is_piecewise_linear for motion in motions if motion)

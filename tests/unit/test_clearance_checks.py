@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from springbench.harness.scenes.clearance_checks import (
+    compute_largest_gap_radius,
     find_first_violation,
-    largest_gap_radius,
+    find_sample_times,
     merge_key_times,
-    sample_times,
 )
 from springbench.harness.scenes.key_frames import KeyFrame, KeyFrameMotion
 from springbench.harness.scenes.primitive_obstacles import PlaneObstacle, SphereObstacle
@@ -68,7 +68,7 @@ def test_no_point_is_faster_than_the_bound(motion: KeyFrameMotion):
 @pytest.mark.parametrize(("height", "radius"), [(1.0, 0.5), (0.1, 0.05), (-1.0, -0.5)])
 def test_the_gap_between_two_planes_is_that_of_the_largest_ball(height: float, radius: float):
     lid = PlaneObstacle(point=(0.0, height, 0.0), normal=(0.0, -1.0, 0.0))
-    assert largest_gap_radius([PlaneObstacle().build_obstacle(), lid.build_obstacle()], 0.0) == pytest.approx(
+    assert compute_largest_gap_radius([PlaneObstacle().build_obstacle(), lid.build_obstacle()], 0.0) == pytest.approx(
         radius, abs=1e-9
     )
 
@@ -76,11 +76,11 @@ def test_the_gap_between_two_planes_is_that_of_the_largest_ball(height: float, r
 def test_four_planes_may_leave_no_room_where_any_three_do():
     normals = [(1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0)]
     planes = [PlaneObstacle(point=normal, normal=normal).build_obstacle() for normal in normals]
-    assert largest_gap_radius(planes, 0.0) < 0.0
-    assert all(largest_gap_radius(planes[:k] + planes[k + 1 :], 0.0) > 0.0 for k in range(4))
+    assert compute_largest_gap_radius(planes, 0.0) < 0.0
+    assert all(compute_largest_gap_radius(planes[:k] + planes[k + 1 :], 0.0) > 0.0 for k in range(4))
 
 
 def test_planes_that_turn_are_checked_between_their_keys():
-    assert list(sample_times([ACROSS])) == [0.0, 1.0]
-    assert len(list(sample_times([ROUND]))) > 32
+    assert list(find_sample_times([ACROSS])) == [0.0, 1.0]
+    assert len(list(find_sample_times([ROUND]))) > 32
     assert merge_key_times(ACROSS, None, KeyFrameMotion(key_frames=(KeyFrame(time=0.5),))) == [0.0, 0.5, 1.0]

@@ -10,7 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from springbench.harness.errors import InputError
-from springbench.harness.scenes.clearance_checks import find_first_violation, largest_gap_radius, sample_times
+from springbench.harness.scenes.clearance_checks import (
+    compute_largest_gap_radius,
+    find_first_violation,
+    find_sample_times,
+)
 from springbench.harness.scenes.effects.effect_interface import EffectContribution, PinGroup
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.primitive_obstacles import AnyObstacle
@@ -111,8 +115,8 @@ class ContactEffect(ConfigModel):
         planes = [one for one in self.obstacles if one.kind == "plane"]
         if len(planes) > 1 and any(one.motion for one in planes):  # the start lies between fixed planes
             solid = [one.build_obstacle() for one in planes]
-            for time in sample_times([one.motion for one in planes]):
-                if (radius := largest_gap_radius(solid, time)) < limit:
+            for time in find_sample_times([one.motion for one in planes]):
+                if (radius := compute_largest_gap_radius(solid, time)) < limit:
                     raise InputError(
                         f"contact: the planes leave no room at {time:g} s: {max(2.0 * radius, 0.0):.3g} m at most lie "
                         f"between them, and vertices stay {self.min_distance:g} m away from each; move them less"
