@@ -22,7 +22,13 @@ from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.mesh.assignment_json import find_key_line, read_assignment_json
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_cleaning import CleaningOptions, clean_cells
-from springbench.harness.scenes.mesh.mesh_topology import NO_PAIRS, NO_TRIANGLES, IndexArray, PointArray, fan_triangles
+from springbench.harness.scenes.mesh.mesh_topology import (
+    NO_PAIRS,
+    NO_TRIANGLES,
+    IndexArray,
+    PointArray,
+    split_into_fans,
+)
 from springbench.harness.scenes.mesh.obj_reader import read_obj
 from springbench.harness.scenes.mesh.spring_network import build_spring_network
 
@@ -68,7 +74,7 @@ def read_assignment_scene(path: Path) -> AssignmentScene:
         raise InputError(InputMistake("has no faces (f lines), so there are no springs", obj))
     mesh = build_spring_network(cells, "face-pairs", obj)
     fans = np.concatenate(
-        [NO_TRIANGLES, *map(fan_triangles, cells.polygons.values())]
+        [NO_TRIANGLES, *map(split_into_fans, cells.polygons.values())]
     )  # the assignment's code splits faces into fans
     if len(fans) == len(mesh.triangles):  # otherwise faces repeat others, and `mesh` counts each once
         mesh = replace(mesh, triangles=fans)

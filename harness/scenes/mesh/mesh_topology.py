@@ -68,12 +68,12 @@ def sort_unique_pairs(pairs: IndexArray) -> IndexArray:
     return np.stack(np.divmod(codes[np.diff(codes, prepend=-1) > 0], base), axis=1)
 
 
-def polygon_sides(polygons: IndexArray) -> IndexArray:
+def list_polygon_sides(polygons: IndexArray) -> IndexArray:
     """Return the sides of polygons of k corners, (f, k), as pairs (f k, 2), with repetitions."""
     return np.stack([polygons, np.roll(polygons, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
-def polygon_corner_pairs(polygons: IndexArray) -> IndexArray:
+def list_polygon_corner_pairs(polygons: IndexArray) -> IndexArray:
     """Return all pairs of corners of polygons (f, k).
 
     Shape (f k (k-1)/2, 2), with repetitions.
@@ -82,7 +82,7 @@ def polygon_corner_pairs(polygons: IndexArray) -> IndexArray:
     return np.stack([polygons[:, i], polygons[:, j]], axis=2).reshape(-1, 2)
 
 
-def fan_triangles(polygons: IndexArray) -> IndexArray:
+def split_into_fans(polygons: IndexArray) -> IndexArray:
     """Split polygons (f, k) into fans of triangles from their first corner.
 
     Shape (f (k-2), 3).

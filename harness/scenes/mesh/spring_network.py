@@ -22,11 +22,11 @@ from springbench.harness.scenes.mesh.mesh_topology import (
     assemble_mesh,
     compute_signed_volumes,
     find_box_parts,
+    list_polygon_corner_pairs,
+    list_polygon_sides,
     lump_areas,
     lump_lengths,
     lump_volumes,
-    polygon_corner_pairs,
-    polygon_sides,
     sort_unique_pairs,
 )
 from springbench.harness.scenes.mesh.polygon_triangulation import (
@@ -157,7 +157,7 @@ def build_spring_network(cells: MeshCells, spring_rule: SpringRule, path: Path) 
         springs = {STRETCH: list_cell_edges(cells)}
         if spring_rule == "face-pairs":
             springs[SHEAR] = _exclude_pairs(
-                sort_unique_pairs(np.concatenate([NO_PAIRS, *map(polygon_corner_pairs, groups)])), springs[STRETCH]
+                sort_unique_pairs(np.concatenate([NO_PAIRS, *map(list_polygon_corner_pairs, groups)])), springs[STRETCH]
             )
     surface = triangulate_cells(cells)
     if surface.crossed:
@@ -259,7 +259,7 @@ def _distribute_areas(surface: FaceTriangulation, springs: Mapping[str, IndexArr
     """
     pairs, shares = [NO_PAIRS], [np.empty(0)]
     for k, (faces, area) in surface.faces.items():
-        pairs.append(polygon_sides(faces))
+        pairs.append(list_polygon_sides(faces))
         shares.append(np.repeat(area if k == 3 else 2 * area / k, k))
     areas = [_sum_by_pair(springs[STRETCH], np.concatenate(pairs), np.concatenate(shares), num_vertices)]
     if SHEAR in springs:
@@ -316,7 +316,7 @@ def _drop_repeated_tetrahedra(tetrahedra: IndexArray, path: Path) -> IndexArray:
 
 def list_cell_edges(cells: MeshCells) -> IndexArray:
     """List the sides of polygons, the segments and the edges of tetrahedra, each once, sorted, (m, 2)."""
-    sides = map(polygon_sides, cells.polygons.values())
+    sides = map(list_polygon_sides, cells.polygons.values())
     return sort_unique_pairs(np.concatenate([NO_PAIRS, *sides, cells.segments, _tetrahedron_edges(cells.tetrahedra)]))
 
 

@@ -14,8 +14,8 @@ from springbench.harness.scenes.mesh.mesh_topology import (
     assemble_mesh,
     build_lattice_triangles,
     build_offset_pairs,
+    list_polygon_sides,
     lump_areas,
-    polygon_sides,
     sort_unique_pairs,
 )
 
@@ -105,7 +105,7 @@ class BalloonMesh(MeshGenerator):
         rest[index] = np.einsum("tc,fcx->ftx", weights / size, corners[faces])
         rest *= self.radius / np.linalg.norm(rest, axis=1, keepdims=True)
         triangles = index[:, cells_of_face].reshape(-1, 3)
-        pairs = sort_unique_pairs(polygon_sides(triangles))
+        pairs = sort_unique_pairs(list_polygon_sides(triangles))
         return assemble_mesh(
             rest_positions=rest,
             springs={STRETCH: pairs},
@@ -147,7 +147,7 @@ def _divide_faces(faces: IndexArray, size: int) -> tuple[IndexArray, IndexArray,
     """
     i, j = np.nonzero(np.tri(size + 1, dtype=bool)[::-1])
     weights = np.stack([size - i - j, i, j], axis=1)
-    edges = sort_unique_pairs(polygon_sides(faces))
+    edges = sort_unique_pairs(list_polygon_sides(faces))
     edge_of = np.zeros((12, 12), np.int64)
     edge_of[edges[:, 0], edges[:, 1]] = edge_of[edges[:, 1], edges[:, 0]] = np.arange(len(edges))
 
