@@ -25,7 +25,7 @@ _MAX_STEM_LENGTH = 100
 """Maximum length of the stem in a temporary name, which the file system limits."""
 
 
-def partial_path(path: Path) -> Path:
+def build_partial_path(path: Path) -> Path:
     """Return the temporary name of a file while this process writes it."""
     return path.with_name(f".{path.stem[:_MAX_STEM_LENGTH]}.{os.getpid()}.partial{path.suffix}")
 
@@ -42,7 +42,7 @@ def atomic_write(path: Path) -> Generator[Path]:
     Raises:
         WriteError: for an OSError inside the block.
     """
-    partial = partial_path(path)
+    partial = build_partial_path(path)
     try:
         yield partial
         os.replace(partial, path)
@@ -115,7 +115,7 @@ def sanitise_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9._-]+", "_", text).lstrip("._")[:200] or "_"
 
 
-def user_cache_dir(name: str) -> Path:
+def get_user_cache_dir(name: str) -> Path:
     """Return the user's cache folder for one kind of file; it may not exist."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "springbench" / name
 

@@ -14,7 +14,7 @@ import pytest
 import springbench  # noqa: F401  sets what Numba and OpenMP read when they load
 import typer.testing
 from hypothesis import settings
-from springbench.harness.atomic_files import user_cache_dir
+from springbench.harness.atomic_files import get_user_cache_dir
 
 from tests import slow_tests
 
@@ -22,7 +22,7 @@ from tests import slow_tests
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # A test with a cache folder of its own does not compile all kernels for it.
-os.environ.setdefault("NUMBA_CACHE_DIR", str(user_cache_dir("kernels")))
+os.environ.setdefault("NUMBA_CACHE_DIR", str(get_user_cache_dir("kernels")))
 
 # What commands time in tests waits for no other's.
 _LOCK_FOLDER = tempfile.TemporaryDirectory(prefix="springbench-locks-")

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, Field, create_model
-from springbench.harness.atomic_files import WriteError, atomic_write, user_cache_dir
+from springbench.harness.atomic_files import WriteError, atomic_write, get_user_cache_dir
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.config.user_code import resolve_tag
 from springbench.harness.execution.error_location import format_error, locate_error
@@ -135,7 +135,7 @@ def _select_parameters(solver: type, parameters: ConfigModel) -> dict[str, Any]:
 def _cache_path(name: str, requested: dict[str, Any]) -> Path:
     """Return the cache path of a shipped solver with the parameters that a config states."""
     stated = f"{_hash_solver_sources()}{json.dumps(requested, sort_keys=True, default=repr)}"
-    return user_cache_dir("parameters") / f"{name}-{hashlib.sha256(stated.encode()).hexdigest()[:16]}.json"
+    return get_user_cache_dir("parameters") / f"{name}-{hashlib.sha256(stated.encode()).hexdigest()[:16]}.json"
 
 
 @cache

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import version
 
-from springbench.harness.atomic_files import WriteError, atomic_write, user_cache_dir
+from springbench.harness.atomic_files import WriteError, atomic_write, get_user_cache_dir
 from springbench.solvers.jit import source_digest
 
 _LIBRARIES = ("pydantic",)
@@ -29,7 +29,7 @@ def read_cached_text(name: str, build_text: Callable[[], str], *inputs: str) -> 
         inputs: what it depends on, besides the sources.
     """
     state = [source_digest.stamp_sources(), sys.version, *map(version, _LIBRARIES), *inputs]
-    path = user_cache_dir("derived") / f"{name}-{hashlib.sha256(repr(state).encode()).hexdigest()[:16]}.txt"
+    path = get_user_cache_dir("derived") / f"{name}-{hashlib.sha256(repr(state).encode()).hexdigest()[:16]}.txt"
     with suppress(OSError, UnicodeDecodeError):
         return path.read_text(encoding="utf-8")
     text = build_text()

@@ -21,7 +21,7 @@ from pathlib import Path
 from time import perf_counter, thread_time, time
 
 import numpy as np
-from springbench.harness.atomic_files import WriteError, atomic_write, user_cache_dir
+from springbench.harness.atomic_files import WriteError, atomic_write, get_user_cache_dir
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.progress_events import ProgressCallback
 from springbench.harness.execution.timing_lock import lock_timing_exclusive
@@ -49,7 +49,7 @@ def calibrate_machine(tick: ProgressCallback) -> dict[str, float]:
     if not _CALIBRATION_CACHE:
         with suppress(MemoryError):  # the run may limit its memory
             _CALIBRATION_CACHE.update(
-                _load_or_measure(user_cache_dir("machine") / f"{machine_info.compute_node_id()}.json", tick)
+                _load_or_measure(get_user_cache_dir("machine") / f"{machine_info.compute_node_id()}.json", tick)
             )
     return dict(_CALIBRATION_CACHE)
 

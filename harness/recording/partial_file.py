@@ -17,7 +17,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
-from springbench.harness.atomic_files import WriteError, build_write_error, partial_path
+from springbench.harness.atomic_files import WriteError, build_partial_path, build_write_error
 from springbench.harness.execution import isolated_worker
 from springbench.harness.recording.recording_integrity import mark_verified, scan_messages
 
@@ -43,7 +43,7 @@ class PartialFile:
     def __init__(self, path: Path, application: str, recording_id: str, title: str) -> None:
         global _first_pid
         self._path, self._broken = path, False
-        self._partial = partial_path(path)
+        self._partial = build_partial_path(path)
         _first_pid = _first_pid or os.getpid()
         isolated_worker.FORK_BLOCKERS.add("Rerun's streams")
         if not _broken_streams and os.getpid() == _first_pid:  # otherwise the call would wait forever or fail

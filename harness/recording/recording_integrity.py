@@ -21,7 +21,7 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
-from springbench.harness.atomic_files import user_cache_dir
+from springbench.harness.atomic_files import get_user_cache_dir
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import sandbox
 
@@ -78,7 +78,7 @@ def _is_verified(path: Path) -> bool:
 
 
 def _notes_path() -> Path:
-    return user_cache_dir("recordings") / f"sound-{_read_library_version()}"
+    return get_user_cache_dir("recordings") / f"sound-{_read_library_version()}"
 
 
 @cache

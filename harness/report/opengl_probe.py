@@ -15,7 +15,7 @@ from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 
-from springbench.harness.atomic_files import user_cache_dir
+from springbench.harness.atomic_files import get_user_cache_dir
 from springbench.harness.errors import RunFailed
 from springbench.harness.execution.optional_parts import PICTURES
 
@@ -92,7 +92,7 @@ def _find_marker() -> Path | None:
         name: value for name, value in os.environ.items() if name.startswith(("LD_", "VTK_", "EGL", "LIBGL", "MESA"))
     }
     state = [(one.st_mtime_ns, one.st_size) for one in found], sorted(variables.items()), version("vtk"), sys.prefix
-    return user_cache_dir("opengl") / sha256(repr((state, _PROBE_SCRIPT)).encode()).hexdigest()[:32]
+    return get_user_cache_dir("opengl") / sha256(repr((state, _PROBE_SCRIPT)).encode()).hexdigest()[:32]
 
 
 def require_opengl() -> None:

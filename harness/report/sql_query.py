@@ -104,7 +104,7 @@ def run_query(sql: str, results: Path, *, max_rows: int = MAX_SHOWN_ROWS, cpu_se
     folders = {table: row_store.find_row_folders(results, table, "*/") for table in _TABLE_SCHEMAS}
     every = list(chain(*folders.values()))
     files = sum(len(row_store.list_unit_files(folder)) for folder in every)
-    if not files and not any(row_store.packed_path(folder).exists() for folder in every):
+    if not files and not any(row_store.build_packed_path(folder).exists() for folder in every):
         raise InputError(f"{results}: contains no rows; run a sweep first, or name its folder with --results")
     limits = sandbox.CallLimits(cpu_seconds + _SECONDS_PER_FILE * files, QUERY_MEMORY_BYTES)
     try:

@@ -157,7 +157,7 @@ def limit_read_memory(units: Sequence[Path]) -> Generator[None]:
     Raises:
         InputError: if reading exceeds the limit.
     """
-    files = {*units, *(row_store.packed_path(folder) for folder in {unit.parent for unit in units})}
+    files = {*units, *(row_store.build_packed_path(folder) for folder in {unit.parent for unit in units})}
     most = _BASE_MEMORY + _EXPANSION_FACTOR * sum(file.stat().st_size for file in files if file.is_file())
     try:
         with sandbox.limit_memory(most):
@@ -267,7 +267,7 @@ def _read_packed(paths: Sequence[Path]) -> dict[Path, pa.Table]:
     found: dict[Path, pa.Table] = {}
     for folder, units in names.items():
         chosen: Any = [(row_store.FILE_COLUMN, "in", units)]
-        file = row_store.packed_path(folder)
+        file = row_store.build_packed_path(folder)
         try:
             with file.open("rb") as content:
                 table = pq.read_table(content, filters=chosen, partitioning=None)

@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import typer
-from springbench.harness.atomic_files import atomic_write, user_cache_dir
+from springbench.harness.atomic_files import atomic_write, get_user_cache_dir
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 
 _BATCH_SIZE = 500
@@ -102,7 +102,7 @@ class RemoteStorage:
         except (ValueError, ImportError, TypeError) as error:
             hint = "; pip install 'springbench[s3]'" if url.startswith("s3:") else ""
             raise InputError(InputMistake(f"{error}{hint}", key=url)) from error
-        folder = user_cache_dir("places") / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
+        folder = get_user_cache_dir("places") / hashlib.sha256(url.rstrip("/").encode()).hexdigest()[:16]
         folder.mkdir(parents=True, exist_ok=True)
         place = cls(url, folder, system, str(root).rstrip("/"))
         with suppress(OSError, ValueError):

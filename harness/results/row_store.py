@@ -30,7 +30,7 @@ _FOOTER_BYTES = 2**15
 """Number of bytes at the end of a file that are searched for its schema."""
 
 
-def packed_path(folder: Path) -> Path:
+def build_packed_path(folder: Path) -> Path:
     """Return the path of the packed file of a folder of rows; it may not exist."""
     return folder.parent / f"{folder.name}.parquet"  # with_name rejects "."
 
@@ -68,7 +68,7 @@ def list_packed_units(folder: Path) -> frozenset[str]:
     Raises:
         InputError: if it is damaged.
     """
-    path = packed_path(folder)
+    path = build_packed_path(folder)
     try:
         there = path.stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -143,7 +143,7 @@ def group_units(paths: Iterable[Path]) -> tuple[list[UnitGroup], list[int]]:
         if folder not in there:
             there[folder] = list_packed_units(folder) - list_unit_files(folder)
         if path.stem in there[folder]:
-            packed.setdefault(packed_path(folder), {})[path.stem] = number
+            packed.setdefault(build_packed_path(folder), {})[path.stem] = number
         elif (kind := _read_schema_key(str(path))) is None:
             damaged.append(number)
         else:

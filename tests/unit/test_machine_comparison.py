@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 import pytest
 from rich.console import Console
-from springbench.harness.atomic_files import user_cache_dir
+from springbench.harness.atomic_files import get_user_cache_dir
 from springbench.harness.cli.main import app
 from springbench.harness.execution.machine_info import compute_node_id, describe_machine
 from springbench.harness.experiments import machine_calibration
@@ -123,7 +123,7 @@ def test_the_limits_of_a_machine_are_measured_once_and_stored(tmp_path: Path, mo
     assert 1e7 < found["machine_bandwidth"] < 1e13
     assert 1e7 < found["machine_flops_per_second"] < 1e13
     assert 1e-6 < found["machine_step_seconds"] < 10.0
-    (saved,) = user_cache_dir("machine").iterdir()
+    (saved,) = get_user_cache_dir("machine").iterdir()
     assert saved.stem == compute_node_id()
     for name in ("measure_copy_bandwidth", "measure_flops", "measure_step_seconds"):
         monkeypatch.delattr(machine_calibration, name)  # what is cached is not computed again
@@ -136,7 +136,7 @@ def test_the_limits_of_a_busy_machine_are_reported_and_not_stored(tmp_path: Path
     monkeypatch.setattr(machine_calibration, "_CALIBRATION_CACHE", {})
     monkeypatch.setattr(machine_calibration, "_MIN_CPU_SHARE", 2.0)  # more than any thread can have
     assert set(machine_calibration.calibrate_machine(lambda said: None)) == set(machine_calibration.CALIBRATION_COLUMNS)
-    assert not user_cache_dir("machine").exists()
+    assert not get_user_cache_dir("machine").exists()
 
 
 def test_a_run_without_the_memory_for_it_is_done_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

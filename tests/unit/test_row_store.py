@@ -170,7 +170,7 @@ def test_damaged_and_recent_units_are_left_as_they_are(sweep: Path):
 
 def test_a_packed_file_that_is_damaged_is_named(sweep: Path):
     compact_results(sweep, lambda line: None)
-    os.truncate(row_store.packed_path(sweep / "rows"), 1000)
+    os.truncate(row_store.build_packed_path(sweep / "rows"), 1000)
     for look in (lambda: row_store.list_units(sweep / "rows"), lambda: run_query("SELECT 1", sweep.parent)):
         with pytest.raises(InputError, match=r"rows\.parquet"):
             look()

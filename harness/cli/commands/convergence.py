@@ -183,7 +183,7 @@ def _study_setting(
     )
     stem = f"{name}-{size}-{solver.name}-{'-'.join(map(_format_setting, given))}"
     folder.mkdir(parents=True, exist_ok=True)
-    with atomic_write(folder / f"{stem}.csv") as partial_path, partial_path.open("w", newline="") as file:
+    with atomic_write(folder / f"{stem}.csv") as build_partial_path, build_partial_path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(study.results[0].columns))
         writer.writeheader()
         writer.writerows(result.columns for result in study.results)

@@ -59,7 +59,7 @@ def compact_results(results: Path, print_message: Callable[[str], None], *, min_
 def _compact_folder(folder: Path, max_modified_time: float, print_message: Callable[[str], None]) -> int:
     for left in folder.parent.glob(f".{folder.name}.*.partial.parquet"):
         left.unlink()
-    packed = row_store.packed_path(folder)
+    packed = row_store.build_packed_path(folder)
     names = sorted(row_store.list_unit_files(folder))
     old = [
         unit

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from springbench.harness.atomic_files import open_lock_file, user_cache_dir
+from springbench.harness.atomic_files import get_user_cache_dir, open_lock_file
 from springbench.harness.errors import InputError
 from springbench.harness.experiments.regression.revision_process import PACKAGE_FOLDER, GitRevision
 from springbench.solvers.platform_calls import LockMode, wait_for_lock
@@ -26,7 +26,7 @@ MAX_WORKTREES = 6
 
 def worktree_cache() -> Path:
     """Return the cache folder of worktrees."""
-    return user_cache_dir("revisions")
+    return get_user_cache_dir("revisions")
 
 
 def find_checkout(folder: Path) -> Path:

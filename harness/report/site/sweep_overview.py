@@ -207,7 +207,7 @@ def _mark_recordings(
 def _find_outdated_runs(folder: SweepFolder, data_folder: Path, run_records: Sequence[dict[str, Any]]) -> list[str]:
     """Find the runs whose script is missing or older than their rows."""
     scripts, rows_of = _modification_times(data_folder / "runs"), _modification_times(folder.path / "rows")
-    packed = row_store.packed_path(folder.path / "rows")
+    packed = row_store.build_packed_path(folder.path / "rows")
     otherwise = packed.stat().st_mtime_ns if packed.exists() else 0
     return [r["run_id"] for r in run_records if scripts.get(r["run_id"], -1) < rows_of.get(r["unit"], otherwise)]
 
