@@ -12,7 +12,7 @@ from pydantic import ConfigDict, Field, SkipValidation
 from springbench.harness.atomic_files import sanitise_name
 from springbench.harness.config.run_options import RUN_OPTIONS, RunOptions, build_list_model
 from springbench.harness.results.solver_metadata import list_packages, read_solver_metadata
-from springbench.harness.scenes.scene_spec import MeshSize, SceneSpec, registered_name
+from springbench.harness.scenes.scene_spec import MeshSize, SceneSpec, build_name_type
 from springbench.harness.schema.base_model import ConfigModel, OneOrMany
 from springbench.solvers.plugins.plugin_discovery import PluginName, PluginTable, identify_code, select_plugins
 from springbench.solvers.registry import SOLVER_TABLE, is_minimiser, load_target
@@ -30,7 +30,7 @@ REPORT_TABLE = PluginTable("springbench.reports", SHIPPED_REPORTS)
 if TYPE_CHECKING:
     ReportName = str
 else:
-    ReportName = registered_name(REPORT_TABLE)
+    ReportName = build_name_type(REPORT_TABLE)
 
 
 class VariedOptions(build_list_model(*RUN_OPTIONS)):

@@ -31,7 +31,7 @@ NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 InitialGuess = Literal["assignment", "previous", "inertial", "extrapolated", "coarse-to-fine"]
 
 
-def registered_name(table: PluginTable) -> Any:
+def build_name_type(table: PluginTable) -> Any:
     """Return the type of the names in a table, including those of plug-ins.
 
     The validation context provides the folder of the config
@@ -54,7 +54,7 @@ def registered_name(table: PluginTable) -> Any:
 if TYPE_CHECKING:
     IntegratorName = str
 else:
-    IntegratorName = registered_name(integrators.INTEGRATOR_TABLE)
+    IntegratorName = build_name_type(integrators.INTEGRATOR_TABLE)
 
 
 def _parse_seconds(value: Any) -> Any:
