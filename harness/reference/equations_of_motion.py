@@ -69,7 +69,7 @@ class OdeField:
         self._others = tuple(energy for energy in system.energies if not (compiled and isinstance(energy, Springs)))
         self._drag = _measure_drag(scene)
         self._p, self._v = scene.mesh.rest_positions.copy(), np.zeros_like(scene.mesh.rest_positions)
-        self._p[system.pins.vertices] = scene.pin_targets_at(0.0)
+        self._p[system.pins.vertices] = scene.compute_pin_targets(0.0)
 
     @property
     def initial_state(self) -> OdeState:
@@ -89,8 +89,10 @@ class OdeField:
         self._p[self._free], self._v[self._free] = y.reshape(2, -1, 3)
         if self._scene.pin_motions:
             pinned, h = self._system.pins.vertices, FINITE_DIFFERENCE_SECONDS
-            self._p[pinned] = self._scene.pin_targets_at(t)
-            self._v[pinned] = (self._scene.pin_targets_at(t + h) - self._scene.pin_targets_at(t - h)) / (2.0 * h)
+            self._p[pinned] = self._scene.compute_pin_targets(t)
+            self._v[pinned] = (self._scene.compute_pin_targets(t + h) - self._scene.compute_pin_targets(t - h)) / (
+                2.0 * h
+            )
         return self._p, self._v
 
     def __call__(self, t: float, y: OdeState) -> OdeState:

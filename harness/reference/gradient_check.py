@@ -86,7 +86,7 @@ def _sample_points(scene: Scene, frames: int) -> Iterator[tuple[System, _SampleP
     begun = build_initial_state(scene).motion
     for k in range(NUM_POINTS):
         index = 0 if k % 5 == 0 else int(rng.integers(1, max(2, frames)))
-        system, time = scene.scene_of_step(index).system, scene.compute_time(index)
+        system, time = scene.find_step_scene(index).system, scene.compute_time(index)
         size = SPACING_FRACTIONS[k % len(SPACING_FRACTIONS)] * scene.mesh.spacing
         origin = begun.positions if k // len(SPACING_FRACTIONS) % 2 == 0 else rest
         p, v, x, velocity_origin = (size * rng.normal(size=rest.shape) for _ in range(4))

@@ -109,7 +109,7 @@ class Scene:
         """Whether an effect prevents self-intersection of the mesh."""
         return any(one.obstacle_positions is None for one in self.intersection_checks)
 
-    def scene_of_step(self, step_index: int) -> Scene:
+    def find_step_scene(self, step_index: int) -> Scene:
         """Return the scene of the step that follows step `step_index`."""
         return self.alternate_scene if self.alternate_scene and step_index % 2 else self
 
@@ -119,7 +119,7 @@ class Scene:
             return step_index * self.system.time_step
         return (step_index + 1) // 2 * self.system.time_step + step_index // 2 * self.alternate_scene.system.time_step
 
-    def pin_targets_at(self, time: float) -> Positions:
+    def compute_pin_targets(self, time: float) -> Positions:
         """Return the pin targets at a time [s], (q, 3) [m]."""
         if not self.pin_motions:
             return self.pin_targets
@@ -128,7 +128,7 @@ class Scene:
             targets[rows] = motion.transform_points(self.pin_targets[rows], time)
         return targets
 
-    def pin_velocities_at(self, time: float) -> Positions:
+    def compute_pin_velocities(self, time: float) -> Positions:
         """Return the velocities of the pin targets at a time [s], (q, 3) [m/s]."""
         velocity = np.zeros_like(self.pin_targets)
         for rows, motion in self.pin_motions:

@@ -197,7 +197,7 @@ class _StepAccount:
     def _pin_and_load_energies(self, step_problem: StepProblem, p: Positions, time: float) -> tuple[float, float]:
         """Return the potentials [J] of penalty pins and of the load at p (n, 3) [m] and a time [s]."""
         soft, vertices, weight = step_problem.system.penalty_pins
-        away = p[vertices] - self._scene.pin_targets_at(time)[soft]
+        away = p[vertices] - self._scene.compute_pin_targets(time)[soft]
         return (
             0.5 * self._when * float(weight @ np.einsum("ij,ij->i", away, away)),
             -_dot(self._load, (p - self._first)[self._free]),
@@ -288,7 +288,7 @@ class EnergyBalance(_StepAccount):
             work.append(self._kinetic_energy(stated.step_start.velocity) - self._kinetic_energy(self._motion.velocity))
         if scene.pin_motions:
             soft, vertices, weight = stated.system.penalty_pins
-            led = scene.pin_targets_at(scene.compute_time(step.index)) - scene.pin_targets_at(
+            led = scene.compute_pin_targets(scene.compute_time(step.index)) - scene.compute_pin_targets(
                 scene.compute_time(step.index - 1)
             )
             work.append(_dot(weight[:, None] * (stated.pin_targets[soft] - x[vertices]), led[soft]))
@@ -434,15 +434,15 @@ class DissipationBudget(_StepAccount):
         with np.errstate(over="ignore", invalid="ignore"):
             found = self._add_stages(step, end) if step.solution.velocity is None else self._add_integrated(step, end)
         self._motion, self._kinetic, self._time = step.state.motion, found.kinetic_energy, end
-        self._is_projected, self._pin_positions = False, self._scene.pin_targets_at(end)
+        self._is_projected, self._pin_positions = False, self._scene.compute_pin_targets(end)
         return found
 
     def _place_start(self, step: SimulationStep, end: float) -> None:
         """Set the pin positions from which the first step, which ends at a time [s], moves the pins."""
-        system, targets = self._scene.system, self._scene.pin_targets_at(0.0)
+        system, targets = self._scene.system, self._scene.compute_pin_targets(0.0)
         pinned, (soft, vertices, _) = system.pins.vertices, system.penalty_pins
         away = targets - self._first[pinned]
-        left = self._scene.pin_targets_at(end)[soft] - step.positions[vertices]
+        left = self._scene.compute_pin_targets(end)[soft] - step.positions[vertices]
         placed = float(np.linalg.norm(left)) <= _PLACED_RTOL * float(np.linalg.norm(away[soft]))
         self._are_pins_driven = bool(away[soft].any()) and placed
         self._dynamic = np.setdiff1d(self._free, vertices) if self._are_pins_driven else self._free
@@ -456,7 +456,7 @@ class DissipationBudget(_StepAccount):
 
     def _add_stages(self, step: SimulationStep, end: float) -> StepDissipation:
         """Add a step of an integrator, which ends at a time [s]."""
-        problem, moved = step.problem, self._scene.pin_targets_at(end) - self._pin_positions
+        problem, moved = step.problem, self._scene.compute_pin_targets(end) - self._pin_positions
         work = self._sum_work(step, moved)
         before, after, driven = self._update_potentials(step, step.solution.positions, end)
         kinetic = self._kinetic_energy(step.state.motion.velocity)
@@ -568,9 +568,9 @@ class DissipationBudget(_StepAccount):
     def _start_power(self, step: SimulationStep) -> _StagePower:
         """Return the power at the start of the run, where the acceleration is that of all forces."""
         start = step.problem.step_start
-        scene = self._scene.scene_of_step(0)
+        scene = self._scene.find_step_scene(0)
         stages = StageSequence(scene, self._motion._replace(velocity=start.velocity), None, start.time)
-        power = self._stage_power(stages.build_start_problem(), self._first, scene.pin_velocities_at(0.0))
+        power = self._stage_power(stages.build_start_problem(), self._first, scene.compute_pin_velocities(0.0))
         return power._replace(inertia=-power.residual, residual=0.0)
 
     def _stage_power(

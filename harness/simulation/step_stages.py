@@ -108,7 +108,7 @@ class StageSequence:
         """
         scene, system = self.scene, self.scene.system
         until = self.time + stage.stage_fraction * system.time_step
-        pin_targets, moving = scene.pin_targets_at(until), scene.pin_velocities_at(until)
+        pin_targets, moving = scene.compute_pin_targets(until), scene.compute_pin_velocities(until)
         stage.velocity_origin[self._pinned] = pin_targets[self._exact] - moving[self._exact] / system.velocity_rate
         if expected is None:
             expected = stage.inertial_target.copy()
@@ -142,8 +142,8 @@ class StageSequence:
         if not len(self._pinned):
             return motion
         p, v = (part.copy() for part in motion)
-        p[self._pinned] = self.scene.pin_targets_at(time)[self._exact]
-        v[self._pinned] = self.scene.pin_velocities_at(time)[self._exact]
+        p[self._pinned] = self.scene.compute_pin_targets(time)[self._exact]
+        v[self._pinned] = self.scene.compute_pin_velocities(time)[self._exact]
         return Motion(p, v)
 
     def build_start_problem(self) -> StepProblem:
@@ -153,7 +153,7 @@ class StageSequence:
         force = reduce(
             lambda total, effect: total + effect(p, v, self.time), self.scene.varying_forces, self.scene.constant_force
         )
-        pin_targets = self.scene.pin_targets_at(self.time)
+        pin_targets = self.scene.compute_pin_targets(self.time)
         return StepProblem(system, p, force, pin_targets, p, p, begun)
 
     def _compute_acceleration(self) -> Positions:

@@ -113,7 +113,7 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
     usual = scene.integrator
     if not isinstance(usual, SingleStageIntegrator):
         return _select_stage_guess(initial_guess)(_build_stages(scene, state).build_first_problem())
-    scene, time = scene.scene_of_step(state.index), scene.compute_time(state.index)
+    scene, time = scene.find_step_scene(state.index), scene.compute_time(state.index)
     dt = scene.system.time_step
     # The previous motion was filtered when it was the current one. The second filtering makes it decay for as long as
     # the current one (an integrating factor); without that, BDF2 would decay at twice the rate.
@@ -143,7 +143,7 @@ def build_problem(scene: Scene, state: MotionState, initial_guess: str) -> StepP
         p, v = (x + a * (x - y) for x, y in zip(now, before, strict=True)) if a and state.previous_motion else now
         for effect in scene.varying_forces:
             force = force + effect(p, v, time + a * dt)
-    pin_targets = scene.pin_targets_at(time + dt)
+    pin_targets = scene.compute_pin_targets(time + dt)
     if method.stage_fraction < 1.0:
         pin_targets = now.positions[system.pins.vertices] + method.stage_fraction * (
             pin_targets - now.positions[system.pins.vertices]
@@ -264,7 +264,7 @@ def _step_stages(
 
 
 def _build_stages(scene: Scene, state: MotionState) -> StageSequence:
-    of = scene.scene_of_step(state.index)
+    of = scene.find_step_scene(state.index)
     return StageSequence(of, _filter_velocity(of, state.motion), state.acceleration, scene.compute_time(state.index))
 
 

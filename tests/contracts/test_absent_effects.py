@@ -145,4 +145,4 @@ def test_a_scene_has_nothing_but_what_it_lists():
     made = build_scene(load_scene(SCENE), 6)
     assert [type(energy).__name__ for energy in made.system.energies] == ["Springs"]
     assert (made.varying_forces, made.pin_motions, len(made.velocity_filters)) == ((), (), 1)
-    assert made.pin_targets_at(3.0) is made.pin_targets
+    assert made.compute_pin_targets(3.0) is made.pin_targets

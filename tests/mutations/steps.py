@@ -62,8 +62,8 @@ _TABLE = (
     (
         "pins-late",
         "harness/simulation/time_loop.py",
-        "scene.pin_targets_at(time + dt)",
-        "scene.pin_targets_at(time)",
+        "scene.compute_pin_targets(time + dt)",
+        "scene.compute_pin_targets(time)",
         f"{_U}/test_effect_motion.py",
     ),
     (

@@ -66,7 +66,7 @@ def sample_points(scene: Scene, declared: SceneDeclaration, frames: int) -> Iter
     limit = 0.05 * scene.mesh.bounding_box_diagonal if half_space_obstacles else np.inf
     for k in range(NUM_POINTS):
         index = 0 if k % 5 == 0 else int(rng.integers(1, max(2, frames)))
-        of = scene.scene_of_step(index)
+        of = scene.find_step_scene(index)
         dt, size = of.system.time_step, SPACING_FRACTIONS[k % len(SPACING_FRACTIONS)] * scene.mesh.spacing
         p = start_motion.positions if k // len(SPACING_FRACTIONS) % 2 == 0 else rest
         p = p + size * rng.normal(size=rest.shape)

@@ -235,7 +235,7 @@ PLANTED_ERRORS: dict[str, FormulaMutation] = {
         [SPRINGS_SPEC, PINS_SPEC],
         "targets of pins",
         patch_attribute(
-            Scene, "pin_targets_at", lambda true: lambda self, time: true(self, time - self.system.time_step)
+            Scene, "compute_pin_targets", lambda true: lambda self, time: true(self, time - self.system.time_step)
         ),
     ),
     "key frames that turn the other way": FormulaMutation(

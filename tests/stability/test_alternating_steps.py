@@ -42,7 +42,7 @@ def test_each_step_is_one_of_its_length_from_where_the_last_one_ended(name: str)
         dt, begun = LENGTHS[state.index % 2], step.problem.step_start
         assert (step.problem.system.time_step, begun.time) == (dt, pytest.approx(time, rel=1e-15))
         np.testing.assert_array_equal(step.problem.inertial_target, state.motion.positions + dt * state.motion.velocity)
-        np.testing.assert_allclose(step.problem.pin_targets, scene.pin_targets_at(time + dt), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(step.problem.pin_targets, scene.compute_pin_targets(time + dt), rtol=0, atol=1e-15)
         solution = alone[state.index % 2].solve(step.problem, STOP)
         np.testing.assert_array_equal(step.solution.positions, solution.positions)
         state, time = step.state, time + dt

@@ -125,11 +125,11 @@ def test_a_scene_may_have_resting_and_moving_pins():
     made = build_test_scene(
         GridMesh(), PinsEffect(parts=("bottom",)), PinsEffect(parts=("top",), weight="exact", motion=SWING), size=3
     )
-    targets = made.pin_targets_at(0.15)
+    targets = made.compute_pin_targets(0.15)
     np.testing.assert_array_equal(made.system.pins.vertices, [0, 1, 2, 6, 7, 8])
     np.testing.assert_array_equal(targets[3:], made.mesh.rest_positions[6:])
     np.testing.assert_array_equal(targets[:3], SWING.transform_points(made.mesh.rest_positions[:3], 0.15))
-    assert made.pin_targets_at(0.15) is not made.pin_targets
+    assert made.compute_pin_targets(0.15) is not made.pin_targets
     np.testing.assert_array_equal(made.pin_targets, made.mesh.rest_positions[made.system.pins.vertices])
 
 

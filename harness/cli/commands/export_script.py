@@ -122,7 +122,7 @@ def write_engine_script(
         raise RunFailed(str(refused)) from refused
     arrays: dict[str, Any] = {**network.export_arrays(begun), "end": end}
     if driven.is_driven:
-        arrays["pins"] = np.array([scene.pin_targets_at(scene.compute_time(k)) for k in range(frames + 1)])
+        arrays["pins"] = np.array([scene.compute_pin_targets(scene.compute_time(k)) for k in range(frames + 1)])
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / f"{name}.npz", **arrays)
     for file, text in texts.items():

@@ -62,7 +62,7 @@ def measure_motion(scene: Scene, submission: SubmittedMotion) -> MotionQuantitie
         velocities = np.diff(p, axis=0) / system.time_step
         for step, q in enumerate(p[1:]):
             kinetic.append(compute_kinetic_energy(mass, velocities[step]))
-            away = q[vertices] - scene.pin_targets_at(scene.compute_time(step))[soft]
+            away = q[vertices] - scene.compute_pin_targets(scene.compute_time(step))[soft]
             near = np.abs(away) <= 4.0 * submission.precision.bound_error(
                 q
             )  # round-off of the file, which heavy pins amplify

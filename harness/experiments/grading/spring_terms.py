@@ -155,5 +155,5 @@ def build_step_problem(
     """
     if initial_guess not in INITIAL_GUESSES:
         initial_guess = "previous"
-    velocity = (current - previous) / scene.scene_of_step(max(0, index - 1)).system.time_step
+    velocity = (current - previous) / scene.find_step_scene(max(0, index - 1)).system.time_step
     return build_problem(scene, MotionState(Motion(current, velocity), None, index), initial_guess)
