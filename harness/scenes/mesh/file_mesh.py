@@ -92,7 +92,7 @@ class FileMesh(SpringValueKeys):
         """
         path = self.find_geometry_path()
         rule = self.spring_rule or ("face-pairs" if path is not self.path else "edges")
-        cells = clean_cells(read_cells(path), self.cleaning_options(), path)
+        cells = clean_cells(read_cells(path), self.build_cleaning_options(), path)
         return self._add_spring_properties(build_spring_network(cells, rule, path), cells)
 
     def _add_spring_properties(self, mesh: Mesh, cells: MeshCells) -> Mesh:
@@ -101,7 +101,7 @@ class FileMesh(SpringValueKeys):
         if self.spring_table is not None:
             table = read_data_table(self.spring_table)
             rows = match_table_rows(table, mesh.springs, len(mesh.rest_positions))
-            columns = spread_columns(table.numeric_columns(), rows, len(mesh.springs))
+            columns = spread_columns(table.find_numeric_columns(), rows, len(mesh.springs))
         elif self.states_values:
             rows = find_springs(cells.segments, mesh.springs)
             named = {name: values[rows >= 0] for name, values in cells.segment_attributes.items()}
@@ -117,7 +117,7 @@ class FileMesh(SpringValueKeys):
             return self.path
         return self.path.parent / read_assignment_json(self.path).obj
 
-    def cleaning_options(self) -> CleaningOptions:
+    def build_cleaning_options(self) -> CleaningOptions:
         """Return the requested changes of the file's cells."""
         by_default = "drop" if self.path.suffix.lower() == ".msh" else "keep"
         scale = METRES_PER_UNIT[self.units] if self.units else self.scale

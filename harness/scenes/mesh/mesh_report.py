@@ -118,7 +118,7 @@ def build_mesh_report(source: FileMesh, support: MeshSupport | None = None) -> M
         InputError: for a file that cannot be read.
     """
     path = source.find_geometry_path()
-    options = source.cleaning_options()
+    options = source.build_cleaning_options()
     cells = clean_cells(read_cells(path), options._replace(unused="keep"), path, accepts_repeated_corners=True)
     found = _report_unused(find_unused_vertices(cells), are_dropped=options.unused == "drop")
     if options.unused == "drop":

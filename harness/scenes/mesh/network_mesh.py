@@ -84,7 +84,7 @@ class NetworkMesh(SpringValueKeys):
         along, columns = _to_pairs(self.springs), dict[str, NDArray[np.float64]]()
         if self.spring_table is not None:
             table = read_data_table(self.spring_table)
-            along, columns = read_vertex_pairs(table, len(rest)), table.numeric_columns()
+            along, columns = read_vertex_pairs(table, len(rest)), table.find_numeric_columns()
         families = {STRETCH: along, SHEAR: _to_pairs(self.shear), BEND: _to_pairs(self.bend)}
         springs = np.concatenate(list(families.values()))
         if springs.max(initial=-1) >= len(rest):
@@ -121,7 +121,7 @@ class NetworkMesh(SpringValueKeys):
         rest = np.column_stack([_require_all(table, axis) for axis in "xyz"])
         if (far := (np.abs(rest) > MAX_COORDINATE).any(axis=1)).any():
             raise table.make_error(f"a coordinate is beyond {MAX_COORDINATE:g} m", int(far.argmax()))
-        columns = table.numeric_columns()
+        columns = table.find_numeric_columns()
         if "mass" in columns and mass is None:
             mass = _require_all(table, "mass")
             if (wrong := mass < 0.0).any() or not mass.any():

@@ -53,7 +53,7 @@ class DataTable:
             raise InputError(InputMistake(f"has no column {name!r}; its columns are {known}{hint}", self.path))
         return self._convert_column(name, self.columns[name])
 
-    def numeric_columns(self) -> dict[str, NDArray[np.float64]]:
+    def find_numeric_columns(self) -> dict[str, NDArray[np.float64]]:
         """Return all columns whose cells are numbers or empty."""
         found = dict[str, NDArray[np.float64]]()
         for name in self.columns:
