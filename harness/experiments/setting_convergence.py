@@ -477,7 +477,12 @@ def build_hanging_scene(spec: SceneSpec, size: int) -> tuple[SceneSpec, NDArray[
     top, bottom = height >= height.max() - reach, height <= height.min() + reach
     strength = next((np.linalg.norm(e.acceleration) for e in spec.effects if isinstance(e, GravityEffect)), 9.81)
     material = [k for k, effect in enumerate(spec.effects) if isinstance(effect, MATERIAL_EFFECTS)]
-    changes: dict[str, Any] = {"mesh": mesh, "start": None, "velocity": (0.0, 0.0, 0.0), **spec.keep_effects(material)}
+    changes: dict[str, Any] = {
+        "mesh": mesh,
+        "start": None,
+        "velocity": (0.0, 0.0, 0.0),
+        **spec.select_effect_fields(material),
+    }
     changes["effects"] = (
         *(_turn_upright(effect, axis) for effect in changes["effects"]),
         GravityEffect.model_validate({"acceleration": (0.0, -float(strength), 0.0)}),

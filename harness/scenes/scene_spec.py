@@ -170,7 +170,7 @@ class SceneSpec(SceneFields):
         says = self.initial_guess != "previous" or isinstance(method, integrators.SingleStageIntegrator)
         return self.initial_guess if says else "extrapolated"
 
-    def keep_effects(self, effect_indices: Sequence[int]) -> dict[str, Any]:
+    def select_effect_fields(self, effect_indices: Sequence[int]) -> dict[str, Any]:
         """Return the fields `effects` and `plugins`, restricted to the effects with these indices."""
         plugins = {place: plugin for place, plugin in self.plugins.items() if place == "mesh"}
         places = {f"effects[{i}]": f"effects[{k}]" for k, i in enumerate(effect_indices)}

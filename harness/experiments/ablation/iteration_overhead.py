@@ -124,7 +124,7 @@ def select_effects(scene: SceneSpec, *kinds: str) -> SceneSpec:
     if ALL_EFFECTS in kinds:
         return scene
     selected = [i for i, e in enumerate(scene.effects) if e.kind in kinds or _is_baseline_effect(e)]
-    return scene.model_copy(update=scene.keep_effects(selected))
+    return scene.model_copy(update=scene.select_effect_fields(selected))
 
 
 def _is_baseline_effect(effect: SceneEffect) -> bool:

@@ -48,4 +48,4 @@ def name_effects(scene: SceneSpec) -> list[str]:
 def _omit_effects(scene: SceneSpec, omitted: tuple[int, ...]) -> SceneSpec:
     values = {key: getattr(scene, key) for key in SceneSpec.model_fields}
     remaining = [i for i in range(len(scene.effects)) if i not in omitted]
-    return SceneSpec.model_construct(None, **values | scene.keep_effects(remaining))
+    return SceneSpec.model_construct(None, **values | scene.select_effect_fields(remaining))
