@@ -69,7 +69,7 @@ class InputError(SpringbenchError):
         super().__init__("\n".join(map(str, self.mistakes)))
 
 
-def suggest_name(got: object, allowed: Iterable[str]) -> str:
+def format_allowed_names(got: object, allowed: Iterable[str]) -> str:
     """Format the allowed names, and the closest one as a suggestion for a typo.
 
     Args:

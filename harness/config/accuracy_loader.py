@@ -35,7 +35,7 @@ from springbench.harness.config.run_options import STEP_OPTIONS
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.config.user_code import DEFAULT_LOAD_LIMITS, load_in_sandbox
-from springbench.harness.errors import suggest_name
+from springbench.harness.errors import format_allowed_names
 from springbench.harness.execution.optional_parts import RECORDINGS
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, UserCodePolicy, quote_value
@@ -186,5 +186,7 @@ class _StudyExpansion:
         """Return the names that a study selects, or all if it selects none."""
         for name in requested:
             if name not in known:
-                self.document.add_mistake(f"got {quote_value(name)}; expected {suggest_name(name, known)}", (*at, key))
+                self.document.add_mistake(
+                    f"got {quote_value(name)}; expected {format_allowed_names(name, known)}", (*at, key)
+                )
         return [name for name in known if name in requested or not requested]

@@ -16,7 +16,7 @@ from springbench.harness.config.sweep_config import (
     SolverSpec,
     SweepConfig,
 )
-from springbench.harness.errors import suggest_name
+from springbench.harness.errors import format_allowed_names
 from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.schema.config_document import ConfigDocument, ConfigKey, quote_value
@@ -146,7 +146,7 @@ class GridExpansion:
                 for key, names in known.items():
                     for name in getattr(entry, key):
                         if name not in names:
-                            problem = f"got {quote_value(name)}; expected {suggest_name(name, names)}"
+                            problem = f"got {quote_value(name)}; expected {format_allowed_names(name, names)}"
                             self.document.add_mistake(problem, (part, i, key))
 
     def _check_error_target(self) -> None:

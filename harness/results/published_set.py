@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, cast
 
 from springbench.harness.atomic_files import describe_cause, is_file_name
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -136,7 +136,7 @@ def find_study(published: Path, name: str) -> PublishedStudy:
     """
     studies = {study.study_name: study for study in list_studies(published)}
     if name not in studies:
-        raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, studies)}", key="STUDY"))
+        raise InputError(InputMistake(f"got {name!r}; expected {format_allowed_names(name, studies)}", key="STUDY"))
     return studies[name]
 
 

@@ -15,7 +15,7 @@ from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple
 
 from pydantic import AfterValidator, WithJsonSchema
-from springbench.harness.errors import suggest_name
+from springbench.harness.errors import format_allowed_names
 from springbench.harness.schema.base_model import ConfigModel, Vector3
 
 WANG_2011 = "Wang, O'Brien and Ramamoorthi 2011"
@@ -101,7 +101,7 @@ def find_fabric(name: str) -> PublishedFabric:
         ValueError: for an unknown name.
     """
     if name not in PUBLISHED_FABRICS:
-        raise ValueError(f"got {name[:60]!r}; should be {suggest_name(name, PUBLISHED_FABRICS)}")
+        raise ValueError(f"got {name[:60]!r}; should be {format_allowed_names(name, PUBLISHED_FABRICS)}")
     return PUBLISHED_FABRICS[name]
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, cast
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, SkipValidation, ValidationInfo, WithJsonSchema
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 from springbench.harness.scenes.effects.effect_interface import SceneEffect
 from springbench.harness.scenes.fabric_table import FabricChoice, FabricName
 from springbench.harness.scenes.mesh.mesh import Mesh
@@ -41,7 +41,7 @@ def build_name_type(table: PluginTable) -> Any:
     def checked(value: str, info: ValidationInfo) -> str:
         name = table.resolve_name(value, Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")))
         if name not in table:
-            raise ValueError(f"got {json.dumps(value)[:60]}; should be {suggest_name(value, table)}")
+            raise ValueError(f"got {json.dumps(value)[:60]}; should be {format_allowed_names(value, table)}")
         return name
 
     shipped = [name for one in table.builtin_tables for name in one]

@@ -44,7 +44,7 @@ from typing import cast
 import numpy as np
 import scipy
 from numpy.typing import NDArray
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 from springbench.harness.scenes.membrane_modulus import compute_area_stiffness
 from springbench.harness.scenes.mesh.mesh import BEND, SHEAR, STRETCH, Mesh
 from springbench.harness.scenes.orthotropic_cloth import OrthotropicStiffness
@@ -78,7 +78,7 @@ def compute_spring_stiffness(
     if scaling_rule not in SCALING_RULES:
         raise InputError(
             InputMistake(
-                f"unknown rule {scaling_rule!r}; expected {suggest_name(scaling_rule, SCALING_RULES)}",
+                f"unknown rule {scaling_rule!r}; expected {format_allowed_names(scaling_rule, SCALING_RULES)}",
                 key="scaling_rule",
             )
         )

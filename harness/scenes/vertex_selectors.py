@@ -15,7 +15,7 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
-from springbench.harness.errors import InputError, suggest_name
+from springbench.harness.errors import InputError, format_allowed_names
 from springbench.harness.scenes.mesh.boundary_loops import BoundaryLoop, find_boundary_loops
 from springbench.harness.scenes.mesh.mesh import Mesh, sort_unique_vertices
 from springbench.harness.schema.base_model import ConfigModel, Vector3
@@ -125,7 +125,7 @@ class VertexSelection(ConfigModel):
         n, rest = len(mesh.rest_positions), mesh.rest_positions
         for part in self.parts:
             if part not in mesh.parts:
-                raise InputError(f"{name}: parts: got {part!r}; this mesh has {suggest_name(part, mesh.parts)}")
+                raise InputError(f"{name}: parts: got {part!r}; this mesh has {format_allowed_names(part, mesh.parts)}")
         outside = [i for i in self.indices if i >= n]
         if outside:
             raise InputError(f"{name}: indices: got {outside[0]}; the mesh has the vertices 0 to {n - 1}")
@@ -184,7 +184,9 @@ def _select_loops(found: list[BoundaryLoop], expected: tuple[int, ...], name: st
 
 def _select_by_attribute(mesh: Mesh, expected: AttributeRange, name: str) -> IndexArray:
     if expected.name not in mesh.attributes:
-        known = suggest_name(expected.name, mesh.attributes) if mesh.attributes else "none; meshes from files may"
+        known = (
+            format_allowed_names(expected.name, mesh.attributes) if mesh.attributes else "none; meshes from files may"
+        )
         raise InputError(f"{name}: got {expected.name!r}; this mesh has {known}")
     values = mesh.attributes[expected.name]
     low, high = (end if end is not None else sign * np.inf for end, sign in ((expected.low, -1), (expected.high, 1)))

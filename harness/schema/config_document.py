@@ -12,7 +12,7 @@ from typing import Any, TypeGuard, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 
 MAX_MISTAKES = 100
 
@@ -154,11 +154,11 @@ class ConfigDocument:
         """
         if not is_mapping(data) or not isinstance(data.get(tag), str):
             place = (*at, tag) if is_mapping(data) and tag in data else at
-            self.add_mistake(f"should be a mapping with a `{tag}`, {suggest_name('', table)}", place)
+            self.add_mistake(f"should be a mapping with a `{tag}`, {format_allowed_names('', table)}", place)
             return None
         if data[tag] not in table:
             self.add_mistake(
-                f"unknown {tag} {quote_value(data[tag])}; expected {suggest_name(data[tag], table)}", (*at, tag)
+                f"unknown {tag} {quote_value(data[tag])}; expected {format_allowed_names(data[tag], table)}", (*at, tag)
             )
             return None
         return data[tag], {key: value for key, value in data.items() if key != tag}
@@ -221,15 +221,16 @@ def _describe_problem(detail: ErrorDetails, model: type[BaseModel], key: ConfigK
     if kind == "extra_forbidden":
         owner = _models_at(model, detail["loc"][:-1])[:1]
         allowed = owner[0].model_fields if owner else ()
-        return "unknown key; " + (f"expected {suggest_name(key[-1], allowed)}" if allowed else "remove it")
+        return "unknown key; " + (f"expected {format_allowed_names(key[-1], allowed)}" if allowed else "remove it")
     if kind == "value_error":
         return message.removeprefix("Value error, ")
     if kind.startswith("union_tag"):
         kinds = [one.model_fields["kind"].default for one in _models_at(model, detail["loc"])]
         got = detail.get("ctx", {}).get("tag")
         if got is not None:
-            return f"unknown kind {quote_value(got)}; expected {suggest_name(got, kinds)}"
-        return f"got {quote_value(detail['input'])}{_EXPECTED_PREFIX}a mapping with a `kind`, {suggest_name('', kinds)}"
+            return f"unknown kind {quote_value(got)}; expected {format_allowed_names(got, kinds)}"
+        expected = f"a mapping with a `kind`, {format_allowed_names('', kinds)}"
+        return f"got {quote_value(detail['input'])}{_EXPECTED_PREFIX}{expected}"
     expected = message.removeprefix("Input should be ").replace("a valid array", "a list")
     return f"got {quote_value(detail['input'])}{_EXPECTED_PREFIX}{expected}"
 

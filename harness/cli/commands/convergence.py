@@ -54,7 +54,7 @@ def convergence(
     Settings around the given ones are simulated, and compared with the reference motion.
     """
     from springbench.harness.config.config_loader import load_scene
-    from springbench.harness.errors import suggest_name
+    from springbench.harness.errors import format_allowed_names
     from springbench.harness.execution.isolated_call import run_isolated
     from springbench.harness.execution.worker_process import TaskLimits
     from springbench.harness.experiments.accuracy.accuracy_units import EXTRA_WALL_SECONDS
@@ -69,7 +69,7 @@ def convergence(
     if t_end is not None and not 0.0 < t_end <= 1e4:
         raise InputError(InputMistake(f"got {t_end:g}; expected seconds above 0, at most 10,000", key="--t-end"))
     if integrator is not None and integrator not in INTEGRATOR_TABLE:
-        problem = f"got {integrator!r}; expected {suggest_name(integrator, INTEGRATOR_TABLE)}"
+        problem = f"got {integrator!r}; expected {format_allowed_names(integrator, INTEGRATOR_TABLE)}"
         raise InputError(InputMistake(problem, key="--integrator"))
     spec = load_scene(scene)
     spec.require_fixed_time_step()
@@ -114,13 +114,15 @@ def read_solver_options(path: Path, name: str, parameters: tuple[str, ...] | lis
         InputError: there is no such solver, or a parameter is wrong.
     """
     from springbench.harness.config.solver_parameters import read_solvers
-    from springbench.harness.errors import suggest_name
+    from springbench.harness.errors import format_allowed_names
     from springbench.harness.schema.config_document import ConfigDocument
     from springbench.harness.schema.yaml_loader import parse_scalar
     from springbench.solvers.registry import SOLVER_TABLE
 
     if name not in SOLVER_TABLE:
-        raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, SOLVER_TABLE)}", key="--solver"))
+        raise InputError(
+            InputMistake(f"got {name!r}; expected {format_allowed_names(name, SOLVER_TABLE)}", key="--solver")
+        )
     chosen: dict[str, Any] = {"name": name}
     for text in parameters:
         key, sign, value = text.partition("=")

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 from springbench.harness.console import get_output_console, print_message
-from springbench.harness.errors import InputError, suggest_name
+from springbench.harness.errors import InputError, format_allowed_names
 
 
 def validate(
@@ -31,7 +31,7 @@ def validate(
     known = list_case_names()
     for name in case or ():
         if name not in known:
-            raise InputError(f"--case: got {name!r}; expected {suggest_name(name, known)}")
+            raise InputError(f"--case: got {name!r}; expected {format_allowed_names(name, known)}")
     if output.exists() and not output.is_dir():
         raise InputError(f"--output: {output} is no folder; give the name of one")
     cases, began = case or known, monotonic()

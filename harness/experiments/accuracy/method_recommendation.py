@@ -28,7 +28,7 @@ from springbench.harness.config.run_options import RUN_OPTIONS, STEP_OPTIONS
 from springbench.harness.config.shipped_configs import get_config_name
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
-from springbench.harness.errors import InputError, InputMistake, RunFailed, suggest_name
+from springbench.harness.errors import InputError, InputMistake, RunFailed, format_allowed_names
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.progress_display import ProgressDisplay
@@ -179,7 +179,7 @@ def find_engine_integrator(solver: Any) -> str:
 def _load_solver(name: str) -> Any:
     known = [*SOLVERS, *OPTIONAL_SOLVERS]
     if name not in known:
-        raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, known)}", key="--engine"))
+        raise InputError(InputMistake(f"got {name!r}; expected {format_allowed_names(name, known)}", key="--engine"))
     return load_target(SOLVER_TABLE[name])
 
 

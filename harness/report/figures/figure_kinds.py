@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from springbench.harness.config.sweep_config import REPORT_TABLE
-from springbench.harness.errors import InputError, InputMistake, RunFailed, SpringbenchError, suggest_name
+from springbench.harness.errors import InputError, InputMistake, RunFailed, SpringbenchError, format_allowed_names
 from springbench.harness.report.ablation_summary import read_ablations
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.charts.ablation_charts import build_effect_chart, build_overhead_chart
@@ -216,7 +216,7 @@ def find_figure_kind(name: str) -> FigureKind:
         return FIGURE_KINDS[name]
     known = {*FIGURE_KINDS, *(other for other in REPORT_TABLE if other not in REPORT_TABLE.builtin_tables[0])}
     if name not in known:
-        raise InputError(InputMistake(f"got {name!r}; expected {suggest_name(name, known)}", key="KIND"))
+        raise InputError(InputMistake(f"got {name!r}; expected {format_allowed_names(name, known)}", key="KIND"))
     report: Any = load_target(REPORT_TABLE[name])
     if not callable(getattr(report, "panels", None)):
         why = f"the report {name!r} draws no figure; expected one that has `panels(rows)`, which returns panels"

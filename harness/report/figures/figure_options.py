@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 
 MIN_FONT_SIZE = 6.0
 """Minimum font size [points], because smaller type is not readable in print."""
@@ -71,7 +71,7 @@ def parse_figure_options(
     for word in expected or ("",):
         if word not in FIGURE_FORMATS:
             mistakes.append(
-                InputMistake(f"got {word!r}; expected {suggest_name(word, FIGURE_FORMATS)}", key="--format")
+                InputMistake(f"got {word!r}; expected {format_allowed_names(word, FIGURE_FORMATS)}", key="--format")
             )
     if not MIN_FONT_SIZE <= font_size <= 24.0:
         why = (

@@ -20,7 +20,7 @@ from typing import Any
 
 import duckdb
 import pyarrow as pa
-from springbench.harness.errors import InputError, suggest_name
+from springbench.harness.errors import InputError, format_allowed_names
 from springbench.harness.report.accuracy.accuracy_reader import read_accuracy
 from springbench.harness.report.accuracy.engine_comparison import OWN_PROGRAM, compare_engines
 from springbench.harness.report.accuracy.liu2013_comparison import compare_with_paper
@@ -54,7 +54,7 @@ class PublishedQueries:
             InputError: if the published set has no study of this name.
         """
         if name not in self.studies:
-            raise InputError(f"unknown study {name!r}; expected {suggest_name(name, self.studies)}")
+            raise InputError(f"unknown study {name!r}; expected {format_allowed_names(name, self.studies)}")
         return self.studies[name]
 
     def query_records(self, sql: str) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import FailFast, Field, ValidationError
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 from springbench.harness.scenes.mesh.spring_network import check_mesh_file
 from springbench.harness.schema.base_model import ConfigModel, read_field_descriptions
 
@@ -80,7 +80,7 @@ def _convert_error(path: Path, detail: Any) -> InputMistake:
     key = str(detail["loc"][0])[:80]
     problem = f"{detail['msg']}, got {str(detail['input'])[:80]!r}"
     if detail["type"] == "extra_forbidden":
-        problem = f"unknown key; expected {suggest_name(key, AssignmentJson.model_fields)}"
+        problem = f"unknown key; expected {format_allowed_names(key, AssignmentJson.model_fields)}"
     elif detail["type"] == "missing":
         problem = f"is missing: {read_field_descriptions(AssignmentJson)[key]}"
     return InputMistake(problem, path, find_key_line(path, key), ".".join(map(str, detail["loc"]))[:80])

@@ -19,7 +19,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 from springbench.harness.scenes.mesh.mesh import SpringProperties
 from springbench.harness.scenes.mesh.mesh_topology import IndexArray
 from springbench.harness.scenes.mesh.table_reader import DataTable
@@ -85,7 +85,7 @@ class SpringValueKeys(ConfigModel):
             return columns.get(key) if reads_unnamed else None
         if isinstance(given, str):
             if given not in columns:
-                where = f"expected {suggest_name(given, columns)}" if columns else "and this mesh has none"
+                where = f"expected {format_allowed_names(given, columns)}" if columns else "and this mesh has none"
                 raise _make_value_error(f"names the column {given!r}; {where}", key)
             return columns[given]
         if not isinstance(given, tuple):

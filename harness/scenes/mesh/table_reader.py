@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.harness.errors import InputError, InputMistake, suggest_name
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 from springbench.harness.scenes.mesh.spring_network import check_mesh_file
 
 MAX_TABLE_BYTES = 2**28
@@ -48,7 +48,7 @@ class DataTable:
             InputError: if it is missing, or a cell is neither empty nor a finite number.
         """
         if name not in self.columns:
-            known = suggest_name(name, self.columns)
+            known = format_allowed_names(name, self.columns)
             hint = "; separate the columns by commas" if len(self.columns) == 1 else ""
             raise InputError(InputMistake(f"has no column {name!r}; its columns are {known}{hint}", self.path))
         return self._convert_column(name, self.columns[name])
