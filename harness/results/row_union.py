@@ -246,7 +246,7 @@ def query_first_rows(
     return found
 
 
-_UNIT_COLUMN, _ROW_COLUMN = "unit_asked_for", "row_of_the_unit"
+_UNIT_COLUMN, _ROW_COLUMN = "unit_number", "unit_row"
 _RESERVED_COLUMNS = (_UNIT_COLUMN, _ROW_COLUMN, "file_index", "file_row_number", "filename")
 """Reserved column names: the module's own, and those by which DuckDB reports the source of a row."""
 
