@@ -1,15 +1,28 @@
-"""Provenance of rows in words: code version and machine, for pictures, figures and the page."""
+"""Provenance of rows: code version and machine in words, and whether other code measured them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from springbench.harness.execution import machine_info
 from springbench.harness.report.number_format import shorten_words
 
 _DIRTY_SUFFIX = "-dirty"
 PROVENANCE_COLUMNS = ("cpu", "threads", "commit", "source_fingerprint")
 """The columns that `describe_provenance` reads."""
+
+
+def is_stale(fingerprint: str | None, newest_fingerprint: str | None = None) -> bool:
+    """Return whether other code measured a row; rows without a fingerprint count as current.
+
+    Args:
+        fingerprint: source fingerprint of the row; None or "" if it is unknown.
+        newest_fingerprint: code of the newest rows, as on the results page; None to compare with the current version.
+    """
+    return bool(fingerprint) and fingerprint != (
+        machine_info.hash_sources() if newest_fingerprint is None else newest_fingerprint
+    )
 
 
 def abbreviate_commit(commit: str) -> str:

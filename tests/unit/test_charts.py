@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from springbench.harness.execution.machine_info import hash_sources
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.report.ablation_summary import read_ablations
 from springbench.harness.report.accuracy.accuracy_data import AccuracyData
@@ -47,6 +48,7 @@ from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.figures.figure_layout import compose_figure
 from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.plot_style import PAGE_WIDTH, TEXT_COLOUR, SeriesStyle, assign_solver_styles
+from springbench.harness.report.provenance_words import is_stale
 from springbench.harness.report.site.chart_json import serialise_chart
 from springbench.harness.report.timing_table import read_run_times
 from springbench.harness.results import parquet_rows, row_store
@@ -56,6 +58,23 @@ from tests import synthetic_accuracy_rows as made
 from tests import synthetic_results
 
 STYLE = SeriesStyle("#123456", "o")
+
+
+@pytest.mark.parametrize(
+    ("fingerprint", "newest", "stale"),
+    [
+        ("0123", None, True),
+        (hash_sources(), None, False),
+        (None, None, False),
+        ("", "0123", False),
+        ("0123", "0123", False),
+        ("0123", "", True),
+    ],
+)
+def test_a_row_is_stale_if_its_code_is_known_and_differs(
+    fingerprint: str | None, newest: str | None, stale: bool
+) -> None:
+    assert is_stale(fingerprint, newest) == stale
 
 
 @pytest.fixture(scope="module")

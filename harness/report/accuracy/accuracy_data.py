@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.harness.execution import machine_info
 from springbench.harness.report.number_format import format_time_step
+from springbench.harness.report.provenance_words import is_stale
 
 FloatArray = NDArray[np.float64]
 
@@ -219,14 +219,6 @@ class AccuracyData:
     newest_fingerprint: str
 
 
-def is_stale(one: ConvergenceCurve | WorkPoint) -> bool:
-    """Return whether other code than the current version measured it.
-
-    Rows without a fingerprint count as current.
-    """
-    return one.source_fingerprint not in ("", machine_info.hash_sources())
-
-
 def describe_stale_results(
     measured: Iterable[ConvergenceCurve | WorkPoint], newest_fingerprint: str | None = None
 ) -> list[str]:
@@ -238,13 +230,7 @@ def describe_stale_results(
         measured: curves or simulations.
         newest_fingerprint: source fingerprint to compare with; None for the current version.
     """
-    names = sorted(
-        {
-            one.label
-            for one in measured
-            if (is_stale(one) if newest_fingerprint is None else one.source_fingerprint != newest_fingerprint)
-        }
-    )
+    names = sorted({one.label for one in measured if is_stale(one.source_fingerprint, newest_fingerprint)})
     than = "today's" if newest_fingerprint is None else "that of the newest rows"
     return [f"Measured by other code than {than}, in whole or in part: {', '.join(names)}."] if names else []
 

@@ -5,12 +5,13 @@ Power laws are fitted to these times.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from springbench.harness.report.accuracy.accuracy_data import AccuracyData, ConvergenceCurve, is_stale
+from springbench.harness.report.accuracy.accuracy_data import AccuracyData, ConvergenceCurve
 from springbench.harness.report.accuracy.time_to_accuracy import median_time
+from springbench.harness.report.provenance_words import is_stale
 
 GAP_TARGET = 1e-3
 
@@ -26,7 +27,7 @@ class SizeScaling(NamedTuple):
         seconds: median over the snapshots (k,) [s].
         exponent: exponent of the fitted power law; nan for too few sizes.
         unsolved_sizes: numbers of vertices of the sizes on which the gap was not reached.
-        stale: which of the sizes (k,) involve measurements by other code than the current version.
+        stale: which of the sizes (k,) involve measurements by other code than `newest_fingerprint`.
     """
 
     scene: str
@@ -39,14 +40,12 @@ class SizeScaling(NamedTuple):
     stale: list[bool]
 
 
-def fit_scalings(
-    table: AccuracyData, is_stale_curve: Callable[[ConvergenceCurve], bool] = is_stale
-) -> list[SizeScaling]:
+def fit_scalings(table: AccuracyData, newest_fingerprint: str | None = None) -> list[SizeScaling]:
     """Fit the scaling of each solver on each scene with two sizes or more.
 
     Args:
         table: data of an accuracy measurement.
-        is_stale_curve: returns whether other code measured a curve.
+        newest_fingerprint: code that curves are compared with; None for the current version.
     """
     groups: dict[tuple[str, str, str], dict[int, list[ConvergenceCurve]]] = {}
     for curve in table.curves:
@@ -58,7 +57,7 @@ def fit_scalings(
         reached = {n: t for n, t in times.items() if np.isfinite(t) and t > 0.0}
         if len(times) > 1:
             lost = [n for n, t in times.items() if t == np.inf]
-            hollow = [any(map(is_stale_curve, sizes[n])) for n in reached]
+            hollow = [any(is_stale(one.source_fingerprint, newest_fingerprint) for one in sizes[n]) for n in reached]
             exponent = fit_size_exponent(reached)
             found.append(SizeScaling(scene, guess, label, [*reached], [*reached.values()], exponent, lost, hollow))
     return found

@@ -8,7 +8,6 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from springbench.harness.execution import machine_info
 from springbench.harness.report.ablation_summary import ResultRow, largest_known_error, select_kind
 from springbench.harness.report.charts.chart_description import ChartAxis, ChartDescription, ChartFrame, ChartSeries
 from springbench.harness.report.charts.figure_panels import (
@@ -22,7 +21,7 @@ from springbench.harness.report.charts.figure_panels import (
 )
 from springbench.harness.report.number_format import format_quantity
 from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles, indexed_style
-from springbench.harness.report.provenance_words import describe_provenance
+from springbench.harness.report.provenance_words import describe_provenance, is_stale
 
 _ERROR_LABELS = {"solver": "error of the solver", "time-step": "error of the time step"}
 _MIN_DISPLACEMENT = 1e-6
@@ -89,7 +88,7 @@ def build_effect_chart(
 def _build_effect_frame(name: str, rows: Sequence[ResultRow], newest_fingerprint: str | None) -> ChartFrame:
     (whole,) = select_kind(rows, "full-scene")
     points = [row for row in select_kind(rows, "ablated") if row["status"] == "ok"]
-    is_stale = _is_stale(whole, newest_fingerprint)
+    stale = is_stale(whole["source_fingerprint"], newest_fingerprint)
     known = [row for row in select_kind(rows, "error") if row["status"] == "ok"]
     error, whose = largest_known_error(rows)
     gone = [row["name"] for row in select_kind(rows, "ablated") if row["status"] != "ok"]
@@ -106,14 +105,14 @@ def _build_effect_frame(name: str, rows: Sequence[ResultRow], newest_fingerprint
         name=(name,),
         subject=f"{whole['scene']}, {whole['vertices']} vertices",
         title="",
-        series=[_build_effect_series(k, row, whole, is_stale=is_stale) for k, row in enumerate(points)],
+        series=[_build_effect_series(k, row, whole, stale=stale) for k, row in enumerate(points)],
         bands={"displacement_max": [ShadedBand(0.0, error, "")]} if np.isfinite(error) else {},
         lines={"displacement_max": [MarkedValue(max(row["displacement_max"], _MIN_DISPLACEMENT), "") for row in known]},
-        notes=[*notes, *([STALE_NOTE] if is_stale else [])],
+        notes=[*notes, *([STALE_NOTE] if stale else [])],
     )
 
 
-def _build_effect_series(number: int, row: ResultRow, whole: ResultRow, *, is_stale: bool) -> ChartSeries:
+def _build_effect_series(number: int, row: ResultRow, whole: ResultRow, *, stale: bool) -> ChartSeries:
     columns = {"added_time_share": "added_seconds"}
     columns |= {f"added_time_share_{end}": f"added_seconds_{end}" for end in ("low", "high")}
     return ChartSeries(
@@ -124,7 +123,7 @@ def _build_effect_series(number: int, row: ResultRow, whole: ResultRow, *, is_st
             "displacement_max": [max(row["displacement_max"], _MIN_DISPLACEMENT)],
         },
         description=f"without it; {whole['solver']}, {whole['frames']} frames",
-        stale=is_stale,
+        stale=stale,
         is_connected=False,
         labels_points=True,
     )
@@ -179,10 +178,6 @@ def _label_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
     return [{**row, "label": label} for row, label in zip(rows, labels, strict=True)]
 
 
-def _is_stale(row: ResultRow, newest_fingerprint: str | None) -> bool:
-    return row["source_fingerprint"] not in (None, newest_fingerprint or machine_info.hash_sources())
-
-
 def _build_overhead_map(here: Sequence[ResultRow], newest_fingerprint: str | None) -> CellMap:
     """Build the overhead map with effects in rows and solvers in columns.
 
@@ -224,7 +219,7 @@ def _build_cell(row: ResultRow, newest_fingerprint: str | None) -> MapCell:
         outcome=outcome.label,
         color=outcome.color,
         value_text=words,
-        is_stale=_is_stale(row, newest_fingerprint),
+        is_stale=is_stale(row["source_fingerprint"], newest_fingerprint),
         reason=reason,
     )
 
@@ -237,7 +232,7 @@ def _classify_refusal(status: str) -> CellOutcome:
 def _build_overhead_frame(rows: Sequence[ResultRow], style: SeriesStyle, newest_fingerprint: str | None) -> ChartFrame:
     """Build the frame of a solver's overheads with their intervals, the most expensive effect first."""
     mine = sorted(rows, key=lambda row: -row["overhead_ratio"])
-    label, stale = mine[0]["label"], [_is_stale(row, newest_fingerprint) for row in mine]
+    label, stale = mine[0]["label"], [is_stale(row["source_fingerprint"], newest_fingerprint) for row in mine]
     names = ("overhead_ratio", "overhead_ratio_low", "overhead_ratio_high", "overhead_ratio_bound")
     columns = {name: [row[name] for row in mine] for name in names}
     return ChartFrame(

@@ -19,7 +19,6 @@ from springbench.harness.report.accuracy.accuracy_data import (
     describe_self_converged,
     describe_stale_results,
     format_stop_rule,
-    is_stale,
 )
 from springbench.harness.report.accuracy.performance_profiles import (
     baseline_solver,
@@ -47,6 +46,7 @@ from springbench.harness.report.charts.chart_description import (
 from springbench.harness.report.charts.figure_panels import AxisScale, FloatArray, ShadedBand
 from springbench.harness.report.number_format import format_count, format_power, format_quantity, format_time_step
 from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles
+from springbench.harness.report.provenance_words import is_stale
 
 ACCURACY_COMMAND = "springbench accuracy CONFIG --rerun"
 COST_LABEL = "wall time a simulated second"
@@ -157,7 +157,7 @@ def _build_convergence_series(
             "status": [curve.status] * len(seconds),
         },
         description=f"{curve.problem.problem_label}, {INITIAL_GUESS_LABELS[curve.initial_guess]}",
-        stale=is_by_other_code(curve, newest_fingerprint),
+        stale=is_stale(curve.source_fingerprint, newest_fingerprint),
         status=curve.status,
         callouts=callouts,
         identity=(curve.label, curve.parameters),
@@ -250,7 +250,7 @@ def _build_time_series(
                 styles[label],
                 columns,
                 description=f"{own[0].problem.mesh_label}, {many} step{'s' if many > 1 else ''}",
-                stale=any(is_by_other_code(curve, newest_fingerprint) for curve in own),
+                stale=any(is_stale(curve.source_fingerprint, newest_fingerprint) for curve in own),
                 identity=(label, own[0].parameters),
                 links={"parameters": own[0].parameters},
             )
@@ -351,7 +351,7 @@ def _build_step_size_series(
                 "time_step": [format_time_step(one.time_step) for one in members],
             },
             description=f"{members[0].mesh_label}, {members[0].integrator}, {stop}",
-            stale=[is_by_other_code(one, newest_fingerprint) for one in members],
+            stale=[is_stale(one.source_fingerprint, newest_fingerprint) for one in members],
             setting=stop,
             marker_scale=1.0 + 0.25 * tolerances.index(tolerance) if tolerance in tolerances else 0.75,
             callouts={k: "the default" for k, one in enumerate(members) if one is default},
@@ -434,7 +434,7 @@ def build_scaling_chart(table: AccuracyData, newest_fingerprint: str | None = No
         newest_fingerprint: see the module.
     """
     styles = _assign_styles(table.curves)
-    found = [one for one in fit_scalings(table, lambda c: is_by_other_code(c, newest_fingerprint)) if one.vertices]
+    found = [one for one in fit_scalings(table, newest_fingerprint) if one.vertices]
     citations = {curve.label: curve.citation for curve in table.curves}
     frames: list[ChartFrame] = []
     for scene, guess in dict.fromkeys((one.scene, one.initial_guess) for one in found):
@@ -493,16 +493,6 @@ def _assign_styles(measured: Iterable[ConvergenceCurve | WorkPoint]) -> dict[str
     return assign_label_styles((one.label, one.solver) for one in measured)
 
 
-def is_by_other_code(one: ConvergenceCurve | WorkPoint, newest_fingerprint: str | None) -> bool:
-    """Return whether a measurement is stale, as the module states.
-
-    Args:
-        one: curve or simulation with the fingerprint of its code.
-        newest_fingerprint: code of the newest rows; None to compare with the current version.
-    """
-    return is_stale(one) if newest_fingerprint is None else one.source_fingerprint != newest_fingerprint
-
-
 def describe_hollow_marks(
     measured: Iterable[ConvergenceCurve | WorkPoint], newest_fingerprint: str | None
 ) -> list[str]:
@@ -515,7 +505,8 @@ def describe_hollow_marks(
     Returns:
         One note where a measurement is stale; empty on the page.
     """
-    return [STALE_NOTE] if newest_fingerprint is None and any(map(is_stale, measured)) else []
+    is_shown = newest_fingerprint is None and any(is_stale(one.source_fingerprint) for one in measured)
+    return [STALE_NOTE] if is_shown else []
 
 
 def _shared_fields(table: AccuracyData, citations: Mapping[str, str]) -> dict[str, Any]:

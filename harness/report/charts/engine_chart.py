@@ -20,12 +20,12 @@ from springbench.harness.report.charts.accuracy_charts import (
     COST_LABEL,
     ERROR_LABEL,
     describe_hollow_marks,
-    is_by_other_code,
 )
 from springbench.harness.report.charts.chart_description import ChartAxis, ChartDescription, ChartFrame, ChartSeries
 from springbench.harness.report.charts.figure_panels import AxisScale
 from springbench.harness.report.number_format import format_quantity
 from springbench.harness.report.plot_style import SeriesStyle
+from springbench.harness.report.provenance_words import is_stale
 
 
 def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = None) -> ChartDescription:
@@ -76,5 +76,5 @@ def _build_series(name: str, style: SeriesStyle, front: list[WorkPoint], newest_
         "error": [work.error for work in front],
         "setting": settings,
     }
-    stale = [is_by_other_code(work, newest_fingerprint) for work in front]
+    stale = [is_stale(work.source_fingerprint, newest_fingerprint) for work in front]
     return ChartSeries(name, style, columns, description=front[0].mesh_label, stale=stale, setting="; ".join(settings))

@@ -8,7 +8,7 @@ from typing import Any
 from springbench.harness.report.charts.chart_description import ChartAxis, ChartDescription, ChartFrame, ChartSeries
 from springbench.harness.report.charts.figure_panels import AxisScale
 from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles
-from springbench.harness.report.provenance_words import describe_provenance
+from springbench.harness.report.provenance_words import describe_provenance, is_stale
 from springbench.harness.report.speed.speed_figures import STEP_ITERATIONS, SpeedFigures
 
 _TIME_SCALE = AxisScale("wall time", "log", "time")
@@ -48,12 +48,10 @@ def build_speed_chart(
     timed = sorted((one for one in candidates if one.status == "ok"), key=lambda one: one.vertices)
     styles = assign_label_styles((one.label, one.solver) for one in timed)
 
-    def is_stale(one: SpeedFigures) -> bool:
-        return one.is_stale if newest_fingerprint is None else one.source_fingerprint != newest_fingerprint
-
     frames: list[ChartFrame] = []
     for scene in dict.fromkeys(one.scene for one in candidates if one.status == "ok"):
         here = [one for one in timed if one.scene == scene]
+        stale = [is_stale(one.source_fingerprint, newest_fingerprint) for one in here]
         loads = sorted(one.load_average for one in here if one.load_average is not None)
         ends = list(dict.fromkeys(f"{load:.1f}" for load in (*loads[:1], *loads[-1:])))
         load = f"; load {' to '.join(ends)}" if ends else ""
@@ -63,10 +61,10 @@ def build_speed_chart(
                 name=(),
                 subject=scene,
                 title="",
-                series=[*_build_series(here, styles, [is_stale(one) for one in here])],
+                series=[*_build_series(here, styles, stale)],
                 notes=[
                     f"Medians over the rounds, candidates interleaved{load}.",
-                    *([STALE_NOTE] if newest_fingerprint is None and any(map(is_stale, here)) else []),
+                    *([STALE_NOTE] if newest_fingerprint is None and any(stale) else []),
                 ],
             )
         )

@@ -13,6 +13,7 @@ from springbench.harness.report.charts.accuracy_charts import ACCURACY_COMMAND
 from springbench.harness.report.charts.chart_description import ChartDescription
 from springbench.harness.report.charts.figure_panels import CellMap, CellOutcome, MapCell
 from springbench.harness.report.number_format import format_count, format_quantity
+from springbench.harness.report.provenance_words import is_stale
 
 _WINNER_NOTE = (
     "Columns: k dt²/m at dt = 1/30 s; rows: error of the positions at the end, relative to the distance "
@@ -36,7 +37,9 @@ def build_winner_chart(table: AccuracyData, newest_fingerprint: str | None = Non
     found = build_winner_cells(table.work_points)
     styles = assign_family_styles(found)
     colors = {name: style.color for name, style in styles.items()} | {NO_WINNER: _NO_WINNER_COLOUR}
-    is_mixed = any(work.source_fingerprint != newest for cell in found for work in cell.cheapest_by_family.values())
+    is_mixed = any(
+        is_stale(work.source_fingerprint, newest) for cell in found for work in cell.cheapest_by_family.values()
+    )
     notes = [_WINNER_NOTE, *describe_self_converged(table.work_points)]
     maps = [
         CellMap(
@@ -60,7 +63,7 @@ def build_winner_chart(table: AccuracyData, newest_fingerprint: str | None = Non
     )
 
 
-def _build_cell(cell: WinnerCell, colors: dict[str, str], newest: str | None) -> MapCell:
+def _build_cell(cell: WinnerCell, colors: dict[str, str], newest: str) -> MapCell:
     family = cell.cheapest_family
     best = cell.cheapest_by_family.get(family)
     return MapCell(
@@ -69,7 +72,7 @@ def _build_cell(cell: WinnerCell, colors: dict[str, str], newest: str | None) ->
         outcome=family,
         color=colors[family],
         value_text=_format_lead(cell.lead_ratio) if best else "",
-        is_stale=best is not None and best.source_fingerprint != newest,
+        is_stale=best is not None and is_stale(best.source_fingerprint, newest),
         reason=_describe_cell(cell) if best else "",
     )
 

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from springbench.harness.execution import machine_info
 from springbench.harness.report.speed.operation_counts import OperationCount, count_operations
 from springbench.harness.results.bootstrap_statistics import ConfidenceInterval, estimate_ratio
 
@@ -89,14 +88,6 @@ class SpeedFigures(NamedTuple):
     cpu: str = ""
     cores: int | None = None
     commit: str = ""
-
-    @property
-    def is_stale(self) -> bool:
-        """Whether other code than the current version measured it.
-
-        Rows without a fingerprint count as current.
-        """
-        return self.source_fingerprint not in ("", machine_info.hash_sources())
 
 
 class MachineLimits:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from springbench.harness.report.number_format import format_count, format_quantity
+from springbench.harness.report.provenance_words import is_stale
 from springbench.harness.report.speed.speed_figures import STEP_ITERATIONS, SpeedFigures
 from springbench.harness.results.bootstrap_statistics import ConfidenceInterval
 
@@ -72,7 +73,7 @@ def _build_scene_labels(candidates: Sequence[SpeedFigures]) -> Callable[[SpeedFi
 
 def _format_label(f: SpeedFigures) -> str:
     notes = [f"{f.iterations} of {STEP_ITERATIONS}"] if f.iterations != STEP_ITERATIONS else []
-    notes += ["by other code"] if f.is_stale else []
+    notes += ["by other code"] if is_stale(f.source_fingerprint) else []
     return f"{f.label} ({', '.join(notes)})" if notes else f.label
 
 
