@@ -1,4 +1,4 @@
-"""Atomic file writes, lock files, safe file names, and messages for file errors."""
+"""Atomic file writes, outdated files, lock files, safe file names, and messages for file errors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import errno
 import os
 import re
 import stat
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
@@ -51,6 +51,11 @@ def atomic_write(path: Path) -> Generator[Path]:
     finally:
         with suppress(OSError):  # the caller reports a missing folder
             partial.unlink(missing_ok=True)
+
+
+def is_outdated(target: Path, sources: Iterable[Path]) -> bool:
+    """Return whether a file is missing, or older than one of its sources."""
+    return not target.is_file() or any(target.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
 
 
 def open_lock_file(path: Path, access: int = os.O_RDWR, *, hint: str = "") -> int:

@@ -5,7 +5,7 @@ The side-by-side recordings of the comparisons are also written.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
+from springbench.harness.atomic_files import is_outdated
 from springbench.harness.config.run_options import RUN_OPTIONS
 from springbench.harness.config.sweep_config import RunSpec
 from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
@@ -57,7 +58,7 @@ def draw_sweep_pictures(
     """
     write_bibtex(folder / "references.bib", table["citation"].to_pylist())
     drawn = [p for p in jobs if p.run.record and p.recording_path.exists()]
-    wanting = [p for p in drawn if p.run.pictures and _is_outdated(p.picture_path, [p.recording_path])]
+    wanting = [p for p in drawn if p.run.pictures and is_outdated(p.picture_path, [p.recording_path])]
     groups = [group for group in group_by_scene(drawn, folder) if group.needs_recording or group.needs_picture]
 
     def times() -> None:
@@ -170,11 +171,6 @@ def _ignore_progress(message: str) -> None:
     pass
 
 
-def _is_outdated(target: Path, sources: Iterable[Path]) -> bool:
-    """Return whether a file is missing, or older than one of its sources."""
-    return not target.exists() or any(target.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
-
-
 @dataclass(frozen=True, slots=True)
 class SolverGroup:
     """Runs that differ only in their solver or its settings.
@@ -198,12 +194,12 @@ class SolverGroup:
     @property
     def needs_recording(self) -> bool:
         """Whether the side-by-side recording has to be made."""
-        return _is_outdated(self.recording_path, self.recording_paths.values())
+        return is_outdated(self.recording_path, self.recording_paths.values())
 
     @property
     def needs_picture(self) -> bool:
         """Whether the comparison picture has to be drawn."""
-        return next(iter(self.jobs_by_label.values())).run.pictures and _is_outdated(
+        return next(iter(self.jobs_by_label.values())).run.pictures and is_outdated(
             self.picture_path, self.recording_paths.values()
         )
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from springbench.harness.atomic_files import is_outdated
 from springbench.harness.errors import SpringbenchError
 from springbench.harness.recording.local_origin import store_relative
 from springbench.harness.recording.recorder_interface import RecordingReplay
@@ -49,7 +50,7 @@ def write_last_frames(
             folder.path / "recordings" / f"{unit}.rrd",
             data_scripts.script_path(data_folder / "meshes", unit),
         )
-        if not _is_up_to_date(target, recording):
+        if is_outdated(target, [recording]):
             replay = _read_recording(recording, [-1], print_message)
             if replay is None or not len(replay.frames):
                 continue
@@ -119,7 +120,7 @@ def _write_snapshot_solves(
         curve.recording_path: data_scripts.script_path(data_folder / "solves", Path(curve.recording_path).stem)
         for curve in curves
     }
-    stale = [name for name, target in targets.items() if not _is_up_to_date(target, folder.path / name, truth)]
+    stale = [name for name, target in targets.items() if is_outdated(target, [folder.path / name, truth])]
     last = _read_recording(truth, [-1], print_message) if stale else None
     for name in stale:
         replay = _read_recording(folder.path / name, None, print_message)
@@ -171,10 +172,6 @@ def _mesh_topology(replay: RecordingReplay) -> dict[str, Any]:
 def _encode_array(values: NDArray[Any], kind: type) -> str:
     """Encode the bytes of an array, little endian, in base64."""
     return b64encode(np.ascontiguousarray(values, np.dtype(kind).newbyteorder("<")).tobytes()).decode()
-
-
-def _is_up_to_date(target: Path, *sources: Path) -> bool:
-    return target.exists() and all(source.stat().st_mtime_ns <= target.stat().st_mtime_ns for source in sources)
 
 
 def _read_recording(recording: Path, frames: list[int] | None, print_message: PrintMessage) -> RecordingReplay | None:

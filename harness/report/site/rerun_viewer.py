@@ -26,7 +26,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import rerun_cli  # pyright: ignore[reportMissingTypeStubs]
-from springbench.harness.atomic_files import atomic_write
+from springbench.harness.atomic_files import atomic_write, is_outdated
 from springbench.harness.errors import RunFailed
 
 RERUN_VERSION = "0.41.0"
@@ -99,8 +99,7 @@ def write_recording(recording: Path, script: Path, title: str) -> Path:
         InputError: if the recording cannot be read.
         WriteError: if the file cannot be written.
     """
-    made = recording.stat().st_mtime_ns
-    if not script.is_file() or script.stat().st_mtime_ns < made:
+    if is_outdated(script, [recording]):
         script.parent.mkdir(parents=True, exist_ok=True)
         value = {"title": title, "rrd": _encode_gzip(move_layout_first(recording.read_bytes()))}
         with atomic_write(script) as partial:
