@@ -27,6 +27,7 @@ from rich.markup import escape
 from rich.table import Table
 from springbench.harness.config.run_options import RUN_OPTIONS
 from springbench.harness.errors import InputError
+from springbench.harness.report.varying_settings import find_varying_keys
 from springbench.harness.results import parquet_rows, row_store
 from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS
 
@@ -310,11 +311,9 @@ def _case_name(row: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str
 
 def _solver_label(row: Mapping[str, Any], runs: Sequence[Mapping[str, Any]]) -> str:
     """Return the solver's name with the parameters in which its runs differ."""
-    stated = {run["parameters"] or "{}" for run in runs}
-    others = [json.loads(text) for text in stated]
-    own = json.loads(row["parameters"] or "{}")  # a parameter that was not given is missing
-    varied = [str(v) for key, v in own.items() if any(other.get(key) != v for other in others)]
-    return " ".join([row["solver"], *varied])
+    varying = find_varying_keys(json.loads(text) for text in {run["parameters"] or "{}" for run in runs})
+    own = json.loads(row["parameters"] or "{}")
+    return " ".join([row["solver"], *(str(value) for key, value in own.items() if key in varying)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from springbench.harness.execution.timing_lock import lock_timing_shared
 from springbench.harness.execution.worker_pool import PoolTask, run_tasks
 from springbench.harness.report.citations import write_bibtex
 from springbench.harness.report.picture_sources import digest_runs, read_sources
+from springbench.harness.report.varying_settings import find_varying_keys
 
 
 class PictureJob(NamedTuple):
@@ -235,7 +236,7 @@ def _distinct_label(p: PictureJob, group: list[PictureJob]) -> str:
     def settings(run: RunSpec) -> dict[str, Any]:
         return {**run.solver.parameters, **{option: getattr(run, option) for option in RUN_OPTIONS}}
 
-    own = [settings(other.run) for other in group if other.run.solver.name == p.run.solver.name]
-    varied = [(k, v) for k, v in settings(p.run).items() if any(k not in other or other[k] != v for other in own)]
+    varying = find_varying_keys(settings(one.run) for one in group if one.run.solver.name == p.run.solver.name)
+    shown = [(key, value) for key, value in settings(p.run).items() if key in varying]
     short = {name: option.short_format for name, option in RUN_OPTIONS.items()}
-    return ", ".join([p.run.solver.name, *(short.get(k, f"{k} {{}}").format(v) for k, v in varied)])
+    return ", ".join([p.run.solver.name, *(short.get(key, f"{key} {{}}").format(value) for key, value in shown)])

@@ -51,6 +51,7 @@ from springbench.harness.report.plot_style import PAGE_WIDTH, TEXT_COLOUR, Serie
 from springbench.harness.report.provenance_words import is_stale
 from springbench.harness.report.site.chart_json import serialise_chart
 from springbench.harness.report.timing_table import read_run_times
+from springbench.harness.report.varying_settings import find_varying_keys
 from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.published_set import STUDY_FILE, TABLE_FILES
 
@@ -58,6 +59,12 @@ from tests import synthetic_accuracy_rows as made
 from tests import synthetic_results
 
 STYLE = SeriesStyle("#123456", "o")
+
+
+def test_settings_vary_where_one_is_stated_and_another_has_the_default() -> None:
+    assert find_varying_keys([]) == find_varying_keys([{"a": 1}]) == set()
+    assert find_varying_keys([{"a": 1, "b": [2]}, {"a": 1, "b": [3], "c": None}]) == {"b"}
+    assert find_varying_keys([{}, {"precision": "float32"}]) == {"precision"}
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from springbench.harness.report.accuracy.accuracy_data import (
     WorkPoint,
 )
 from springbench.harness.report.provenance_words import describe_commits, describe_processors
+from springbench.harness.report.varying_settings import find_varying_keys
 from springbench.harness.results import row_store
 from springbench.harness.results.parquet_rows import read_rows
 
@@ -214,24 +215,18 @@ def _build_row_labeller(rows: Sequence[_ResultRow]) -> _RowLabeller:
 
     These are the parameters and threads in which the solver's rows differ.
     """
-    values: dict[tuple[str, str], set[str]] = defaultdict(set)
 
     def settings(row: _ResultRow) -> _ResultRow:
         return {**json.loads(row["parameters"] or "{}"), "threads": row["threads"]}
 
-    stated: dict[str, set[str]] = defaultdict(set)
+    by_solver: dict[str, list[_ResultRow]] = defaultdict(list)
     for row in rows:
-        stated[row["solver"]] |= settings(row).keys()
-    for row in rows:
-        own = settings(row)
-        for key in stated[row["solver"]]:  # a parameter that a row does not state has its default value
-            values[row["solver"], key].add(str(own.get(key)))
+        by_solver[row["solver"]].append(settings(row))
+    varying = {solver: find_varying_keys(own) for solver, own in by_solver.items()}
 
     def label(row: _ResultRow) -> str:
-        differing_settings = [
-            f"{key} {value}" for key, value in settings(row).items() if len(values[row["solver"], key]) > 1
-        ]
-        return ", ".join([row["solver"], *differing_settings])
+        shown = [f"{key} {value}" for key, value in settings(row).items() if key in varying[row["solver"]]]
+        return ", ".join([row["solver"], *shown])
 
     return label
 

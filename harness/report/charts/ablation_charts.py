@@ -22,6 +22,7 @@ from springbench.harness.report.charts.figure_panels import (
 from springbench.harness.report.number_format import format_quantity
 from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles, indexed_style
 from springbench.harness.report.provenance_words import describe_provenance, is_stale
+from springbench.harness.report.varying_settings import find_varying_keys
 
 _ERROR_LABELS = {"solver": "error of the solver", "time-step": "error of the time step"}
 _MIN_DISPLACEMENT = 1e-6
@@ -167,14 +168,16 @@ def build_overhead_chart(rows: Sequence[ResultRow], newest_fingerprint: str | No
 
 
 def _label_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
-    """Add a `label` to rows: the solver, with its parameters if they vary."""
-    settings: dict[str, set[str]] = {row["solver"]: set() for row in rows}
-    for row in rows:
-        settings[row["solver"]].add(row["parameters"] or "{}")
-    labels: list[str] = []
-    for row in rows:
-        stated: dict[str, Any] = json.loads(row["parameters"] or "{}") if len(settings[row["solver"]]) > 1 else {}
-        labels.append(", ".join([row["solver"], *(f"{name} {value}" for name, value in stated.items())]))
+    """Add a `label` to rows: the solver with its varying parameters."""
+    parameters: list[dict[str, Any]] = [json.loads(row["parameters"] or "{}") for row in rows]
+    by_solver: dict[str, list[dict[str, Any]]] = {}
+    for row, own in zip(rows, parameters, strict=True):
+        by_solver.setdefault(row["solver"], []).append(own)
+    varying = {solver: find_varying_keys(some) for solver, some in by_solver.items()}
+    labels = [
+        ", ".join([row["solver"], *(f"{key} {value}" for key, value in own.items() if key in varying[row["solver"]])])
+        for row, own in zip(rows, parameters, strict=True)
+    ]
     return [{**row, "label": label} for row, label in zip(rows, labels, strict=True)]
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from springbench.harness.report.speed.operation_counts import OperationCount, count_operations
+from springbench.harness.report.varying_settings import find_varying_keys
 from springbench.harness.results.bootstrap_statistics import ConfidenceInterval, estimate_ratio
 
 MACHINE_SOLVER, CPP_BASELINE = "machine", "eigen"
@@ -207,14 +208,14 @@ def _label_candidates(first_rows: Sequence[ResultRow]) -> dict[str, str]:
 
     A label has the solver, its varying parameters, and its threads if several.
     """
-    values: dict[tuple[str, str], set[str]] = defaultdict(set)
+    by_solver: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in first_rows:
-        for key, value in json.loads(row["parameters"]).items():
-            values[row["solver"], key].add(str(value))
+        by_solver[row["solver"]].append(json.loads(row["parameters"]))
+    varying = {solver: find_varying_keys(some) for solver, some in by_solver.items()}
     return {
         row["run_id"]: " ".join(
             [row["solver"]]
-            + [str(v) for key, v in json.loads(row["parameters"]).items() if len(values[row["solver"], key]) > 1]
+            + [str(value) for key, value in json.loads(row["parameters"]).items() if key in varying[row["solver"]]]
             + ([f"x{row['threads']}"] if row["threads"] > 1 else [])
         )
         for row in first_rows
