@@ -214,10 +214,7 @@ class _TextBody:
     def _parse_length(self, element: PlyElement, at: int) -> int:
         if at >= len(self._values):
             raise _make_truncation_error(element)
-        value = float(self._values[at])
-        if not 0 <= value < 2**32 or value != int(value):
-            raise ValueError(f"a list of its {element.name} has the length {value:g}; expected a whole number")
-        return int(value)
+        return _check_list_length(element, float(self._values[at]))
 
     def _read_unequal_rows(self, element: PlyElement, expected: str, begun: int) -> _ElementRows:
         lists, columns = (
@@ -278,11 +275,10 @@ class _BinaryBody:
     def _parse_length(self, element: PlyElement, one: PlyProperty) -> int:
         """Read the length of the list at the current position, and advance past it."""
         (value,) = self._read_values(element, one.length_type, 1).tolist()
-        if not 0 <= value < 2**32 or value != int(value):
-            raise ValueError(f"a list of its {element.name} has the length {value:g}; expected a whole number")
-        if len(self._content) - self._position < int(value) * np.dtype(one.type).itemsize:
+        length = _check_list_length(element, value)
+        if len(self._content) - self._position < length * np.dtype(one.type).itemsize:
             raise _make_truncation_error(element)
-        return int(value)
+        return length
 
     def _read_values(self, element: PlyElement, kind: str, count: int) -> NDArray[np.generic]:
         dtype = np.dtype(self._order + kind)
@@ -306,6 +302,13 @@ class _BinaryBody:
                 if one.name == expected:
                     lists.append(_to_floats(values))
         return _ElementRows({name: np.array(column) for name, column in columns.items()}, lists)
+
+
+def _check_list_length(element: PlyElement, length: float) -> int:
+    """Return the length of a list as an integer; raise ValueError if it is none."""
+    if not 0 <= length < 2**32 or length != int(length):
+        raise ValueError(f"a list of its {element.name} has the length {length:g}; expected a whole number")
+    return int(length)
 
 
 def _to_floats(values: NDArray[np.generic]) -> FloatArray:
