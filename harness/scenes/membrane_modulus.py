@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.mesh.mesh_checks import build_edge_table, find_connected_parts
+from springbench.harness.scenes.mesh.mesh_topology import compute_area_normals
 
 FloatArray = NDArray[np.float64]
 
@@ -211,10 +212,7 @@ def _compute_tangent_frames(mesh: Mesh) -> FloatArray:
 
     The first one is along the vertical, or along x where most of the surface is horizontal.
     """
-    a, b, c = (mesh.rest_positions[mesh.triangles[:, k]] for k in range(3))
-    area, normals = np.cross(b - a, c - a), np.zeros_like(mesh.rest_positions)
-    for k in range(3):
-        np.add.at(normals, mesh.triangles[:, k], area)
+    area, normals = compute_area_normals(mesh.rest_positions, mesh.triangles)
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
     is_level = np.abs(area[:, 1]).sum() > 0.7 * np.linalg.norm(area, axis=1).sum()
     axes = np.eye(3)[[0, 2, 1]] if is_level else np.eye(3)[[1, 0, 2]]

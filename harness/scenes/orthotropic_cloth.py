@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import NonNegativeFloat, model_validator
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.scenes.mesh.mesh import Mesh
+from springbench.harness.scenes.mesh.mesh_topology import compute_area_normals
 from springbench.harness.schema.base_model import ConfigModel, Vector3
 
 _MIN_TANGENT_FRACTION = 1e-6
@@ -56,10 +57,7 @@ class OrthotropicStiffness(ConfigModel):
         """
         if mesh.dimension != 2 or not len(mesh.triangles):
             raise InputError(InputMistake("warp and weft need a mesh of triangles; give one number", key="stretch"))
-        a, b, c = (mesh.rest_positions[mesh.triangles[:, k]] for k in range(3))
-        area, normals = np.cross(b - a, c - a), np.zeros_like(mesh.rest_positions)
-        for k in range(3):
-            np.add.at(normals, mesh.triangles[:, k], area)
+        _, normals = compute_area_normals(mesh.rest_positions, mesh.triangles)
         i, j = springs.T
         normal = normals[i] + normals[j]
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]

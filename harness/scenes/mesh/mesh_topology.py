@@ -131,6 +131,20 @@ def lump_areas(rest: PointArray, triangles: IndexArray) -> PointArray:
     return lump_to_vertices(triangles, np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2, len(rest))
 
 
+def compute_area_normals(rest: PointArray, triangles: IndexArray) -> tuple[PointArray, PointArray]:
+    """Compute the normals of triangles (f, 3), of twice their area in length, and their sums at vertices (n, 3) [m^2].
+
+    Args:
+        rest: rest positions (n, 3) [m].
+        triangles: vertex indices (f, 3).
+    """
+    a, b, c = (rest[triangles[:, k]] for k in range(3))
+    of_triangles, of_vertices = np.cross(b - a, c - a), np.zeros_like(rest)
+    for k in range(3):
+        np.add.at(of_vertices, triangles[:, k], of_triangles)
+    return of_triangles, of_vertices
+
+
 def lump_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArray:
     """Lump a quarter of the volume of each tetrahedron to its vertices, (n,) [m^3].
 
