@@ -32,16 +32,16 @@ class ConfidenceInterval(NamedTuple):
     high: float
 
 
-def estimate_ratio(theirs: ArrayLike, ours: ArrayLike) -> ConfidenceInterval:
-    """Estimate the ratio theirs / ours of paired times.
+def estimate_ratio(numerator: ArrayLike, denominator: ArrayLike) -> ConfidenceInterval:
+    """Estimate the ratio numerator / denominator of paired times.
 
     The estimate is the median over the rounds.
 
     Args:
-        theirs: times (rounds,), in any unit.
-        ours: times (rounds,) of the same rounds in the same unit.
+        numerator: times (rounds,), in any unit.
+        denominator: times (rounds,) of the same rounds in the same unit.
     """
-    return _bootstrap_interval((np.asarray(theirs, float) / np.asarray(ours, float),), np.median)
+    return _bootstrap_interval((np.asarray(numerator, float) / np.asarray(denominator, float),), np.median)
 
 
 def estimate_added_time(more: ArrayLike) -> ConfidenceInterval:

@@ -11,11 +11,11 @@ from springbench.harness.results.bootstrap_statistics import (
 
 
 def test_the_interval_contains_the_ratio_and_is_the_same_each_time():
-    theirs, ours = np.exp(0.1 * np.random.default_rng(1).standard_normal((2, 15)))
-    found = estimate_ratio(3.0 * theirs, ours)
+    numerator, denominator = np.exp(0.1 * np.random.default_rng(1).standard_normal((2, 15)))
+    found = estimate_ratio(3.0 * numerator, denominator)
     assert found.low < found.estimate < found.high
     assert found.low < 3.0 < found.high
-    assert estimate_ratio(3.0 * theirs, ours) == found
+    assert estimate_ratio(3.0 * numerator, denominator) == found
 
 
 @pytest.mark.parametrize("rounds", [1, 2, 5])
@@ -25,9 +25,9 @@ def test_equal_times_have_an_interval_of_no_width(rounds: int):
 
 
 def test_rounds_that_were_disturbed_do_not_move_the_ratio():
-    ours = np.ones(15)
-    ours[[2, 3, 7, 8, 9, 11]] = 40.0
-    assert estimate_ratio(np.full(15, 6.0), ours).estimate == 6.0
+    denominator = np.ones(15)
+    denominator[[2, 3, 7, 8, 9, 11]] = 40.0
+    assert estimate_ratio(np.full(15, 6.0), denominator).estimate == 6.0
 
 
 def test_what_frames_add_is_added_up_however_unequal_they_are():
