@@ -24,7 +24,6 @@ from springbench.harness.scenes.key_frames import KeyFrameMotion
 from springbench.harness.scenes.mesh.body_mesh import BodyMesh
 from springbench.harness.scenes.mesh.file_mesh import FileMesh
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
-from springbench.harness.scenes.mesh.mesh_generator import LengthMetres
 from springbench.harness.scenes.mesh.mesh_topology import build_capped_triangles
 from springbench.harness.scenes.mesh.solid_meshes import BlockMesh
 from springbench.harness.scenes.mesh.spring_network import MAX_COORDINATE
@@ -39,6 +38,8 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 SurfaceMesh = tuple[FloatArray, IndexArray]
 """Points (o, 3) [m] and triangles (f, 3)."""
+PositiveScale = Annotated[float, Field(ge=1e-6, le=1e6)]
+"""A factor or a rate from 1e-6 to 1e6."""
 
 
 class TriangleSurface(ConfigModel):
@@ -68,7 +69,7 @@ class RecordedFrames(ConfigModel):
 
     positions: Path | tuple[tuple[Vector3, ...], ...]
     """An .npz with `positions` (frames, points, 3) [m], as `springbench run --positions` writes it; or inline."""
-    frame_rate: LengthMetres = 60.0
+    frame_rate: PositiveScale = 60.0
     """Frames per second."""
     start_time: float = Field(default=0.0, ge=0.0, le=1e9)
     """Time of the first frame [s]."""
@@ -106,7 +107,7 @@ class MeshObstacle(ConfigModel):
     """A mesh from a file, from a generator, or inline as `triangles`."""
     size: Annotated[int, Field(ge=2, le=10_000)] = 24
     """Mesh size, ignored for a mesh from a file."""
-    scale: LengthMetres = 1.0
+    scale: PositiveScale = 1.0
     """Factor of all coordinates of the mesh."""
     offset: Vector3 = (0.0, 0.0, 0.0)
     """Translation after scaling [m]."""
