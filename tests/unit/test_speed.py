@@ -15,7 +15,12 @@ from springbench.harness.config.sweep_config import RunSpec, SolverSpec
 from springbench.harness.errors import InputError, RunFailed
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.folder_locks import lock_folder_exclusive
-from springbench.harness.experiments.roofline import benchmark_candidates, round_robin, stream_probes
+from springbench.harness.experiments.roofline import (
+    benchmark_candidates,
+    roofline_comparison,
+    round_robin,
+    stream_probes,
+)
 from springbench.harness.experiments.roofline.benchmark_candidates import CandidateTiming, compute_call_seconds
 from springbench.harness.experiments.roofline.precision_error import compute_precision_error, find_converged_problem
 from springbench.harness.experiments.roofline.roofline_comparison import run_roofline
@@ -29,8 +34,10 @@ from springbench.harness.experiments.roofline.round_robin import (
 from springbench.harness.report.speed.operation_counts import count_operations
 from springbench.harness.report.speed.speed_figures import compute_speed_figures
 from springbench.harness.report.speed.speed_table import build_speed_table, describe_speed
+from springbench.harness.scenes.scene_builder import build_scene
+from springbench.harness.simulation.time_loop import build_initial_state, build_problem
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
-from springbench.solvers.model.step_problem import Unsupported
+from springbench.solvers.model.step_problem import StopRule, Unsupported
 
 from tests.preemption_retry import retry_if_preempted
 from tests.progress_displays import SilentDisplay
@@ -205,6 +212,42 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(stream_probes.build_probes, "__defaults__", ((1 << 14, 1 << 16),))
     monkeypatch.setattr(benchmark_candidates.compute_call_seconds, "__defaults__", (0.0,))
     return load_sweep(tmp_path / "small.yaml")
+
+
+def test_candidates_compute_the_step_that_their_rows_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    options = {"integrator": "bdf2", "initial_guess": "inertial", "max_iterations": 4}
+    (made,) = load_config(SCENE, solvers=["sparse"], sizes=[4], rounds=1, threads=1, **options).list_runs()
+    (candidate,) = _catch_candidates([made], tmp_path, monkeypatch)
+    scene = build_scene(made.scene, 4, "bdf2")
+    problem = build_problem(scene, build_initial_state(scene), "inertial")
+    assert candidate._scene.integrator is scene.integrator
+    np.testing.assert_array_equal(candidate._problem.initial_guess, problem.initial_guess)
+    # The first step of BDF2 is one of implicit Euler, of another system than the scene's.
+    candidate.prepare()
+    candidate._solve_step()
+    solution = CompiledLocalGlobal().prepare(problem.system).solve(problem, StopRule(4))
+    assert candidate._positions == pytest.approx(solution.positions, rel=1e-9, abs=1e-12)
+
+
+def _catch_candidates(runs: list[RunSpec], folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    caught: list[Any] = []
+
+    def catch(candidates: list[Any], *rest: Any) -> list[Any]:
+        caught.extend(candidates)
+        return []
+
+    monkeypatch.setattr(roofline_comparison, "measure_round_robin", catch)
+    roofline_comparison._measure_rows(runs, folder, {}, 1.0, lambda phase: None)
+    return caught
+
+
+def test_runs_that_take_different_steps_are_refused(tmp_path: Path):
+    (tmp_path / "two.yaml").write_text(
+        SWEEP.replace("max_iterations: 4", "max_iterations: 4, integrator: [implicit-euler, bdf2]")
+    )
+    (tmp_path / SCENE.name).write_bytes(SCENE.read_bytes())
+    with pytest.raises(InputError, match="integrator: got implicit-euler, bdf2 for yardstick-cloth 4; expected one"):
+        run_roofline(load_sweep(tmp_path / "two.yaml"), tmp_path / "out", SilentDisplay(), print)
 
 
 def test_a_folder_admits_one_report_at_a_time(sweep, tmp_path: Path):

@@ -94,7 +94,7 @@ class SolverCandidate:
         watch = PhaseWatch(numba.get_num_threads())
         with watch:
             began = perf_counter()
-            prepared = self._solver.prepare(self._scene.system)
+            prepared = self._solver.prepare(self._problem.system)
             seconds = perf_counter() - began
         watch.build_columns("prepare", [seconds])
         if self._prepared is None:

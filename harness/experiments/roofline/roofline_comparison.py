@@ -1,7 +1,7 @@
 """Speed report: a sweep's runs, the C++ baseline and the roofline, by size.
 
 An ordinary sweep specifies the runs. All runs of a size are one unit here. They are timed interleaved in one process,
-each from the same first step of its scene.
+each from the same first step of its scene, so they have one time step, integrator and initial guess.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import pyarrow as pa
 from springbench.harness.config.config_loader import SweepPlan
 from springbench.harness.config.sweep_config import RunSpec, SolverSpec
+from springbench.harness.errors import InputError
 from springbench.harness.execution import folder_locks, machine_info
 from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
 from springbench.harness.execution.progress_display import ProgressDisplay, RunCost
@@ -159,7 +160,7 @@ def run_roofline(
         isolated: see `springbench.harness.experiments.experiment_units.execute_units`.
 
     Raises:
-        InputError: an option is invalid.
+        InputError: an option is invalid, or runs of one scene and size take different steps.
     """
     runs = [run.replace_options(threads=machine_info.choose_threads(run.threads).count) for run in sweep.list_runs()]
     require_threads({machine_info.choose_threads(run.threads).count for run in runs})
@@ -179,10 +180,21 @@ def run_roofline(
 
 
 def _group_runs(runs: Sequence[RunSpec]) -> list[list[RunSpec]]:
-    """Group the runs by scene and size, smaller sizes first."""
+    """Group the runs by scene and size, smaller sizes first.
+
+    Raises InputError if runs of a group take different steps: their times and positions could not be compared.
+    """
     groups: dict[tuple[str, int], list[RunSpec]] = {}
     for run in sorted(runs, key=lambda run: run.size):
         groups.setdefault((run.scene_name, run.size), []).append(run)
+    for (scene, size), group in groups.items():
+        for option in ("time_step", "integrator", "initial_guess"):
+            values = dict.fromkeys(str(getattr(run, option)) for run in group)
+            if len(values) > 1:
+                raise InputError(
+                    f"{option}: got {', '.join(values)} for {scene} {size}; expected one value, because all candidates "
+                    "of a size compute the same step: use a config for each"
+                )
     return list(groups.values())
 
 
@@ -208,8 +220,9 @@ def _measure_rows(
     tick: ProgressCallback,
 ) -> list[list[dict[str, Any]]]:
     """Measure all runs of one scene and size, and return the rows of each."""
-    scene = build_scene(runs[0].scene, runs[0].size)
-    stated = build_problem(scene, build_initial_state(scene), runs[0].initial_guess)
+    first = runs[0]  # all take the same step, as `_group_runs` requires
+    scene = build_scene(first.scene, first.size, first.integrator)
+    stated = build_problem(scene, build_initial_state(scene), first.initial_guess)
     program = partial(cpp_baseline.compile_baseline, folder / "build")
     prepared: dict[str, PreparedSolver] = {}
     rest = find_converged_problem(stated) if any(read_precision(run) != "float64" for run in runs) else None
