@@ -69,7 +69,7 @@ def measure_cell(config: Path, size: int, effect: str, solver: str, frames: int,
     row: dict[str, Any] = {"scene": config.stem, "size": size, "effect": effect, "solver": solver}
     try:
         both = prepare_scene(scene, size, made, effect), prepare_scene(scene, size, made)
-        found = measure_overhead(effect, *both, STOP, frames=frames, max_rounds=rounds)
+        found = measure_overhead(effect, *both, STOP, initial_guess="previous", frames=frames, max_rounds=rounds)
     except Unsupported as error:
         return row | {"refused": str(error)}
     middle, low, high = found.ratio_interval

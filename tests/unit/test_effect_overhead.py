@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from springbench.harness.cli.main import app
@@ -10,9 +12,13 @@ from springbench.harness.config.config_loader import load_config, load_scene
 from springbench.harness.console import get_error_console, print_message
 from springbench.harness.errors import InputError
 from springbench.harness.execution.progress_display import create_display
+from springbench.harness.experiments.ablation import iteration_overhead
 from springbench.harness.experiments.ablation.iteration_overhead import list_measured_effects, select_effects
 from springbench.harness.experiments.ablation.overhead_unit import measure_all_overheads
 from springbench.harness.report.ablation_summary import build_overhead_table, read_ablation
+from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.time_loop import simulate_scene
+from springbench.solvers.model.integrators import INTEGRATORS
 from typer.testing import CliRunner
 
 CLOTH = """
@@ -58,6 +64,24 @@ def test_every_solver_has_an_overhead_of_each_effect_or_states_why_not(cloth: Pa
     table = build_overhead_table(list(values.values()))
     assert [str(column.header) for column in table.columns] == ["effect", "newton", "dense"]
     assert next(iter(table.columns[2].cells)) == "unsupported"
+
+
+def test_overheads_are_those_of_the_integrator_and_the_initial_guess_of_the_run(
+    cloth: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    seen: set[tuple[str, str]] = set()
+
+    def simulate(scene: Scene, *rest: Any, initial_guess: str, frames: int) -> Iterator[Any]:
+        name = next(name for name, one in INTEGRATORS.items() if one is scene.integrator)
+        seen.add((name, initial_guess))
+        return simulate_scene(scene, *rest, initial_guess=initial_guess, frames=frames)
+
+    monkeypatch.setattr(iteration_overhead, "simulate_scene", simulate)
+    options = {"integrator": "midpoint", "initial_guess": "inertial"}
+    sweep = load_config(cloth, solvers=["newton"], rounds=1, rtol=1e-6, threads=1, **options)
+    (path,) = measure_all_overheads(sweep, tmp_path, create_display(get_error_console()), print_message, isolated=False)
+    assert {row["status"] for row in read_ablation(path)} == {"ok"}
+    assert seen == {("midpoint", "inertial")}
 
 
 @pytest.mark.parametrize("also", [["--with-pairs"], ["--solver", "newton"]], ids=" ".join)

@@ -133,7 +133,15 @@ def _is_baseline_effect(effect: SceneEffect) -> bool:
 
 
 def measure_overheads(
-    scene: SceneSpec, size: int, solver: Solver, stop_rule: StopCriterion, *, frames: int, max_rounds: int
+    scene: SceneSpec,
+    size: int,
+    solver: Solver,
+    stop_rule: StopCriterion,
+    *,
+    integrator: str,
+    initial_guess: str,
+    frames: int,
+    max_rounds: int,
 ) -> Iterator[EffectOverhead]:
     """Measure the overhead of each effect with one solver; unsupported effects yield a reason.
 
@@ -142,6 +150,8 @@ def measure_overheads(
         size: mesh size.
         solver: the solver.
         stop_rule: stop rule of a step.
+        integrator: name of the integrator.
+        initial_guess: name of the initial guess.
         frames: number of counted steps in a round.
         max_rounds: largest number of rounds.
     """
@@ -149,13 +159,14 @@ def measure_overheads(
     for effect in list_measured_effects(scene):
         try:
             if plain is None:
-                plain = prepare_scene(scene, size, solver)
-                stop_rule = _limit_iterations(plain, stop_rule)
+                plain = prepare_scene(scene, size, solver, integrator=integrator)
+                stop_rule = _limit_iterations(plain, stop_rule, initial_guess)
             yield measure_overhead(
                 effect,
-                prepare_scene(scene, size, solver, effect),
+                prepare_scene(scene, size, solver, effect, integrator=integrator),
                 plain,
                 stop_rule,
+                initial_guess=initial_guess,
                 frames=frames,
                 max_rounds=max_rounds,
             )
@@ -163,7 +174,9 @@ def measure_overheads(
             yield EffectOverhead(effect, unsupported_reason=str(error))
 
 
-def prepare_scene(scene: SceneSpec, size: int, solver: Solver, *effects: str) -> PreparedScene:
+def prepare_scene(
+    scene: SceneSpec, size: int, solver: Solver, *effects: str, integrator: str = "implicit-euler"
+) -> PreparedScene:
     """Build the scene with some effects and the baseline effects, and prepare the solver.
 
     Args:
@@ -171,6 +184,7 @@ def prepare_scene(scene: SceneSpec, size: int, solver: Solver, *effects: str) ->
         size: mesh size.
         solver: solver to prepare.
         effects: kinds of the effects to select; ALL_EFFECTS selects all.
+        integrator: name of the integrator.
 
     Returns:
         The built scene, and the solver prepared for its system.
@@ -180,7 +194,7 @@ def prepare_scene(scene: SceneSpec, size: int, solver: Solver, *effects: str) ->
         NotPositiveDefinite: the system matrix is not positive definite.
         Unsupported: the solver does not support an effect.
     """
-    made = build_scene(select_effects(scene, *effects), size)
+    made = build_scene(select_effects(scene, *effects), size, integrator)
     return made, prepare(made, solver)
 
 
@@ -190,6 +204,7 @@ def measure_overhead(
     baseline: PreparedScene,
     stop_rule: StopCriterion,
     *,
+    initial_guess: str,
     frames: int,
     max_rounds: int,
 ) -> EffectOverhead:
@@ -200,6 +215,7 @@ def measure_overhead(
         with_effect: scene with the effect.
         baseline: scene without it.
         stop_rule: stop rule of a step.
+        initial_guess: name of the initial guess.
         frames: number of counted steps in a round.
         max_rounds: largest number of rounds.
     """
@@ -207,7 +223,9 @@ def measure_overhead(
     found = ConfidenceInterval(np.nan, np.nan, np.nan)
     while len(pairs) < max_rounds:
         runs = [
-            _TimedRun(iter(simulate_scene(*it, stop_rule, initial_guess="previous", frames=NUM_WARMUP_STEPS + frames)))
+            _TimedRun(
+                iter(simulate_scene(*it, stop_rule, initial_guess=initial_guess, frames=NUM_WARMUP_STEPS + frames))
+            )
             for it in (with_effect, baseline)
         ]
         enough = False
@@ -233,12 +251,12 @@ def measure_overhead(
     )
 
 
-def _limit_iterations(baseline: PreparedScene, stop_rule: StopCriterion) -> StopCriterion:
+def _limit_iterations(baseline: PreparedScene, stop_rule: StopCriterion, initial_guess: str) -> StopCriterion:
     """Return the stop rule, with fewer iterations if a step takes longer than MAX_ROUND_SECONDS.
 
     The reduced number of iterations takes a quarter of that time.
     """
-    run = _TimedRun(iter(simulate_scene(*baseline, stop_rule, initial_guess="previous", frames=NUM_WARMUP_STEPS)))
+    run = _TimedRun(iter(simulate_scene(*baseline, stop_rule, initial_guess=initial_guess, frames=NUM_WARMUP_STEPS)))
     for k in range(NUM_WARMUP_STEPS):  # only the last step counts, since the first one compiles
         run.run_step(is_counted=k == NUM_WARMUP_STEPS - 1)
     return (

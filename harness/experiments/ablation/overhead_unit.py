@@ -49,10 +49,19 @@ class OverheadUnit(EffectUnit):
         run = self.run
         solver: Solver = load_target(SOLVER_TABLE[run.solver.name])(**run.solver.parameters)
         stop, rows = build_stop_rule(run.max_iterations, run.rtol), list[ResultRow]()
-        plain = build_scene(select_effects(run.scene), run.size)
+        plain = build_scene(select_effects(run.scene), run.size, run.integrator)
         counts = {"vertices": len(plain.mesh.rest_positions), "springs": len(plain.all_springs.edges)}
         with machine_info.limit_threads(machine_info.choose_threads(run.threads).count):
-            for found in measure_overheads(run.scene, run.size, solver, stop, frames=run.frames, max_rounds=run.rounds):
+            for found in measure_overheads(
+                run.scene,
+                run.size,
+                solver,
+                stop,
+                integrator=run.integrator,
+                initial_guess=run.initial_guess,
+                frames=run.frames,
+                max_rounds=run.rounds,
+            ):
                 rows.append(counts | _build_row(found))
                 tick(found.effect_kind)
         return self._add_shared_columns(rows)
