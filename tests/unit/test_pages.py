@@ -134,6 +134,22 @@ def test_a_study_that_is_too_large_leaves_the_published_one_as_it_is(
     assert {path: path.read_bytes() for path in study.parent.rglob("*") if path.is_file()} == before
 
 
+def test_an_interrupted_publication_keeps_the_published_tables(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    study = checkout / "results" / "published" / "dummy"
+    before = {path.name: path.read_bytes() for path in study.glob("*.parquet")}
+
+    def interrupt(source: Path, target: Path) -> None:
+        if target.parent == study:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "replace", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        study_publication.write_study(
+            [checkout / "runs"], checkout / "configs" / "dummy.yaml", study.parent, lambda line: None
+        )
+    assert {path.name: path.read_bytes() for path in study.glob("*.parquet")} == before
+
+
 def test_equal_data_give_equal_bytes(checkout: Path) -> None:
     page, picture = (checkout / "results" / "findings" / name for name in ("runs.md", "pictures/iterations.png"))
     assert set(write_pages(checkout)) == {page, picture}

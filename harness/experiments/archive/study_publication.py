@@ -95,10 +95,12 @@ def write_study(
             why = f"takes {size:,} bytes with this study, and at most {MAX_PUBLISHED_BYTES:,} are part of a clone"
             raise InputError(InputMistake(f"{why}; publish fewer runs", published))
         folder.mkdir(exist_ok=True)
-        for path in older:
-            path.unlink()
-        for path in Path(temporary).iterdir():
+        written = sorted(Path(temporary).iterdir())
+        for path in written:
             path.replace(folder / path.name)
+        for path in older:  # last: an interruption leaves a table of each kind
+            if path.name not in {one.name for one in written}:
+                path.unlink()
     metadata = {
         "config": os.path.relpath(config.resolve(), folder.resolve()),
         "config_digest": published_set.compute_file_digest(config),
