@@ -136,6 +136,15 @@ def test_exact_pins_are_no_part_of_q_and_the_iteration_leaves_them_in_place(tmp_
     np.testing.assert_array_equal(found[fixed], V[fixed])
 
 
+def test_the_first_guess_of_a_step_problem_is_one_that_exists(tmp_path):
+    scene = build_graded_scene(load_scene(written_assignment(tmp_path)), 0)
+    V = scene.mesh.rest_positions
+    guesses = [build_step_problem(scene, V, V, 0, name).initial_guess for name in ("coarse-to-fine", "previous")]
+    np.testing.assert_array_equal(*guesses)
+    with pytest.raises(InputError, match=r"got 'previus'; expected one of .*; did you mean 'previous'"):
+        build_step_problem(scene, V, V, 0, "previus")
+
+
 @pytest.mark.slow
 def test_the_command_prints_formulas_and_writes_a_picture(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

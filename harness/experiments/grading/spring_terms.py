@@ -12,10 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.errors import InputError, InputMistake, format_allowed_names
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.simulation.time_loop import INITIAL_GUESSES, MotionState, build_initial_state, build_problem
+from springbench.harness.simulation.time_loop import (
+    COARSE_TO_FINE,
+    INITIAL_GUESSES,
+    MotionState,
+    build_initial_state,
+    build_problem,
+)
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.energies.edge_energy import unit_directions
 from springbench.solvers.model.energies.spring_energy import Springs
@@ -151,9 +157,16 @@ def build_step_problem(
         current: p^t (n, 3) [m].
         previous: p^(t-dt) (n, 3) [m].
         index: number of the last step, 0 at the start.
-        initial_guess: a key of `INITIAL_GUESSES`; any other name means `previous`.
+        initial_guess: a key of `INITIAL_GUESSES`; or COARSE_TO_FINE, for which the step starts as with "previous",
+            without a solution on a coarser mesh.
+
+    Raises:
+        InputError: there is no such initial guess.
     """
-    if initial_guess not in INITIAL_GUESSES:
+    if initial_guess == COARSE_TO_FINE:
         initial_guess = "previous"
+    if initial_guess not in INITIAL_GUESSES:
+        expected = format_allowed_names(initial_guess, [*INITIAL_GUESSES, COARSE_TO_FINE])
+        raise InputError(InputMistake(f"got {initial_guess!r}; expected {expected}", key="initial_guess"))
     velocity = (current - previous) / scene.find_step_scene(max(0, index - 1)).system.time_step
     return build_problem(scene, MotionState(Motion(current, velocity), None, index), initial_guess)
