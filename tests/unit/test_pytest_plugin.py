@@ -124,6 +124,20 @@ def test_other_answers(paired_benchmark):
     assert [b["extra_info"]["verdict"] for b in stored] == ["pass", "pass"]
 
 
+def test_an_error_probability_of_zero_is_no_default(tmp_path: Path):
+    (tmp_path / "cloth.yaml").write_text(SCENE)
+    test = """
+def test_it(paired_benchmark): paired_benchmark(spin(10), spin(10), max_ratio=9, alpha=0)
+def test_solvers(paired_benchmark):
+    paired_benchmark.compare_solvers("cloth.yaml", "sparse", "sparse", max_ratio=9, max_iterations=2, alpha=2.0)
+"""
+    code, said, stored = session(tmp_path, test)
+    assert code == 1
+    assert "ValueError: alpha: got 0; expected a probability" in said
+    assert "ValueError: alpha: got 2.0; expected a probability" in said
+    assert not stored
+
+
 def regress(path: Path, *options: str) -> tuple[int, str]:
     done = CliRunner().invoke(app, ["regress", str(path), *options])
     return done.exit_code, " ".join(done.output.split())

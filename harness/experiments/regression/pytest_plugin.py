@@ -82,7 +82,7 @@ class PairedBenchmark:
         )
         from springbench.harness.results.regression_verdict import RegressionVerdict
 
-        sequential_test = SequentialTest(max_ratio, alpha or DEFAULT_ALPHA)
+        sequential_test = SequentialTest(max_ratio, DEFAULT_ALPHA if alpha is None else alpha)
         benchmark = cast(Any, self._benchmark)
         answer: Any = benchmark.pedantic(candidate) if benchmark.disabled else candidate()
         if agreement_rtol is not None:
@@ -97,7 +97,9 @@ class PairedBenchmark:
         programs = build_program_pair(candidate, baseline, clock)
         results: list[BenchmarkResult] = []
         seconds: list[float] = []
-        blocks = iterate_paired_benchmark(programs.b, sequential_test, time_budget=budget or self._budget)
+        blocks = iterate_paired_benchmark(
+            programs.b, sequential_test, time_budget=self._budget if budget is None else budget
+        )
 
         def advance_blocks() -> None:
             try:
@@ -127,6 +129,7 @@ class PairedBenchmark:
         agreement_rtol: float | None = 1e-9,
         clock: Literal["cpu", "wall"] = "cpu",
         budget: float | None = None,
+        alpha: float | None = None,
         size: int | None = None,
         **options: Any,
     ) -> BenchmarkResult | None:
@@ -140,6 +143,7 @@ class PairedBenchmark:
             agreement_rtol: tolerance of the difference of the positions, relative to the scene's size.
             clock: "cpu" or "wall".
             budget: seconds; --paired-benchmark-budget by default.
+            alpha: probability of a wrong verdict; 0.1 % by default.
             size: mesh size; the scene's default if omitted.
             options: options of a run: max_iterations, rtol, frames, integrator, time_step, initial_guess.
 
@@ -153,7 +157,9 @@ class PairedBenchmark:
         with limit_threads(1):
             path = resolve_scene_path(os.fspath(scene), self._item.path.parent)
             both = prepare_solver_pair(path, solver, baseline, size=size, **options)
-            return self(*both, max_ratio=max_ratio, clock=clock, agreement_rtol=agreement_rtol, budget=budget)
+            return self(
+                *both, max_ratio=max_ratio, clock=clock, agreement_rtol=agreement_rtol, budget=budget, alpha=alpha
+            )
 
 
 def _build_extra_info(result: BenchmarkResult, num_calls: int, clock: str) -> dict[str, Any]:
