@@ -51,5 +51,5 @@ def test_a_third_party_integrator_that_is_not_installed_is_a_row_that_names_the_
         error_target, 1e-2, seen, lambda line: None, [("substepping", SolverSpec("velocity-verlet", {}))]
     )
     (peer,) = compare_third_party(error_target, 1e-2, answer, ["cvode-bdf"])
-    assert "pip install -e '.[sundials]'" in peer.reason
+    assert "pip install 'springbench[sundials]'" in peer.reason
     assert not THIRD_PARTY_INTEGRATORS["scipy-radau"].missing_reason

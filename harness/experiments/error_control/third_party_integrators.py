@@ -67,7 +67,7 @@ class ThirdPartyIntegrator:
         """How to install the module if it is missing; empty otherwise."""
         if not self.module or find_spec(self.module):
             return ""
-        return f"is not installed; `.venv/bin/pip install -e '.[{self.pip_extra}]'` in the checkout installs it"
+        return f"is not installed; `pip install 'springbench[{self.pip_extra}]'` installs it"
 
 
 def _build_scipy_integrator(method: str) -> Callable[[InitialValueProblem], OdeState]:
