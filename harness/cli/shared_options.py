@@ -10,11 +10,11 @@ from typing import Annotated, Any
 
 import typer
 from springbench.harness.atomic_files import USER_ERRNOS, describe_os_error
+from springbench.harness.cli import results_location
 from springbench.harness.config.shipped_configs import locate_config
 from springbench.harness.console import enable_logging, print_message
 from springbench.harness.errors import InputError, SpringbenchError
 from springbench.harness.execution.optional_parts import find_part
-from springbench.harness.results import remote_storage
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
@@ -35,12 +35,12 @@ def describe_config(metavar: str, help_text: str) -> Any:
 
 
 _RESULTS_SETTINGS: Any = {
-    "parser": remote_storage.parse_location,
+    "parser": results_location.parse_location,
     "metavar": "PATH|URL",
     "help": "Folder with a subfolder for each sweep.",
 }
-ResultsOption = Annotated[Path, typer.Option(callback=remote_storage.sync_results, **_RESULTS_SETTINGS)]
-RowsOption = Annotated[Path, typer.Option(callback=remote_storage.fetch_rows, **_RESULTS_SETTINGS)]
+ResultsOption = Annotated[Path, typer.Option(callback=results_location.sync_results, **_RESULTS_SETTINGS)]
+RowsOption = Annotated[Path, typer.Option(callback=results_location.fetch_rows, **_RESULTS_SETTINGS)]
 RerunOption = Annotated[bool, typer.Option("--rerun", help="Repeat completed runs.")]
 RerunStaleOption = Annotated[
     bool,

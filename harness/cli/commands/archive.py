@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from springbench.harness.cli import results_location
 from springbench.harness.console import print_message
 from springbench.harness.errors import InputError, InputMistake
-from springbench.harness.results import remote_storage
 
 _FOLDER_ARGUMENT: Any = {
-    "parser": remote_storage.parse_location,
+    "parser": results_location.parse_location,
     "metavar": "PATH|URL",
     "help": "A folder of results, or that of one sweep.",
 }
-ResultsFolder = Annotated[Path, typer.Argument(callback=remote_storage.sync_results, **_FOLDER_ARGUMENT)]
+ResultsFolder = Annotated[Path, typer.Argument(callback=results_location.sync_results, **_FOLDER_ARGUMENT)]
 
 
 def compact(
