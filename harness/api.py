@@ -39,6 +39,8 @@ from springbench.harness.recording.recorder_interface import (
 )
 from springbench.harness.recording.strain_shading import compute_strain_range
 from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
+from springbench.harness.scenes.fabric_table import FABRIC_EFFECTS
 from springbench.harness.scenes.mesh.mesh import Mesh
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.scenes.scene_spec import InitialGuess, MeshSource, SceneSpec
@@ -120,19 +122,31 @@ def make_scene(
         'chain'
     """
     # Objects are validated already. Placeholders stand for them while the other parts of the scene are checked.
-    listed = [dict(effect) if isinstance(effect, Mapping) else {"kind": "gravity"} for effect in effects]
+    keys = [_list_effect_keys(effect, has_fabric=fields.get("fabric") is not None) for effect in effects]
+    listed = [{"kind": "gravity"} if of_effect is None else of_effect for of_effect in keys]
     given = dict(mesh) if isinstance(mesh, Mapping) else {"kind": "grid"}
     data = {**fields, "mesh": given, "effects": listed}
     checked = config_loader.build_scene_from_document(
         ConfigDocument(Path(folder) / f"{name}.yaml", _to_plain_data(data))
     )
     own = tuple(
-        made if isinstance(effect, Mapping) else effect for effect, made in zip(effects, checked.effects, strict=True)
+        effect if of_effect is None else made
+        for effect, of_effect, made in zip(effects, keys, checked.effects, strict=True)
     )
     changed: dict[str, Any] = {"effects": own}
     if not isinstance(mesh, Mapping):
         changed["mesh"] = mesh
     return checked.model_copy(update=changed)
+
+
+def _list_effect_keys(effect: Any, *, has_fabric: bool) -> dict[str, Any] | None:
+    """Return the keys that an effect has in a file; None for an object, unless a fabric may complete its material."""
+    if isinstance(effect, Mapping):
+        return dict(cast(Mapping[str, Any], effect))
+    of: type[Any] = type(effect)
+    if not has_fabric or f"{of.__module__}:{of.__qualname__}" not in [EFFECT_CLASSES[kind] for kind in FABRIC_EFFECTS]:
+        return None
+    return effect.model_dump(mode="json", exclude_unset=True) | {"kind": effect.kind}
 
 
 class Simulation:

@@ -105,11 +105,15 @@ def find_fabric(name: str) -> PublishedFabric:
     return PUBLISHED_FABRICS[name]
 
 
+FABRIC_EFFECTS = ("springs", "bending")
+"""Kinds of the effects that a fabric completes."""
+
+
 def fill_effect(effect: Any, name: str, warp: Vector3 | None = None) -> Any:
     """Complete the data of an effect that states no material with the values of a fabric.
 
     Args:
-        effect: data of an effect as read from a scene; only `springs` and `bending` have a material.
+        effect: data of an effect as read from a scene; only FABRIC_EFFECTS have a material.
         name: name of the fabric.
         warp: direction of the warp in the rest shape, None for the same membrane stiffness in all directions.
     """

@@ -5,11 +5,14 @@ from __future__ import annotations
 import logging
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import springbench
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.errors import InputError
+from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.fabric_table import IMPLAUSIBLE_FACTOR, MEMBRANE_RANGE, PUBLISHED_FABRICS
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.solvers.model.energies.bending_energy import Bending
@@ -102,6 +105,17 @@ def test_what_a_scene_states_takes_precedence_over_its_fabric(tmp_path: Path):
     ):
         with pytest.raises(InputError, match=needle):
             build_cloth(tmp_path, "kind: springs, stretch: 7", mass=text)
+
+
+def test_a_fabric_completes_an_effect_object():
+    fields: dict[str, Any] = {"mesh": {"kind": "grid"}, "mass": 1.0, "time_step": 0.1, "frames": 1}
+    fields["fabric"] = "royal-target"
+    given, spring = SpringsEffect(scaling_rule="area"), {"kind": "springs", "scaling_rule": "area"}
+    (made,) = springbench.make_scene(effects=[given], **fields).effects
+    assert made == springbench.make_scene(effects=[spring], **fields).effects[0]
+    assert made.stretch is not None
+    with pytest.raises(InputError, match="provides nothing"):
+        springbench.make_scene(effects=[SpringsEffect(stretch=5.0)], **fields)
 
 
 @pytest.mark.parametrize("mesh", ["chain", "block"])
