@@ -18,6 +18,7 @@ from springbench.harness.report.accuracy.accuracy_data import (
     ConvergenceCurve,
     SnapshotProblem,
 )
+from springbench.harness.report.accuracy.time_to_accuracy import FATAL_STATUSES
 from springbench.solvers.iteration.solver_info import LOCAL_GLOBAL_FAMILY
 
 LIU2013_FIGURE_2 = {1: (3.61e-1, 5.4e-3), 10: (1.96e-1, 50.6e-3), 100: (4.02e-2, 0.501), 1000: (2.98e-4, 5.05)}
@@ -104,11 +105,7 @@ def gap_at_iteration(curve: ConvergenceCurve, iterations: int) -> float:
     Returns:
         The gap; nan if it is unknown or the minimum is not certified.
     """
-    if (
-        curve.problem.uncertified_reason
-        or not len(curve.iterations)
-        or curve.status in ("failed", "diverged", "unsupported")
-    ):
+    if curve.problem.uncertified_reason or not len(curve.iterations) or curve.status in FATAL_STATUSES:
         return np.nan
     k = int(np.searchsorted(curve.iterations, iterations, side="right")) - 1
     ended = curve.iterations[-1] < iterations and curve.status == "ok"

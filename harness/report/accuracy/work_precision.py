@@ -28,7 +28,7 @@ def is_default_setting(work: WorkPoint) -> bool:
 def find_default_setting(works: Iterable[WorkPoint]) -> WorkPoint | None:
     """Find the most common setting among these, by the fastest of its backends."""
     return min(
-        (w for w in works if is_default_setting(w) and _is_complete(w)),
+        (w for w in works if is_default_setting(w) and is_complete(w)),
         key=lambda w: w.seconds_per_simulated_second,
         default=None,
     )
@@ -37,7 +37,7 @@ def find_default_setting(works: Iterable[WorkPoint]) -> WorkPoint | None:
 def pareto_front(works: Iterable[WorkPoint]) -> list[WorkPoint]:
     """Return the Pareto front in time and error, the cheapest first."""
     front: list[WorkPoint] = []
-    for work in sorted((w for w in works if _is_complete(w)), key=lambda w: (w.seconds_per_simulated_second, w.error)):
+    for work in sorted((w for w in works if is_complete(w)), key=lambda w: (w.seconds_per_simulated_second, w.error)):
         if not front or work.error < front[-1].error:
             front.append(work)
     return front
@@ -56,7 +56,7 @@ def describe_cheapest_settings(works: Sequence[WorkPoint]) -> list[str]:
         best = next((work for work in pareto_front(works) if work.error <= error), None)
         if best:
             euler = min(
-                (w for w in works if is_same_method(w, base) and _is_complete(w) and w.error <= error),
+                (w for w in works if is_same_method(w, base) and is_complete(w) and w.error <= error),
                 key=lambda w: w.seconds_per_simulated_second,
                 default=None,
             )
@@ -88,5 +88,6 @@ def is_same_method(work: WorkPoint, base: WorkPoint | None) -> bool:
     )
 
 
-def _is_complete(work: WorkPoint) -> bool:
+def is_complete(work: WorkPoint) -> bool:
+    """Return whether a simulation succeeded, and has an error and a time that can be drawn."""
     return work.status == "ok" and 0.0 < work.error < np.inf and 0.0 < work.seconds_per_simulated_second < np.inf

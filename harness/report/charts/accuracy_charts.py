@@ -36,7 +36,7 @@ from springbench.harness.report.accuracy.time_to_accuracy import (
     format_gap,
     median_time,
 )
-from springbench.harness.report.accuracy.work_precision import find_default_setting, pareto_front
+from springbench.harness.report.accuracy.work_precision import find_default_setting, is_complete, pareto_front
 from springbench.harness.report.charts.chart_description import (
     ChartAxis,
     ChartDescription,
@@ -265,11 +265,7 @@ def build_work_precision_chart(table: AccuracyData, newest_fingerprint: str | No
         table: data of an accuracy measurement.
         newest_fingerprint: see the module.
     """
-    works = [
-        w
-        for w in table.work_points
-        if w.status == "ok" and 0.0 < w.error < np.inf and 0.0 < w.seconds_per_simulated_second < np.inf
-    ]
+    works = [work for work in table.work_points if is_complete(work)]
     styles = _assign_styles(table.work_points)
     frames: list[ChartFrame] = []
     for scene, size, mesh in dict.fromkeys((w.scene, w.size, w.mesh_label) for w in works):
@@ -396,7 +392,7 @@ def build_profile_chart(table: AccuracyData, newest_fingerprint: str | None = No
                 frames.append(
                     ChartFrame(
                         group=(kind,),
-                        name=(f"{target:.0e}".replace("e-0", "e-"),),
+                        name=(format_gap(target),),
                         subject=f"to a gap of {format_power(target)}: {problems} problems",
                         title=f"{kind} profile",
                         series=[*_build_profile_series(found, styles)],

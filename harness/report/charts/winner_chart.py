@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from springbench.harness.report.accuracy.accuracy_data import AccuracyData, describe_self_converged
+from springbench.harness.report.accuracy.time_to_accuracy import format_gap
 from springbench.harness.report.accuracy.winner_map import (
     NO_WINNER,
     WinnerCell,
@@ -67,7 +68,7 @@ def _build_cell(cell: WinnerCell, colors: dict[str, str], newest: str) -> MapCel
     family = cell.cheapest_family
     best = cell.cheapest_by_family.get(family)
     return MapCell(
-        row=f"{cell.error:.0e}".replace("e-0", "e-"),
+        row=format_gap(cell.error),
         column=format_quantity(cell.stiffness_number),
         outcome=family,
         color=colors[family],

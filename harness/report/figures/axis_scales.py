@@ -184,10 +184,10 @@ def _label_boxes(axis: Axis) -> list[Bbox]:
 def _labels_overlap(boxes: Sequence[Bbox]) -> bool:
     """Return whether two neighbouring labels are closer than a gap of 2 pixels."""
     gap = 2.0
-    return any(_boxes_overlap(a, b, gap) for a, b in pairwise(boxes))
+    overlaps = (measure_overlap(a, b) for a, b in pairwise(boxes))
+    return any(across > -gap and up > 0.0 for across, up in overlaps)
 
 
-def _boxes_overlap(a: Bbox, b: Bbox, gap: float) -> bool:
-    across = min(a.x1, b.x1) - max(a.x0, b.x0)
-    up = min(a.y1, b.y1) - max(a.y0, b.y0)
-    return bool(across > -gap and up > 0.0)
+def measure_overlap(one: Bbox, other: Bbox) -> tuple[float, float]:
+    """Return by how much two boxes overlap, across and up; negative where there is a gap."""
+    return float(min(one.x1, other.x1) - max(one.x0, other.x0)), float(min(one.y1, other.y1) - max(one.y0, other.y0))

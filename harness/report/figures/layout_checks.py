@@ -8,6 +8,7 @@ from itertools import combinations
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
+from springbench.harness.report.figures.axis_scales import measure_overlap
 from springbench.harness.report.figures.figure_layout import visible_texts
 from springbench.harness.report.figures.figure_options import MIN_FONT_SIZE
 
@@ -37,6 +38,4 @@ def find_layout_faults(figure: Figure) -> list[str]:
 
 
 def _boxes_overlap(one: Bbox, other: Bbox, slack: float) -> bool:
-    across = min(one.x1, other.x1) - max(one.x0, other.x0)
-    up = min(one.y1, other.y1) - max(one.y0, other.y0)
-    return bool(across > slack and up > slack)
+    return min(measure_overlap(one, other)) > slack
