@@ -22,9 +22,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
-from springbench.harness.errors import InputError
+from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.results.bootstrap_statistics import ConfidenceInterval, estimate_ratio
 from springbench.harness.scenes.effects.effect_interface import SceneEffect
+from springbench.harness.scenes.effects.effect_table import EFFECT_CLASSES
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.auto_tolerance import StopCriterion
@@ -37,6 +38,7 @@ from springbench.solvers.model.step_problem import (
     Solver,
     Unsupported,
 )
+from springbench.solvers.registry import load_target
 
 ALL_EFFECTS = "all"
 """Name of all effects together."""
@@ -110,7 +112,9 @@ def list_measured_effects(scene: SceneSpec) -> list[str]:
     kinds = list(dict.fromkeys(effect.kind for effect in scene.effects if not _is_baseline_effect(effect)))
     if not kinds:
         listed = ", ".join(dict.fromkeys(effect.kind for effect in scene.effects))
-        raise InputError(f"{scene.path}: has no effect that has a price; those without one: {listed or 'none'}")
+        measured = [kind for kind, target in EFFECT_CLASSES.items() if not _is_baseline_effect(load_target(target))]
+        problem = f"got {listed or 'none'}, which are part of the baseline; add one whose overhead can be measured: "
+        raise InputError(InputMistake(problem + ", ".join(sorted(measured)), scene.path, key="effects"))
     return [*kinds, ALL_EFFECTS]
 
 
@@ -127,8 +131,8 @@ def select_effects(scene: SceneSpec, *kinds: str) -> SceneSpec:
     return scene.model_copy(update=scene.select_effect_fields(selected))
 
 
-def _is_baseline_effect(effect: SceneEffect) -> bool:
-    """Return whether an effect is declared part of the baseline."""
+def _is_baseline_effect(effect: SceneEffect | type[SceneEffect]) -> bool:
+    """Return whether an effect, or a class of effects, is declared part of the baseline."""
     return bool(getattr(effect, "is_baseline_effect", False))
 
 

@@ -33,7 +33,7 @@ class OverheadUnit(EffectUnit):
     @property
     def title(self) -> str:
         """Title of the unit, for messages."""
-        return f"{self.run.title}: the price of each effect"
+        return f"{self.run.title}: the overhead of each effect"
 
     @property
     def num_progress_steps(self) -> int:
@@ -42,7 +42,7 @@ class OverheadUnit(EffectUnit):
 
     def file_suffix(self) -> str:
         """Return the suffix of the file of overheads."""
-        return "-prices"
+        return "-overhead"
 
     def measure_rows(self, tick: ProgressCallback) -> list[ResultRow]:
         """Measure the overhead of each effect and return the rows."""
@@ -135,7 +135,7 @@ def measure_all_overheads(
     folder.mkdir(parents=True, exist_ok=True)
     with folder_locks.lock_folder_exclusive(folder):
         execute_units(
-            select_missing_units(units, "prices", print_message, rerun=rerun, rerun_stale=rerun_stale),
+            select_missing_units(units, "units of overheads", print_message, rerun=rerun, rerun_stale=rerun_stale),
             display,
             isolated=isolated,
         )
