@@ -1,4 +1,4 @@
-"""The speed report: who takes turns with whom, what is left out and why, what is counted."""
+"""The speed report: which candidates are interleaved, what is left out and why, what is counted."""
 
 from __future__ import annotations
 
@@ -264,7 +264,7 @@ def test_a_report_is_complete_and_done_once(sweep, tmp_path: Path, monkeypatch: 
         return run_roofline(sweep, tmp_path / "out", display, said.append, isolated=False)
 
     table = run_report()
-    titles = [f"yardstick-cloth {size}: 5 candidates take turns" for size in (4, 5)]
+    titles = [f"yardstick-cloth {size}: 5 candidates interleaved" for size in (4, 5)]
     assert (display.titles, said) == (titles, [])
     found = compute_speed_figures(table)
     assert [(f.size, f.label, f.status) for f in found] == [

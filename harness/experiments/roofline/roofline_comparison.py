@@ -86,7 +86,7 @@ class RooflineUnit:
     def title(self) -> str:
         """Title of the unit, for messages."""
         first = self.candidate_runs[0]
-        return f"{first.scene_name} {first.size}: {len(self.candidate_runs)} candidates take turns"
+        return f"{first.scene_name} {first.size}: {len(self.candidate_runs)} candidates interleaved"
 
     @property
     def num_progress_steps(self) -> int:

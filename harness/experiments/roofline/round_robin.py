@@ -93,7 +93,7 @@ def measure_round_robin(
             for candidate in list(alive):
                 with _catch_failure(candidate, rows[candidate], alive):
                     rows[candidate] += [_build_row(reading, round) for reading in candidate.time_phases()]
-            tick("turns")
+            tick("rounds")
         _compare_positions(rows, alive)
         for candidate in alive:
             rows[candidate] = [candidate.columns | {"status": "ok"} | row for row in rows[candidate]]
