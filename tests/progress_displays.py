@@ -18,7 +18,7 @@ class SilentDisplay:
 
     def start_run(self, title: str, ticks: int, cost: RunCost) -> SilentDisplay:
         self.titles.append(title)
-        self._counts = not title.endswith("steps to freeze")
+        self._counts = not title.endswith("step snapshots")
         return self
 
     def report_tick(self, phase: str) -> None: ...

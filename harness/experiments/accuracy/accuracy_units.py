@@ -18,7 +18,7 @@ from springbench.harness.errors import InputError
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.isolated_worker import ProgressCallback, TaskFailure, TaskLimits
 from springbench.harness.execution.progress_display import UNIT_COST, RunCost
-from springbench.harness.experiments.accuracy.accuracy_failures import build_accuracy_failure_columns as ended
+from springbench.harness.experiments.accuracy.accuracy_failures import build_accuracy_failure_columns
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.snapshot_rows import SnapshotEvaluation, build_curve_rows
 from springbench.harness.experiments.accuracy.work_precision import build_option_columns, build_work_rows
@@ -78,7 +78,7 @@ class SnapshotUnit:
     @property
     def title(self) -> str:
         """Title of the unit, for messages."""
-        return f"{self.curve_specs[0].case.title} {self.curve_specs[0].case.integrator}: steps to freeze"
+        return f"{self.curve_specs[0].case.title} {self.curve_specs[0].case.integrator}: step snapshots"
 
     @property
     def num_progress_steps(self) -> int:
@@ -107,7 +107,7 @@ class SnapshotUnit:
             except InputError:
                 raise
             except Exception as error:  # no solver can be graded on this step; the other steps continue
-                found = [_build_missing_snapshot_row(spec, ended(error))]
+                found = [_build_missing_snapshot_row(spec, build_accuracy_failure_columns(error))]
                 messages.append(f"{spec.snapshot}: {found[0]['status']}: {found[0]['reason']}")
             else:
                 if step.step_snapshot.digest in known:
@@ -204,7 +204,7 @@ class CurveUnit:
         except InputError:
             raise
         except Exception as error:
-            return self._build_failure_rows(ended(error))
+            return self._build_failure_rows(build_accuracy_failure_columns(error))
         found = build_curve_rows(self.spec, graded, self.results.folder, lambda: tick(graded.snapshot_name))
         # The curves may have found more minima; the rows of the step are updated before those of its curves exist.
         _write_snapshot_rows(self.results.rows_path(self.spec.build_problem_stem()), self.results, graded.build_rows())
