@@ -103,7 +103,11 @@ def run_sweep(
         RunFailed: the drawing process was lost.
     """
     if scheduler_address and (positions or not isolated):
-        raise InputError("--positions and --in-process are of this machine; leave --scheduler out")
+        given = [name for name, is_set in (("--positions", positions), ("--in-process", not isolated)) if is_set]
+        raise InputError(
+            f"{' and '.join(given)} cannot be combined with --scheduler, which executes the runs elsewhere; "
+            "omit one or the other"
+        )
     if positions and len(runs) != 1:
         raise InputError(f"--positions stores the positions of one run; this is {len(runs)} runs")
     if not scheduler_address:
