@@ -217,7 +217,7 @@ def _read_long_table(path: Path, n: int, names: list[str], table: NDArray[np.flo
     frames, times = (_to_whole_numbers(column, key, path), None) if key == "frame" else (None, _to_times(column, path))
     values, rows = np.unique(column, return_inverse=True)
     vertices = _to_whole_numbers(table[:, names.index("vertex")], "vertex", path)
-    first = int(vertices.min(initial=0)) if len(vertices) and vertices.min() == 0 else 1
+    first = 0 if vertices.min(initial=1) == 0 else 1
     vertices = vertices - first
     expected = len(values) * n
     if vertices.min(initial=0) < 0 or vertices.max(initial=0) >= n or len(vertices) != expected:

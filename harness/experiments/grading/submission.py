@@ -128,7 +128,7 @@ def align_submission(
     p, mistake = read.positions, lambda problem: InputError(InputMistake(problem, read.source))
     first_bad = next((k for k, one in enumerate(p) if not (np.abs(one) <= MAX_POSITION).all()), None)
     if first_bad is not None:
-        notes.append(f"positions are not finite from the {first_bad + 1}. stored frame on; those before are graded")
+        notes.append(f"positions are not finite from stored frame {first_bad + 1} on; those before are graded")
         p = p[:first_bad]
     if not len(p):
         raise mistake("has no frame of finite positions")
