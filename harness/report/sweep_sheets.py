@@ -14,8 +14,8 @@ from springbench.harness.report.device_speedup import read_device_runs, summaris
 from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.provenance_words import describe_provenance
 from springbench.harness.report.robustness import MAP_NOTE, VerifiedRun, map_headline, read_verified_runs
-from springbench.harness.report.site.row_provenance import find_config
 from springbench.harness.results import parquet_rows, row_store
+from springbench.harness.results.folder_ownership import find_config
 
 
 def draw_device_sheets(results: Path) -> Iterator[tuple[Path | None, list[str]]]:

@@ -36,6 +36,21 @@ def read_owner(folder: Path) -> Path | None:
     return None
 
 
+def find_config(folder: Path) -> str:
+    """Find the config of a sweep's folder, as a path for a command line.
+
+    It is relative to the current folder, or else to the one that contains `configs/`; "" if the config is unknown or
+    deleted.
+    """
+    owner = read_owner(folder)
+    if owner is None:
+        return ""
+    for above in (Path.cwd(), *owner.parents):
+        if owner.is_relative_to(above) and (above == Path.cwd() or (above / "configs").is_dir()):
+            return owner.relative_to(above).as_posix()
+    return owner.name
+
+
 def claim_folder(folder: Path, config: Path) -> Path:
     """Create the results folder of a config if needed, and record its owner.
 

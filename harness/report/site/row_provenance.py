@@ -1,4 +1,4 @@
-"""Provenance of rows for the results page: code, machine and config."""
+"""Provenance of rows for the results page: code, machine and scene files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pyarrow as pa
 from springbench.harness.report.table_queries import query_table
-from springbench.harness.results.folder_ownership import OWNER_FILE as CLAIM
+from springbench.harness.results.folder_ownership import find_config, read_owner
 
 _MACHINE_COLUMNS = ("machine_id", "cpu", "cores", "memory_gib", "operating_system", "commit")
 
@@ -41,23 +41,6 @@ def find_newest_fingerprint(table: pa.Table) -> str:
     return max(((started or "", code or "") for started, code in dated), default=("", ""))[1]
 
 
-def find_config(folder: Path) -> str:
-    """Find the config of a sweep's folder, as a path for a command line.
-
-    It is "" if the config is unknown or deleted.
-    """
-    note = folder / CLAIM
-    config_path = note.read_text(errors="replace").strip() if note.is_file() else ""
-    path = folder / config_path
-    if not config_path or "\0" in config_path or not path.is_file():
-        return ""
-    there = path.resolve()
-    for above in (Path.cwd(), *there.parents):  # else relative to the folder that contains `configs/`
-        if there.is_relative_to(above) and (above == Path.cwd() or (above / "configs").is_dir()):
-            return there.relative_to(above).as_posix()
-    return there.name
-
-
 def find_scene_files(folder: Path) -> dict[str, str]:
     """Find the scene files that a sweep's config lists, by scene name.
 
@@ -65,10 +48,10 @@ def find_scene_files(folder: Path) -> dict[str, str]:
     """
     from springbench.harness.schema.yaml_loader import read_yaml
 
-    called = find_config(folder)
-    if not called:
+    owner = read_owner(folder)
+    if owner is None:
         return {}
-    data = read_yaml(folder / (folder / CLAIM).read_text().strip()).data
+    called, data = find_config(folder), read_yaml(owner).data
     if "mesh" in data:
         return {Path(called).stem: called}
     listed = [str(scene) for scene in data.get("scenes") or ()]

@@ -39,6 +39,7 @@ from springbench.harness.report.site.sweep_folders import SweepFolder, find_benc
 from springbench.harness.report.speed.speed_figures import compute_speed_figures, has_machine_limits
 from springbench.harness.report.speed.speed_table import describe_speed
 from springbench.harness.results import parquet_rows, row_store
+from springbench.harness.results.folder_ownership import find_config
 
 PrintMessage = Callable[[str], None]
 
@@ -97,7 +98,7 @@ def build_overview(
         "name": folder.name,
         "relative_url": folder.relative_url,
         "kinds": there,
-        "config": row_provenance.find_config(folder.path),
+        "config": find_config(folder.path),
         "scenes": row_provenance.find_scene_files(folder.path),
         "provenance": made,
         "first_started_at": min((one["first_started_at"] or "" for one in made), default=""),
@@ -147,7 +148,7 @@ def _build_run_section(
         name: serialise_chart(chart) for name, chart in (("size", times), ("accuracy", accuracies)) if chart.frames
     }
     device_runs = read_device_runs(table)
-    words = summarise_runs(device_runs, row_provenance.find_config(folder.path))
+    words = summarise_runs(device_runs, find_config(folder.path))
     findings = [{"text": sentence} for sentence in words] + describe_runs(found)
     devices = build_device_chart(device_runs)
     if devices.frames:
