@@ -96,7 +96,7 @@ def test_nodes_place_and_mirror_their_meshes(tmp_path):
     assert mesh.parts["a"].tolist() == [0, 1, 2]
 
 
-def test_normalised_integers_lie_between_minus_one_and_one(tmp_path):
+def test_normalised_integers_are_between_minus_one_and_one(tmp_path):
     document, _ = gltf(None)
     points = np.array([[-128, 0, 0], [-127, 0, 0], [127, 0, 0], [0, 127, 0]], np.int8).tobytes()
     document["accessors"][0] |= {"componentType": 5120, "normalized": True}
