@@ -54,7 +54,12 @@ def atomic_write(path: Path) -> Generator[Path]:
 
 
 def is_outdated(target: Path, sources: Iterable[Path]) -> bool:
-    """Return whether a file is missing, or older than one of its sources."""
+    """Return whether a file is missing, or older than one of its sources.
+
+    Args:
+        target: the file.
+        sources: files that it is made from, which must exist.
+    """
     return not target.is_file() or any(target.stat().st_mtime_ns < source.stat().st_mtime_ns for source in sources)
 
 

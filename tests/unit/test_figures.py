@@ -186,7 +186,7 @@ def test_the_command_writes_each_format_the_data_and_a_script_that_draws_them(
     assert len(stem.with_suffix(".py").read_text().splitlines()) < 110
 
 
-def test_a_script_draws_each_curve_in_its_own_way(tmp_path: Path) -> None:
+def test_a_script_draws_each_curve_with_its_style(tmp_path: Path) -> None:
     x = np.array([1.0, 2.0, 3.0])
     series = [
         CurveSeries("front", SeriesStyle("#b9b6af", "None"), x, x, is_stepped=True),

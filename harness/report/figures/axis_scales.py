@@ -189,5 +189,9 @@ def _labels_overlap(boxes: Sequence[Bbox]) -> bool:
 
 
 def measure_overlap(one: Bbox, other: Bbox) -> tuple[float, float]:
-    """Return by how much two boxes overlap, across and up; negative where there is a gap."""
+    """Return by how much two boxes overlap, across and up; negative where there is a gap.
+
+    Args:
+        one, other: the boxes, in the same unit.
+    """
     return float(min(one.x1, other.x1) - max(one.x0, other.x0)), float(min(one.y1, other.y1) - max(one.y0, other.y0))
