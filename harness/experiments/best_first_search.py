@@ -177,7 +177,11 @@ def search_best_first(
         except StopIteration as ended:
             answer: TrialOutcome[Result] | None = ended.value
             if ends_at_answer and answer and answer.error <= max_error:
-                return SearchSummary(num_trials, omitted, answer)
+                return SearchSummary(num_trials, _drop_zeros(omitted), answer)
             continue
         heappush(waiting, (proposal.attempt, proposal.expected_cost, number, proposal))
-    return SearchSummary(num_trials, {reason: count for reason, count in omitted.items() if count})
+    return SearchSummary(num_trials, _drop_zeros(omitted))
+
+
+def _drop_zeros(omitted: Counter[str]) -> dict[str, int]:
+    return {reason: count for reason, count in omitted.items() if count}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from math import inf
 from random import Random
 from types import SimpleNamespace
@@ -11,7 +12,14 @@ import pytest
 from springbench.harness.config.accuracy_config import BenchmarkCase, MeasurementSettings, WorkSpec
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.experiments.accuracy.setting_grid import LEAST_LIMIT, SLOWER, search_grid
-from springbench.harness.experiments.best_first_search import OUT_OF_TIME
+from springbench.harness.experiments.best_first_search import (
+    OUT_OF_TIME,
+    GiveUpRule,
+    SettingProposal,
+    SettingProposals,
+    TrialOutcome,
+    search_best_first,
+)
 
 STEPS, TOLERANCES, SOLVERS = (0.4, 0.2, 0.1, 0.05, 0.025), (1e-1, 1e-2, 1e-3), ("a", "b", "c", "d", "e")
 
@@ -141,3 +149,20 @@ def test_within_a_cost_the_choice_is_near_the_least_error_in_hindsight():
         search_grid(specs(), 0.0, 2.0 * limit / SLOWER, measure, 60.0)
         ratios.append(find_least(measure.found) / find_least(rows))
     assert max(ratios) <= 1.3
+
+
+@pytest.mark.parametrize("ends_at_answer", [True, False])
+def test_a_reason_for_which_nothing_is_omitted_is_not_listed(ends_at_answer: bool):
+    def propose() -> SettingProposals[int, None]:
+        return (yield SettingProposal(1))
+
+    summary = search_best_first(
+        [(0.0, propose())],
+        lambda setting, limit: TrialOutcome(0.0, 1.0),
+        0.1,
+        GiveUpRule(2.0, 0.0),
+        omitted=Counter({"they diverge": 0, "they are slow": 2}),
+        ends_at_answer=ends_at_answer,
+    )
+    assert summary.reasons == {"they are slow": 2}
+    assert (summary.answer is not None) == ends_at_answer
