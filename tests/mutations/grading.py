@@ -70,8 +70,8 @@ _TABLE = (
     (
         "grade-iterations-from-0",
         f"{_FOLDER}/fingerprints.py",
-        "k = int(np.argmax(by_count <= max(1.5 * lowest, noise))) + 1",
-        "k = int(np.argmax(by_count <= max(1.5 * lowest, noise)))",
+        "k = int(np.argmax(by_count <= max(CONVERGED_FACTOR * lowest, noise))) + 1",
+        "k = int(np.argmax(by_count <= max(CONVERGED_FACTOR * lowest, noise)))",
         f"{_GRADE}::test_a_scene_without_required_iterations_requires_convergence",
     ),
     (

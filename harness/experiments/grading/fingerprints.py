@@ -44,6 +44,13 @@ NOISE_FACTOR = 20.0
 """Factor on the stored digits' share of the deviation, up to which a submission counts as correct."""
 SAME_FACTOR = 3.0
 """Mistakes whose deviations differ by less than this factor, or by the noise, cannot be distinguished."""
+CONVERGED_FACTOR = 1.5
+"""Largest ratio to the least deviation of all iterates at which an iterate explains a submission as well."""
+MINIMUM_FACTOR = 10.0
+"""Largest ratio to that deviation at which the minima of the steps explain a submission as well.
+
+They are compared more leniently, since a program that stops near the minimum lies beside it.
+"""
 MAX_ITERATIONS = 100
 """Number of iterations whose iterates are compared, unless more are required."""
 MIN_MISTAKEN_ITERATIONS = 10
@@ -168,15 +175,15 @@ class FingerprintFinder:
         noise = all_steps.noise
         by_count = self._compare_correct(all_steps)
         lowest, limit = float(by_count.min()), max(MIN_DEVIATION, NOISE_FACTOR * noise)
-        k = int(np.argmax(by_count <= max(1.5 * lowest, noise))) + 1
+        k = int(np.argmax(by_count <= max(CONVERGED_FACTOR * lowest, noise))) + 1
         allowed = float(by_count[(self._required or 1) - 1 :].min())
         at_minimum = np.inf if allowed <= limit else self._compare_minima(submission, chosen, all_steps, find_minimum)
         deviation = min(allowed, at_minimum)
-        is_minimum = at_minimum <= max(10.0 * lowest, noise)
+        is_minimum = at_minimum <= max(MINIMUM_FACTOR * lowest, noise)
         words = f"local-global with {k} iterations a step"
         if is_minimum:
             words = "a solver that converges in every step"
-        elif by_count[-1] <= max(1.5 * lowest, noise):
+        elif by_count[-1] <= max(CONVERGED_FACTOR * lowest, noise):
             words = f"local-global, which has converged after {k} iterations of each step"
         correct = words, None if is_minimum else k
         visible = self._find_visible_programs(all_steps)
