@@ -283,7 +283,7 @@ class SampledReference:
             trajectory: reference at the times at which motions are compared.
         """
         kinetic = [_kinetic_energy(scene, v) for v in trajectory.velocities]
-        energy = _compute_energy(scene, trajectory.positions[-1], trajectory.velocities[-1])
+        energy = _compute_mechanical_energy(scene, trajectory.positions[-1], trajectory.velocities[-1])
         uncertainty = float(trajectory.disagreement.max())
         words = f"the {trajectory.reference_kind} motion"
         words += f" (known to {describe_percent(uncertainty)})" if has_contact(scene.system) else ""
@@ -320,7 +320,7 @@ class SampledReference:
         """
         if self.end_energy is None or not self.kinetic_scale:
             return float("nan")
-        return (_compute_energy(scene, p, v) - self.end_energy) / self.kinetic_scale
+        return (_compute_mechanical_energy(scene, p, v) - self.end_energy) / self.kinetic_scale
 
 
 def measure_change(p: Positions, q: Positions, start: Positions, free_vertices: NDArray[np.int64]) -> float:
@@ -593,7 +593,7 @@ def _measure_stiffness(
     return {setting: true / sag for setting, sag in sags.items() if true > 0.0 and sag > 0.0 and isfinite(sag)}
 
 
-def _compute_energy(scene: Scene, p: Positions, v: Positions) -> float:
+def _compute_mechanical_energy(scene: Scene, p: Positions, v: Positions) -> float:
     """Return the kinetic energy plus the potentials [J].
 
     Potentials are those of energies that depend on positions only, and of constant forces.

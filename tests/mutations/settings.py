@@ -34,8 +34,8 @@ _TABLE = (
     (
         "setting-drift-reversed",
         _STUDY,
-        "return (_compute_energy(scene, p, v) - self.end_energy) / self.kinetic_scale",
-        "return (self.end_energy - _compute_energy(scene, p, v)) / self.kinetic_scale",
+        "return (_compute_mechanical_energy(scene, p, v) - self.end_energy) / self.kinetic_scale",
+        "return (self.end_energy - _compute_mechanical_energy(scene, p, v)) / self.kinetic_scale",
         f"{_TESTS}::test_the_drift_is_the_energy_above_the_reference_over_its_largest_kinetic_energy",
     ),
     (

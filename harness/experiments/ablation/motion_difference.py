@@ -24,7 +24,9 @@ def compute_motion_difference(scene: Scene, a: MotionStates, b: MotionStates) ->
     unit, mass = compute_mean_rest_length(scene), scene.system.mass
     away = np.linalg.norm(p - q, axis=2)
     centres = np.einsum("i,fix->fx", mass, p - q) / mass.sum()
-    energies = np.array([[_compute_energy(scene, x, v) for x, v in zip(*motion, strict=True)] for motion in (a, b)])
+    energies = np.array(
+        [[_compute_kinetic_and_spring_energy(scene, x, v) for x, v in zip(*motion, strict=True)] for motion in (a, b)]
+    )
     most = float(np.abs(energies[0]).max())
     return {
         "displacement_max": float(away.max()) / unit,
@@ -43,7 +45,7 @@ def compute_mean_rest_length(scene: Scene) -> float:
     return float(lengths.mean()) if lengths.any() else scene.mesh.spacing
 
 
-def _compute_energy(scene: Scene, p: NDArray[np.float64], v: NDArray[np.float64]) -> float:
+def _compute_kinetic_and_spring_energy(scene: Scene, p: NDArray[np.float64], v: NDArray[np.float64]) -> float:
     """Return the kinetic energy plus the energy of the full scene's springs [J].
 
     The same energies are evaluated for all motions.
