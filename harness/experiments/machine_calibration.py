@@ -85,14 +85,14 @@ def measure_copy_bandwidth() -> float:
     """Measure the bandwidth of an array copy, read plus written [B/s]."""
     source = np.ones(_COPY_BYTES // 8)
     target = np.zeros_like(source)
-    return 2 * _COPY_BYTES / _measure_min_seconds(lambda: np.copyto(target, source))
+    return 2 * _COPY_BYTES / _measure_min_cpu_seconds(lambda: np.copyto(target, source))
 
 
 def measure_flops() -> float:
     """Measure the speed of a matrix product [FLOP/s]."""
     a = np.random.default_rng(0).normal(size=(_MATRIX_SIZE, _MATRIX_SIZE))
     out = np.empty_like(a)
-    return 2.0 * _MATRIX_SIZE**3 / _measure_min_seconds(lambda: np.matmul(a, a, out=out))
+    return 2.0 * _MATRIX_SIZE**3 / _measure_min_cpu_seconds(lambda: np.matmul(a, a, out=out))
 
 
 def measure_step_seconds() -> float:
@@ -132,10 +132,10 @@ def measure_step_seconds() -> float:
             along = A @ p
             p = factor.solve(At @ (along / np.linalg.norm(along, axis=1, keepdims=True)) + y)
 
-    return _measure_min_seconds(iterate)
+    return _measure_min_cpu_seconds(iterate)
 
 
-def _measure_min_seconds(work: Callable[[], object]) -> float:
+def _measure_min_cpu_seconds(work: Callable[[], object]) -> float:
     """Return the smallest CPU time of several repetitions after a warm-up [s]."""
     work()
     took = list[float]()

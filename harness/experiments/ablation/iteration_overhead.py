@@ -282,11 +282,12 @@ def _compute_min_seconds(scene: Scene) -> float:
         return 0.0
     x, A = np.ones(size // 8), np.ones((_MATRIX_SIZE, _MATRIX_SIZE))
     return max(
-        _measure_min_seconds(lambda: x.dot(x)), flops / (2.0 * _MATRIX_SIZE**3) * _measure_min_seconds(lambda: A @ A)
+        _measure_min_wall_seconds(lambda: x.dot(x)),
+        flops / (2.0 * _MATRIX_SIZE**3) * _measure_min_wall_seconds(lambda: A @ A),
     )
 
 
-def _measure_min_seconds(work: Callable[[], object]) -> float:
+def _measure_min_wall_seconds(work: Callable[[], object]) -> float:
     """Return the smallest of several wall times of a function [s]."""
     best = np.inf
     for _ in range(_NUM_REPEATS):
