@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 from springbench.harness.atomic_files import atomic_write, explain_unreadable_file
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.errors import InputError, InputMistake
+from springbench.harness.experiments.archive.compaction import TABLE_FOLDERS
 from springbench.harness.results import parquet_rows, published_set, row_store, run_schema
 
 DROPPED_COLUMNS = frozenset(
@@ -39,8 +40,6 @@ DROPPED_COLUMNS = frozenset(
 
 _TIME_COLUMNS = frozenset(("seconds", "cpu_seconds", "preempted", "load_average", "cold_seconds", "search_seconds"))
 """Columns without meaning where the steps were not timed, and several runs shared the machine."""
-
-_TABLES = ("rows", "accuracy", "ablation")
 
 MAX_PAUSE = 600.0
 """Longest time between the starts of two runs that counts as work [s]; one run of a study takes less."""
@@ -75,7 +74,7 @@ def write_study(
     made = _read_measurements(provenance) if provenance else None
     found = {
         table: _drop_missing_software(_join_newest_runs(several))
-        for table in ("measurements", *_TABLES)
+        for table in ("measurements", *TABLE_FOLDERS)
         if (several := [tables[table] for tables in by_part if table in tables])
     }
     if not found:
@@ -184,7 +183,7 @@ def _read_part(part: Path) -> dict[str, pa.Table]:
     if (part / published_set.STUDY_FILE).is_file():
         with published_set.open_study_folder(published_set.read_study(part)) as folder:
             return _read_part(folder)
-    return {table: rows for table in _TABLES if (rows := _read_table(part / table)) is not None}
+    return {table: rows for table in TABLE_FOLDERS if (rows := _read_table(part / table)) is not None}
 
 
 def _join_newest_runs(parts: Sequence[pa.Table]) -> pa.Table:
