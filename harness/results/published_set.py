@@ -58,7 +58,7 @@ RUN_KEYS = (
 
 
 QUICK_SHARE = 0.1
-"""Share of the runs that `springbench reproduce --quick` repeats."""
+"""Share of the runs that `springbench reproduce --quick` and `springbench verify-archive` repeat."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,7 @@ from springbench.harness.experiments.run_unit import RunUnit
 from springbench.harness.experiments.sweep_plan import RunFiles
 from springbench.harness.results import bootstrap_statistics, parquet_rows, row_store, run_schema
 from springbench.harness.results.folder_ownership import read_owner
-from springbench.harness.results.published_set import compute_file_digest
+from springbench.harness.results.published_set import QUICK_SHARE, compute_file_digest
 from springbench.harness.results.solver_metadata import read_solver_metadata
 from springbench.harness.results.time_ratios import OTHER_MACHINE_FACTOR
 
@@ -352,18 +352,17 @@ def _verify_options(published_run: PublishedRun) -> VerifiedClaim | None:
     )
 
 
-def sample_runs(runs: Sequence[PublishedRun], seed: int, fraction: float = 0.1) -> list[PublishedRun]:
-    """Select a random fraction of the runs, at least one.
+def sample_runs(runs: Sequence[PublishedRun], seed: int) -> list[PublishedRun]:
+    """Select a random share of the runs, `QUICK_SHARE` and at least one.
 
     A second solver on the same scene and size is added to each where possible.
 
     Args:
         runs: runs of the archive.
         seed: seed of the selection.
-        fraction: fraction of the runs.
     """
     chance = random.Random(seed)
-    taken = chance.sample(list(runs), max(1, math.ceil(fraction * len(runs)))) if runs else []
+    taken = chance.sample(list(runs), max(1, math.ceil(QUICK_SHARE * len(runs)))) if runs else []
     for one in list(taken):
         rivals = [run for run in runs if run.comparison_group == one.comparison_group and run not in taken]
         if rivals and sum(run.comparison_group == one.comparison_group for run in taken) == 1:
