@@ -284,7 +284,7 @@ def _run_error_controlled(job: RunJob, max_error: float, session: TimingSession)
     run = job.run
     with _acquire_timing_lock(run, job.tick) as lock_columns:
         found = load_target(ERROR_CONTROL_TARGET)(run, max_error, job.tick, job.files.results_folder)
-    rows, seen, last = found.rows(), found.positions, dict[str, Any]()
+    rows, seen, last = found.build_rows(), found.positions, dict[str, Any]()
     session.finish_timing()
     if job.positions_path:
         save_positions(job.positions_path, seen[1:])

@@ -57,7 +57,7 @@ def test_it_is_queried_line_by_line(echo: Path, tmp_path: Path):
     made = build_cloth(4)
     running = CppBaseline(echo, build_first_problem(made), made.all_springs, tmp_path, "")
     assert running.prepare_seconds == 0.125
-    assert running.step(7) == [7.0, 1.5, 2.5]
+    assert running.time_step_phases(7) == [7.0, 1.5, 2.5]
     assert running.close().shape == (16, 3)
     assert [path.name for path in tmp_path.iterdir()] == ["echo"]
 
@@ -66,9 +66,9 @@ def test_a_program_that_ends_early_is_a_failed_run(echo: Path, tmp_path: Path):
     made = build_cloth(4)
     running = CppBaseline(echo, build_first_problem(made), made.all_springs, tmp_path, "")
     with pytest.raises(RunFailed, match="too short"):
-        running.step(101)
+        running.time_step_phases(101)
     with pytest.raises(RunFailed):
-        running.step(1)
+        running.time_step_phases(1)
     running.kill()
 
 
@@ -94,7 +94,7 @@ def test_it_takes_the_same_steps_as_the_solver_in_python(program: Path, tmp_path
     ours = SparseLocalGlobal().prepare(made.system).solve(stated, StopRule(50)).positions
     running = CppBaseline(program, stated, made.all_springs, tmp_path, tunables)
     for _ in range(2):  # each step starts from the first guess again
-        step, local, global_ = running.step(50)
+        step, local, global_ = running.time_step_phases(50)
         assert step >= local + global_ > 0.0
     # Two factorisations of a matrix with weights from 1e2 to 1e10: round-off in positions of a metre.
     np.testing.assert_allclose(running.close(), ours, rtol=0, atol=1e-11)

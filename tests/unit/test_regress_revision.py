@@ -119,7 +119,7 @@ def test_a_revision_whose_libraries_are_unavailable_does_not_build(repository: P
     assert code == 2
     assert "cannot be installed:" in said
     # One that was killed while it was built is not taken for whole.
-    (tree,) = (path for path in git_worktrees.worktree_cache().iterdir() if path.is_dir())
+    (tree,) = (path for path in git_worktrees.locate_worktree_cache().iterdir() if path.is_dir())
     (tree / ".venv" / "bin").mkdir(parents=True)
     (tree / ".venv" / "bin" / "python").touch()
     code, said = regress("--baseline", "HEAD", "-k", "adding")

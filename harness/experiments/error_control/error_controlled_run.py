@@ -63,7 +63,7 @@ class ErrorControlledRun:
         """Time per step [ms], where each frame counts as one step."""
         return compute_ms_per_step([seconds for path in self.timed_trajectories for seconds in path.frame_seconds])
 
-    def rows(self) -> list[dict[str, Any]]:
+    def build_rows(self) -> list[dict[str, Any]]:
         """Build a row for each frame of each round."""
         best, scene = self.search_result.best_trial, self.scene
         balances = self.search_result.compute_balances(scene)

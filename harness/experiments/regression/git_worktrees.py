@@ -24,7 +24,7 @@ MAX_WORKTREES = 6
 """Maximum number of worktrees in the cache."""
 
 
-def worktree_cache() -> Path:
+def locate_worktree_cache() -> Path:
     """Return the cache folder of worktrees."""
     return get_user_cache_dir("revisions")
 
@@ -90,8 +90,8 @@ def prepare_worktree(checkout: Path, commit: str) -> Path:
     Raises:
         InputError: git cannot create the worktree.
     """
-    tree = worktree_cache() / commit[:16]
-    with _lock_exclusive(worktree_cache()):
+    tree = locate_worktree_cache() / commit[:16]
+    with _lock_exclusive(locate_worktree_cache()):
         _run_git(checkout, "worktree", "prune")
         if tree.exists():
             clean = _run_git(tree, "status", "--porcelain", "--untracked-files=no")
@@ -107,7 +107,9 @@ def prepare_worktree(checkout: Path, commit: str) -> Path:
         done = _run_git(checkout, "worktree", "add", "--detach", "--force", str(tree), commit)
         if done.returncode:
             raise InputError(f"--baseline: no worktree of {commit[:10]}: {_last_line(done.stderr)}")
-        for old in sorted(worktree_cache().glob("[0-9a-f]*"), key=lambda path: path.stat().st_mtime)[:-MAX_WORKTREES]:
+        for old in sorted(locate_worktree_cache().glob("[0-9a-f]*"), key=lambda path: path.stat().st_mtime)[
+            :-MAX_WORKTREES
+        ]:
             shutil.rmtree(old, ignore_errors=True)
     return tree
 

@@ -164,9 +164,9 @@ class CppCandidate:
         """Time a step, its local steps and its global steps."""
         running, iterations = self._process, self.run.max_iterations
         assert running is not None
-        once = running.step(iterations)
+        once = running.time_step_phases(iterations)
         number = _choose_num_repeats(once[0])
-        answers = [running.step(iterations) for _ in range(number)] if number > 1 else [once]
+        answers = [running.time_step_phases(iterations) for _ in range(number)] if number > 1 else [once]
         step, local, global_ = (sum(column) / len(answers) for column in zip(*answers, strict=True))
         return [
             CandidateTiming("step", step, {"num_iterations": iterations}),

@@ -74,8 +74,8 @@ class CppBaseline:
         self.prepare_seconds = self._read_answer()[0]
         scene.unlink()
 
-    def step(self, iterations: int) -> list[float]:
-        """Compute one step with a number of iterations, from the initial guess.
+    def time_step_phases(self, iterations: int) -> list[float]:
+        """Time one step with a number of iterations, from the initial guess, and its phases.
 
         Returns:
             Wall seconds of the whole step, of its local steps, and of its global steps. Raises RunFailed.

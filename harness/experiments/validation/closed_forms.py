@@ -42,7 +42,7 @@ from springbench.harness.scenes.mesh.mesh_topology import build_offset_pairs
 from springbench.harness.scenes.mesh.network_mesh import NetworkMesh
 from springbench.solvers.model.step_problem import Positions, Solver
 
-_TAUT = EtherDragEffect(decay_rate=2.0)
+_REST_DRAG = EtherDragEffect(decay_rate=2.0)
 """Drag until rest is reached, which does not change the state of rest."""
 SAFETY_FACTOR = 1.25
 """Factor on the error estimated from two refinements of known order (Roache 1994, grid convergence index)."""
@@ -173,7 +173,7 @@ def _hang_cable(num_springs: int, axial_stiffness: float, span: float, solver: S
         rest_length=10.0 / num_springs,
         mass=tuple(weights.tolist()),
     ).build_mesh()
-    effects = [SpringsEffect(), GravityEffect(), _TAUT, PinsEffect(indices=(0, num_springs), weight="exact")]
+    effects = [SpringsEffect(), GravityEffect(), _REST_DRAG, PinsEffect(indices=(0, num_springs), weight="exact")]
     return simulate_to_rest(build_validation_scene(mesh, effects, time_step=REST_STEP), solver)
 
 
@@ -219,7 +219,7 @@ def _build_hanging_chain(length: float = 2.0, mass: float = 4.0, axial_stiffness
             axial_stiffness=axial_stiffness,
             mass=tuple(weights.tolist()),
         ).build_mesh()
-        effects = [SpringsEffect(), GravityEffect(), _TAUT, PinsEffect(indices=(0,), weight="exact")]
+        effects = [SpringsEffect(), GravityEffect(), _REST_DRAG, PinsEffect(indices=(0,), weight="exact")]
         p = simulate_to_rest(build_validation_scene(mesh, effects, time_step=REST_STEP), solver)
         return -float(p[-1, 1]) - length
 
@@ -275,7 +275,7 @@ def hang_strip(
     effects: list[Any] = [
         SpringsEffect(stretch=stretch, shear=0.5 * stretch),
         GravityEffect(),
-        _TAUT,
+        _REST_DRAG,
         PinsEffect(indices=tuple(fixed.tolist()), weight="exact"),
     ]
     if rigidity:
@@ -352,7 +352,7 @@ def _build_membrane(side: float = 1.0, pressure: float = 10.0, tension: float = 
         effects = [
             SpringsEffect(),
             ConstantForceEffect(force=(0.0, pressure * h**2, 0.0)),
-            _TAUT,
+            _REST_DRAG,
             PinsEffect(indices=tuple(boundary.tolist()), weight="exact"),
         ]
         p = simulate_to_rest(build_validation_scene(mesh, effects, time_step=REST_STEP, mass=0.1), solver)
