@@ -143,7 +143,7 @@ def _list_effect_keys(effect: Any, *, has_fabric: bool) -> dict[str, Any] | None
     """Return the keys that an effect has in a file; None for an object, unless a fabric may complete its material."""
     if isinstance(effect, Mapping):
         return dict(cast(Mapping[str, Any], effect))
-    of: type[Any] = type(effect)
+    of = cast(object, effect).__class__
     if not has_fabric or f"{of.__module__}:{of.__qualname__}" not in [EFFECT_CLASSES[kind] for kind in FABRIC_EFFECTS]:
         return None
     return effect.model_dump(mode="json", exclude_unset=True) | {"kind": effect.kind}
