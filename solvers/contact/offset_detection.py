@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from springbench.solvers.contact import offset_blocks
 from springbench.solvers.contact.broad_phase.candidate_cache import (
     CACHE_INFLATION,
-    ROUNDOFF_INFLATION,
     CachedCandidates,
+    compute_roundoff_margin,
 )
 from springbench.solvers.contact.collision_mesh import CollisionMesh
 from springbench.solvers.contact.collisions import EDGE_EDGE, allocate_collisions, build_collisions, pad_positions
@@ -128,11 +128,6 @@ class OffsetSurface(NamedTuple):
         weight = np.where(own, np.abs(coefficients), 0.0)
         total = np.einsum("ki,ki->k", weight, self.vertex_stiffness[np.where(own, vertices, 0)])
         return np.asarray(total / weight.sum(axis=1), np.float64)
-
-
-def compute_roundoff_margin(p: Positions) -> float:
-    """Return the distance [m] that rounding errors of positions may amount to."""
-    return ROUNDOFF_INFLATION * float(np.abs(p).max(initial=0.0))
 
 
 def is_supported_contact(energy: object) -> bool:

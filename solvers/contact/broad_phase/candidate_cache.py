@@ -23,9 +23,8 @@ from springbench.solvers.model.step_problem import Positions
 
 FloatArray = NDArray[np.float64]
 
-ROUNDOFF_INFLATION = 8.0 * np.finfo(np.float64).eps
+_ROUNDOFF_INFLATION = 8.0 * np.finfo(np.float64).eps
 """Inflation of bounding boxes, relative to the largest coordinate."""
-
 
 CACHE_INFLATION = 1.5
 """Query radius relative to the activation distance. A larger one makes each evaluation slower by more than the rarer
@@ -220,7 +219,7 @@ def find_candidates(source: CandidateSource, caches: list[CachedCandidates], p: 
     for one in caches:
         if one.covers_positions(p, limit):
             return one.candidates
-    reach = CACHE_INFLATION * limit + _roundoff_margin(p)
+    reach = CACHE_INFLATION * limit + compute_roundoff_margin(p)
     if (
         caches
         and all(one.is_empty for one in caches)
@@ -264,7 +263,7 @@ def find_collision_free_step_size(
         return 1.0
     if not np.isfinite(displacement).all():
         return 0.0
-    rounded = _roundoff_margin(p)
+    rounded = compute_roundoff_margin(p)
     reach = CACHE_INFLATION * (closed + source.dhat) + rounded
     if alone and (gaps := source.compute_clearance_bounds(p, q, CollisionQuery(reach, closed, MIN_GAP_FRACTION))):
         caches[:] = [CachedCandidates.without_candidates(source, q, gaps), *caches[:1]]
@@ -292,9 +291,9 @@ def _store_cache(before: list[CachedCandidates], found: CachedCandidates, caches
     caches[:] = [found, *before[: _MAX_CACHES - 1]]
 
 
-def _roundoff_margin(p: Positions) -> float:
-    """Return the inflation of bounding boxes [m]."""
-    return ROUNDOFF_INFLATION * float(np.abs(p).max(initial=0.0))
+def compute_roundoff_margin(p: Positions) -> float:
+    """Return the distance [m] that rounding errors of positions may amount to; bounding boxes are inflated by it."""
+    return _ROUNDOFF_INFLATION * float(np.abs(p).max(initial=0.0))
 
 
 def _max_displacement_from_mean(p: Positions, q: Positions) -> float:

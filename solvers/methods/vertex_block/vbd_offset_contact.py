@@ -25,12 +25,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from springbench.solvers.contact.broad_phase.candidate_cache import compute_roundoff_margin
 from springbench.solvers.contact.contact_potential import BarrierContact
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.contact.offset_detection import (
     OffsetCollisions,
     OffsetSurface,
-    compute_roundoff_margin,
     is_supported_contact,
 )
 from springbench.solvers.iteration import vertex_terms
