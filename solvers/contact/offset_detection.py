@@ -72,7 +72,8 @@ class OffsetSurface(NamedTuple):
         edges, triangles = (
             np.concatenate([getattr(side, kind).primitives for side in sides]) for kind in ("edges", "triangles")
         )
-        adjacency = SurfaceAdjacency.from_primitives(edges, triangles, 1 + int(edges.max(initial=-1)))
+        num_vertices = 1 + max(int(edges.max(initial=-1)), int(triangles.max(initial=-1)))
+        adjacency = SurfaceAdjacency.from_primitives(edges, triangles, num_vertices)
         return cls(adjacency, float(sides[0].edge_lengths.mean()), mesh.stiffness, [])
 
     def detect_contacts(

@@ -142,6 +142,14 @@ def displace_vertices(seed: int, p: Positions, bound: np.ndarray, share: float) 
     return p + share * bound[:, None] * way / np.linalg.norm(way, axis=1)[:, None]
 
 
+def test_triangles_without_edges_have_an_adjacency():
+    rest, edges = np.random.default_rng(0).uniform(size=(6, 3)), np.array([[0, 1], [1, 2]])
+    mesh = CollisionMesh.from_rest_shape(rest, edges, np.array([[0, 1, 2], [3, 4, 5]]), np.ones(6), 1e-6, 1e-6)
+    adjacency = OffsetSurface.from_contact(SelfContact(mesh)).adjacency
+    assert adjacency.edge_starts.tolist() == [0, 1, 3, 4, 4, 4, 4]
+    assert adjacency.triangle_starts.tolist() == list(range(7))
+
+
 @pytest.mark.parametrize("share", [1.0, 0.5])
 @pytest.mark.parametrize("seed", range(8))
 def test_displacements_within_their_bounds_never_collide(seed, share):
