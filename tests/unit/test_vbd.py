@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from springbench.harness.simulation.time_loop import INITIAL_GUESSES
 from springbench.solvers.contact.half_space.half_space_potential import ContactPlanes
+from springbench.solvers.contact.half_space.half_space_steps import insert_index
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
+from springbench.solvers.jit.kernel_compilation import jit_kernel
 from springbench.solvers.methods.local_global.compiled_local_global import CompiledLocalGlobal
 from springbench.solvers.methods.vertex_block.vbd import PreparedVertexBlockDescent, SweepState, VertexBlockDescent
 from springbench.solvers.model.step_problem import NotPositiveDefinite, StepProblem, StopRule, Unsupported
@@ -172,3 +174,17 @@ def test_a_push_by_pairs_leaves_the_half_spaces_of_obstacles_where_they_were():
     after = sweeps(problem)
     after.sweep_with_planes(p, ContactPlanes(none.astype(int), np.empty((0, 3)), none, np.empty((0, 3)), none, none))
     np.testing.assert_array_equal(after.sweep_without_contact(p), swept)
+
+
+@jit_kernel
+def write_set_keys(keys):
+    """Write the keys of the sets of one half-space each."""
+    for k in range(len(keys)):
+        keys[k] = insert_index(0, k)
+
+
+def test_the_sets_of_active_half_spaces_have_different_keys():
+    keys = np.empty(200, np.int64)
+    write_set_keys(keys)
+    assert keys[:63].tolist() == [2**k for k in range(63)]
+    assert len(set(keys.tolist())) == len(keys)

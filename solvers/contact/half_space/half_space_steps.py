@@ -34,6 +34,9 @@ EXACT_BLOCK, _FRICTION_MAJORANT, SPRING_MAJORANT, _FULL_MAJORANT = range(4)
 _PIVOT_ROUNDOFF = 1e-14
 """Pivots up to this fraction of the trace are round-off."""
 
+_NUM_KEY_BITS, _INDEX_MULTIPLIER = 63, 0x9E3779B1
+"""Number of half-spaces of a row that have a bit each in the key of a set, and the factor that hashes further ones."""
+
 
 class HalfSpaces(NamedTuple):
     """Half-spaces by the rows of their vertices.
@@ -134,6 +137,20 @@ def _add_outer_product(block, weight, n0, n1, n2):
 
 
 @jit_inner
+def insert_index(key, k):
+    """Return the key of a set of half-spaces after the insertion of one that it does not contain.
+
+    The keys of two sets of the first `_NUM_KEY_BITS` half-spaces of a row differ. Of larger ones they may be equal, but
+    rarely are; the search for active half-spaces then ends a pass early.
+
+    Args:
+        key: key of the set, 0 if it is empty.
+        k: index of the half-space in its row.
+    """
+    return key | (1 << k) if k < _NUM_KEY_BITS else key ^ (k * _INDEX_MULTIPLIER)
+
+
+@jit_inner
 def add_half_spaces(s, i, x, d, level, gradient, block):
     """Add the half-spaces of a row to its gradient and block.
 
@@ -150,14 +167,14 @@ def add_half_spaces(s, i, x, d, level, gradient, block):
         block: upper triangle by rows, six numbers [N/m].
 
     Returns:
-        The new gradient and block, and the included half-spaces of the row as bits.
+        The new gradient and block, and the key of the set of included half-spaces (see `insert_index`).
     """
-    mask = 0
+    key = 0
     for k in range(s.row_starts[i], s.row_starts[i + 1]):
         n0, n1, n2, weight = s.normal[k, 0], s.normal[k, 1], s.normal[k, 2], s.stiffness[k]
         gap = n0 * x[0] + n1 * x[1] + n2 * x[2] - s.offset[k]
         if s.is_two_sided or gap < 0.0 or level == _FULL_MAJORANT or gap + n0 * d[0] + n1 * d[1] + n2 * d[2] < 0.0:
-            mask |= 1 << (k - s.row_starts[i])
+            key = insert_index(key, k - s.row_starts[i])
             block = _add_outer_product(block, weight, n0, n1, n2)
             force = weight * (_penetration_depth(s, gap) if level == _FULL_MAJORANT else gap)
             gradient = gradient[0] + force * n0, gradient[1] + force * n1, gradient[2] + force * n2
@@ -169,7 +186,7 @@ def add_half_spaces(s, i, x, d, level, gradient, block):
             block = a00 + weight, a01, a02, a11 + weight, a12, a22 + weight
             if level == EXACT_BLOCK and length > s.smoothing_length[k]:
                 block = _add_outer_product(block, -weight, u0 / length, u1 / length, u2 / length)
-    return gradient, block, mask
+    return gradient, block, key
 
 
 @jit_inner
@@ -273,10 +290,10 @@ def build_block_step(energy_change: Any) -> Any:
                 block = majorant
             d, definite, before = (0.0, 0.0, 0.0), True, -1
             for _ in range(_MAX_ACTIVE_SET_PASSES):
-                slope, whole, mask = add_half_spaces(s, i, x, d, level, gradient, block)
-                if mask == before:
+                slope, whole, key = add_half_spaces(s, i, x, d, level, gradient, block)
+                if key == before:
                     break
-                before = mask
+                before = key
                 d, definite = solve_block(whole, slope)
             if definite and add_half_space_change(s, i, x, d, energy_change(d, where)) <= 0.0:
                 return d
