@@ -31,8 +31,9 @@ class CollisionQuery(NamedTuple):
     """Limits that no pair may violate during a motion.
 
     A pair violates them if it comes closer than `inflation_radius` [m], or closer than `min_distance` [m] plus
-    `relative_min_distance` times its initial distance. max_displacement [m]: upper bound of the displacement of any two
-    vertices relative to each other.
+    `relative_min_distance` times its initial distance. The second limit does not apply to ranges of vertices whose
+    boxes around the whole motion are farther apart than `inflation_radius` (`compute_aabb_clearance`).
+    max_displacement [m]: upper bound of the displacement of any two vertices relative to each other.
     """
 
     inflation_radius: float
@@ -85,7 +86,8 @@ def compute_aabb_clearance(
 ) -> float:
     """Return the distance [m] at q of the boxes of two vertex ranges.
 
-    It is 0 unless the boxes prove that no limit is violated.
+    It is 0 unless the boxes prove that no limit is violated. If the boxes around the whole motion are farther apart
+    than the inflation radius, the limit relative to the initial distance is not tested.
 
     Args:
         one: first vertex of one range, and the vertex after its last one.
@@ -99,12 +101,12 @@ def compute_aabb_clearance(
     """
     low, high = np.empty((2, 2, 3)), np.empty((2, 2, 3))
     for k, x in enumerate((p, q)):
-        for j, (first, last) in enumerate((one, other)):
-            compute_vertex_aabb(x, first, last, low[k, j], high[k, j])
+        for j, (first, end) in enumerate((one, other)):
+            compute_vertex_aabb(x, first, end, low[k, j], high[k, j])
     apart = np.maximum(low[1, 0] - high[1, 1], low[1, 1] - high[1, 0])
     clearance = float(np.linalg.norm(np.maximum(apart, 0.0)))
-    begin, end = low.min(axis=0), high.max(axis=0)
-    if max(float((begin[0] - end[1]).max()), float((begin[1] - end[0]).max())) > query.inflation_radius:
+    least, most = low.min(axis=0), high.max(axis=0)
+    if max(float((least[0] - most[1]).max()), float((least[1] - most[0]).max())) > query.inflation_radius:
         return clearance  # the boxes around the whole motion are separated, so that no pair limits the step size
     wide = float(np.linalg.norm(high[0].max(axis=0) - low[0].min(axis=0)))
     wide = min(
@@ -115,16 +117,16 @@ def compute_aabb_clearance(
 
 
 @jit_kernel
-def compute_vertex_aabb(x, first, last, low, high):
+def compute_vertex_aabb(x, first, end, low, high):
     """Write the smallest and largest coordinates of a range of vertices.
 
     Args:
         x: positions (n, 3) [m].
-        first, last: range of rows, without the last one.
+        first, end: first row of the range, and the row after its last one.
         low, high: outputs (3,) [m]; infinite for an empty range.
     """
     low[:], high[:] = np.inf, -np.inf
-    for i in range(first, last):
+    for i in range(first, end):
         for axis in range(3):
             low[axis], high[axis] = min(low[axis], x[i, axis]), max(high[axis], x[i, axis])
 
