@@ -74,7 +74,7 @@ def collision_free_step_size(candidates, p, displacement, max_step, local_indice
                 if e < end:
                     max_step = min(
                         max_step,
-                        pair_time_of_impact(
+                        pair_collision_free_step_size(
                             candidates,
                             e,
                             p,
@@ -140,8 +140,12 @@ def _packet_max(a, b):
 
 
 @jit_inner
-def pair_time_of_impact(candidates, e, p, displacement, max_step, edges, local_indices, corners, relative_displacement):
+def pair_collision_free_step_size(
+    candidates, e, p, displacement, max_step, edges, local_indices, corners, relative_displacement
+):
     """Return the largest step size in [0, max_step] at which one pair stays separated.
+
+    It is a lower bound of the time of impact, with the distance that `MIN_GAP_FRACTION` demands.
 
     Args:
         candidates: the candidate pairs.
@@ -272,6 +276,8 @@ def is_rigid_translation(x, p, max_step):
         p: end positions (n, 3) [m].
         max_step: tolerance along each axis [m].
     """
+    if len(p) == 0:
+        return True
     a, b, c = p[0, 0] - x[0, 0], p[0, 1] - x[0, 1], p[0, 2] - x[0, 2]
     for i in range(len(p)):
         d, e, f = p[i, 0] - x[i, 0] - a, p[i, 1] - x[i, 1] - b, p[i, 2] - x[i, 2] - c

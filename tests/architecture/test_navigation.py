@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 LOCATIONS = {
-    "where is the time of impact computed?": "solvers/contact/ccd.py:pair_time_of_impact",
+    "where is the time of impact computed?": "solvers/contact/ccd.py:pair_collision_free_step_size",
     "which file adds friction's Hessian?": "solvers/contact/potentials/friction.py:write_friction_hessian",
     "where does a row get its residual?": "harness/simulation/instrumentation_pass.py:compute_returned_residual",
     "where is the numeric phase of Cholesky?": ("solvers/linalg/cholesky/block_multifrontal.py:run_stages"),
