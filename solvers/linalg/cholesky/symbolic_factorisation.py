@@ -57,7 +57,7 @@ class SymbolicFactor(NamedTuple):
 
 _AnalysisCache = list[tuple[NDArray[np.int64], NDArray[np.int32], SymbolicFactor]]
 
-_analysis_cache: ContextVar[_AnalysisCache | None] = ContextVar("_known", default=None)
+_analysis_cache: ContextVar[_AnalysisCache | None] = ContextVar("analysis_cache", default=None)
 
 
 @contextmanager
