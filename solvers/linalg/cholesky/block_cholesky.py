@@ -107,7 +107,7 @@ class BlockCholesky:
             raise Unsupported(
                 f"a factor of the Hessian has {self.nonzeros:,} entries and takes "
                 f"{memory.format_bytes(needs)} of memory, "
-                f"where {memory.format_bytes(free)} may be taken; take numba or newton-cg, or a coarser mesh"
+                f"where {memory.format_bytes(free)} is available; use solver numba or newton-cg, or a coarser mesh"
             )
         self.panels = np.zeros(f.panel_start[-1] + TILE_ROWS)
         self._no_values, self._no_vectors = np.empty((0, d, d)), np.empty((0, d))
