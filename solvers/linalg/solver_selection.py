@@ -17,7 +17,11 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from scipy.sparse import csr_array
 from springbench.solvers.jit.kernel_compilation import cached_njit
-from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky, count_stored_entries
+from springbench.solvers.linalg.cholesky.supernodal_cholesky import (
+    Precision,
+    SupernodalCholesky,
+    count_stored_entries,
+)
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import SymbolicFactor, analyse_graph
 from springbench.solvers.linalg.dense_inverse import DenseInverse
 from springbench.solvers.linalg.direct_solvers import LinearSolver, SimplicialCholesky
@@ -27,7 +31,6 @@ from springbench.solvers.model.step_problem import Unsupported
 from springbench.solvers.model.system_matrix_assembly import energy_norm
 
 LinearSolverName = Literal["auto", "inverse", "cholespy", "supernodal", "cg"]
-Precision = Literal["float64", "float32", "float16"]
 
 MAX_DENSE_VERTICES = 25
 """Number of vertices up to which the inverse is no slower. A step of 50 iterations takes as long at 9 and 25 vertices
@@ -162,32 +165,28 @@ def select_solver(
             f"linear_solver: {linear!r} is not known; it is one of {', '.join(get_args(LinearSolverName))}"
         )
     if linear == "cholespy" and precision != "float64":
-        raise Unsupported(f"{linear}: is used in float64 alone, not in {precision}; use supernodal")
+        raise Unsupported(f"linear_solver: cholespy supports float64 only, not {precision}; use supernodal")
     n = len(Q.indptr) - 1
     room = compute_memory_limit() if memory_limit is None else memory_limit
     if linear == "cholespy":
         return SolverChoice(linear, "as requested; its factor is not estimated beforehand")
     if linear == "inverse" or (linear == "auto" and n <= MAX_DENSE_VERTICES):
         why = "as requested" if linear == "inverse" else f"{n} vertices, at most {MAX_DENSE_VERTICES}"
-        return (
-            SolverChoice("inverse", why)
-            if _fits_in_memory(_estimate_inverse_cost(n), room)
-            else _raise_out_of_memory(room, {"inverse": _estimate_inverse_cost(n)})
-        )
+        if not _fits_in_memory(_estimate_inverse_cost(n), room):
+            raise _build_memory_error(room, {"inverse": _estimate_inverse_cost(n)})
+        return SolverChoice("inverse", why)
     iterative = _estimate_cg_cost(Q)
     if linear == "cg":
-        found = SolverChoice("cg", f"as requested; {iterative.description}")
-        return found if _fits_in_memory(iterative, room) else _raise_out_of_memory(room, {"cg": iterative})
+        if not _fits_in_memory(iterative, room):
+            raise _build_memory_error(room, {"cg": iterative})
+        return SolverChoice("cg", f"as requested; {iterative.description}")
     pointers, neighbours = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32)
     symbolic = analyse_graph(pointers, neighbours)
     direct = estimate_supernodal_cost(symbolic, precision)
     if linear == "supernodal":
-        found = SolverChoice("supernodal", f"as requested; {direct.description}", symbolic)
-        return (
-            found
-            if _fits_in_memory(direct, room)
-            else _raise_out_of_memory(room, {"supernodal": direct, "cg": iterative})
-        )
+        if not _fits_in_memory(direct, room):
+            raise _build_memory_error(room, {"supernodal": direct, "cg": iterative})
+        return SolverChoice("supernodal", f"as requested; {direct.description}", symbolic)
     if _fits_in_memory(direct, room) and direct.traffic_bytes <= iterative.traffic_bytes:
         return SolverChoice("supernodal", direct.description, symbolic)
     if _fits_in_memory(iterative, room):
@@ -199,7 +198,7 @@ def select_solver(
         return SolverChoice("cg", f"{iterative.description}; {reason} ({direct.description})")
     if _fits_in_memory(direct, room):
         return SolverChoice("supernodal", direct.description, symbolic)
-    return _raise_out_of_memory(room, {"supernodal": direct, "cg": iterative})
+    raise _build_memory_error(room, {"supernodal": direct, "cg": iterative})
 
 
 def estimate_supernodal_cost(s: SymbolicFactor, precision: Precision = "float64") -> CostEstimate:
@@ -247,11 +246,11 @@ def _fits_in_memory(need: CostEstimate, memory_limit: float) -> bool:
     return need.memory_bytes <= memory_limit
 
 
-def _raise_out_of_memory(memory_limit: float, needs: dict[str, CostEstimate]) -> SolverChoice:
+def _build_memory_error(memory_limit: float, needs: dict[str, CostEstimate]) -> Unsupported:
     listed = "; ".join(
         f"{name} needs {format_bytes(need.memory_bytes)} ({need.description})" for name, need in needs.items()
     )
-    raise Unsupported(
+    return Unsupported(
         f"the system does not fit in {format_bytes(memory_limit)} of memory: {listed}; use a coarser mesh"
     )
 
