@@ -17,7 +17,8 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.sparse import csr_array
 from springbench.solvers.jit.kernel_compilation import cached_njit
 from springbench.solvers.jit.typed_kernel import TypedKernel
-from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions
+from springbench.solvers.linalg.matrix_errors import build_definiteness_error, require_finite_rows
+from springbench.solvers.model.step_problem import Positions
 
 _ROWS_PER_BLOCK = 4
 """Rows of the inverse that are processed together: 12 independent sums hide the latency of an addition."""
@@ -44,20 +45,14 @@ class DenseInverse:
             NotPositiveDefinite: with the vertex at fault.
         """
         n = len(Q.indptr) - 1
+        require_finite_rows(Q)
         dense = np.asfortranarray(Q.toarray())
-        if not np.isfinite(dense).all():
-            v = int(np.flatnonzero(~np.isfinite(dense).all(axis=1))[0])
-            raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
         inverse = dense
         if n:
             factor, info = dpotrf(dense, lower=1)
             lost = np.flatnonzero(factor.diagonal() ** 2 <= 4.0 * np.finfo(float).eps * dense.diagonal())
             if info or len(lost):
-                v = info - 1 if info else int(lost[0])
-                raise NotPositiveDefinite(
-                    f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex {v}: nothing "
-                    "determines its position, or stiffnesses, masses and pin weights lie too far apart or are negative"
-                )
+                raise build_definiteness_error(info - 1 if info else int(lost[0]))
             inverse, _ = dpotri(factor, lower=1)
         padded = -(-n // _ROWS_PER_BLOCK) * _ROWS_PER_BLOCK
         stored = np.zeros((padded, padded), precision)

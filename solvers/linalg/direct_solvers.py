@@ -12,12 +12,8 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
-from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, Unsupported
-
-_NOT_DEFINITE_MESSAGE = (
-    "Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point: its stiffnesses, masses and "
-    "pin weights lie too far apart, or one of them is negative or not finite"
-)
+from springbench.solvers.linalg.matrix_errors import build_definiteness_error, require_finite_rows
+from springbench.solvers.model.step_problem import Positions, Unsupported
 
 
 class LinearSolver(Protocol):
@@ -43,7 +39,7 @@ class DenseCholesky:
         try:
             self._factor = cho_factor(Q, lower=True)
         except (LinAlgError, ValueError) as error:
-            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE) from error
+            raise build_definiteness_error() from error
         self.nonzeros: int | None = len(Q) * (len(Q) + 1) // 2
 
     def solve(self, b: Positions, out: Positions) -> None:
@@ -69,10 +65,10 @@ class SparseLU:
                 options={"SymmetricMode": True},
             )
         except RuntimeError as error:
-            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE) from error
+            raise build_definiteness_error() from error
         # With diagonal pivots Q = P'LUP is L D L', so that Q is positive definite if D is positive.
         if not (self._factor.U.diagonal() > 0.0).all():
-            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE)
+            raise build_definiteness_error()
         self.nonzeros: int | None = self._factor.L.nnz
 
     def solve(self, b: Positions, out: Positions) -> None:
@@ -96,15 +92,14 @@ class SimplicialCholesky:
             from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
         except ImportError as error:
             raise Unsupported(
-                "cholespy is not installed, for it has no wheel for this machine; leave `linear_solver` out"
+                f"linear_solver: cholespy cannot be imported ({error}); install cholespy, or leave linear_solver out"
             ) from error
-        if not np.isfinite(Q.data).all():
-            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE)
+        require_finite_rows(Q)
         pointers, columns = Q.indptr.astype(np.int32), Q.indices.astype(np.int32)
         try:
             self._factor = CholeskySolverD(len(pointers) - 1, pointers, columns, Q.data, MatrixType.CSR)
         except ValueError as error:
-            raise NotPositiveDefinite(_NOT_DEFINITE_MESSAGE) from error
+            raise build_definiteness_error() from error
 
     def solve(self, b: Positions, out: Positions) -> None:
         """Write Q^-1 b to `out`.

@@ -25,8 +25,9 @@ from springbench.solvers.linalg.cholesky.supernode_amalgamation import COLUMN_LA
 from springbench.solvers.linalg.cholesky.symbolic_factorisation import SymbolicFactor, analyse_graph
 from springbench.solvers.linalg.cholesky.thread_team import ThreadTeam
 from springbench.solvers.linalg.cholesky.triangular_solve import SupernodalFactor, solve_from_arrays
+from springbench.solvers.linalg.matrix_errors import build_definiteness_error, require_finite_rows
 from springbench.solvers.linalg.memory import allocate_aligned
-from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions
+from springbench.solvers.model.step_problem import Positions
 
 Precision = Literal["float64", "float32", "float16"]
 
@@ -168,21 +169,14 @@ class SupernodalCholesky:
         Raises:
             NotPositiveDefinite: with a vertex at fault.
         """
-        if not np.isfinite(Q.data).all():
-            rows = np.repeat(np.arange(len(Q.indptr) - 1), np.diff(Q.indptr))
-            v = rows[~np.isfinite(Q.data)][0]
-            raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
+        require_finite_rows(Q)
         pointers = np.asarray(Q.indptr, np.int64)
         neighbours = np.asarray(Q.indices, np.int32)
         s = symbolic_factor or analyse_graph(pointers, neighbours)
         layout = PanelLayout.from_symbolic(s)
         cholesky = BlockCholesky(Q, block_size=1, symbolic_factor=s)
         if not cholesky.factorise(np.asarray(Q.data, np.float64).reshape(-1, 1, 1)):
-            raise NotPositiveDefinite(
-                "Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point at vertex "
-                f"{cholesky.failed_vertex}: nothing determines its position, or stiffnesses, masses and pin weights "
-                "lie too far apart or are negative"
-            )
+            raise build_definiteness_error(int(cholesky.failed_vertex))
         squares, panels = allocate_aligned(layout.num_inverse_entries), allocate_aligned(layout.num_panel_entries)
         write_inverse_panels(
             cholesky.fronts, cholesky.panels, s.postorder, layout.first_chunk, layout.chunks, squares, panels

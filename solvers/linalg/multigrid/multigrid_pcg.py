@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from springbench.solvers.linalg.krylov import NEGATIVE_CURVATURE, ConjugateGradientIteration
+from springbench.solvers.linalg.matrix_errors import build_definiteness_error, require_finite_rows
 from springbench.solvers.linalg.multigrid import multigrid_kernels as kernels
 from springbench.solvers.linalg.multigrid.smoothed_aggregation import Multigrid
-from springbench.solvers.model.step_problem import NotPositiveDefinite, Positions, Unsupported
+from springbench.solvers.model.step_problem import Positions, Unsupported
 
 CG_RTOL = 1e-12
 """Largest correction, relative to the largest entry of x, at which the iteration ends.
@@ -44,16 +45,10 @@ class ConjugateGradients:
 
     def __init__(self, Q: csr_array) -> None:
         """Set up the preconditioner; raise NotPositiveDefinite, with the vertex at fault where it is known."""
-        if not np.isfinite(Q.data).all():
-            v = np.repeat(np.arange(len(Q.indptr) - 1), np.diff(Q.indptr))[~np.isfinite(Q.data)][0]
-            raise NotPositiveDefinite(f"Q is not finite in row {v}: a stiffness, a mass or a pin weight there is not")
+        require_finite_rows(Q)
         diagonal = Q.diagonal()
         if not (diagonal > 0.0).all():
-            v = np.flatnonzero(~(diagonal > 0.0))[0]
-            raise NotPositiveDefinite(
-                f"Q = A'KA + M/dt^2 + w C'C is not positive definite at vertex {v}: it has neither mass nor a spring "
-                "nor a pin, or a negative one"
-            )
+            raise build_definiteness_error(int(np.flatnonzero(~(diagonal > 0.0))[0]))
         self._Q = np.asarray(Q.indptr, np.int64), np.asarray(Q.indices, np.int32), Q.data
         self._multigrid = Multigrid(Q)
         self.nonzeros: int | None = self._multigrid.nonzeros
@@ -77,10 +72,8 @@ class ConjugateGradients:
         self.num_iterations, ended = columns.run_iterations(columns.apply_preconditioner(), _MAX_ITERATIONS)
         self.correction_ratios = columns.correction_ratios
         if ended == NEGATIVE_CURVATURE:
-            raise NotPositiveDefinite(
-                "Q = A'KA + M/dt^2 + w C'C is not positive definite about vertex "
-                f"{columns.failing_vertex}: stiffnesses, "
-                "masses and pin weights lie too far apart or are negative"
+            raise build_definiteness_error(
+                columns.failing_vertex, "the largest entry of a direction of negative curvature"
             )
         if not columns.is_within_tolerance():
             raise Unsupported(

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, dia_array
 from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
+from springbench.solvers.linalg.matrix_errors import build_definiteness_error
 from springbench.solvers.linalg.multigrid import multigrid_kernels as kernels
 from springbench.solvers.model import system_matrix_assembly
 from springbench.solvers.model.step_problem import NotPositiveDefinite
@@ -85,11 +86,8 @@ class Multigrid:
         try:
             self._factor = SupernodalCholesky(A)
         except NotPositiveDefinite as error:
-            raise NotPositiveDefinite(
-                f"Q = A'KA + M/dt^2 + w C'C is not positive definite in floating point: level {len(self._levels)} of "
-                f"multigrid, of {self.level_sizes[-1]} vertices, is not; stiffnesses, "
-                "masses and pin weights lie too far "
-                "apart or are negative"
+            raise build_definiteness_error(
+                place=f"level {len(self._levels)} of multigrid, of {self.level_sizes[-1]} vertices"
             ) from error
         self.nonzeros += self._factor.nonzeros or 0
         self._coarse_vectors = (
