@@ -21,6 +21,9 @@ from scipy.sparse import coo_array, csr_array, dia_array
 from springbench.solvers.linalg.krylov import ConjugateGradientIteration
 from springbench.solvers.linalg.multigrid.multigrid_kernels import build_aggregates, sweep_gauss_seidel
 from springbench.solvers.linalg.multigrid.smoothed_aggregation import (
+    DOMINANCE_RATIO,
+    MAX_COARSENING_RATIO,
+    STRENGTH_THRESHOLD,
     compute_chebyshev_weights,
     estimate_largest_eigenvalue,
 )
@@ -30,13 +33,9 @@ FloatVector = NDArray[np.float64]
 _MAX_COARSE_SIZE, _MAX_DENSE_COARSE_SIZE = 400, 4000
 """Sizes up to which a level is factorised densely; the second one if its matrix has a quarter of all entries."""
 
-_MAX_COARSENING_RATIO = 0.7
-"""Size relative to the level above, beyond which a coarser level is not worthwhile."""
-
 _MAX_UNKNOWN_FRACTION = 0.5
 """Aggregates are merged until their vectors number at most this fraction of the unknowns."""
 
-_STRENGTH_THRESHOLD, _DOMINANCE_RATIO = 0.25, 10.0
 _COARSE_DIAGONAL_SHIFT = 1e-12
 """Shift of the coarsest matrix, relative to its diagonal, which makes its factorisation robust to round-off."""
 
@@ -88,7 +87,7 @@ class ProlongationHierarchy:
         nodes = np.arange(A.shape[0])
         while not is_coarsest_level(A):
             P, B, nodes = _build_prolongator(A, B, nodes)
-            if not 0 < P.shape[1] <= _MAX_COARSENING_RATIO * P.shape[0]:
+            if not 0 < P.shape[1] <= MAX_COARSENING_RATIO * P.shape[0]:
                 break
             if smooth_prolongators:
                 diagonal = A.diagonal()
@@ -141,7 +140,7 @@ def _aggregate_unknowns(A: csr_array, nodes: NDArray[np.int64], max_aggregates: 
     while True:
         condensed = _condense_blocks(A, owner)
         of, count = build_aggregates(
-            condensed.indptr, condensed.indices, condensed.data, _STRENGTH_THRESHOLD, _DOMINANCE_RATIO
+            condensed.indptr, condensed.indices, condensed.data, STRENGTH_THRESHOLD, DOMINANCE_RATIO
         )
         owner = np.where(owner >= 0, of[owner], -1)
         if count <= max_aggregates or count == before:

@@ -25,7 +25,20 @@ from springbench.solvers.model.step_problem import NotPositiveDefinite
 _MAX_COARSE_SIZE = 1500
 """Size up to which a level is factorised: its solve then costs less than 2 % of a cycle."""
 
-_STRENGTH_THRESHOLD, _DOMINANCE_RATIO = 0.25, 10.0
+STRENGTH_THRESHOLD, DOMINANCE_RATIO = 0.25, 10.0
+"""Parameters `strength` and `dominance` of `build_aggregates`, of both hierarchies."""
+
+MAX_COARSENING_RATIO = 0.7
+"""Size relative to the level above, beyond which a coarser level is not worthwhile."""
+
+_MIN_FILTERED_DIAGONAL = 0.05
+"""Least diagonal of the matrix that smooths prolongations, relative to that of A. Lumping of weak entries leaves a
+positive diagonal for springs; the bound ensures it for other matrices, and is too small to matter for springs."""
+
+_POWER_ITERATIONS, _EIGENVALUE_MARGIN = 20, 1.1
+"""Iterations of the power method, and the factor on its estimate. It approaches the largest eigenvalue from below, but
+the smoother would amplify the modes above the estimate."""
+
 _CHEBYSHEV_DEGREE = 2
 _SMOOTHED_FRACTION = 0.25
 """The smoother damps the eigenvalues of D^-1 A above this fraction of the largest one."""
@@ -77,7 +90,7 @@ class Multigrid:
         A = Q
         while self.level_sizes[-1] > _MAX_COARSE_SIZE:
             level, coarse = _build_level(A)
-            if len(coarse.indptr) - 1 > 0.7 * self.level_sizes[-1]:
+            if len(coarse.indptr) - 1 > MAX_COARSENING_RATIO * self.level_sizes[-1]:
                 break
             self._levels.append(level)
             self.nonzeros += A.nnz + 2 * len(level.P.values)
@@ -132,18 +145,19 @@ class Multigrid:
 def _build_level(A: csr_array) -> tuple[MultigridLevel, csr_array]:
     """Return a level and the matrix of the next one."""
     n = len(A.indptr) - 1
-    of, count = kernels.build_aggregates(A.indptr, A.indices, A.data, _STRENGTH_THRESHOLD, _DOMINANCE_RATIO)
+    of, count = kernels.build_aggregates(A.indptr, A.indices, A.data, STRENGTH_THRESHOLD, DOMINANCE_RATIO)
     diagonal = np.asarray(A.diagonal(), np.float64)
     largest = estimate_largest_eigenvalue(A, diagonal)
     inside = np.flatnonzero(of >= 0)
     start = np.concatenate([[0], np.cumsum(of >= 0)])
     T = csr_array((np.ones(len(inside)), of[inside], start.astype(A.indptr.dtype)), shape=(n, count))
     F = csr_array(
-        (kernels.filter_weak_entries(A.indptr, A.indices, A.data, _STRENGTH_THRESHOLD), A.indices, A.indptr),
+        (kernels.filter_weak_entries(A.indptr, A.indices, A.data, STRENGTH_THRESHOLD), A.indices, A.indptr),
         shape=A.shape,
     )
-    # For springs, lumping leaves a positive diagonal; this bound ensures it for other matrices.
-    D = dia_array((1.0 / np.maximum(F.diagonal(), 0.05 * diagonal)[None, :], np.array([0])), shape=(n, n))
+    D = dia_array(
+        (1.0 / np.maximum(F.diagonal(), _MIN_FILTERED_DIAGONAL * diagonal)[None, :], np.array([0])), shape=(n, n)
+    )
     P = system_matrix_assembly.drop_zeros(csr_array(T - (4.0 / 3.0 / largest) * (D @ (F @ T))))
     R = csr_array(P.T)
     coarse = csr_array(R @ csr_array(A @ P))
@@ -173,10 +187,10 @@ def estimate_largest_eigenvalue(A: csr_array, diagonal: NDArray[np.float64]) -> 
         return 0.0
     bound = float(((abs(A) @ np.ones(len(diagonal))) / diagonal).max())
     v = np.random.default_rng(0).normal(size=len(diagonal))  # contains all modes, and is the same in each call
-    for _ in range(20):
+    for _ in range(_POWER_ITERATIONS):
         v = (A @ v) / diagonal
         v /= np.linalg.norm(v)
-    return min(bound, 1.1 * float(v @ (A @ v) / (v @ (diagonal * v))))
+    return min(bound, _EIGENVALUE_MARGIN * float(v @ (A @ v) / (v @ (diagonal * v))))
 
 
 def compute_chebyshev_weights(largest: float) -> list[tuple[np.float32, np.float32]]:
