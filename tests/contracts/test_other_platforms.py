@@ -7,16 +7,18 @@ import os
 import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure, TaskLimits
 from springbench.harness.execution.sandbox import CallLimits, SandboxError, call_in_sandbox
+from springbench.harness.simulation import stopwatch
 from springbench.solvers import platform_calls
 from springbench.solvers.jit import kernel_cache
 
 ABSENT_CALLS = """
-import multiprocessing.popen_fork, os, psutil, signal, subprocess, sys, tempfile  # what uses these calls itself
+import multiprocessing.popen_fork, os, psutil, signal, subprocess, sys, tempfile, time  # what uses these calls itself
 for name in ("fcntl", "resource"):
     sys.modules[name] = None
 for name in ("sched_getaffinity", "sched_setaffinity", "getloadavg", "fork", "pidfd_open", "waitid", "setsid",
@@ -24,6 +26,8 @@ for name in ("sched_getaffinity", "sched_setaffinity", "getloadavg", "fork", "pi
     delattr(os, name)
 for name in ("SIGKILL", "SIGUSR1"):
     delattr(signal, name)
+for name in ("CLOCK_MONOTONIC_RAW", "clock_gettime"):
+    delattr(time, name)
 """
 """What Windows lacks; macOS lacks less."""
 
@@ -120,6 +124,15 @@ def test_cores_are_counted_without_affinity(monkeypatch: pytest.MonkeyPatch):
     assert platform_calls.list_usable_cores() == list(range(os.cpu_count() or 1))
 
 
+def test_the_raw_clock_advances_on_all_platforms(monkeypatch: pytest.MonkeyPatch):
+    start = stopwatch.read_raw_clock()
+    assert stopwatch.read_raw_clock() >= start
+    monkeypatch.delattr(time, "CLOCK_MONOTONIC_RAW")
+    monkeypatch.delattr(time, "clock_gettime")
+    start = stopwatch.read_raw_clock()
+    assert stopwatch.read_raw_clock() >= start
+
+
 def test_a_kernel_is_stored_without_locks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(platform_calls, "fcntl", None)
     monkeypatch.delattr(os, "O_CLOEXEC")
@@ -140,13 +153,14 @@ UNIX_MODULES = re.compile(r"^\s*(?:import|from) (?:fcntl|resource|grp|pwd|termio
 UNIX_CALLS = re.compile(
     r"\bos\.(?:fork|setsid|killpg|getpgid|sched_\w+|sysconf|waitid|pidfd_open|geteuid|getuid|mkfifo|uname|getloadavg|"
     r"O_NOFOLLOW|O_NONBLOCK|O_CLOEXEC|O_DIRECTORY|WNOHANG)\b|\bsignal\.(?:SIGKILL|SIGALRM|SIGXCPU|SIGCONT|SIGUSR\d|"
-    r"pthread_sigmask|setitimer)\b|\bselect\.poll\b|[\"']/proc/"
+    r"pthread_sigmask|setitimer)\b|\b(?:CLOCK_MONOTONIC_RAW|clock_gettime)\b|\bselect\.poll\b|[\"']/proc/"
 )
 """What Windows lacks."""
 GUARDED_CALLS = {
     "harness/execution/interrupts.py": "sys.platform",
     "harness/experiments/archive/compaction.py": 'hasattr(os, "O_DIRECTORY")',
     "harness/execution/process_memory.py": "OSError",
+    "harness/simulation/stopwatch.py": 'hasattr(time, "CLOCK_MONOTONIC_RAW")',
     **dict.fromkeys(
         (f"harness/execution/{name}.py" for name in ("isolated_worker", "sandbox")), "can_isolate_processes()"
     ),
