@@ -74,7 +74,7 @@ def call_in_sandbox(function: Callable[..., Any], *arguments: Any, limits: CallL
         child.send_message((os.getcwd(), function, arguments, limits))
         kind, answer = child.receive_message(_TIMEOUT_FACTOR * limits.cpu_seconds)
     except (EOFError, OSError):
-        raise SandboxError(_describe_exit(child.stop_process(), limits)) from None
+        raise SandboxError(_describe_exit(child.stop_process(), limits, timed_out=child.timed_out)) from None
     if kind == "mistakes":
         raise InputError(answer)
     if kind == "error":
@@ -92,15 +92,23 @@ def _call_unlimited(function: Callable[..., Any], arguments: tuple[Any, ...]) ->
         raise SandboxError(" ".join(str(error).split())[:300] or type(error).__name__) from error
 
 
-def _describe_exit(code: int, limits: CallLimits) -> str:
-    if code in (-signal.SIGXCPU, -signal.SIGKILL):
-        return f"reading it takes more than {limits.cpu_seconds:.3g} s"
+def _describe_exit(code: int, limits: CallLimits, *, timed_out: bool) -> str:
+    """Describe why the subprocess ended; timed_out: whether it was killed at the limit of wall time."""
+    if code == -signal.SIGXCPU:
+        return f"reading it takes more than {limits.cpu_seconds:.3g} s of processor time"
+    if timed_out:
+        return f"reading it takes more than {_TIMEOUT_FACTOR * limits.cpu_seconds:.3g} s"
+    if code == -signal.SIGKILL:
+        return "the process that reads it was killed, as the system does when its memory runs out"
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     return f"the library that reads it crashed ({name})"
 
 
 class _SandboxProcess:
-    """A running subprocess that serves calls."""
+    """A running subprocess that serves calls.
+
+    `timed_out`: whether it was killed at the limit of wall time.
+    """
 
     _instance: _SandboxProcess | None = None
 
@@ -108,7 +116,7 @@ class _SandboxProcess:
         paths = [path or os.getcwd() for path in sys.path]
         settings: dict[str, str] = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"), "1")
         settings["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # others reserve a GiB at once, which counts as taken
-        self._owner = os.getpid()
+        self._owner, self.timed_out = os.getpid(), False
         self._process = subprocess.Popen(
             [sys.executable, "-c", f"from {__name__} import serve_calls; serve_calls()"],
             stdin=subprocess.PIPE,
@@ -144,12 +152,16 @@ class _SandboxProcess:
             EOFError: if the subprocess ends before the message.
         """
         assert self._process.stdout
-        timer = Timer(seconds, self._process.kill)
+        timer = Timer(seconds, self._end_at_time_limit)
         timer.start()
         try:
             return _read_message(self._process.stdout)
         finally:
             timer.cancel()
+
+    def _end_at_time_limit(self) -> None:
+        self.timed_out = True
+        self._process.kill()
 
     def stop_process(self) -> int:
         """Stop the subprocess if needed, and return its exit code, negative for a signal."""

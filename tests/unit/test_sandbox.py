@@ -5,7 +5,9 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import signal
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,10 @@ def end() -> None:
     os._exit(7)
 
 
+def kill() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 def panic() -> None:
     raise BaseException("index out of\nrange")
 
@@ -79,6 +85,7 @@ def test_a_sandboxed_call_returns_its_result_and_prints_nothing(capfd: pytest.Ca
         (abort, "crashed (SIGABRT)"),
         (leave, "I am off"),
         (end, "crashed (exit code 7)"),
+        (kill, "was killed, as the system does when its memory runs out"),
         (panic, "index out of range"),
     ],
 )
@@ -86,6 +93,12 @@ def test_a_failed_call_is_reported_in_words_and_the_next_call_succeeds(function,
     with pytest.raises(sandbox.SandboxError) as caught:
         sandbox.call_in_sandbox(function, limits=SHORT if function is loop else LIMITS)
     assert why in str(caught.value)
+    assert sandbox.call_in_sandbox(double, 21, limits=LIMITS) == 42
+
+
+def test_a_call_that_waits_is_reported_with_the_limit_of_wall_time():
+    with pytest.raises(sandbox.SandboxError, match=r"takes more than 0\.5 s$"):
+        sandbox.call_in_sandbox(time.sleep, 60.0, limits=sandbox.CallLimits(0.05, 2**27))
     assert sandbox.call_in_sandbox(double, 21, limits=LIMITS) == 42
 
 
