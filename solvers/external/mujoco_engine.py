@@ -29,6 +29,9 @@ from springbench.solvers.model.step_problem import Positions, StepProblem, Unsup
 
 MujocoIntegrator = Literal["implicitfast", "implicit", "Euler", "RK4"]
 
+_MIN_MASS = 1e-14
+"""Least mass of a vertex [kg]: MuJoCo takes masses up to 1e-15 for none."""
+
 _STABILITY_LIMIT = {"RK4": 8.0**0.5}
 """Stability limit of omega h for RK4; it is 2 for the others."""
 
@@ -183,8 +186,12 @@ def build_mjcf(network: EngineNetwork, integrator: str, problem: StepProblem | N
         Unsupported: for masses that MuJoCo treats as zero.
     """
     net, lines = network, network.spring_dashpots
-    if (net.mass[net.free_vertices] < 1e-14).any():
-        raise Unsupported("mujoco: takes masses below 1e-15 kg for none; give the vertices more")
+    if len(light := net.free_vertices[net.mass[net.free_vertices] < _MIN_MASS]):
+        i = int(light[0])
+        raise Unsupported(
+            f"mujoco: vertex {i} has a mass of {net.mass[i]:.3g} kg, and at least {_MIN_MASS:g} kg are needed; give it "
+            "more"
+        )
     gravity = None if problem is None else net.uniform_acceleration(problem.external_force)
     option = f'timestep="{net.time_step / substeps!r}" integrator="{integrator}"'
     option += f' gravity="{_format_numbers(np.zeros(3) if gravity is None else gravity)}"'

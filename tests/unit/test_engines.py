@@ -7,6 +7,7 @@ import runpy
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.simulation.time_loop import build_initial_state, build_problem
 from springbench.solvers.external import external_engine
 from springbench.solvers.external.external_engine import ExternalEngine, PreparedEngine
+from springbench.solvers.external.mujoco_engine import build_mjcf
 from springbench.solvers.methods.position_based.xpbd import XpbdSmallSteps
 from springbench.solvers.model.step_problem import Positions, StepProblem, StopRule, System, Unsupported
 from springbench.solvers.registry import OPTIONAL_SOLVERS, SOLVERS, find_solver_info, is_minimiser, load_target
@@ -342,6 +344,12 @@ def test_a_script_moves_pins_and_slows_velocities_as_the_run_does(
     with np.load("pulled.npz") as stored:
         assert np.abs(stored["end"] - scene.mesh.rest_positions).max() > 0.05
     assert away < 1e-6
+
+
+def test_mujoco_names_a_vertex_that_is_too_light():
+    network: Any = SimpleNamespace(mass=np.array([1.0, 0.0, 1e-15]), free_vertices=np.array([0, 2]), spring_dashpots=())
+    with pytest.raises(Unsupported, match=r"vertex 2 has a mass of 1e-15 kg, and at least 1e-14 kg"):
+        build_mjcf(network, "RK4")
 
 
 def test_a_point_of_none_or_of_several_is_a_mistake(tmp_path: Path):
