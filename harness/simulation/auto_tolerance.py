@@ -86,7 +86,10 @@ class LocalErrorStopRule:
             Unsupported: the step size is not constant.
         """
         if scene.alternate_scene:
-            raise Unsupported("tolerance: auto differences steps of one length, and the scene alternates two; give one")
+            raise Unsupported(
+                "rtol: auto differences steps of one length, and the scene alternates two; give a number, such as "
+                "rtol: 1e-6"
+            )
         system, order = scene.system, scene.integrator.order
         self._iterations, self._span, self._order = auto.max_iterations, frames * system.time_step, order
         self._step, self._rate, self._free = system.time_step, system.velocity_rate, system.free_vertices
