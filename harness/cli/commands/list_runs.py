@@ -162,7 +162,11 @@ def _describe_names() -> str:
         width = max(len(name) for name, _ in lines)
         text += [f"{name:{width}}  {summary}".rstrip() for name, summary in lines]
     return "\n".join(
-        [*text, "\nsolvers/README.md and configs/README.md describe each; `springbench schema` has all parameters"]
+        [
+            *text,
+            "\nconfigs/reference/solvers.md describes each solver, configs/README.md the rest; "
+            "`springbench schema` has all parameters",
+        ]
     )
 
 
