@@ -108,7 +108,9 @@ def reserve_cores(number: int, tick: ProgressCallback) -> Generator[list[int]]:
     """
     mine = list_usable_cores()
     if number > len(mine):
-        raise ValueError(f"{number} cores of {len(mine)}")
+        raise ValueError(
+            f"{number} cores are requested, and this process may use {len(mine)}; use at most {len(mine)} threads"
+        )
     with lock_timing_shared(tick):
         claimed: dict[int, int] = {}
         try:
