@@ -11,7 +11,7 @@ from pathlib import Path
 from time import monotonic, sleep
 
 from springbench.harness.execution.worker_process import ProgressCallback
-from springbench.solvers.iteration.device_interface import is_device_lost
+from springbench.solvers.iteration.device_interface import record_device_loss
 
 
 def double_number(number: int, tick: ProgressCallback) -> int:
@@ -69,7 +69,7 @@ def exhaust_memory(tick: ProgressCallback) -> int:
 
 
 def break_device(tick: ProgressCallback) -> int:
-    is_device_lost("an illegal address")
+    record_device_loss("an illegal address")
     return os.getpid()
 
 

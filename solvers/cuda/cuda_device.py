@@ -13,7 +13,7 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from springbench.solvers.iteration.device_interface import SIMULATOR_NAME, is_device_lost
+from springbench.solvers.iteration.device_interface import SIMULATOR_NAME, is_device_lost, record_device_loss
 from springbench.solvers.linalg.memory import format_bytes
 from springbench.solvers.model.step_problem import Unsupported
 
@@ -172,5 +172,5 @@ def guard_device_errors() -> Generator[None]:
         text = " ".join(str(error).split())
         if "MEMORY" in text.upper() and "ILLEGAL" not in text.upper():
             raise DeviceFailure(f"the device has no memory left: {text}") from error
-        is_device_lost(text)
+        record_device_loss(text)
         raise DeviceFailure(f"the device failed: {text}") from error

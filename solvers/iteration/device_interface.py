@@ -112,8 +112,15 @@ def device_columns_of(prepared: object) -> dict[str, Any]:
 _DEVICE_FAILURES: list[str] = []
 
 
-def is_device_lost(reason: str = "") -> bool:
-    """Return whether this process has lost its device permanently; a reason records such a loss."""
-    if reason:
-        _DEVICE_FAILURES.append(reason)
+def record_device_loss(reason: str) -> None:
+    """Record that this process has lost its device permanently.
+
+    Args:
+        reason: error of the driver.
+    """
+    _DEVICE_FAILURES.append(reason)
+
+
+def is_device_lost() -> bool:
+    """Return whether this process has lost its device permanently."""
     return bool(_DEVICE_FAILURES)
