@@ -17,7 +17,7 @@ from springbench.solvers.cuda.cuda_target import cuda
 _DEVICE_COPIES: dict[Any, Any] = {}
 
 
-def _filter_kernel(function: Any) -> Any:
+def _compile_for_device(function: Any) -> Any:
     return function if is_simulated() else cuda.jit(device=True)(function)
 
 
@@ -30,7 +30,7 @@ def share_with_device(function: Any) -> Any:
         cells = tuple(CellType(_replace_global(cell.cell_contents)) for cell in plain.__closure__ or ())
         copy = FunctionType(plain.__code__, own, plain.__name__, plain.__defaults__, cells)
         copy.__module__ = plain.__module__
-        _DEVICE_COPIES[plain] = _filter_kernel(copy)
+        _DEVICE_COPIES[plain] = _compile_for_device(copy)
     return _DEVICE_COPIES[plain]
 
 

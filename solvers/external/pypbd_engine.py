@@ -178,14 +178,14 @@ class _PyPbdStepper:
         constraints = self._model.getConstraints()
         for e, r in enumerate(network.spring_dashpots.rest_length.tolist()):
             constraints[e].restLength = r
-        self._set_if_changed(iterations, "MAX_ITERATIONS")
-        self._set_if_changed(0, "MAX_ITERATIONS_V")  # the network has no velocity constraints
+        self._set_control(iterations, "MAX_ITERATIONS")
+        self._set_control(0, "MAX_ITERATIONS_V")  # the network has no velocity constraints
         control = library.TimeStepController
         self._control.setValueInt(control.VELOCITY_UPDATE_METHOD, control.ENUM_VUPDATE_FIRST_ORDER)
         self._velocity = np.zeros((len(network.mass), 3))
         self.precision = f"float{8 * np.asarray(self._particles.getVertices()).itemsize}"
 
-    def _set_if_changed(self, value: int, name: str) -> None:
+    def _set_control(self, value: int, name: str) -> None:
         self._control.setValueUInt(getattr(self._library.TimeStepController, name), value)
 
     def _read_positions(self) -> Positions:
@@ -224,5 +224,5 @@ class _PyPbdStepper:
         """Run substeps of h [s]."""
         if number:
             self._library.TimeManager.getCurrent().setTimeStepSize(h * number)
-            self._set_if_changed(number, "NUM_SUB_STEPS")
+            self._set_control(number, "NUM_SUB_STEPS")
             self._control.step(self._model)
