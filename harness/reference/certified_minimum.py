@@ -82,7 +82,7 @@ class MinimumCertificate:
         return self.kind == MINIMUM
 
     @property
-    def describe_flaw(self) -> str:
+    def flaw_description(self) -> str:
         """The reason why the minimum is not certified."""
         curvature = (
             f"the smallest eigenvalue is {self.min_eigenvalue:.1e} N/m, give or "
@@ -145,7 +145,9 @@ def collect_minima(found: Iterable[MinimumCertificate]) -> KnownMinima:
     known, reason = KnownMinima(()), ""
     for one in found:
         known = known.add_minimum(one)
-        reason = reason if one.is_certified else f"no certified minimum: Newton's method ends where {one.describe_flaw}"
+        reason = (
+            reason if one.is_certified else f"no certified minimum: Newton's method ends where {one.flaw_description}"
+        )
     return known if known.minima else KnownMinima((), reason)
 
 

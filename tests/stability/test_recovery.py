@@ -76,7 +76,7 @@ def comes_to_a_minimum(made: Scene, p: Positions) -> None:
     system = replace(made.system, time_step=1e6)  # inertia weighs nothing
     static = build_problem(replace(made, system=system), MotionState(Motion(p, np.zeros_like(p)), None, 0), "previous")
     minimum = certify_minimum(static, p)
-    assert minimum.is_certified, minimum.describe_flaw
+    assert minimum.is_certified, minimum.flaw_description
     # A hundredth of the size: what is left after a hundred steps of swings that gravity alone brings back.
     np.testing.assert_allclose(p, minimum.positions, rtol=0, atol=1e-2 * made.mesh.bounding_box_diagonal)
 

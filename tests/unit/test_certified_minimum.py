@@ -299,4 +299,4 @@ def test_minima_that_were_stored_with_less_than_a_certificate_are_found_again(tm
 def test_an_inaccurate_minimum_states_its_error():
     problem = PROBLEMS["cloth"]()
     best = find_minima(problem, NewtonSolver()).lowest_minimum
-    assert "next step" in replace(best, kind=INACCURATE).describe_flaw
+    assert "next step" in replace(best, kind=INACCURATE).flaw_description

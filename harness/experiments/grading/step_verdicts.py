@@ -204,7 +204,7 @@ class StepJudge:
             gap = 0.0 if abs(above) <= noise else above / scale
             floor = self._measure_gap_floor(problem, found.positions, submission.bound_error(verdict.step)) / scale
             distance = float(np.linalg.norm(p - found.positions, axis=1).max(initial=0.0)) / self._size
-        flaw = "" if found.is_certified else found.describe_flaw
+        flaw = "" if found.is_certified else found.flaw_description
         return replace(verdict, gap=float(gap), distance=distance, flaw=flaw, gap_floor=float(floor))
 
 
