@@ -97,13 +97,13 @@ class ReferenceStore:
         """
         request = _ReferenceRequest(spec, size, integrator)
         path = self.folder / f"run-{request.name}.npz"
-        violence = _read_arrays(path, ["objective_decrease"]).get("objective_decrease", np.empty(0))
-        moments = select_snapshot_frames(violence, spec.frames)
-        known = self._load_known_snapshots(request, moments.values()) if len(violence) == spec.frames else {}
+        objective_decrease = _read_arrays(path, ["objective_decrease"]).get("objective_decrease", np.empty(0))
+        moments = select_snapshot_frames(objective_decrease, spec.frames)
+        known = self._load_known_snapshots(request, moments.values()) if len(objective_decrease) == spec.frames else {}
         if not set(moments.values()) <= set(known):
-            steps, violence = run_reference(request.scene, self.solver, spec.frames)
-            _write_arrays(path, {"objective_decrease": violence})
-            known, moments = self._save_steps(request, steps), select_snapshot_frames(violence, spec.frames)
+            steps, objective_decrease = run_reference(request.scene, self.solver, spec.frames)
+            _write_arrays(path, {"objective_decrease": objective_decrease})
+            known, moments = self._save_steps(request, steps), select_snapshot_frames(objective_decrease, spec.frames)
         return {moment: known[frame] for moment, frame in moments.items()}
 
     def load_frames(
@@ -135,39 +135,39 @@ class ReferenceStore:
             known |= self._save_steps(request, steps)
         return {frame: known[frame] for frame in frames}
 
-    def find_minima(self, frozen: StepSnapshot) -> KnownMinima:
+    def find_minima(self, snapshot: StepSnapshot) -> KnownMinima:
         """Load the known minima of a problem, or find them.
 
         `lowest_minimum` of the result raises UncertifiedError if there is none.
 
         Args:
-            frozen: snapshot whose step problem is minimised.
+            snapshot: snapshot whose step problem is minimised.
         """
-        path = self.folder / f"minima-{frozen.digest}.npz"
+        path = self.folder / f"minima-{snapshot.digest}.npz"
         if stored := _read_arrays(path, _CERTIFICATE_FIELDS):
             return _build_minima(stored)
-        found = find_minima(frozen.problem, self.solver)
+        found = find_minima(snapshot.problem, self.solver)
         if found.minima:
-            self._save_minima(frozen, found)
+            self._save_minima(snapshot, found)
         return found
 
-    def classify_minimum(self, frozen: StepSnapshot, p: Positions) -> MinimumCertificate:
+    def classify_minimum(self, snapshot: StepSnapshot, p: Positions) -> MinimumCertificate:
         """Find the minimum in whose basin p is.
 
         A new certified minimum is added to the known ones, and becomes the reference if it is the lowest. Its index is
-        `find_minima(frozen).find_index(minimum)` where it is certified.
+        `find_minima(snapshot).find_index(minimum)` where it is certified.
 
         Args:
-            frozen: snapshot whose step problem is minimised, and under whose digest its minima are stored.
+            snapshot: snapshot whose step problem is minimised, and under whose digest its minima are stored.
             p: positions (n, 3) [m], from which Newton's method starts.
 
         Returns:
             The known minimum that equals the one found, or the end point of Newton's method where it is not certified.
         """
-        found, known = refine_minimum(frozen.problem, p, self.solver), self.find_minima(frozen)
+        found, known = refine_minimum(snapshot.problem, p, self.solver), self.find_minima(snapshot)
         joined = known.add_minimum(found)
         if joined is not known:
-            self._save_minima(frozen, joined)
+            self._save_minima(snapshot, joined)
         return joined.minima[joined.find_index(found)] if found.is_certified else found
 
     def load_trajectory(
@@ -388,9 +388,9 @@ class ReferenceStore:
             _write_arrays(self._snapshot_path(request, frame), arrays)
         return snapshots
 
-    def _save_minima(self, frozen: StepSnapshot, known: KnownMinima) -> None:
+    def _save_minima(self, snapshot: StepSnapshot, known: KnownMinima) -> None:
         arrays = {name: np.array([getattr(minimum, name) for minimum in known.minima]) for name in _CERTIFICATE_FIELDS}
-        _write_arrays(self.folder / f"minima-{frozen.digest}.npz", arrays)
+        _write_arrays(self.folder / f"minima-{snapshot.digest}.npz", arrays)
 
 
 class _ReferenceRequest:

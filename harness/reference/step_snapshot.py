@@ -114,7 +114,7 @@ def run_reference(
         RunFailed: a step does not converge.
     """
     stored: dict[int, SimulationStep] = {}
-    violence, keep = np.full(num_steps, np.nan), set(frames)
+    objective_decrease, keep = np.full(num_steps, np.nan), set(frames)
     run = simulate_scene(
         scene,
         prepare(scene, solver),
@@ -130,26 +130,28 @@ def run_reference(
         ):
             raise RunFailed(f"step {step.index} of the reference run does not converge")
         stated = step.problem
-        violence[step.index - 1] = stated.value(stated.current_positions) - stated.value(step.solution.positions)
+        objective_decrease[step.index - 1] = stated.value(stated.current_positions) - stated.value(
+            step.solution.positions
+        )
         if not frames:
-            keep = set(select_snapshot_frames(violence[: step.index], num_steps).values())
+            keep = set(select_snapshot_frames(objective_decrease[: step.index], num_steps).values())
         stored[step.index] = step
         stored = {frame: one for frame, one in stored.items() if frame in keep}
-    return stored, violence
+    return stored, objective_decrease
 
 
-def select_snapshot_frames(violence: NDArray[np.float64], num_steps: int) -> dict[str, int]:
+def select_snapshot_frames(objective_decrease: NDArray[np.float64], num_steps: int) -> dict[str, int]:
     """Select the frames of SNAPSHOT_NAMES in a run.
 
     Args:
-        violence: decrease of the objective [J] of the first steps (frames,).
+        objective_decrease: decrease of the objective [J] of the first steps (frames,).
         num_steps: number of steps of the run.
     """
     first = min(2, num_steps)
     return {
         "early": max(first, -(-num_steps // 10)),
         "middle": max(first, (num_steps + 1) // 2),
-        "peak": first + int(np.argmax(violence[first - 1 :])) if len(violence) >= first else 1,
+        "peak": first + int(np.argmax(objective_decrease[first - 1 :])) if len(objective_decrease) >= first else 1,
     }
 
 

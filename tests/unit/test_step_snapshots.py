@@ -143,7 +143,7 @@ def test_a_first_guess_beyond_an_obstacle_is_where_the_step_starts(tmp_path):
 
 def test_the_peak_snapshot_is_the_step_with_the_largest_initial_gap():
     scene, length = build_exact_scene(SPEC, SIZE), 30  # it swings through its lowest point after half a second
-    saved, violence = run_reference(scene, NewtonSolver(), length)
+    saved, objective_decrease = run_reference(scene, NewtonSolver(), length)
     run = list(
         simulate_scene(
             scene, prepare(scene, NewtonSolver()), StopRule(100, 1e-12), initial_guess="previous", frames=length
@@ -152,14 +152,16 @@ def test_the_peak_snapshot_is_the_step_with_the_largest_initial_gap():
     gap = [
         step.problem.value(step.problem.current_positions) - step.problem.value(step.solution.positions) for step in run
     ]
-    np.testing.assert_allclose(violence, gap, rtol=1e-9)  # differences of sums that are some hundred times as large
+    np.testing.assert_allclose(
+        objective_decrease, gap, rtol=1e-9
+    )  # differences of sums that are some hundred times as large
     violent = 2 + int(np.argmax(gap[1:]))
     assert 2 < violent < length
     assert set(saved) == {3, 15, violent}
 
 
 @pytest.mark.parametrize(
-    ("violence", "wanted"),
+    ("objective_decrease", "wanted"),
     [
         ([1.0, 0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 6, 4)),
         ([9.0, 1.0, 2.0], (2, 2, 3)),  # BDF2 takes its first step by another method
@@ -167,8 +169,8 @@ def test_the_peak_snapshot_is_the_step_with_the_largest_initial_gap():
         (np.arange(60.0), (6, 30, 60)),
     ],
 )
-def test_snapshots_are_at_a_tenth_and_a_half_of_the_run_and_at_its_peak(violence, wanted):
-    assert tuple(select_snapshot_frames(np.array(violence), len(violence)).values()) == wanted
+def test_snapshots_are_at_a_tenth_and_a_half_of_the_run_and_at_its_peak(objective_decrease, wanted):
+    assert tuple(select_snapshot_frames(np.array(objective_decrease), len(objective_decrease)).values()) == wanted
 
 
 CHANGES = {
