@@ -129,7 +129,7 @@ def _load_plugins(
     return stated(load(UserCodePolicy(on_import=tick)))
 
 
-def _run_in_worker(piece: Callable[[ProgressCallback], Any], limits: LoadLimits, names: list[PluginName]) -> Any:
+def _run_in_worker(task: Callable[[ProgressCallback], Any], limits: LoadLimits, names: list[PluginName]) -> Any:
     from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure, TaskLimits
 
     does = "loading"
@@ -138,15 +138,15 @@ def _run_in_worker(piece: Callable[[ProgressCallback], Any], limits: LoadLimits,
         nonlocal does
         does = message.removeprefix("\0") if message.startswith((IMPORT_NOTICE, BINDING_PREFIX)) else does
 
-    workers = IsolatedWorker()
+    worker = IsolatedWorker()
     try:
-        return workers.run_task(piece, hear, TaskLimits(*limits))
+        return worker.run_task(task, hear, TaskLimits(*limits))
     except TaskFailure as lost:
         reason = str(lost).replace(", before its first step", "")  # the worker's messages are about runs
         behind = "" if any(name in does for name in names) else f" with {', '.join(names)}"
         raise InputError(f"{does}{behind} {reason}") from None
     finally:
-        workers.stop_worker()
+        worker.stop_worker()
 
 
 def build_load_limits(seconds: float | None, memory_gib: float | None) -> LoadLimits:

@@ -33,12 +33,12 @@ def run_isolated(
     from springbench.harness.execution.isolated_worker import IsolatedWorker, TaskFailure
     from springbench.harness.execution.progress_events import is_step_event
 
-    workers = IsolatedWorker()
+    worker = IsolatedWorker()
     try:
-        return workers.run_task(
+        return worker.run_task(
             function, lambda message: print_message(message) if is_step_event(message) else None, limits
         )
     except TaskFailure as lost:
         raise RunFailed(f"the process that runs {', '.join(map(str, user_code))} {lost}") from None
     finally:
-        workers.stop_worker()
+        worker.stop_worker()

@@ -102,7 +102,7 @@ class IsolatedWorker:
 
     def run_task(
         self,
-        function: TaskFunction,
+        task: TaskFunction,
         tick: ProgressCallback,
         limits: TaskLimits,
         background_call: Callable[[], object] = int,
@@ -110,7 +110,7 @@ class IsolatedWorker:
         """Run a task and wait for its result.
 
         Args:
-            function: function of the task.
+            task: function of the task.
             tick: progress callback.
             limits: wall time and memory.
             background_call: called once in this process after the task was submitted.
@@ -122,7 +122,7 @@ class IsolatedWorker:
             SpringbenchError: if the task raises it.
             TaskFailure: if the task returns no result.
         """
-        going = self.start_task(function, tick, limits)
+        going = self.start_task(task, tick, limits)
         while True:
             try:
                 come = next(going)
@@ -134,7 +134,7 @@ class IsolatedWorker:
 
     def start_task(
         self,
-        function: TaskFunction,
+        task: TaskFunction,
         tick: ProgressCallback,
         limits: TaskLimits,
         user_code: frozenset[Hashable] = frozenset(),
@@ -142,7 +142,7 @@ class IsolatedWorker:
         """Start a task that runs concurrently with others.
 
         Args:
-            function: function of the task.
+            task: function of the task.
             tick: progress callback, which also receives POLL each time the generator is resumed.
             limits: wall time and memory.
             user_code: user code that the task runs. A worker that has run user code is replaced before a task without
@@ -155,14 +155,14 @@ class IsolatedWorker:
             SpringbenchError, TaskFailure: as `run_task`.
         """
         if not can_isolate_processes():
-            return _run_unlimited(function, tick)
+            return _run_unlimited(task, tick)
         if not self._own <= user_code:
             self.stop_worker()
         self.start_worker()
         self._own = user_code
         assert self._worker
         try:
-            answer = yield from self._worker.submit_task(function, tick, limits)
+            answer = yield from self._worker.submit_task(task, tick, limits)
         except BaseException:  # the worker was lost, or the command was interrupted
             if self._worker:
                 self._worker.kill_process()
@@ -183,10 +183,10 @@ class IsolatedWorker:
             self._worker, self._own = None, frozenset[Hashable]()
 
 
-def _run_unlimited(function: TaskFunction, tick: ProgressCallback) -> Any:
+def _run_unlimited(task: TaskFunction, tick: ProgressCallback) -> Any:
     """Run a task in this process, without limits, with the errors of a worker."""
     try:
-        return function(tick)
+        return task(tick)
     except SpringbenchError:
         raise
     except Exception as error:
@@ -221,13 +221,13 @@ class _WorkerProcess:
         return self._process.is_alive() and not self._calls.poll()
 
     def submit_task(
-        self, piece: TaskFunction, tick: ProgressCallback, limits: TaskLimits
+        self, task: TaskFunction, tick: ProgressCallback, limits: TaskLimits
     ) -> Generator[Connection, None, TaskOutcome]:
         """Submit a task and return its result at the end; raise TaskFailure."""
         heard, began = _TaskOutput(self._ticks, self._output, tick, limits.log_path), monotonic()
         memory = ProcessTreeMemory(self._process.pid or 0, limits.memory_gib) if limits.memory_gib else None
         try:
-            self._calls.send((piece, limits, heard.end))
+            self._calls.send((task, limits, heard.end))
             while not self._calls.poll():
                 yield self._calls
                 heard.read_pending()

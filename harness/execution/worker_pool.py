@@ -42,7 +42,7 @@ TaskFactory = Callable[[int], PoolTask | None]
 
 @dataclass
 class _PoolWorker:
-    workers: IsolatedWorker
+    worker: IsolatedWorker
     group: Hashable = None
     number: int = -1
     running_task: RunningTask | None = None
@@ -51,7 +51,7 @@ class _PoolWorker:
         """Stop the running task and the worker."""
         if self.running_task:
             self.running_task.close()
-        self.workers.stop_worker()
+        self.worker.stop_worker()
 
 
 def run_tasks(
@@ -90,7 +90,7 @@ def run_tasks(
                     number = _select_task(left, member, [other.group for other in crew if other is not member])
                     member.number, member.group = number, left.pop(number)
                     if task := create_task(number):
-                        member.running_task = member.workers.start_task(
+                        member.running_task = member.worker.start_task(
                             task.function, task.tick, task.limits, task.user_code
                         )
             going = [member for member in crew if member.running_task]

@@ -116,8 +116,8 @@ def serve_tasks(
     looked = monotonic()
     with suppress(EOFError, OSError):  # the task may have closed the connection
         while (request := calls.recv()) is not None:
-            piece, limits, end = request
-            answer = _run_task(piece, limits, lambda phase: ticks.send_bytes(phase.encode()))
+            task, limits, end = request
+            answer = _run_task(task, limits, lambda phase: ticks.send_bytes(phase.encode()))
             if os.getpid() != me:  # a fork of this process, made by the task
                 os._exit(0)
             with suppress(OSError, ValueError, AttributeError):  # closed or replaced by the task
@@ -157,12 +157,12 @@ def adopt_orphans() -> None:
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def _run_task(piece: TaskFunction, limits: TaskLimits, tick: ProgressCallback) -> TaskOutcome:
+def _run_task(task: TaskFunction, limits: TaskLimits, tick: ProgressCallback) -> TaskOutcome:
     before = threading.active_count(), _list_children()
     if limits.memory_gib is not None:
         set_soft_limit("RLIMIT_DATA", read_data_bytes() + limits.memory_gib * 2**30)
     try:
-        value: Any = piece(tick)
+        value: Any = task(tick)
     except SpringbenchError as error:
         return TaskOutcome(None, error, is_clean=_is_clean_after(before) and not is_device_lost())
     except BaseException as error:  # also SystemExit and GeneratorExit, which must not end the worker

@@ -59,14 +59,14 @@ def run_reports(names: Iterable[str], table: pa.Table, folder: Path, seconds: fl
 
 
 def _run_in_worker(name: PluginName, table: pa.Table, folder: Path, seconds: float | None) -> list[Path]:
-    workers = IsolatedWorker()
+    worker = IsolatedWorker()
     try:
         limits = TaskLimits(min(_TIME_LIMIT, seconds or _TIME_LIMIT), _MEMORY_LIMIT, folder / "logs" / "reports.txt")
-        return workers.run_task(partial(_run_plugin_report, name, table, folder.absolute()), _ignore_progress, limits)
+        return worker.run_task(partial(_run_plugin_report, name, table, folder.absolute()), _ignore_progress, limits)
     except (TaskFailure, SpringbenchError) as error:
         raise RunFailed(f"the report {name} failed: {error}") from None
     finally:
-        workers.stop_worker()
+        worker.stop_worker()
 
 
 def _run_plugin_report(name: PluginName, table: pa.Table, folder: Path, tick: ProgressCallback) -> list[Path]:

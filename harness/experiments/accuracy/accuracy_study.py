@@ -128,13 +128,13 @@ def open_measurement(
     home = AccuracyResults(folder.name, folder)
     require_threads({spec.measurement.threads for spec in work})
     (folder / "accuracy").mkdir(parents=True, exist_ok=True)
-    workers = IsolatedWorker(partial(update_registries, [dict(table) for table in REGISTRY_TABLES]))
+    worker = IsolatedWorker(partial(update_registries, [dict(table) for table in REGISTRY_TABLES]))
 
     def measure(spec: WorkSpec) -> ResultRow:
         unit = WorkPrecisionUnit(spec, home)
         run = display.start_run(unit.title, unit.num_progress_steps, unit.cost_estimate)
         try:
-            outcome = workers.run_task(partial(execute_timed, unit), run.report_tick, unit.task_limits)
+            outcome = worker.run_task(partial(execute_timed, unit), run.report_tick, unit.task_limits)
         except TaskFailure as lost:
             outcome = unit.write_lost_rows(lost)
         run.finish_run(outcome)
@@ -146,7 +146,7 @@ def open_measurement(
         try:
             yield measure
         finally:
-            workers.stop_worker()
+            worker.stop_worker()
             display.finish_sweep()
 
 
