@@ -48,7 +48,7 @@ ALGEBRAIC_ERROR_SHARE = 0.1
 """Maximum part of a step's error estimate that the residuals of its stages cause, relative to the tolerance."""
 MAX_FACTOR_BYTES = 2**28
 """Memory limit [bytes] of cached factors; the two used last are always cached."""
-MIN_RELATIVE_STEP = 1e-9
+MIN_STEP_SECONDS = 1e-9
 """Minimum step size [s]."""
 MAX_SOLVE_ITERATIONS = 200
 """Maximum number of iterations of a solve; a step that needs more is rejected."""
@@ -272,7 +272,7 @@ class _AdaptiveIntegration:
             self._rejected += 1
             change = min(MAX_REJECTION_FACTOR, compute_rejection_factor(self._elementary, ratio))
             self._level += ceil(log2(1.0 / change))
-            if self._ladder.compute_step_size(self._level) < MIN_RELATIVE_STEP:
+            if self._ladder.compute_step_size(self._level) < MIN_STEP_SECONDS:
                 raise self._build_underflow_error(ratio, time)
             return
         self._accepted += 1
@@ -333,7 +333,7 @@ class _AdaptiveIntegration:
     def _build_underflow_error(self, ratio: float, time: float) -> StepSizeUnderflow:
         cause = "is not solved" if ratio == inf else f"errs by {ratio:.2g} times what it may"
         return StepSizeUnderflow(
-            f"frame {len(self._seen)}, after {time:.6g} s: even a step of {MIN_RELATIVE_STEP:g} s {cause}; up to there "
+            f"frame {len(self._seen)}, after {time:.6g} s: even a step of {MIN_STEP_SECONDS:g} s {cause}; up to there "
             f"{self._accepted} steps were within {self._tolerance:.2g} m: forces are too sudden there, or round-off is "
             "larger; use a larger --error or a shorter --t-end"
         )
