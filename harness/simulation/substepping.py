@@ -5,6 +5,7 @@ The substeps are adaptive, or have a fixed size: the largest stable one or a sma
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -88,8 +89,8 @@ class FixedSubstepping(_SubsteppingSolver, Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class AdaptiveSubstepper(Stepper):
-    """Stepping by a solver with adaptive substeps within frames.
+class _Substepper(Stepper):
+    """Stepping by a solver with substeps within frames.
 
     The step of the scene is a frame, and its integrator is `substepping`.
     """
@@ -154,8 +155,16 @@ class AdaptiveSubstepper(Stepper):
             *stack_motions(seen), *counts, (mean, mean), reached[-1], share_frame_seconds(reached), thread_time() - cpu
         )
 
+    @abstractmethod
     def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:
         """Return the scene, the prepared solver and the number of pieces of each frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptiveSubstepper(_Substepper):
+    """Stepping by a solver with adaptive substeps within frames."""
+
+    def _prepare_pieces(self, setting: float) -> tuple[Scene, _SubsteppingSolver, int]:
         if changes := _list_time_dependence(self.scene):
             raise Unsupported(f"takes {' and '.join(changes)} as even within a frame, which is of order 1")
         ready = self.solver.prepare(self.scene.system)
@@ -165,7 +174,7 @@ class AdaptiveSubstepper(Stepper):
 
 
 @dataclass(frozen=True, eq=False)
-class FixedSubstepper(AdaptiveSubstepper):
+class FixedSubstepper(_Substepper):
     """Stepping by a solver with a fixed substep size.
 
     Quantities that change within a frame are taken as constant within each of a number of pieces, which is of order 1.
