@@ -66,6 +66,16 @@ class TimeBudgetExceeded(Exception):
     """The limit on processor time is exceeded."""
 
 
+def build_budget_error(cpu_limit: float, time: float) -> TimeBudgetExceeded:
+    """Build the error of a motion that takes too long.
+
+    Args:
+        cpu_limit: limit on the processor time [s].
+        time: time that the motion had reached [s].
+    """
+    return TimeBudgetExceeded(f"it takes more than {cpu_limit:g} s of processor time; it reached {time:.6g} s")
+
+
 class StepSizeUnderflow(RunFailed):
     """The error tolerance would need steps below the minimum step size."""
 
@@ -253,7 +263,7 @@ class _AdaptiveIntegration:
         while self._ticks < 1 << _MAX_LEVEL:
             self._try_step()
             if thread_time() - self._cpu > self._limit:
-                raise TimeBudgetExceeded
+                raise build_budget_error(self._limit, self._tick_time(self._ticks))
         counts = self._accepted, self._rejected, self._ladder.made, self._iterations
         shared, processor = share_frame_seconds(self._reached), thread_time() - self._cpu
         return Trajectory(*stack_motions(self._seen), *counts, self._lengths, self._reached[-1], shared, processor)

@@ -13,8 +13,8 @@ from springbench.harness.simulation.adaptive_stepping import (
     MAX_SOLVE_ITERATIONS,
     StepObserver,
     Stepper,
-    TimeBudgetExceeded,
     Trajectory,
+    build_budget_error,
     share_frame_seconds,
     stack_motions,
 )
@@ -79,7 +79,7 @@ class FixedImplicitStepper(Stepper):
                 seen.append(step.state.motion)
                 reached.append(perf_counter() - began)
             if thread_time() - cpu > cpu_limit:
-                raise TimeBudgetExceeded
+                raise build_budget_error(cpu_limit, scene.compute_time(step.index))
         h = scene.system.time_step
         shared, processor = share_frame_seconds(reached), thread_time() - cpu
         return Trajectory(*stack_motions(seen), steps, 0, 1, iterations, (h, h), reached[-1], shared, processor)

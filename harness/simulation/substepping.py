@@ -19,8 +19,8 @@ from springbench.harness.simulation.adaptive_stepping import (
     StepObserver,
     Stepper,
     StepSizeUnderflow,
-    TimeBudgetExceeded,
     Trajectory,
+    build_budget_error,
     share_frame_seconds,
     stack_motions,
 )
@@ -146,7 +146,7 @@ class _Substepper(Stepper):
                 seen.append(state.motion)
                 reached.append(perf_counter() - began)
             if thread_time() - cpu > cpu_limit:
-                raise TimeBudgetExceeded
+                raise build_budget_error(cpu_limit, scene.compute_time(k + 1))
         accepted, rejected = (int(count) for count in step_stats[:, :2].sum(axis=0))
         evaluations = (accepted + rejected) * ready.num_evaluations
         mean = scene.system.time_step * len(step_stats) / accepted

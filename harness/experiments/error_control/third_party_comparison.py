@@ -21,7 +21,7 @@ from springbench.harness.experiments.error_control.third_party_integrators impor
 )
 from springbench.harness.reference.equations_of_motion import OdeField, OdeState
 from springbench.harness.scenes.scene_builder import Scene
-from springbench.harness.simulation.adaptive_stepping import TimeBudgetExceeded
+from springbench.harness.simulation.adaptive_stepping import TimeBudgetExceeded, build_budget_error
 
 MAX_INTEGRATION_SECONDS = 5.0
 """CPU time limit of an integrator for one motion [s]."""
@@ -144,7 +144,7 @@ def _limit_cpu_time(vector_field: OdeField, deadline: float) -> Callable[[float,
 
     def rate(t: float, y: OdeState) -> OdeState:
         if thread_time() > deadline:
-            raise TimeBudgetExceeded
+            raise build_budget_error(MAX_INTEGRATION_SECONDS, t)
         return vector_field(t, y)
 
     return rate
