@@ -36,7 +36,7 @@ MAX_FRICTION_ITERATIONS = 20
 FRICTION_RTOL = 1e-4
 """Change relative to the largest friction force below which the iteration has converged."""
 
-PERIOD, RETURN = 4, 1e-2
+MAX_CYCLE_PERIOD, CYCLE_RTOL = 4, 1e-2
 """Longest detected cycle, and the distance from an earlier iterate that counts as a return, relative to the distance
 from the previous one. Iterates that converge by less than 1 % per iteration would not converge within the maximum
 number of iterations either."""
@@ -101,7 +101,7 @@ def solve_with_friction(prepared: PreparedSolver, problem: StepProblem, stop: St
     if not rounds or evaluates_friction(prepared):
         return FrictionSolve(problem, solution, (solution.num_iterations,), None)
     counts, guess = [solution.num_iterations], problem.initial_guess
-    earlier = deque[_Round](maxlen=PERIOD)
+    earlier = deque[_Round](maxlen=MAX_CYCLE_PERIOD)
     while True:
         x = solution.positions
         # Later solves move little, so that all reuse the sparsity pattern at the first solution, and its analysis.
@@ -154,8 +154,8 @@ def _is_cycle_at_largest(earlier: deque[_Round], x: Positions, acting: float) ->
         return False
     moved = _largest_component(x - earlier[-1].positions)
     for period in range(2, len(earlier) + 1):
-        if _largest_component(x - earlier[-period].positions) <= RETURN * moved:
-            return acting >= (1.0 - RETURN) * max(one.acting for one in list(earlier)[-period:])
+        if _largest_component(x - earlier[-period].positions) <= CYCLE_RTOL * moved:
+            return acting >= (1.0 - CYCLE_RTOL) * max(one.acting for one in list(earlier)[-period:])
     return False
 
 
