@@ -26,7 +26,7 @@ from springbench.solvers.contact.contact_potential import BarrierContact, SelfCo
 from springbench.solvers.contact.offset_blocks import SurfaceAdjacency, find_offset_contacts
 from springbench.solvers.contact.offset_detection import OffsetSurface
 from springbench.solvers.contact.potentials.barrier import compute_distances
-from springbench.solvers.contact.potentials.offset_activation import evaluate_offset_activation
+from springbench.solvers.contact.potentials.offset_activation import offset_force
 from springbench.solvers.jit.kernel_compilation import jit_kernel
 from springbench.solvers.methods.vertex_block.vbd import VertexBlockDescent
 from springbench.solvers.methods.vertex_block.vbd_offset_contact import OffsetContactDescent, fill_row_entries
@@ -38,6 +38,18 @@ from tests.self_contact_scenes import CONTACT_DHAT, CONTACT_THICKNESS, build_tou
 
 RADIUS = 0.03
 FRACTION = OffsetContactDescent().bound_fraction
+
+
+@jit_kernel
+def evaluate_offset_activation(distances, radius, value, force, curvature):
+    """Write g, -g' and g'' of positive distances."""
+    for k in range(len(distances)):
+        d = distances[k]
+        force[k], curvature[k] = offset_force(d, radius)
+        if 2.0 * d >= radius:
+            value[k] = 0.5 * max(0.0, radius - d) ** 2
+        else:
+            value[k] = 0.25 * radius * radius * (0.5 - np.log(2.0 * d / radius))
 
 
 def activation(distances: Any, radius: float = RADIUS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,8 +10,7 @@ the same function as `TwoStageBarrier`.
 
 from __future__ import annotations
 
-import numpy as np
-from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.jit.kernel_compilation import jit_inner
 
 
 @jit_inner
@@ -28,21 +27,3 @@ def offset_force(d, radius):
         return radius - d, 1.0
     factor = 0.25 * radius * radius
     return factor / d, factor / (d * d)
-
-
-@jit_kernel
-def evaluate_offset_activation(distances, radius, value, force, curvature):
-    """Write g, -g' and g'' of positive distances.
-
-    Args:
-        distances: (k,) [m].
-        radius: contact radius [m].
-        value, force, curvature: outputs, (k,) each.
-    """
-    for k in range(len(distances)):
-        d = distances[k]
-        force[k], curvature[k] = offset_force(d, radius)
-        if 2.0 * d >= radius:
-            value[k] = 0.5 * max(0.0, radius - d) ** 2
-        else:
-            value[k] = 0.25 * radius * radius * (0.5 - np.log(2.0 * d / radius))
