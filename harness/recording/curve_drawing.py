@@ -19,7 +19,7 @@ _WIDTH, _HEIGHT = 150.0, 100.0
 _TEXT_COLOUR, _RULE_COLOUR = 0xFFFFFFFF, 0x464950FF
 _LINE_HEIGHT = 7.0
 """Height of a label, and minimum spacing of the labels at the ends of curves."""
-_MIN_LABEL_HEIGHT = 4.5
+_LABEL_OFFSET = 4.5
 """Distance by which the viewer draws a label below its position."""
 
 _MAX_DECADES = 18
@@ -69,7 +69,7 @@ def draw_curves(
     stream.log(f"{entity}/lines", lines, static=True)
     label_positions = np.column_stack([np.full(len(ends), _WIDTH + 14.0), _spread_labels([y for _, y in ends])])
     points = rr.Points2D(
-        np.concatenate([places, label_positions]) - (0.0, _MIN_LABEL_HEIGHT),
+        np.concatenate([places, label_positions]) - (0.0, _LABEL_OFFSET),
         labels=[*words, *found],
         show_labels=True,
         colors=_append_colour(len(words), _TEXT_COLOUR, colours),

@@ -40,7 +40,7 @@ _QUANTITIES = {
     "/energy/springs": "Elastic energy [J]",
     "/num_iterations": "Iterations of a step",
 }
-_MAX_LISTED_PROPERTIES = 3
+_MAX_VISIBLE_PLOTS = 3
 """Number of quantities shown at once; the others are in another tab."""
 
 
@@ -82,11 +82,11 @@ def write_side_by_side(out: Path, recordings: Mapping[str, Path], title: str, st
     try:
         with ExitStack() as opened:
             sources = {name: opened.enter_context(open_recording_source(path)) for name, path in recordings.items()}
-            longest = max(float(read_network(source)["strain_range"][0]) for source in sources.values())
+            strain_range = max(float(read_network(source)["strain_range"][0]) for source in sources.values())
             box: ViewExtent | None = None  # of all recordings, so that all views have one camera
             runs = list[_SourceRun]()
             for name, source in sources.items():
-                runs.append(_SourceRun(name, len(runs), source, longest))
+                runs.append(_SourceRun(name, len(runs), source, strain_range))
                 box = runs[-1].widen_extent(source, box, 0.75 if len(sources) == _MAX_VIEWS_PER_ROW else 1.0)
             for run, source in zip(runs, sources.values(), strict=True):
                 _copy_chunks(file, run, source, styles[run.name], box)
@@ -228,9 +228,9 @@ def _build_layout(runs: list[_SourceRun], box: ViewExtent | None) -> rrb.Bluepri
             rrb.Tabs(
                 *_name_rows(
                     {
-                        "By frame": plots[:_MAX_LISTED_PROPERTIES],
+                        "By frame": plots[:_MAX_VISIBLE_PLOTS],
                         "Convergence": drawn,
-                        "More": plots[_MAX_LISTED_PROPERTIES:],
+                        "More": plots[_MAX_VISIBLE_PLOTS:],
                     }
                 ),
                 table,
