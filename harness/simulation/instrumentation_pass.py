@@ -343,5 +343,5 @@ def require_finite(columns_by_frame: Mapping[int, dict[str, Any]], *, is_minimis
         for name, value in columns.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise StepError(frame) from DivergenceError(
-                    f"{name} is {value} from frame {frame} on, of finite positions"
+                    f"{name} is {value} from frame {frame} on, although all positions are finite"
                 )
