@@ -16,6 +16,7 @@ __all__ = [
     "SOLVER_TABLE",
     "find_solver_info",
     "find_solver_name",
+    "is_engine",
     "is_minimiser",
     "load_target",
 ]

@@ -357,7 +357,7 @@ def inspect(
     csv: Annotated[Path | None, typer.Option(help="File for the scalars (CSV).")] = None,
 ) -> None:
     """Print the content of recordings without a viewer, or compare two of them."""
-    from springbench.harness.report.recording_inspection import inspect_recordings as inspect_recordings
+    from springbench.harness.report.recording_inspection import inspect_recordings
 
     inspect_recordings(recordings, frame=frame, export=export, csv=csv, console=get_output_console())
 
@@ -365,7 +365,7 @@ def inspect(
 @app.command()
 def view(recordings: RecordingsArgument) -> None:
     """Open recordings in the Rerun viewer."""
-    from springbench.harness.report.recording_inspection import view_recordings as view_recordings
+    from springbench.harness.report.recording_inspection import view_recordings
 
     view_recordings(recordings)
 

@@ -27,8 +27,7 @@ from springbench.harness.reference.reference_trajectory import (
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.simulation import time_loop as steps
-from springbench.harness.simulation.time_loop import prepare, simulate_scene
+from springbench.harness.simulation.time_loop import MotionState, prepare, simulate_scene
 from springbench.solvers.methods.time_stepping.explicit_integrators import BlanesMoan6
 from springbench.solvers.model.integrators import Motion
 from springbench.solvers.model.step_problem import StopRule, Unsupported
@@ -173,7 +172,7 @@ def _build_motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, O
                 ends = list[OdeState]()
                 for y in np.split(both, 2):
                     p, v = (part.copy() for part in field.unpack_state(k * interval, y))
-                    begun = steps.MotionState(Motion(p, v), None, k)
+                    begun = MotionState(Motion(p, v), None, k)
                     (done,) = simulate_scene(
                         scene, ready, StopRule(1), initial_guess="previous", frames=k + 1, initial_state=begun
                     )
