@@ -22,14 +22,6 @@ for _settings in ("numba.core.config", "numba.cuda.core.config"):  # of Numba, a
     with suppress(ImportError):  # small meshes have few blocks, and a warning for each launch helps no user
         import_module(_settings).__dict__["CUDA_LOW_OCCUPANCY_WARNINGS"] = 0
 
-THREADS = 8 if is_simulated() else 128
-"""Threads per block; the simulator starts a CPU thread for each."""
-
-
-def blocks(threads: int) -> int:
-    """Return the number of blocks for a number of threads, at least one."""
-    return int(max(1, -(-threads // THREADS)))
-
 
 class DeviceStream:
     """A stream with copies to and from the device, and its events."""

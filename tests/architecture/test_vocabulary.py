@@ -45,7 +45,7 @@ ALLOWED_TEXTS = {
 SYMBOLS = _split_words(
     "solve step prepare residual iterates value gradient hessian stats description title order close main run "
     "positions velocity time elements energies factorise multiply matvec toarray dhat gamma beta state kind index "
-    "name weight vertices values targets blocks"
+    "name weight vertices values targets"
 )
 """Operations and quantities that papers and SciPy, optimistix and ipctk call by this one word."""
 PROPER = _split_words("Admm Xpbd Anderson Chebyshev Lbfgs Tsitouras5 Ros2 Rodas Jgs2 Multigrid Woodbury BVH Colouring")

@@ -15,7 +15,7 @@ import numpy as np
 from springbench.solvers.contact.half_space.half_space_potential import HalfSpaceContact
 from springbench.solvers.contact.half_space.vertex_contact import is_vertex_contact, without_vertex_contact
 from springbench.solvers.cuda import cuda_device, device_springs
-from springbench.solvers.cuda.cuda_target import THREADS, DeviceStream, LaunchGraph, blocks
+from springbench.solvers.cuda.cuda_target import DeviceStream, LaunchGraph
 from springbench.solvers.cuda.device_network import DeviceNetwork
 from springbench.solvers.cuda.device_solver import DeviceSolverState, MinimisingSolver
 from springbench.solvers.cuda.device_springs import DeviceLanes
@@ -29,7 +29,9 @@ from springbench.solvers.methods.vertex_block.device_vbd_kernels import (
     IS_REQUESTED,
     NUM_CONTROLS,
     OBJECTIVE,
+    VBD_THREADS_PER_BLOCK,
     build_vbd_kernels,
+    count_vbd_blocks,
 )
 from springbench.solvers.model.energies.quadratic_energy import Quadratic
 from springbench.solvers.model.energies.spring_energy import Springs
@@ -177,7 +179,7 @@ class DeviceSweepState(DeviceSolverState):
                 made.vertex_blocks.num_free,
             )
         more = self._half_spaces.launch_shape[0] if self._half_spaces else 0
-        self._sums = [stream.allocate_zeros(blocks(lanes) + more, np.float64) for _ in range(2)]
+        self._sums = [stream.allocate_zeros(count_vbd_blocks(lanes) + more, np.float64) for _ in range(2)]
         self.loaded_step, self._control = (
             LoadedStep(made.uploaded_network),
             stream.allocate_zeros(NUM_CONTROLS, np.float64),
@@ -253,7 +255,9 @@ class DeviceSweepState(DeviceSolverState):
                 run.extrapolate_iterate, rows, self._displacement, self._previous_iterate, self._control
             )
             self._sum_objective(self._previous_iterate, EXTRAPOLATION, self._sums[1])
-            self._launch_kernel(run.decide_extrapolation, THREADS, made.spectral_radius, *self._sums, self._control)
+            self._launch_kernel(
+                run.decide_extrapolation, VBD_THREADS_PER_BLOCK, made.spectral_radius, *self._sums, self._control
+            )
             self._launch_kernel(
                 run.finish_extrapolation,
                 rows,
@@ -298,9 +302,9 @@ class DeviceSweepState(DeviceSolverState):
                 u,
                 condition,
                 self._control,
-                blocks(len(lanes.lane_row)),
+                count_vbd_blocks(len(lanes.lane_row)),
                 sums,
             )
 
     def _launch_kernel(self, kernel: Any, threads: int, *arguments: Any) -> None:
-        kernel[blocks(threads), THREADS, self.stream.cuda_stream](*arguments)
+        kernel[count_vbd_blocks(threads), VBD_THREADS_PER_BLOCK, self.stream.cuda_stream](*arguments)

@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import float64
 from springbench.solvers.cuda import device_springs
-from springbench.solvers.cuda.cuda_target import THREADS, cuda
+from springbench.solvers.cuda.cuda_device import is_simulated
+from springbench.solvers.cuda.cuda_target import cuda
 from springbench.solvers.kernels.spring_local_step import ZERO_LENGTH_SQUARED
 from springbench.solvers.simd.spring_packets import LANES
 
@@ -25,6 +26,14 @@ OMEGA, OBJECTIVE, EXTRAPOLATION, IS_ACCEPTED, IS_REQUESTED = range(5)
 NUM_CONTROLS = 5
 _PIVOT_ROUNDOFF = {np.float32: 1e-6, np.float64: 1e-14}
 """Pivots up to this fraction of the diagonal's sum are round-off, with about ten springs per vertex."""
+
+VBD_THREADS_PER_BLOCK = 8 if is_simulated() else 128
+"""Threads per block, one for each vertex; the simulator starts a CPU thread for each."""
+
+
+def count_vbd_blocks(num_threads: int) -> int:
+    """Return the number of blocks for a number of threads, at least one."""
+    return int(max(1, -(-num_threads // VBD_THREADS_PER_BLOCK)))
 
 
 class VbdKernels(NamedTuple):
@@ -257,7 +266,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             control: scalars of the iteration.
             sums: receives the sum of each block [J].
         """
-        shared_sums = cuda.shared.array(THREADS, float64)
+        shared_sums = cuda.shared.array(VBD_THREADS_PER_BLOCK, float64)
         t, inside = cuda.grid(1), cuda.threadIdx.x
         if condition == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
             return
@@ -292,7 +301,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             total = energy
         shared_sums[inside] = total
         cuda.syncthreads()
-        span = THREADS // 2
+        span = VBD_THREADS_PER_BLOCK // 2
         while span > 0:
             if inside < span:
                 shared_sums[inside] += shared_sums[inside + span]
@@ -310,19 +319,19 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             at_before, at_new: sums of the objective, if requested.
             control: scalars of the iteration, updated.
         """
-        shared_sums = cuda.shared.array((2, THREADS), float64)
+        shared_sums = cuda.shared.array((2, VBD_THREADS_PER_BLOCK), float64)
         inside = cuda.threadIdx.x
         before, new = float64(0.0), float64(0.0)
         w = control[EXTRAPOLATION]
         if w > 1.0:
-            for k in range(inside, len(at_new), THREADS):
+            for k in range(inside, len(at_new), VBD_THREADS_PER_BLOCK):
                 new += at_new[k]
             if control[IS_REQUESTED] > 0.0:
-                for k in range(inside, len(at_before), THREADS):
+                for k in range(inside, len(at_before), VBD_THREADS_PER_BLOCK):
                     before += at_before[k]
         shared_sums[0, inside], shared_sums[1, inside] = before, new
         cuda.syncthreads()
-        span = THREADS // 2
+        span = VBD_THREADS_PER_BLOCK // 2
         while span > 0:
             if inside < span:
                 shared_sums[0, inside] += shared_sums[0, inside + span]
