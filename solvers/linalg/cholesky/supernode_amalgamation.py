@@ -25,6 +25,10 @@ _PANEL_COST, _ROW_COST = 30.0, 3.0
 NUM_SUBTREE_GROUPS = 4
 """Number of groups of subtrees, of about equal cost, that threads can process in parallel."""
 
+_MAX_GROUP_EXCESS = 1.1
+"""Cost of a subtree, relative to a group's equal share, up to which it is not split: each split moves a root to the
+top, which one thread processes."""
+
 MIN_GROUPED_COST = 3e4
 """Cost of a solve below which a single group is used (a sheet of 28 x 28 vertices). One group is then faster by 1 to 7
 % on one thread, and waking a second thread consumes most of its gain: speedup 1.1 at 16 x 16, 1.3 at 20 x 20, 1.6 at
@@ -154,8 +158,9 @@ def _find_best_merge(s, child, sibling, width, rows):
 def group_subtrees(parent: NDArray[Any], cost: NDArray[np.float64], num_groups: int) -> NDArray[np.int32]:
     """Assign each node of a forest to a group of subtrees, `num_groups` for the top.
 
-    The heaviest subtree is split, with its root assigned to the top, until none exceeds a group's share. The lightest
-    group then repeatedly gets the heaviest remaining subtree. The result depends on the tree alone, never on threads.
+    The heaviest subtree is split, with its root assigned to the top, until none exceeds `_MAX_GROUP_EXCESS` times a
+    group's share. The lightest group then repeatedly gets the heaviest remaining subtree. The result depends on the
+    tree alone, never on threads.
 
     Args:
         parent: parent of each node, after its children; -1 for roots.
@@ -173,7 +178,7 @@ def group_subtrees(parent: NDArray[Any], cost: NDArray[np.float64], num_groups: 
     top = []
     heap = [(-total[v], v) for v in roots]
     heapify(heap)
-    while heap and -heap[0][0] > 1.1 * whole / num_groups:
+    while heap and -heap[0][0] > _MAX_GROUP_EXCESS * whole / num_groups:
         v = heappop(heap)[1]
         top.append(v)
         for c in children.get(v, []):
