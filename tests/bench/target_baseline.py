@@ -18,7 +18,7 @@ from time import thread_time
 import numpy as np
 from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget
-from springbench.harness.experiments.error_control.method_search import SearchResult
+from springbench.harness.experiments.error_control.method_trials import SearchResult
 from springbench.harness.experiments.error_control.third_party_comparison import compare_third_party
 from springbench.harness.simulation.auto_tolerance import StopCriterion, build_stop_rule
 from springbench.harness.simulation.time_loop import prepare, simulate_scene

@@ -30,10 +30,10 @@ from springbench.harness.experiments.accuracy.accuracy_units import open_referen
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget
 from springbench.harness.experiments.error_control.method_search import (
     MIN_ERROR_FRACTION,
-    Trial,
     compute_predictability_horizon,
     search_cheapest_method,
 )
+from springbench.harness.experiments.error_control.method_trials import Trial
 from springbench.harness.experiments.provenance import build_provenance_columns
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.results import parquet_rows

@@ -13,7 +13,8 @@ import pytest
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, Method
-from springbench.harness.experiments.error_control.method_search import SearchResult, Trial, search_cheapest_method
+from springbench.harness.experiments.error_control.method_search import search_cheapest_method
+from springbench.harness.experiments.error_control.method_trials import SearchResult, Trial
 from springbench.harness.reference.perturbation_growth import estimate_growth
 from springbench.harness.simulation.adaptive_stepping import StepObserver, Stepper, TimeBudgetExceeded, Trajectory
 

@@ -13,7 +13,7 @@ import pytest
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, prepare_candidate_methods
-from springbench.harness.experiments.error_control.method_search import Trial
+from springbench.harness.experiments.error_control.method_trials import Trial
 from springbench.harness.report.sweep_summary import summarise_sweep
 from springbench.harness.report.timing_table import read_run_times
 from springbench.harness.results.run_schema import RUN_SCHEMA

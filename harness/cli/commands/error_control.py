@@ -26,12 +26,11 @@ from springbench.harness.experiments.error_control.candidate_methods import (
     list_contact_methods,
 )
 from springbench.harness.experiments.error_control.method_search import (
-    SearchResult,
-    Trial,
     compute_predictability_horizon,
     search_cheapest_contact_method,
     search_cheapest_method,
 )
+from springbench.harness.experiments.error_control.method_trials import SearchResult, Trial
 from springbench.harness.experiments.error_control.stored_trials import (
     ResultRow,
     build_trial_rows,

@@ -19,11 +19,11 @@ from springbench.harness.experiments.error_control.candidate_methods import (
     list_methods_of_solver,
 )
 from springbench.harness.experiments.error_control.method_search import (
-    SearchResult,
     compute_predictability_horizon,
     search_cheapest_contact_method,
     search_cheapest_method,
 )
+from springbench.harness.experiments.error_control.method_trials import SearchResult
 from springbench.harness.results.quantities import compute_ms_per_step
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.simulation.adaptive_stepping import Trajectory

@@ -15,7 +15,7 @@ from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.execution import machine_info
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget, list_candidate_methods
-from springbench.harness.experiments.error_control.method_search import SearchResult
+from springbench.harness.experiments.error_control.method_trials import SearchResult
 from springbench.harness.results import parquet_rows, row_store
 
 ResultRow = dict[str, Any]

@@ -14,7 +14,8 @@ from time import perf_counter, thread_time
 
 from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.error_control.candidate_methods import ErrorTarget
-from springbench.harness.experiments.error_control.method_search import ERROR_AIM, SearchResult
+from springbench.harness.experiments.error_control.method_search import ERROR_AIM
+from springbench.harness.experiments.error_control.method_trials import SearchResult
 from springbench.harness.experiments.error_control.third_party_integrators import (
     THIRD_PARTY_INTEGRATORS,
     InitialValueProblem,
