@@ -11,7 +11,7 @@ import meshio
 import numpy as np
 import pytest
 from springbench.harness.errors import InputError
-from springbench.harness.experiments.archive.archive_verification import unpack_archive
+from springbench.harness.experiments.archive.archive_unpacking import unpack_archive
 from springbench.harness.experiments.grading.position_files import read_position_file
 from springbench.harness.recording.recording_reader import read_replay
 from springbench.harness.results import parquet_rows

@@ -15,7 +15,7 @@ import pytest
 from springbench.harness.cli.main import app
 from springbench.harness.console import get_error_console
 from springbench.harness.execution.progress_display import ProgressLines
-from springbench.harness.experiments.archive import archive_verification
+from springbench.harness.experiments.archive import archive_unpacking, archive_verification
 from springbench.harness.experiments.archive.archive_verification import (
     ClaimVerdict,
     PublishedRun,
@@ -73,7 +73,7 @@ def change_archive(archive: Path, into: Path, change: Callable[[dict[str, bytes]
 
 @pytest.mark.parametrize("name", ["x.zip", "packed.zip"])
 def test_published_archives_unpack_and_verify(home: Path, name: str, tmp_path: Path):
-    with archive_verification.unpack_archive(home / name) as folder:
+    with archive_unpacking.unpack_archive(home / name) as folder:
         subprocess.run(["sha256sum", "--check", "--quiet", "SHA256SUMS"], cwd=folder, check=True)
         assert archive_verification.verify_checksums(folder) == []
         runs, wrong = archive_verification.load_published_runs(folder, print, with_user_code=False)
@@ -121,7 +121,7 @@ def repeated_runs(
     home: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[list[PublishedRun], list[list[ResultRow]]]:
     """The published runs, dense and sparse, and what they leave when they are done again."""
-    with archive_verification.unpack_archive(home / "x.zip") as folder:
+    with archive_unpacking.unpack_archive(home / "x.zip") as folder:
         runs, _ = archive_verification.load_published_runs(folder, print, with_user_code=False)
         return runs, archive_verification.rerun_published(
             runs, tmp_path_factory.mktemp("again"), ProgressLines(get_error_console())
@@ -304,7 +304,7 @@ def test_damaged_rows_are_not_published(home: Path, tmp_path: Path):
 
 def claim(home: Path, factor: float, *, interrupted: bool = False, machine: str = "00000000") -> VerifiedClaim:
     """What is said of a ratio that was 1 and is `factor`."""
-    with archive_verification.unpack_archive(home / "x.zip") as folder:
+    with archive_unpacking.unpack_archive(home / "x.zip") as folder:
         run = archive_verification.load_published_runs(folder, print, with_user_code=False)[0][0].run
     old = [row | {"preempted": False} for row in build_dummy_rows(1)]
     there = (PublishedRun(old, run), PublishedRun(old, run.replace_options(size=5)))
@@ -322,7 +322,7 @@ def test_a_ratio_is_met_or_not_or_inconclusive(home: Path):
 
 
 def test_a_tenth_is_chosen_and_each_has_another_solver_for_comparison(home: Path):
-    with archive_verification.unpack_archive(home / "x.zip") as folder:
+    with archive_unpacking.unpack_archive(home / "x.zip") as folder:
         (a, b), _ = archive_verification.load_published_runs(folder, print, with_user_code=False)
     runs = [replace(one, run=one.run.replace_options(size=size)) for size in range(10) for one in (a, b)]
     for seed in range(20):

@@ -108,8 +108,9 @@ def verify_one_archive(archive: Path, seed: int | None, *, with_user_code: bool)
     from springbench.harness.console import get_error_console
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.archive import archive_verification as checks
+    from springbench.harness.experiments.archive.archive_unpacking import unpack_archive
 
-    with checks.unpack_archive(archive) as folder, TemporaryDirectory() as scratch:
+    with unpack_archive(archive) as folder, TemporaryDirectory() as scratch:
         if wrong := checks.verify_checksums(folder):
             for claim in wrong:
                 print_message(str(claim))

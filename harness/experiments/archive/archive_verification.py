@@ -15,20 +15,13 @@ import json
 import math
 import os
 import random
-import shutil
-import struct
-import zipfile
-import zlib
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-from springbench.harness.atomic_files import explain_unreadable_file
 from springbench.harness.config.config_loader import load_config
 from springbench.harness.config.run_options import AUTO, RUN_OPTIONS
 from springbench.harness.config.sweep_config import RunSpec
@@ -105,8 +98,8 @@ These are times, state and type of the machine, the sweep's name, how the run wa
 which is not repeated.
 """
 
-_MAX_FILES, _MAX_CHECKSUM_BYTES, _MAX_COMPRESSION_RATIO = 200_000, 2**26, 200
-"""Largest number of files in an archive, of bytes of its checksums, and ratio of unpacked to packed size."""
+_MAX_CHECKSUM_BYTES = 2**26
+"""Largest size of the checksums of an archive."""
 _MAX_LOADED_CONFIGS = 200
 """Largest number of different option sets with which configs are read."""
 
@@ -154,58 +147,6 @@ class PublishedRun:
     def step_rows(self) -> list[ResultRow]:
         """Rows of the run's steps."""
         return [row for row in self.rows if row["phase"] == "step"]
-
-
-@contextmanager
-def unpack_archive(archive: Path) -> Generator[Path]:
-    """Unpack an archive to a temporary folder. Raises InputError for a damaged or oversized archive."""
-    expected = "expected an archive that `springbench publish` wrote (.zip)"
-    if not archive.is_file():  # a device or a pipe would be read for ever
-        raise InputError(
-            InputMistake(f"is {'no plain file' if archive.exists() else 'not there'}; {expected}", archive)
-        )
-    with TemporaryDirectory() as scratch:
-        try:
-            with zipfile.ZipFile(archive) as packed:
-                if why := _explain_excess(packed.infolist(), archive.stat().st_size, shutil.disk_usage(scratch).free):
-                    raise InputError(InputMistake(f"{why}; {expected}", archive))
-                packed.extractall(scratch)  # names that lead out of the folder are made to stay in it
-        except (*_DAMAGED_ARCHIVE_ERRORS, OSError) as error:
-            problem = explain_unreadable_file(archive) or f"cannot be unpacked ({error}); {expected}"
-            raise InputError(InputMistake(problem, archive)) from error
-        yield Path(scratch)
-
-
-_DAMAGED_ARCHIVE_ERRORS = (
-    zipfile.BadZipFile,
-    RuntimeError,
-    NotImplementedError,
-    ValueError,
-    EOFError,
-    zlib.error,
-    struct.error,
-)
-"""Errors that zipfile raises for damaged or forged archives."""
-
-
-def _explain_excess(files: Sequence[zipfile.ZipInfo], size: int, free: int) -> str:
-    """Return why an archive is not unpacked; empty if it is.
-
-    Args:
-        files: entries of the archive.
-        size: size of the archive [B].
-        free: free space on the disk [B].
-    """
-    unpacked = sum(info.file_size for info in files)
-    if len(files) > _MAX_FILES:
-        return f"contains {len(files):,} files, and at most {_MAX_FILES:,} are unpacked"
-    if unpacked > free:
-        return f"takes {unpacked:,} bytes unpacked; there are {free:,}"
-    if unpacked > _MAX_COMPRESSION_RATIO * size or sum(info.compress_size for info in files) > size:
-        return f"takes {unpacked:,} bytes unpacked of {size:,}, which no results do"
-    if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in files):
-        return "is compressed by another method"
-    return ""
 
 
 def verify_checksums(folder: Path) -> list[VerifiedClaim]:
