@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
-from springbench.harness.experiments.accuracy.method_recommendation import find_engine_integrator
+from springbench.harness.experiments.accuracy.candidate_grids import find_engine_integrator
 from springbench.harness.reference.equations_of_motion import NotIntegrable
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import REFERENCE_MARGIN, ReferenceTrajectory

@@ -37,13 +37,9 @@ from springbench.harness.config.accuracy_config import WorkSpec
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
-from springbench.harness.experiments.accuracy.method_recommendation import (
-    BUDGET_REFERENCE_ERROR,
-    RecommendationGoal,
-    StudyCandidates,
-    build_study,
-    recommend_method,
-)
+from springbench.harness.experiments.accuracy.candidate_grids import StudyCandidates
+from springbench.harness.experiments.accuracy.method_recommendation import build_study, recommend_method
+from springbench.harness.experiments.accuracy.recommendation_goal import BUDGET_REFERENCE_ERROR, RecommendationGoal
 from springbench.harness.experiments.accuracy.setting_grid import compute_setting_cost, is_measured
 from springbench.harness.experiments.accuracy.work_precision import build_work_rows
 from springbench.solvers.registry import SOLVERS, find_solver_info, load_target

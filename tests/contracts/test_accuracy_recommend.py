@@ -18,16 +18,13 @@ from springbench.harness.config.config_loader import load_config, load_scene
 from springbench.harness.config.shipped_configs import locate_config
 from springbench.harness.config.sweep_config import SolverSpec
 from springbench.harness.errors import InputError, RunFailed
+from springbench.harness.experiments.accuracy import candidate_grids, work_precision
 from springbench.harness.experiments.accuracy import method_recommendation as module
-from springbench.harness.experiments.accuracy import work_precision
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
-from springbench.harness.experiments.accuracy.method_recommendation import (
-    MethodRecommendation,
-    RecommendationGoal,
-    StudyCandidates,
-    recommend_method,
-)
+from springbench.harness.experiments.accuracy.candidate_grids import StudyCandidates
+from springbench.harness.experiments.accuracy.method_recommendation import MethodRecommendation, recommend_method
+from springbench.harness.experiments.accuracy.recommendation_goal import MeasuredMethod, RecommendationGoal
 from springbench.harness.experiments.accuracy.setting_grid import compute_setting_cost
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.results import parquet_rows
@@ -58,8 +55,8 @@ pytestmark = pytest.mark.usefixtures("without_workers")
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """A grid of six simulations."""
-    monkeypatch.setattr(module, "build_candidate_grid", lambda: METHODS)
-    monkeypatch.setattr(module, "TIME_STEP_REFINEMENTS", REFINEMENTS)
+    monkeypatch.setattr(candidate_grids, "build_candidate_grid", lambda: METHODS)
+    monkeypatch.setattr(candidate_grids, "TIME_STEP_REFINEMENTS", REFINEMENTS)
 
 
 @pytest.fixture
@@ -240,7 +237,7 @@ def test_steps_that_a_solver_takes_within_a_frame_are_printed() -> None:
         path, load_scene(path), 4, StudyCandidates.from_goal(RecommendationGoal(max_error=0.1), None), 0.2, 60.0
     ).work[0]
     spec = replace(spec, solver=SolverSpec("velocity-verlet", {}))
-    way = module.MeasuredMethod(spec, 1e-3, 1.0, "integrated", "1140 substeps of 2.9e-05 s")
+    way = MeasuredMethod(spec, 1e-3, 1.0, "integrated", "1140 substeps of 2.9e-05 s")
     assert str(way).startswith(f"solver {spec.solver.name}, 1140 substeps of 2.9e-05 s, in each frame of ")
     assert "time step" not in str(way)
 
@@ -281,7 +278,7 @@ def test_step_sizes_between_powers_of_two_use_up_a_budget(scene: Path) -> None:
     steps = round(spec.t_end / spec.case.scene.time_step)
 
     def count_frames(cost: float) -> list[int]:
-        method = module.MeasuredMethod(spec, 0.1, cost, "integrated", "")
+        method = MeasuredMethod(spec, 0.1, cost, "integrated", "")
         found = module.list_tuned_specs([method], 1.0, spec.t_end)
         return [round(one.t_end / one.case.scene.time_step) for one in found]
 
@@ -315,7 +312,7 @@ def test_the_search_can_be_of_one_solver(scene: Path) -> None:
 @pytest.mark.long
 @pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed: pip install 'springbench[mujoco]'")
 def test_an_engine_is_searched_over_its_substeps(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ENGINE_SUBSTEPS", [16])
+    monkeypatch.setattr(candidate_grids, "ENGINE_SUBSTEPS", [16])
     found, _ = recommend(scene, 0.0, goal=RecommendationGoal(frame_seconds=0.02), engine="mujoco")
     assert {method.work_spec.solver.parameters["mujoco_integrator"] for method in found.measured_methods} >= {"RK4"}
     assert "substeps a frame of 0.0333333 s" in str(found.best_method)

@@ -10,7 +10,8 @@ from springbench.harness.cli.main import app
 from springbench.harness.config.accuracy_loader import load_accuracy
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
-from springbench.harness.experiments.accuracy.method_recommendation import RecommendationGoal, recommend_method
+from springbench.harness.experiments.accuracy.method_recommendation import recommend_method
+from springbench.harness.experiments.accuracy.recommendation_goal import RecommendationGoal
 from springbench.harness.reference import reference_store
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.self_converged_trajectory import (

@@ -13,7 +13,7 @@ from springbench.harness.console import get_error_console, get_output_console, p
 from springbench.harness.errors import InputError, InputMistake
 
 if TYPE_CHECKING:
-    from springbench.harness.experiments.accuracy.method_recommendation import MeasuredMethod
+    from springbench.harness.experiments.accuracy.recommendation_goal import MeasuredMethod
 
 
 _UNITS = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
@@ -45,8 +45,8 @@ def recommend(
     """Find and check the cheapest method for an error, or the most accurate one for a wall time a frame."""
     from rich.table import Table
     from springbench.harness.execution.progress_display import create_display
-    from springbench.harness.experiments.accuracy.method_recommendation import RecommendationGoal
     from springbench.harness.experiments.accuracy.method_recommendation import recommend_method as find
+    from springbench.harness.experiments.accuracy.recommendation_goal import RecommendationGoal
     from springbench.harness.report.charts.recommendation_chart import (
         CandidatePoint,
         RecommendationLimits,

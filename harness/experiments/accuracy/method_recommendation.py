@@ -12,23 +12,20 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from time import monotonic
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 from springbench.harness.config.accuracy_config import AccuracyConfig, BenchmarkCase, MeasurementSettings, WorkSpec
 from springbench.harness.config.accuracy_loader import AccuracyPlan, expand_studies
 from springbench.harness.config.config_loader import find_scene_mistakes, load_scene
 from springbench.harness.config.run_options import RUN_OPTIONS, STEP_OPTIONS
-from springbench.harness.config.shipped_configs import get_config_name
 from springbench.harness.config.solver_parameters import read_solvers
 from springbench.harness.config.sweep_config import SolverSpec
-from springbench.harness.errors import InputError, InputMistake, RunFailed, format_allowed_names
+from springbench.harness.errors import InputError, InputMistake, RunFailed
 from springbench.harness.execution import machine_info
 from springbench.harness.execution.isolated_call import run_isolated
 from springbench.harness.execution.progress_display import ProgressDisplay
@@ -40,6 +37,8 @@ from springbench.harness.experiments.accuracy.accuracy_units import (
     load_reference_trajectory,
     open_reference_store,
 )
+from springbench.harness.experiments.accuracy.candidate_grids import StudyCandidates
+from springbench.harness.experiments.accuracy.recommendation_goal import MeasuredMethod, RecommendationGoal
 from springbench.harness.experiments.accuracy.setting_grid import (
     LEAST_LIMIT,
     SLOWER,
@@ -51,47 +50,21 @@ from springbench.harness.experiments.accuracy.work_precision import build_work_r
 from springbench.harness.experiments.best_first_search import SearchSummary
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.reference_trajectory import ReferenceTrajectory
-from springbench.harness.reference.self_converged_trajectory import (
-    LIMIT_INTEGRATORS,
-    describe_self_convergence,
-    has_contact,
-)
+from springbench.harness.reference.self_converged_trajectory import describe_self_convergence, has_contact
 from springbench.harness.reference.step_snapshot import build_exact_scene
 from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.folder_ownership import claim_folder
 from springbench.harness.scenes.mesh.mesh_generator import MeshGenerator
 from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.schema.config_document import ConfigDocument
-from springbench.solvers.iteration.solver_info import LOCAL_GLOBAL_FAMILY
-from springbench.solvers.registry import (
-    OPTIONAL_SOLVERS,
-    SOLVER_TABLE,
-    SOLVERS,
-    find_solver_info,
-    is_engine,
-    is_minimiser,
-    load_target,
-)
-
-TIME_STEP_REFINEMENTS = (0.5, 1, 2, 4, 8)
-"""Numbers of steps up to the horizon, relative to those at the scene's own time step."""
+from springbench.solvers.registry import SOLVER_TABLE, is_engine, load_target
 
 DEFAULT_T_END = 1.0
 """Default simulated time at which the error counts [s]."""
 SEARCH_TIME = 60.0
 """Default limit for the wall time of all measurements together [s]."""
-BUDGET_REFERENCE_ERROR = 1e-3
-"""Relative error that the reference must resolve where a wall time is given: a percent suffices there."""
-CONTACT_BUDGET_ERROR = 0.02
-"""BUDGET_REFERENCE_ERROR with contact: errors at a frame's time step are some percent, and references less accurate."""
 BUDGET_RANGE = 2.0
 """Multiple of a given wall time up to which methods are measured, to show what more time would yield."""
-FIXED_ITERATIONS, FEWER_ITERATIONS = 50, [2, 5, 10, 20]
-"""Iterations of methods without a tolerance; smaller numbers that are also tried where a wall time is given."""
-ENGINE_SUBSTEPS = [1, 2, 4, 8, 16, 32, 64, 128]
-"""Substeps of outside engines in a frame."""
-ENGINE_ITERATIONS = [1, 4, 16]
-"""Iterations of outside engines in a substep, of those that iterate."""
 _SEARCH_FRACTION = 0.75
 """Part of the time for a search in which powers of two are measured; the rest is for step sizes between them."""
 _NUM_TUNED, _TUNING_ROUNDS = 8, 2
@@ -104,175 +77,6 @@ _MESSAGE_INTERVAL = 2.0
 """Interval between two messages about the reference [s]."""
 _ERROR_RTOL, _MAX_TIME_RATIO = 1e-6, 1.3
 """Relative difference of two errors of one simulation that compilers may cause; accepted ratio of its two times."""
-
-CANDIDATE_INTEGRATORS = ["implicit-euler", "bdf2", "midpoint", "sdirk-4"]
-"""Integrators to try: one of each order and kind."""
-
-
-def build_candidate_grid() -> list[dict[str, Any]]:
-    """Return the grid that is measured where no rows exist.
-
-    The first solver of each family runs with steps solved to a tolerance, or with 50 iterations or substeps. All
-    adaptive solvers with their own integrator are included.
-    """
-    made = {name: load_target(target) for name, target in SOLVERS.items()}
-    infos = {name: find_solver_info(solver, name) for name, solver in made.items()}
-    own = [name for name, of in infos.items() if of.is_substepping and of.supports_error_control]
-    first = {name: made[name] for name, of in infos.items() if of.is_family_default}
-    implicit = [name for name, solver in first.items() if is_minimiser(solver)]
-    fixed = [
-        name for name, solver in first.items() if not is_minimiser(solver) or infos[name].family == LOCAL_GLOBAL_FAMILY
-    ]
-    return [  # solvers with the fewest kernels first, because their cost limits the time of all others
-        {"solver": own, "max_iterations": 1, "integrator": ["substepping"]},
-        {"solver": fixed, "max_iterations": FIXED_ITERATIONS},
-        {"solver": implicit, "rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500, "integrator": CANDIDATE_INTEGRATORS},
-    ]
-
-
-def build_solver_grid(name: str) -> list[dict[str, Any]]:
-    """Return the grid of one solver or outside engine.
-
-    Args:
-        name: its name.
-
-    Raises:
-        InputError: there is no solver of this name.
-    """
-    solver = _load_solver(name)
-    info = find_solver_info(solver, name)
-    if is_engine(solver):
-        return [{"solver": [name], "max_iterations": ENGINE_SUBSTEPS, "integrator": [find_engine_integrator(solver)]}]
-    if info.is_substepping and info.supports_error_control:
-        return [{"solver": [name], "max_iterations": 1, "integrator": ["substepping"]}]
-    fixed = {"solver": [name], "max_iterations": [*FEWER_ITERATIONS, FIXED_ITERATIONS]}
-    if not is_minimiser(solver):
-        return [fixed]
-    solved = {"rtol": [1e-1, 1e-2, 1e-3], "max_iterations": 500}
-    return [{"solver": [name], "integrator": CANDIDATE_INTEGRATORS, **solved}, fixed]
-
-
-def list_solver_variants(name: str) -> list[dict[str, Any]]:
-    """Return the sets of parameters with which a solver is tried.
-
-    Parameters of outside engines vary; other solvers have their defaults.
-    """
-    solver = _load_solver(name)
-    values: dict[str, Sequence[Any]] = {}
-    for parameter in fields(solver) if is_engine(solver) else ():
-        if parameter.name == "iterations_per_substep":
-            values[parameter.name] = sorted({*ENGINE_ITERATIONS, parameter.default})
-        elif parameter.name in ("mujoco_integrator", "newton_solver"):
-            values[parameter.name] = get_args(get_type_hints(solver)[parameter.name])
-    return [{"name": name, **dict(zip(values, chosen, strict=True))} for chosen in product(*values.values())]
-
-
-def find_engine_integrator(solver: Any) -> str:
-    """Return the name of the integrator with which an engine steps frames.
-
-    It is `substepping` if the engine supports damping. Otherwise it is `implicit-euler`, whose damping acts before each
-    frame.
-    """
-    return "substepping" if solver.supports_damping else "implicit-euler"
-
-
-def _load_solver(name: str) -> Any:
-    known = [*SOLVERS, *OPTIONAL_SOLVERS]
-    if name not in known:
-        raise InputError(InputMistake(f"got {name!r}; expected {format_allowed_names(name, known)}", key="--engine"))
-    return load_target(SOLVER_TABLE[name])
-
-
-@dataclass(frozen=True, slots=True)
-class RecommendationGoal:
-    """Limit on a method's error or wall time; one of them is given.
-
-    Attributes:
-        max_error: relative error at the end.
-        frame_seconds: wall time [s] of a frame, which is a time step of the scene.
-        budget_error: relative error that the reference must resolve where a wall time is given.
-    """
-
-    max_error: float | None = None
-    frame_seconds: float | None = None
-    budget_error: float = BUDGET_REFERENCE_ERROR
-
-    @property
-    def reference_error(self) -> float:
-        """Relative error that the reference must resolve."""
-        return self.budget_error if self.max_error is None else self.max_error
-
-    def loosen_for_contact(self) -> RecommendationGoal:
-        """Return the goal for a scene with contact, whose reference resolves larger errors only."""
-        return replace(self, budget_error=CONTACT_BUDGET_ERROR)
-
-    def select_methods(
-        self, methods: Sequence[MeasuredMethod], frame: float, factor: float = 1.0
-    ) -> list[MeasuredMethod]:
-        """Return the methods within the goal's limit, the best one first.
-
-        Args:
-            methods: measured methods, the cheapest first.
-            frame: time step of the scene [s].
-            factor: multiple of the wall time.
-        """
-        if self.frame_seconds is None:
-            return [method for method in methods if method.error <= self.reference_error]
-        limit = factor * self.frame_seconds / frame
-        within = [method for method in methods if method.seconds_per_simulated_second <= limit]
-        return sorted(within, key=lambda method: method.error)
-
-
-@dataclass(frozen=True, slots=True)
-class MeasuredMethod:
-    """Method that was measured on the scene.
-
-    Attributes:
-        work_spec: the simulation.
-        error: relative error.
-        seconds_per_simulated_second: wall time per simulated second.
-        reference_kind: kind of the reference solution for the error.
-        solver_description: what the solver selected automatically.
-        sweep: name of the study that measured it.
-    """
-
-    work_spec: WorkSpec
-    error: float
-    seconds_per_simulated_second: float
-    reference_kind: str
-    solver_description: str
-    sweep: str = ""
-
-    def __str__(self) -> str:
-        u = self.work_spec
-        solver = load_target(SOLVER_TABLE[u.solver.name])
-        if is_engine(solver):
-            chosen = "".join(f", {key} {value}" for key, value in u.solver.parameters.items() if key != "device")
-            substeps = f"{u.options['max_iterations']} substeps a frame"
-            return f"{u.solver.name}{chosen}, {substeps} of {u.case.scene.time_step:.6g} s"
-        if find_solver_info(solver, u.solver.name).is_substepping:
-            return f"solver {u.solver.name}, {self.solver_description}, in each frame of {u.case.scene.time_step:.6g} s"
-        tolerance = u.options["rtol"]
-        stop = f"{u.options['max_iterations']} iterations" if tolerance is None else f"tolerance {tolerance:g}"
-        return f"{u.case.integrator}, time step {u.case.scene.time_step:.6g} s, {stop}, solver {u.solver.name}"
-
-    @property
-    def kind(self) -> tuple[object, ...]:
-        """Solver, integrator and parameters, which identify the method at any setting."""
-        spec = self.work_spec
-        return spec.solver.name, spec.case.integrator, *sorted(spec.solver.parameters.items())
-
-    def format_command(self, scene: Path) -> str:
-        """Return the command line for this method; empty where the solver's parameters need a sweep."""
-        u, made = self.work_spec, load_target(SOLVER_TABLE[self.work_spec.solver.name])
-        if made(**u.solver.parameters) != made():
-            return ""
-        steps = round(u.t_end / u.case.scene.time_step)
-        given: dict[str, Any] = {"size": u.case.size or None, "solver": u.solver.name, "integrator": u.case.integrator}
-        given |= {"time-step": repr(u.case.scene.time_step), "frames": steps, **u.options}
-        named_values = ((name.replace("_", "-"), value) for name, value in given.items() if value is not None)
-        options = (part for name, value in named_values for part in (f"--{name}", str(value)))
-        return shlex.join(["springbench", "run", get_config_name(scene), *options])
 
 
 @dataclass(frozen=True, slots=True)
@@ -421,50 +225,6 @@ def recommend_method(
         raise RunFailed(_explain_no_method(methods, failed_rows, goal, frame, t_end, summary))
     checked = isolated(partial(_check_method, within[0], goal.reference_error, store))
     return MethodRecommendation(goal, frame, tuple(methods), within[0], checked)
-
-
-@dataclass(frozen=True, slots=True)
-class StudyCandidates:
-    """Solvers of a study with their parameters, its grid, and refinements of the time step."""
-
-    solvers: Sequence[dict[str, Any]]
-    grid: Sequence[dict[str, Any]]
-    refinements: Sequence[float]
-
-    @classmethod
-    def from_goal(cls, goal: RecommendationGoal, engine: str | None) -> StudyCandidates:
-        """Return the candidates for a goal.
-
-        Args:
-            goal: limit of the error or of the wall time; with the latter, no step is longer than a frame.
-            engine: name of the only solver or engine to consider; None for all.
-
-        Raises:
-            InputError: there is no solver or engine of this name.
-        """
-        refinements = [
-            one for one in TIME_STEP_REFINEMENTS if one >= 1 or goal.max_error is not None
-        ]  # a frame at most
-        if engine:
-            refinements = [1] if is_engine(_load_solver(engine)) else refinements
-            return cls(list_solver_variants(engine), build_solver_grid(engine), refinements)
-        grid = build_candidate_grid()
-        if goal.max_error is None:
-            fixed = [entry for entry in grid if entry["max_iterations"] == FIXED_ITERATIONS]
-            grid += [{**entry, "max_iterations": FEWER_ITERATIONS} for entry in fixed]
-        names = dict.fromkeys(name for entry in grid for name in entry["solver"])
-        return cls([{"name": name} for name in names], grid, refinements)
-
-    def restrict_to_contact(self) -> StudyCandidates:
-        """Return the minimising solvers with integrators that support contact; all candidates if there are none."""
-        grid = list[dict[str, Any]]()
-        for entry in self.grid:
-            names = [name for name in entry["solver"] if is_minimiser(_load_solver(name))]
-            integrators = [one for one in entry.get("integrator", ["implicit-euler"]) if one in LIMIT_INTEGRATORS]
-            grid += [{**entry, "solver": names, "integrator": integrators}] if names and integrators else []
-        known = {name for entry in grid for name in entry["solver"]}
-        solvers = [one for one in self.solvers if one["name"] in known]
-        return StudyCandidates(solvers, grid, self.refinements) if solvers else self
 
 
 def _plan_study(
