@@ -73,14 +73,14 @@ class PixelBox(NamedTuple):
     height: int
 
 
-def layout_frames(final: float, full_run: float, earlier: int) -> tuple[PixelBox, list[PixelBox]]:
+def layout_frames(final_aspect: float, run_aspect: float, earlier: int) -> tuple[PixelBox, list[PixelBox]]:
     """Lay out the final frame and the earlier ones.
 
     Scenes of the given aspect ratios fill their boxes.
 
     Args:
-        final: width / height of the final frame.
-        full_run: width / height of all frames together.
+        final_aspect: width / height of the final frame.
+        run_aspect: width / height of all frames together.
         earlier: number of earlier frames.
 
     Returns:
@@ -91,7 +91,7 @@ def layout_frames(final: float, full_run: float, earlier: int) -> tuple[PixelBox
     main = PixelBox(
         _FRAMES_LEFT,
         _FRAMES_TOP,
-        int(min(max(_FRAMES_HEIGHT * final, _MIN_FINAL_WIDTH), _MAX_FINAL_WIDTH)),
+        int(min(max(_FRAMES_HEIGHT * final_aspect, _MIN_FINAL_WIDTH), _MAX_FINAL_WIDTH)),
         _FRAMES_HEIGHT,
     )
     start = main.left + main.width + _RULE_GAP
@@ -101,7 +101,7 @@ def layout_frames(final: float, full_run: float, earlier: int) -> tuple[PixelBox
         rows = ceil(earlier / columns)
         width = (room - (columns - 1) * _TILE_GAP) // columns
         height = (_FRAMES_HEIGHT - rows * _CAPTION_HEIGHT) // rows
-        return min(float(width), full_run * height), width, min(height, int(width / min(full_run, 1.0)))
+        return min(float(width), run_aspect * height), width, min(height, int(width / min(run_aspect, 1.0)))
 
     columns = max(range(1, earlier + 1), key=lambda c: tile(c)[0])
     _, width, height = tile(columns)

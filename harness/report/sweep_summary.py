@@ -130,16 +130,16 @@ def _describe_strain_growth(ok_runs: Sequence[RunTimes], names: Mapping[str, str
             sizes[run.scene][names[run.run_id]][run.size] = run
     for scene, by_name in sizes.items():
         of_one = max(by_name.values(), key=len)
-        coarse, fine_one = of_one[min(of_one)], of_one[max(of_one)]
-        if words := _compare_strains(coarse, fine_one):
+        coarse, fine = of_one[min(of_one)], of_one[max(of_one)]
+        if words := _compare_strains(coarse, fine):
             yield f"{scene}: {words}"
 
 
-def _compare_strains(coarse_run: RunTimes, ok_runs: RunTimes) -> str:
+def _compare_strains(coarse_run: RunTimes, fine_run: RunTimes) -> str:
     """Compare the strains of two sizes in words; empty if they do not differ notably."""
-    largest, finest = coarse_run.max_strain or 0.0, ok_runs.max_strain or 0.0
-    most, below = coarse_run.strain_p99 or 1.0, ok_runs.strain_p99 or 1.0
-    change = f"from {100 * largest:.3g} to {100 * finest:.3g} %, from size {coarse_run.size} to {ok_runs.size}"
+    largest, finest = coarse_run.max_strain or 0.0, fine_run.max_strain or 0.0
+    most, below = coarse_run.strain_p99 or 1.0, fine_run.strain_p99 or 1.0
+    change = f"from {100 * largest:.3g} to {100 * finest:.3g} %, from size {coarse_run.size} to {fine_run.size}"
     if (
         coarse_run.modulus_exponent
         and not 1 / STRAIN_GROWTH_FACTOR <= finest / (largest or 1.0) <= STRAIN_GROWTH_FACTOR

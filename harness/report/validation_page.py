@@ -136,7 +136,7 @@ def draw_closed_forms(forms: Sequence[dict[str, Any]], solver: str, path: Path) 
         count = sum(row["verdict"] == "confirmed" for row in forms)
         title = f"{solver}: {count} of {len(forms)} closed forms are confirmed"
         figure.text(0.025, 0.94, title, fontsize=20, weight="bold", va="center")
-        _draw_forms(figure, forms, 0.99)
+        _draw_forms(figure, forms)
         figure.savefig(path, format="png")
         plt.close(figure)
 
@@ -168,11 +168,11 @@ def is_in_band(measured: Mapping[str, float]) -> bool:
     return measured["low"] <= measured["value"] <= measured["high"]
 
 
-def _draw_forms(figure: Any, forms: Sequence[dict[str, Any]], right: float) -> None:
+def _draw_forms(figure: Any, forms: Sequence[dict[str, Any]]) -> None:
     """Draw a panel for each closed form: relative error and what explains it, by level."""
     columns = 4
     for k, row in enumerate(forms):
-        width = (right - 0.05) / columns
+        width = 0.94 / columns
         left, bottom = 0.05 + (k % columns) * width, 0.66 - (k // columns) * 0.27
         axes = figure.add_axes((left, bottom, 0.74 * width, 0.165))
         scale = abs(row["exact"]) or 1.0

@@ -52,18 +52,24 @@ def list_simulation_times(
     Returns:
         Times by round of the published and of the repeated study, in the same order.
     """
-    ours, theirs = ({_build_setting(work): work for work in side.work_points} for side in (repeated, published))
-    settings = [key for key in theirs if key in ours and theirs[key].round_seconds and ours[key].round_seconds]
+    repeated_points, published_points = (
+        {_build_setting(work): work for work in side.work_points} for side in (repeated, published)
+    )
+    settings = [
+        key
+        for key in published_points
+        if key in repeated_points and published_points[key].round_seconds and repeated_points[key].round_seconds
+    ]
     found: tuple[list[MethodTimes], list[MethodTimes]] = ([], [])
     for target in ERROR_TARGETS:
         tasks: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
         for key in settings:
-            work = theirs[key]
+            work = published_points[key]
             if work.error <= target:
                 task = work.scene, work.size, work.t_end, f"to {format_gap(target)}"
                 tasks.setdefault((*task, work.solver), []).append(key)
         for (*task, solver), keys in tasks.items():
-            for listed, works in zip(found, (theirs, ours), strict=True):
+            for listed, works in zip(found, (published_points, repeated_points), strict=True):
                 best = min((works[key] for key in keys), key=lambda work: median(work.round_seconds))
                 rounds = dict(enumerate(best.round_seconds))
                 listed.append(MethodTimes(tuple(task), (solver,), rounds, False, best.is_preempted))

@@ -44,7 +44,7 @@ _PANEL_WIDTH, _PICTURE_WIDTH = 58.0, 36.0
 """Preferred minimum width of a panel and of a picture [mm], at a font size of 8 points."""
 _MAX_HEIGHT_RATIO = 1.5
 """Maximum total height of the rows of frames, in units of the figure's width, so that a two-column page has space."""
-_MIN_FRAME_HEIGHT = 48.0 / MILLIMETRES_PER_INCH
+_FRAME_HEIGHT_OFFSET = 48.0 / MILLIMETRES_PER_INCH
 """Constant part of the height of a wide frame [inches].
 
 A frame of aspect 1 that is wider than 85 mm is flatter: its height is 0.3 of its width plus this.
@@ -126,8 +126,8 @@ LAYOUT_DPI = 100
 
 
 def _choose_column_count(panels: Sequence[FigurePanel], options: FigureOptions) -> int:
-    expected = _PICTURE_WIDTH if isinstance(panels[0], MeshPicture) else _PANEL_WIDTH
-    abreast = max(1, int(options.width_mm * 8.0 / options.font_size / expected))
+    min_width = _PICTURE_WIDTH if isinstance(panels[0], MeshPicture) else _PANEL_WIDTH
+    abreast = max(1, int(options.width_mm * 8.0 / options.font_size / min_width))
     rows = -(-len(panels) // abreast)
     return -(-len(panels) // rows)
 
@@ -138,11 +138,11 @@ def _compute_row_heights(
     """Compute the height of each row of panels [inches]."""
     width = options.width_mm / MILLIMETRES_PER_INCH / columns
     room = _MAX_HEIGHT_RATIO * options.width_mm / MILLIMETRES_PER_INCH / -(-len(panels) // columns)
-    expected = [
+    heights = [
         _compute_panel_height(panel, len(head), width, room, options)
         for panel, head in zip(panels, title_lines, strict=True)
     ]
-    return [max(expected[k : k + columns]) for k in range(0, len(expected), columns)]
+    return [max(heights[k : k + columns]) for k in range(0, len(heights), columns)]
 
 
 def _compute_panel_height(panel: FigurePanel, head: int, width: float, room: float, options: FigureOptions) -> float:
@@ -155,7 +155,7 @@ def _compute_panel_height(panel: FigurePanel, head: int, width: float, room: flo
         return width / panel.aspect + line * (1 + len(panel.facts))
     if panel.y.division == "names":
         return line * (1.25 * len(panel.y.place_names) + 4.0)
-    return min(min(0.86 * width, 0.3 * width + _MIN_FRAME_HEIGHT) * panel.aspect, room) + max(3.0, head + 1.0) * line
+    return min(min(0.86 * width, 0.3 * width + _FRAME_HEIGHT_OFFSET) * panel.aspect, room) + max(3.0, head + 1.0) * line
 
 
 def _panel_title_lines(panel: FigurePanel, options: FigureOptions, columns: int, *, several: bool) -> list[str]:

@@ -67,8 +67,8 @@ def parse_figure_options(
     """
     mistakes: list[InputMistake] = []
     millimetres = _parse_length(width, mistakes)
-    expected = tuple(dict.fromkeys(word.strip().lower() for word in formats.split(",") if word.strip()))
-    for word in expected or ("",):
+    given = tuple(dict.fromkeys(word.strip().lower() for word in formats.split(",") if word.strip()))
+    for word in given or ("",):
         if word not in FIGURE_FORMATS:
             mistakes.append(
                 InputMistake(f"got {word!r}; expected {format_allowed_names(word, FIGURE_FORMATS)}", key="--format")
@@ -81,7 +81,7 @@ def parse_figure_options(
     if mistakes:
         raise InputError(mistakes)
     selectors = tuple(tuple(part for part in one.split(":") if part) for one in panels.split(",") if one.strip(" :"))
-    return FigureOptions(millimetres, expected, font_size, selectors, has_title, is_transparent)
+    return FigureOptions(millimetres, given, font_size, selectors, has_title, is_transparent)
 
 
 def _parse_length(words: str, mistakes: list[InputMistake]) -> float:
@@ -93,6 +93,6 @@ def _parse_length(words: str, mistakes: list[InputMistake]) -> float:
         return 0.0
     length = float(found[1]) * _MILLIMETRES_PER_UNIT[found[2]]
     if not _MIN_WIDTH <= length <= _MAX_WIDTH:
-        expected = f"got {words}; expected from {_MIN_WIDTH:g}mm to {_MAX_WIDTH:g}mm"
-        mistakes.append(InputMistake(expected, key="--width"))
+        problem = f"got {words}; expected from {_MIN_WIDTH:g}mm to {_MAX_WIDTH:g}mm"
+        mistakes.append(InputMistake(problem, key="--width"))
     return length

@@ -62,10 +62,10 @@ def select_entries(entries: Sequence[PanelEntry], selectors: Sequence[tuple[str,
             named = [entry for entry in named if entry.group == named[0].group]
         found += [entry for entry in named if entry not in found]
     if len(found) > MAX_PANELS:
-        expected = (
+        problem = (
             f"got the names of {len(found)} panels; expected at most {MAX_PANELS}, as parts of {_join_names(entries)}"
         )
-        raise InputError(InputMistake(expected, key="--panels"))
+        raise InputError(InputMistake(problem, key="--panels"))
     return found
 
 
