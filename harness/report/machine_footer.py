@@ -39,7 +39,7 @@ def assign_machine_names(machine_keys: Iterable[MachineKey]) -> dict[MachineKey,
     }
 
 
-def machine_footer(table: pa.Table) -> list[str]:
+def build_machine_footer(table: pa.Table) -> list[str]:
     """Return the footer lines of a table of rows.
 
     They list its machines, and which numbers may be compared.

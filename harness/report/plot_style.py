@@ -249,7 +249,7 @@ def _assign_variants(
     return found
 
 
-def indexed_style(number: int) -> SeriesStyle:
+def build_indexed_style(number: int) -> SeriesStyle:
     """Return the style of something that is not a solver, by its index.
 
     There are 64 styles from index 0 on, the first 8 in distinct colours.

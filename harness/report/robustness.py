@@ -363,7 +363,7 @@ def format_share(share: float | None) -> str:
     return "" if share is None else f"{share:.0%}"
 
 
-def map_headline(cells: Sequence[VerifiedRun], name: str) -> str:
+def build_map_headline(cells: Sequence[VerifiedRun], name: str) -> str:
     """Return the headline of the map: counts of the main outcomes.
 
     Args:

@@ -38,7 +38,7 @@ from springbench.harness.report.plot_style import (
     PAGE_RC,
     PAGE_WIDTH,
     TEXT_COLOUR,
-    indexed_style,
+    build_indexed_style,
 )
 
 _VIEW_LEFT, _VIEW_TOP, _COLUMN_GAP, _LEGEND_ROW_HEIGHT = 36, 114, 40, 24
@@ -81,7 +81,7 @@ def draw_scene_preview(
     """
     wide, p = PAGE_WIDTH - 2 * _VIEW_LEFT - _COLUMN_GAP - _LEGEND_WIDTH, replay.positions[0]
     angles = camera or choose_view_angles(p, compute_area_vectors(replay, 0))
-    dots = [(one.points, indexed_style(k).color) for k, one in enumerate(marks)]
+    dots = [(one.points, build_indexed_style(k).color) for k, one in enumerate(marks)]
     with matplotlib.rc_context(PAGE_RC), OffscreenRenderer(wide, _VIEW_HEIGHT, mesh_lines=_PIXELS_PER_VERTEX) as studio:
         page = new_page()
         draw_header(page, replay.title, facts)
@@ -89,7 +89,7 @@ def draw_scene_preview(
         paste_picture(page, studio.render_frame(replay, 0, view, coloured_points=dots), _VIEW_LEFT, _VIEW_TOP)
         x, y = PAGE_WIDTH - _VIEW_LEFT - _LEGEND_WIDTH, _VIEW_TOP + _LEGEND_ROW_HEIGHT
         for k, one in enumerate(marks):
-            draw_text(page, x, y, "●", size=13, color=indexed_style(k).color)
+            draw_text(page, x, y, "●", size=13, color=build_indexed_style(k).color)
             draw_text(page, x + 24, y, one.label, size=12, color=TEXT_COLOUR)
             y = _draw_paragraph(page, one.description, x + 24, y + 19) + 12
         y += _LEGEND_ROW_HEIGHT

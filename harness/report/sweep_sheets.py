@@ -13,7 +13,7 @@ from springbench.harness.report.charts.hard_case_chart import build_hard_case_ch
 from springbench.harness.report.device_speedup import read_device_runs, summarise_runs
 from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 from springbench.harness.report.provenance_words import describe_provenance
-from springbench.harness.report.robustness import MAP_NOTE, VerifiedRun, map_headline, read_verified_runs
+from springbench.harness.report.robustness import MAP_NOTE, VerifiedRun, build_map_headline, read_verified_runs
 from springbench.harness.results import parquet_rows, row_store
 from springbench.harness.results.folder_ownership import find_config
 
@@ -60,6 +60,6 @@ def draw_hard_case_sheets(
             provenance = describe_provenance([{"cpu": cell.cpu, "commit": cell.commit} for cell in cells])
             chart = build_hard_case_chart(cells, find_stale(folder), provenance)
             frames = [replace(frame, notes=[*frame.notes, MAP_NOTE]) for frame in chart.frames]
-            chart = replace(chart, title=map_headline(cells, folder.resolve().name), frames=frames)
+            chart = replace(chart, title=build_map_headline(cells, folder.resolve().name), frames=frames)
             picture, *_ = draw_chart_sheets(chart, folder / "pictures" / "robustness")
             yield picture, cells

@@ -19,8 +19,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 from springbench.harness.report.citations import format_citation
-from springbench.harness.report.machine_footer import assign_machine_names as machine_names
-from springbench.harness.report.machine_footer import machine_footer
+from springbench.harness.report.machine_footer import assign_machine_names, build_machine_footer
 from springbench.harness.report.number_format import format_quantity, format_time_step
 from springbench.harness.report.table_queries import query_table
 from springbench.harness.results.quantities import DISSIPATION_CAUSES, SQL_EXPRESSIONS
@@ -166,7 +165,7 @@ def label_runs(timed_runs: Sequence[RunTimes]) -> dict[str, str]:
     """
     parameters: dict[str, dict[str, Any]] = {run.run_id: json.loads(run.parameters_json or "{}") for run in timed_runs}
     settings = {run.run_id: _effective_options(run) | parameters[run.run_id] for run in timed_runs}
-    places = machine_names((run.machine_id, run.node_id) for run in timed_runs)
+    places = assign_machine_names((run.machine_id, run.node_id) for run in timed_runs)
     on = {run.run_id: places.get((run.machine_id, run.node_id), "unknown") for run in timed_runs if len(places) > 1}
     values: dict[tuple[str, str, str], set[str]] = defaultdict(set)
     stated: dict[tuple[str, str], set[str]] = defaultdict(set)
@@ -290,7 +289,11 @@ def build_summary_table(table: pa.Table, stale_ids: Collection[str] = ()) -> Tab
     marks[SHARED_TIMING_NOTE.format(max(shared, default=0))] = bool(shared)
     out.caption = Text(
         "\n".join(
-            [*(words for words, there in marks.items() if there), *_describe_methods(table), *machine_footer(table)]
+            [
+                *(words for words, there in marks.items() if there),
+                *_describe_methods(table),
+                *build_machine_footer(table),
+            ]
         )
     )
     longest = max(map(len, [*names.values(), *scenes]), default=0)

@@ -21,22 +21,22 @@ from springbench.harness.report.accuracy.liu2013_comparison import (
     compare_with_paper,
 )
 from springbench.harness.report.accuracy.performance_profiles import (
-    cumulative_share,
-    data_profile_ratios,
+    compute_cumulative_share,
+    compute_data_profile_ratios,
+    compute_performance_ratios,
     describe_omitted_solvers,
-    performance_ratios,
 )
 from springbench.harness.report.accuracy.size_scaling import fit_scalings
 from springbench.harness.report.accuracy.time_to_accuracy import (
     GAP_TARGETS,
-    amortised_seconds,
+    compute_amortised_seconds,
     describe_crossings,
     find_time_to_accuracy,
     format_duration,
     format_gap,
     is_contested,
 )
-from springbench.harness.report.accuracy.work_precision import find_default_setting, pareto_front
+from springbench.harness.report.accuracy.work_precision import find_default_setting, find_pareto_front
 
 from tests import synthetic_accuracy_rows as made
 
@@ -94,8 +94,8 @@ def test_an_accuracy_is_reached_at_the_first_whole_iteration_at_or_below_it(tmp_
 
 def test_set_up_is_spread_over_the_steps(tmp_path: Path) -> None:
     curve = by_solver(net(tmp_path, "numba"))["numba"]
-    alone = amortised_seconds(curve, 1e-3)
-    assert [amortised_seconds(curve, 1e-3, n) - alone for n in (1, 10, 100)] == pytest.approx(
+    alone = compute_amortised_seconds(curve, 1e-3)
+    assert [compute_amortised_seconds(curve, 1e-3, n) - alone for n in (1, 10, 100)] == pytest.approx(
         [SETUP * 100, SETUP * 10, SETUP], rel=1e-6
     )
 
@@ -111,7 +111,7 @@ def test_failures_reach_nothing_and_time_limits_preserve_earlier_iterates(
         row | {"status": status} for row in made.build_curve_rows("net", 10, "early", "numba") if row["kind"] == "curve"
     ]
     curve = table(tmp_path, [*made.build_snapshot_rows("net", 10, "early"), *rows]).curves[0]
-    assert amortised_seconds(curve, 1e-3) == pytest.approx(seconds)  # 96 iterations of 5e-8 s a vertex
+    assert compute_amortised_seconds(curve, 1e-3) == pytest.approx(seconds)  # 96 iterations of 5e-8 s a vertex
     assert isnan(curve.warm_seconds)
 
 
@@ -139,7 +139,9 @@ def test_an_uncertified_reference_is_reported_and_not_used(tmp_path: Path, chang
     problem, minimum = made.build_snapshot_rows("net", 10, "early")
     found = table(tmp_path, [problem, minimum | change, *made.build_curve_rows("net", 10, "early", "numba")])
     assert (doubt in found.problems[0].uncertified_reason) if doubt else not found.problems[0].uncertified_reason
-    assert len(performance_ratios(found, 1e-2)["numba"]) == (0 if doubt else 1), "profiles take certified steps alone"
+    assert len(compute_performance_ratios(found, 1e-2)["numba"]) == (0 if doubt else 1), (
+        "profiles take certified steps alone"
+    )
     assert np.nanmin(found.curves[0].gap) < 1e-9, "the gaps shown refer to the lowest energy that is known"
     assert ("References that are not certified" in summarise_findings(found)) == bool(doubt)
 
@@ -184,14 +186,14 @@ def test_profiles_count_failures_as_never_and_omit_solvers_not_tried_everywhere(
         rows.append(made.build_failure_row("net", size, "early", "newton", "diverged", "not finite"))
     rows += made.build_curve_rows("net", 10, "early", "lbfgs")  # not tried at 20
     found = table(tmp_path, rows)
-    ratios = performance_ratios(found, 1e-3)
+    ratios = compute_performance_ratios(found, 1e-3)
     # 20 iterations at 1.2e-7 against 96 at 5e-8 and at 4e-7 s a vertex.
     assert "lbfgs" not in ratios
     assert describe_omitted_solvers(found) == ["Not shown, as not tried on every problem: lbfgs (on 1 of 2)."]
     assert ratios["numba"] == pytest.approx([96 * 5e-8 / (20 * 1.2e-7), 1.0])
     assert ratios["newton"].tolist() == [inf, inf]
-    assert cumulative_share(ratios["numba"], np.array([1.0, 2.1])).tolist() == [0.5, 1.0]
-    assert data_profile_ratios(found, 1e-3)["sparse"] == pytest.approx([96.0, 96.0]), "in its own iterations"
+    assert compute_cumulative_share(ratios["numba"], np.array([1.0, 2.1])).tolist() == [0.5, 1.0]
+    assert compute_data_profile_ratios(found, 1e-3)["sparse"] == pytest.approx([96.0, 96.0]), "in its own iterations"
 
 
 def test_growth_is_the_power_of_the_vertices(tmp_path: Path) -> None:
@@ -208,7 +210,7 @@ def test_growth_is_the_power_of_the_vertices(tmp_path: Path) -> None:
 
 def test_the_front_contains_undominated_solvers_and_the_default_is_found(tmp_path: Path) -> None:
     works = table(tmp_path, list(made.build_work_rows("net", 10))).work_points
-    best = pareto_front(works)
+    best = find_pareto_front(works)
     assert [w.seconds_per_simulated_second for w in best] == sorted(w.seconds_per_simulated_second for w in best)
     assert [w.error for w in best] == sorted((w.error for w in best), reverse=True)
     assert not any(

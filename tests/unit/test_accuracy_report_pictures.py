@@ -13,7 +13,7 @@ from springbench.harness.report.plot_style import (
     BACKGROUND_COLOUR,
     assign_solver_styles,
 )
-from springbench.harness.report.site.plotly_styles import plotly_style
+from springbench.harness.report.site.plotly_styles import build_plotly_style
 from springbench.solvers.registry import SOLVER_TABLE, find_solver_info, load_target
 
 # Machado, Oliveira and Fernandes 2009, "A Physiologically-based Model for Simulation of Color Vision Deficiency",
@@ -56,7 +56,7 @@ def test_families_are_far_apart_and_members_of_one_differ_in_lightness_line_and_
         assert apart >= 7.5, f"{a} and {b}: {apart:.1f}"
         assert one.dash != other.dash
         assert one.marker != other.marker
-        shown, neighbour = plotly_style(one), plotly_style(other)
+        shown, neighbour = build_plotly_style(one), build_plotly_style(other)
         assert shown["dash"] != neighbour["dash"]
         assert shown["symbol"] != neighbour["symbol"]
 

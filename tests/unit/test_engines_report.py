@@ -13,8 +13,8 @@ from springbench.harness.report.accuracy.engine_comparison import (
     OWN_PROGRAM,
     compare_engines,
     describe_best_settings,
+    find_pareto_fronts,
     format_markdown_table,
-    pareto_fronts,
 )
 from springbench.harness.report.charts.chart_description import select_curve_plots
 from springbench.harness.report.charts.engine_chart import build_engine_chart
@@ -56,7 +56,7 @@ def test_the_table_names_programs_that_refuse_that_have_no_rival_and_that_miss_t
 
 
 def test_a_front_contains_undominated_settings_of_the_program(works: list[WorkPoint]) -> None:
-    best = pareto_fronts([work for work in works if work.mesh_label == "net 9"])
+    best = find_pareto_fronts([work for work in works if work.mesh_label == "net 9"])
     assert list(best) == [OWN_PROGRAM, "mujoco", "pypbd"]
     assert [work.label for work in best[OWN_PROGRAM]] == [
         "hybrid",

@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 from springbench.harness.cli.main import app
 from springbench.harness.report import opengl_probe
-from springbench.harness.report.plot_style import indexed_style
+from springbench.harness.report.plot_style import build_indexed_style
 from typer.testing import CliRunner
 
 SCENE = """
@@ -40,7 +40,7 @@ def test_the_chosen_settings_are_printed_and_drawn(tmp_path: Path):
         pixels = np.asarray(drawn.convert("RGB"), np.float64) / 255
     hue = pixels - pixels.mean(axis=2, keepdims=True)
     for k in range(3):  # lit from one side, so lighter and darker: by its hue
-        colour = np.array(to_rgb(indexed_style(k).color))
+        colour = np.array(to_rgb(build_indexed_style(k).color))
         wanted = colour - colour.mean()
         alike = (hue @ wanted) / np.maximum(np.linalg.norm(hue, axis=2) * np.linalg.norm(wanted), 1e-9)
         assert int(((alike > 0.98) & (np.linalg.norm(hue, axis=2) > 0.3)).sum()) > 100

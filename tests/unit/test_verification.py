@@ -26,9 +26,9 @@ from springbench.harness.report.robustness import (
     UNSUPPORTED,
     WRONG_GRADIENT,
     VerifiedRun,
+    build_map_headline,
     build_score_table,
     classify_run,
-    map_headline,
     read_verified_runs,
     score_solvers,
 )
@@ -208,7 +208,7 @@ def test_a_solver_is_scored_by_the_cases_that_it_does_not_refuse():
         1e-2,
     )
     assert (second.correct_share, second.finite_share, second.worst_run.worst_error) == (None, None, None)
-    assert map_headline(cells, "hard") == "hard: 1 of 6 runs right, 0 silently wrong, 1 diverged or failed"
+    assert build_map_headline(cells, "hard") == "hard: 1 of 6 runs right, 0 silently wrong, 1 diverged or failed"
 
 
 def test_runs_that_end_at_other_minima_are_right_counted_and_marked():

@@ -25,7 +25,7 @@ from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import InputError, InputMistake
 from springbench.harness.execution import folder_locks
 from springbench.harness.experiments.archive.compaction import TABLE_FOLDERS, unify_schemas
-from springbench.harness.report.machine_footer import FOOTER_COLUMNS, machine_footer
+from springbench.harness.report.machine_footer import FOOTER_COLUMNS, build_machine_footer
 from springbench.harness.report.results_comparison import PAIRING_COLUMNS
 from springbench.harness.results import parquet_rows, row_store, row_union, run_schema
 from springbench.harness.results.folder_ownership import OWNER_FILE as CLAIM
@@ -254,4 +254,4 @@ def _query_conflicts(units: Sequence[Path], table: pa.Table | None = None) -> tu
             ]
 
         where = connection.sql(f"SELECT {', '.join(FOOTER_COLUMNS)} FROM rows GROUP BY ALL").to_arrow_table()
-        return differing("run_id, source_fingerprint"), differing("0"), machine_footer(where)
+        return differing("run_id, source_fingerprint"), differing("0"), build_machine_footer(where)

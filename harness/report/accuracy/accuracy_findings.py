@@ -24,12 +24,12 @@ from springbench.harness.report.accuracy.liu2013_comparison import (
     PaperComparison,
     compare_with_paper,
 )
-from springbench.harness.report.accuracy.performance_profiles import performance_ratios
+from springbench.harness.report.accuracy.performance_profiles import compute_performance_ratios
 from springbench.harness.report.accuracy.size_scaling import GAP_TARGET, fit_scalings
 from springbench.harness.report.accuracy.time_to_accuracy import (
     AMORTISATION_STEPS,
     GAP_TARGETS,
-    amortised_seconds,
+    compute_amortised_seconds,
     describe_crossings,
     find_time_to_accuracy,
     format_gap,
@@ -155,7 +155,7 @@ def _build_entry(curve: ConvergenceCurve) -> dict[str, Any]:
             and {"iteration": reached.iteration, "seconds": reached.seconds}
             | {"lower_quartile": reached.lower, "upper_quartile": reached.upper}
             | {
-                f"with_setup_over_{n}": _finite_or_none(amortised_seconds(curve, float(name), n))
+                f"with_setup_over_{n}": _finite_or_none(compute_amortised_seconds(curve, float(name), n))
                 for n in AMORTISATION_STEPS
             }
             for name, reached in found.items()
@@ -176,9 +176,9 @@ def _describe_methods(table: AccuracyData) -> Iterator[str]:
 
 
 def _describe_times(table: AccuracyData) -> Iterator[str]:
-    for (_, guess), race in group_by_start(table).items():
-        problem = race[0].problem
-        sentences = describe_crossings(race)
+    for (_, guess), curves in group_by_start(table).items():
+        problem = curves[0].problem
+        sentences = describe_crossings(curves)
         if sentences:
             doubt = " (reference not certified)" if problem.uncertified_reason else ""
             yield f"{problem.problem_label}, {INITIAL_GUESS_LABELS.get(guess, guess)}{doubt}: {'; '.join(sentences)}."
@@ -186,7 +186,7 @@ def _describe_times(table: AccuracyData) -> Iterator[str]:
 
 def _describe_profiles(table: AccuracyData) -> Iterator[str]:
     for target in GAP_TARGETS:
-        found = {label: values for label, values in performance_ratios(table, target).items() if len(values)}
+        found = {label: values for label, values in compute_performance_ratios(table, target).items() if len(values)}
         if found:
             wins = {label: int(np.sum(values <= 1.0)) for label, values in found.items()}
             count = len(next(iter(found.values())))

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 from springbench.harness.report.accuracy.accuracy_data import WorkPoint
 from springbench.harness.report.accuracy.time_to_accuracy import format_duration, format_gap
-from springbench.harness.report.accuracy.work_precision import pareto_front
+from springbench.harness.report.accuracy.work_precision import find_pareto_front
 from springbench.harness.report.number_format import format_factor
-from springbench.harness.report.plot_style import TEXT_COLOUR, SeriesStyle, indexed_style
+from springbench.harness.report.plot_style import TEXT_COLOUR, SeriesStyle, build_indexed_style
 from springbench.solvers.iteration.solver_info import ENGINE_FAMILY
 
 OWN_PROGRAM = "springbench"
@@ -51,7 +51,7 @@ def program_name(work: WorkPoint) -> str:
     return work.solver if work.family == ENGINE_FAMILY else OWN_PROGRAM
 
 
-def meshes_with_engines(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
+def list_engine_meshes(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
     """Return simulations by mesh, for the meshes with runs of both engines and own methods."""
     meshes: dict[str, list[WorkPoint]] = {}
     for work in works:
@@ -59,7 +59,7 @@ def meshes_with_engines(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]
     return {mesh: here for mesh, here in meshes.items() if {OWN_PROGRAM} < {program_name(work) for work in here}}
 
 
-def pareto_fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
+def find_pareto_fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
     """Return the Pareto front of each program's settings in time and error.
 
     The front of the own methods is the first one. In each front, the cheapest setting is the first one. Settings with
@@ -70,7 +70,8 @@ def pareto_fronts(works: Iterable[WorkPoint]) -> dict[str, list[WorkPoint]]:
         by_program.setdefault(program_name(work), []).append(work)
     names = [OWN_PROGRAM, *sorted(set(by_program) - {OWN_PROGRAM})]
     return {
-        name: [work for work in pareto_front(by_program[name]) if work.error < MAX_MEANINGFUL_ERROR] for name in names
+        name: [work for work in find_pareto_front(by_program[name]) if work.error < MAX_MEANINGFUL_ERROR]
+        for name in names
     }
 
 
@@ -82,8 +83,8 @@ def compare_engines(works: Iterable[WorkPoint], errors: Sequence[float] = ERROR_
         errors: relative errors.
     """
     found = list[EngineComparison]()
-    for mesh, here in meshes_with_engines(works).items():
-        by_program = pareto_fronts(here)
+    for mesh, here in list_engine_meshes(works).items():
+        by_program = find_pareto_fronts(here)
         for error in errors:
             within = {name: [work for work in best if work.error <= error] for name, best in by_program.items()}
             found.append(EngineComparison(mesh, error, {name: front[0] for name, front in within.items() if front}))
@@ -98,7 +99,7 @@ def engine_names(works: Iterable[WorkPoint]) -> list[str]:
 def assign_program_styles(works: Iterable[WorkPoint]) -> dict[str, SeriesStyle]:
     """Assign a style to each program; the own methods are drawn in the text colour."""
     return {OWN_PROGRAM: SeriesStyle(TEXT_COLOUR, "o")} | {
-        name: indexed_style(k)._replace(dash="-") for k, name in enumerate(engine_names(works))
+        name: build_indexed_style(k)._replace(dash="-") for k, name in enumerate(engine_names(works))
     }
 
 
@@ -112,7 +113,7 @@ def format_markdown_table(works: Sequence[WorkPoint]) -> Iterator[str]:
         return
     yield f"| mesh | error | {' | '.join(names)} | ours, a simulated second |"
     yield "|---|---|" + "---|" * (len(names) + 1)
-    refused = {mesh: _find_unsupported(here) for mesh, here in meshes_with_engines(works).items()}
+    refused = {mesh: _find_unsupported(here) for mesh, here in list_engine_meshes(works).items()}
     for one in compare_engines(works):
         if one.fastest_by_program:
             cells = (_format_cell(one, name, refused[one.mesh]) for name in names)

@@ -24,7 +24,7 @@ from springbench.harness.report.accuracy.accuracy_data import (
     FloatArray,
 )
 from springbench.harness.report.accuracy.time_to_accuracy import (
-    amortised_seconds,
+    compute_amortised_seconds,
     group_by_start,
     is_contested,
     is_solvable,
@@ -32,7 +32,7 @@ from springbench.harness.report.accuracy.time_to_accuracy import (
 from springbench.solvers.iteration.solver_info import LOCAL_GLOBAL_FAMILY
 
 
-def performance_ratios(table: AccuracyData, target: float) -> dict[str, FloatArray]:
+def compute_performance_ratios(table: AccuracyData, target: float) -> dict[str, FloatArray]:
     """Return times to the target divided by the smallest of all solvers, by label.
 
     Args:
@@ -42,13 +42,13 @@ def performance_ratios(table: AccuracyData, target: float) -> dict[str, FloatArr
     Returns:
         Ratios (problems,); infinite where the gap is not reached.
     """
-    found = solvable_races(table, target)
+    found = group_solvable_curves(table, target)
     return _compute_ratios(
-        table, found, target, [min(amortised_seconds(curve, target) for curve in race) for race in found]
+        table, found, target, [min(compute_amortised_seconds(curve, target) for curve in curves) for curves in found]
     )
 
 
-def data_profile_ratios(table: AccuracyData, target: float) -> dict[str, FloatArray]:
+def compute_data_profile_ratios(table: AccuracyData, target: float) -> dict[str, FloatArray]:
     """Return times to the target divided by that of one baseline iteration, by label.
 
     Args:
@@ -58,15 +58,18 @@ def data_profile_ratios(table: AccuracyData, target: float) -> dict[str, FloatAr
     Returns:
         Ratios (problems,), for the problems where the baseline was measured.
     """
-    units = [(race, median_iteration_seconds(race, baseline_solver(table))) for race in solvable_races(table, target)]
-    known = [(race, unit) for race, unit in units if np.isfinite(unit)]
-    return _compute_ratios(table, [race for race, _ in known], target, [unit for _, unit in known])
+    units = [
+        (curves, compute_median_iteration_seconds(curves, find_baseline_solver(table)))
+        for curves in group_solvable_curves(table, target)
+    ]
+    known = [(curves, unit) for curves, unit in units if np.isfinite(unit)]
+    return _compute_ratios(table, [curves for curves, _ in known], target, [unit for _, unit in known])
 
 
 def _compute_ratios(
-    table: AccuracyData, ratios: Sequence[list[ConvergenceCurve]], target: float, units: Sequence[float]
+    table: AccuracyData, curve_groups: Sequence[list[ConvergenceCurve]], target: float, units: Sequence[float]
 ) -> dict[str, FloatArray]:
-    times = [{curve.label: amortised_seconds(curve, target) for curve in race} for race in ratios]
+    times = [{curve.label: compute_amortised_seconds(curve, target) for curve in curves} for curves in curve_groups]
     missed = count_partial_coverage(table)
     return {
         label: np.array([each.get(label, inf) / unit for each, unit in zip(times, units, strict=True)], float)
@@ -77,11 +80,11 @@ def _compute_ratios(
 
 def count_partial_coverage(table: AccuracyData) -> dict[str, int]:
     """Count the problems, by label, of solvers measured on fewer problems than others."""
-    tried = Counter(label for race in group_by_start(table).values() for label in {curve.label for curve in race})
+    tried = Counter(label for curves in group_by_start(table).values() for label in {curve.label for curve in curves})
     return {label: count for label, count in sorted(tried.items()) if count < max(tried.values())}
 
 
-def baseline_solver(table: AccuracyData) -> str:
+def find_baseline_solver(table: AccuracyData) -> str:
     """Return the backend of the plain local-global iteration that data profiles use as the unit.
 
     Of the backends measured on the most problems, it is the last one in alphabetical order; "" if none was measured.
@@ -97,7 +100,7 @@ def describe_omitted_solvers(table: AccuracyData) -> list[str]:
     return [f"Not shown, as not tried on every problem: {names}."] if names else []
 
 
-def cumulative_share(values: FloatArray, at: FloatArray) -> FloatArray:
+def compute_cumulative_share(values: FloatArray, at: FloatArray) -> FloatArray:
     """Return the cumulative share of values at given limits.
 
     Args:
@@ -110,8 +113,8 @@ def cumulative_share(values: FloatArray, at: FloatArray) -> FloatArray:
     return np.searchsorted(np.sort(values), at, side="right") / len(values)
 
 
-def solvable_races(table: AccuracyData, target: float) -> list[list[ConvergenceCurve]]:
-    """Return the races for which an accuracy is meaningful.
+def group_solvable_curves(table: AccuracyData, target: float) -> list[list[ConvergenceCurve]]:
+    """Group the curves of the problems for which an accuracy is meaningful.
 
     In these, the minimum is certified, and some solver reaches the accuracy, but no initial guess does.
 
@@ -120,22 +123,22 @@ def solvable_races(table: AccuracyData, target: float) -> list[list[ConvergenceC
         target: accuracy, an energy gap.
 
     Returns:
-        Curves with the same problem and initial guess, by race.
+        Lists of curves with the same problem and initial guess.
     """
     return [r for r in group_by_start(table).values() if is_solvable(r[0].problem, target) and is_contested(r, target)]
 
 
-def median_iteration_seconds(race: Iterable[ConvergenceCurve], solver: str) -> float:
-    """Return the median time of one iteration of a solver in a race [s].
+def compute_median_iteration_seconds(curves: Iterable[ConvergenceCurve], solver: str) -> float:
+    """Return the median time of one iteration of a solver on a problem [s].
 
     Args:
-        race: curves with the same problem and initial guess; the first timed one of the solver counts.
+        curves: curves with the same problem and initial guess; the first timed one of the solver counts.
         solver: name of the solver.
 
     Returns:
-        The median over the rounds; nan if the solver did not take part or was not timed.
+        The median over the rounds; nan if the solver was not measured or not timed.
     """
-    for curve in race:
+    for curve in curves:
         if curve.solver == solver and len(curve.iterations) > 1 and np.isfinite(curve.seconds).all():
             spans = curve.seconds[:, -1] - curve.seconds[:, 0]
             return float(np.median(spans)) / (curve.iterations[-1] - curve.iterations[0])

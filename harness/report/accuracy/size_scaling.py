@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from springbench.harness.report.accuracy.accuracy_data import AccuracyData, ConvergenceCurve
-from springbench.harness.report.accuracy.time_to_accuracy import median_time
+from springbench.harness.report.accuracy.time_to_accuracy import compute_median_time
 from springbench.harness.report.provenance_words import is_stale
 
 GAP_TARGET = 1e-3
@@ -53,7 +53,7 @@ def fit_scalings(table: AccuracyData, newest_fingerprint: str | None = None) -> 
         sizes.setdefault(curve.problem.vertices, []).append(curve)
     found: list[SizeScaling] = []
     for (scene, guess, label), sizes in groups.items():
-        times = {n: median_time(curves, GAP_TARGET) for n, curves in sorted(sizes.items())}
+        times = {n: compute_median_time(curves, GAP_TARGET) for n, curves in sorted(sizes.items())}
         reached = {n: t for n, t in times.items() if np.isfinite(t) and t > 0.0}
         if len(times) > 1:
             lost = [n for n, t in times.items() if t == np.inf]

@@ -69,7 +69,7 @@ def find_time_to_accuracy(curve: ConvergenceCurve, target: float) -> TimeToAccur
     return TimeToAccuracy(int(iteration), tuple(seconds.tolist()), float(middle), float(lower), float(upper))
 
 
-def amortised_seconds(curve: ConvergenceCurve, target: float, steps: int | None = None) -> float:
+def compute_amortised_seconds(curve: ConvergenceCurve, target: float, steps: int | None = None) -> float:
     """Return the median time to the accuracy [s], infinite if it is not reached.
 
     Args:
@@ -111,32 +111,32 @@ def group_by_start(table: AccuracyData) -> dict[tuple[str, str], list[Convergenc
     return found
 
 
-def is_contested(race: Sequence[ConvergenceCurve], target: float) -> bool:
+def is_contested(curves: Sequence[ConvergenceCurve], target: float) -> bool:
     """Return whether a solver, but not the initial guess, reaches the accuracy.
 
     Args:
-        race: curves with the same problem and initial guess.
+        curves: curves with the same problem and initial guess.
         target: accuracy, an energy gap.
     """
-    times = [reached for curve in race if (reached := find_time_to_accuracy(curve, target))]
+    times = [reached for curve in curves if (reached := find_time_to_accuracy(curve, target))]
     return bool(times) and all(reached.iteration > 0 for reached in times)
 
 
-def describe_crossings(race: Iterable[ConvergenceCurve]) -> list[str]:
+def describe_crossings(curves: Iterable[ConvergenceCurve]) -> list[str]:
     """Describe which solver is fastest to which accuracy, without set-up.
 
     One sentence describes the coarsest accuracy, and one each change of the fastest solver. A solver takes the lead if
     its upper quartile is below the leader's lower quartile, because a smaller difference may be chance.
     """
-    race = list(race)
-    if len(race) < 2:
+    curves = list(curves)
+    if len(curves) < 2:
         return []
     sentences: list[str] = []
     leader: ConvergenceCurve | None = None
     for target in _HALF_DECADES:
-        if not is_contested(race, target) or target <= race[0].problem.roundoff_gap:
+        if not is_contested(curves, target) or target <= curves[0].problem.roundoff_gap:
             continue
-        times = {curve: reached for curve in race if (reached := find_time_to_accuracy(curve, target))}
+        times = {curve: reached for curve in curves if (reached := find_time_to_accuracy(curve, target))}
         best = min(times, key=lambda curve: times[curve].seconds)
         if leader is None:
             sentences.append(
@@ -163,7 +163,7 @@ def format_duration(seconds: float) -> str:
     return f"{format_quantity(seconds / scale)} {unit}"
 
 
-def median_time(curves: Sequence[ConvergenceCurve], target: float, steps: int | None = None) -> float:
+def compute_median_time(curves: Sequence[ConvergenceCurve], target: float, steps: int | None = None) -> float:
     """Return the median time over a solver's solvable problems [s].
 
     Args:
@@ -174,6 +174,6 @@ def median_time(curves: Sequence[ConvergenceCurve], target: float, steps: int | 
     Returns:
         The median, infinite if half of them are unsolved; nan if no problem is solvable.
     """
-    times = [amortised_seconds(curve, target, steps) for curve in curves if is_solvable(curve.problem, target)]
+    times = [compute_amortised_seconds(curve, target, steps) for curve in curves if is_solvable(curve.problem, target)]
     # The upper of the two middle values: a mean with infinity would hide the solved half.
     return sorted(times)[len(times) // 2] if times else np.nan

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from math import inf, isfinite
 
 from springbench.harness.report.accuracy.accuracy_data import WorkPoint
-from springbench.harness.report.plot_style import SeriesStyle, indexed_style
+from springbench.harness.report.plot_style import SeriesStyle, build_indexed_style
 from springbench.solvers.model.integrators import INTEGRATORS
 
 FRAME_SECONDS = 1.0 / 30.0
@@ -99,4 +99,4 @@ def build_winner_cells(works: Iterable[WorkPoint], errors: Sequence[float] = ERR
 def assign_family_styles(cells: Sequence[WinnerCell]) -> dict[str, SeriesStyle]:
     """Assign a style to each family; equal sets of names get equal styles."""
     names = sorted({name for cell in cells for name in cell.cheapest_by_family})
-    return {name: indexed_style(k) for k, name in enumerate(names)}
+    return {name: build_indexed_style(k) for k, name in enumerate(names)}

@@ -34,7 +34,7 @@ def find_default_setting(works: Iterable[WorkPoint]) -> WorkPoint | None:
     )
 
 
-def pareto_front(works: Iterable[WorkPoint]) -> list[WorkPoint]:
+def find_pareto_front(works: Iterable[WorkPoint]) -> list[WorkPoint]:
     """Return the Pareto front in time and error, the cheapest first."""
     front: list[WorkPoint] = []
     for work in sorted((w for w in works if is_complete(w)), key=lambda w: (w.seconds_per_simulated_second, w.error)):
@@ -53,7 +53,7 @@ def describe_cheapest_settings(works: Sequence[WorkPoint]) -> list[str]:
             f"for {format_duration(base.seconds_per_simulated_second)} a simulated second"
         )
     for error in ERROR_TARGETS:
-        best = next((work for work in pareto_front(works) if work.error <= error), None)
+        best = next((work for work in find_pareto_front(works) if work.error <= error), None)
         if best:
             euler = min(
                 (w for w in works if is_same_method(w, base) and is_complete(w) and w.error <= error),

@@ -20,7 +20,7 @@ from springbench.harness.report.charts.figure_panels import (
     describe_stale_cells,
 )
 from springbench.harness.report.number_format import format_quantity
-from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles, indexed_style
+from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles, build_indexed_style
 from springbench.harness.report.provenance_words import describe_provenance, is_stale
 from springbench.harness.report.varying_settings import find_varying_keys
 
@@ -118,7 +118,7 @@ def _build_effect_series(number: int, row: ResultRow, whole: ResultRow, *, stale
     columns |= {f"added_time_share_{end}": f"added_seconds_{end}" for end in ("low", "high")}
     return ChartSeries(
         label=row["name"],
-        style=indexed_style(number),
+        style=build_indexed_style(number),
         columns={
             **{name: [row[column] / whole["seconds"]] for name, column in columns.items()},
             "displacement_max": [max(row["displacement_max"], _MIN_DISPLACEMENT)],

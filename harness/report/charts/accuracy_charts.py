@@ -21,22 +21,22 @@ from springbench.harness.report.accuracy.accuracy_data import (
     format_stop_rule,
 )
 from springbench.harness.report.accuracy.performance_profiles import (
-    baseline_solver,
-    cumulative_share,
-    data_profile_ratios,
+    compute_cumulative_share,
+    compute_data_profile_ratios,
+    compute_performance_ratios,
     describe_omitted_solvers,
-    performance_ratios,
-    solvable_races,
+    find_baseline_solver,
+    group_solvable_curves,
 )
 from springbench.harness.report.accuracy.size_scaling import GAP_TARGET, SizeScaling, fit_scalings
 from springbench.harness.report.accuracy.time_to_accuracy import (
     AMORTISATION_STEPS,
     GAP_TARGETS,
+    compute_median_time,
     describe_excluded_steps,
     format_gap,
-    median_time,
 )
-from springbench.harness.report.accuracy.work_precision import find_default_setting, is_complete, pareto_front
+from springbench.harness.report.accuracy.work_precision import find_default_setting, find_pareto_front, is_complete
 from springbench.harness.report.charts.chart_description import (
     ChartAxis,
     ChartDescription,
@@ -238,7 +238,7 @@ def _build_time_series(
         own = [curve for curve in curves if curve.label == label]
         columns: dict[str, Any] = {}
         for steps in (None, *AMORTISATION_STEPS):
-            times = np.array([median_time(own, target, steps) for target in GAP_TARGETS])
+            times = np.array([compute_median_time(own, target, steps) for target in GAP_TARGETS])
             columns["alone" if steps is None else f"over-{steps}"] = np.where(
                 np.isfinite(times) & (times > 0.0), times, np.nan
             )
@@ -312,7 +312,7 @@ def build_work_precision_chart(table: AccuracyData, newest_fingerprint: str | No
 
 
 def _build_front_series(works: Sequence[WorkPoint]) -> ChartSeries:
-    best = pareto_front(works)
+    best = find_pareto_front(works)
     columns = {
         "seconds": [work.seconds_per_simulated_second for work in best],
         "error": [work.error for work in best],
@@ -377,16 +377,16 @@ def build_profile_chart(table: AccuracyData, newest_fingerprint: str | None = No
         table: data of an accuracy measurement.
         newest_fingerprint: see the module.
     """
-    baseline = baseline_solver(table)
-    kinds = {"performance": ("time, over the fastest solver's", performance_ratios)}
+    baseline = find_baseline_solver(table)
+    kinds = {"performance": ("time, over the fastest solver's", compute_performance_ratios)}
     if baseline:
-        kinds["data"] = (f"time, in iterations of {baseline}", data_profile_ratios)
+        kinds["data"] = (f"time, in iterations of {baseline}", compute_data_profile_ratios)
     styles = _assign_styles(table.curves)
     frames: list[ChartFrame] = []
     notes = [*describe_omitted_solvers(table), *describe_stale_results(table.curves, newest_fingerprint)]
     for kind, (words, ratios) in kinds.items():
         for target in GAP_TARGETS:
-            problems = len(solvable_races(table, target))
+            problems = len(group_solvable_curves(table, target))
             found = {label: values for label, values in ratios(table, target).items() if np.isfinite(values).any()}
             if found and problems:
                 frames.append(
@@ -418,7 +418,7 @@ def _build_profile_series(ratios: Mapping[str, FloatArray], styles: Mapping[str,
     low, high = known.min(initial=1.0), 2.0 * known.max(initial=5.0)
     for label, values in ratios.items():
         x = np.unique([low, *values[np.isfinite(values)], high])
-        columns = {"ratio": x, "share": cumulative_share(values, x)}
+        columns = {"ratio": x, "share": compute_cumulative_share(values, x)}
         yield ChartSeries(label, styles[label], columns, description=f"{len(values)} problems", is_stepped=True)
 
 

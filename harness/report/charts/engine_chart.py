@@ -12,8 +12,8 @@ from springbench.harness.report.accuracy.accuracy_data import (
 from springbench.harness.report.accuracy.engine_comparison import (
     OWN_PROGRAM,
     assign_program_styles,
-    meshes_with_engines,
-    pareto_fronts,
+    find_pareto_fronts,
+    list_engine_meshes,
 )
 from springbench.harness.report.charts.accuracy_charts import (
     ACCURACY_COMMAND,
@@ -37,8 +37,8 @@ def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = Non
     """
     styles = assign_program_styles(table.work_points)
     frames: list[ChartFrame] = []
-    for mesh, works in meshes_with_engines(table.work_points).items():
-        fronts = {name: front for name, front in pareto_fronts(works).items() if front}
+    for mesh, works in list_engine_meshes(table.work_points).items():
+        fronts = {name: front for name, front in find_pareto_fronts(works).items() if front}
         frames.append(
             ChartFrame(
                 group=("engines",),

@@ -150,7 +150,7 @@ FIGURE_KINDS: dict[str, FigureKind] = {
         f"{_ACCURACY_ROWS}, of liu2013.yaml",
         _list_accuracy_panels("liu2013"),
     ),
-    "timing": FigureKind("Time a step", _SWEEP_ROWS, timing_panels.timing_panels, (("step",), ("prepare",))),
+    "timing": FigureKind("Time a step", _SWEEP_ROWS, timing_panels.list_timing_panels, (("step",), ("prepare",))),
     "hard": FigureKind(
         "Hard cases",
         f"{_SWEEP_ROWS} with `verify: true`",
@@ -170,7 +170,7 @@ FIGURE_KINDS: dict[str, FigureKind] = {
     "speed": FigureKind(
         "Speed",
         "rows of `springbench roofline CONFIG`",
-        _without_stale(timing_panels.speed_panels),
+        _without_stale(timing_panels.list_speed_panels),
         (("step",), ("global",)),
     ),
     "devices": FigureKind(
@@ -181,19 +181,19 @@ FIGURE_KINDS: dict[str, FigureKind] = {
     "run": FigureKind(
         "The mesh at the end",
         f"{_SWEEP_ROWS} with recordings",
-        _list_mesh_panels("last_frame_panels"),
+        _list_mesh_panels("list_last_frame_panels"),
         prepare_panels=_align_mesh_pictures,
     ),
     "comparison": FigureKind(
         "Solvers side by side",
         f"{_SWEEP_ROWS} with recordings",
-        _list_mesh_panels("solver_comparison_panels"),
+        _list_mesh_panels("list_solver_comparison_panels"),
         prepare_panels=_align_mesh_pictures,
     ),
     "scenes": FigureKind(
         "Scenes at their end",
         f"{_SWEEP_ROWS} with recordings",
-        _list_mesh_panels("scene_panels"),
+        _list_mesh_panels("list_scene_panels"),
         prepare_panels=_prepare_scene_sheet,
     ),
     "history": FigureKind(

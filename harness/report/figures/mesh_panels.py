@@ -74,12 +74,12 @@ class _RecordedRun(NamedTuple):
         return PanelEntry(group, name, partial(_build_picture, group, name, self.path, self.label, self.machine_words))
 
 
-def last_frame_panels(folder: Path) -> list[PanelEntry]:
+def list_last_frame_panels(folder: Path) -> list[PanelEntry]:
     """Build an entry for the last frame of each recorded run."""
     return [one.build_entry((*one.mesh_key, *one.label_parts), ("mesh",)) for one in _find_recorded_runs(folder)]
 
 
-def solver_comparison_panels(folder: Path) -> list[PanelEntry]:
+def list_solver_comparison_panels(folder: Path) -> list[PanelEntry]:
     """Build entries for the last frames of all solvers of a scene and size.
 
     `align_pictures` gives those of a scene and size one camera and one scale.
@@ -87,7 +87,7 @@ def solver_comparison_panels(folder: Path) -> list[PanelEntry]:
     return [one.build_entry(one.mesh_key, one.label_parts) for one in _find_recorded_runs(folder)]
 
 
-def scene_panels(folder: Path) -> list[PanelEntry]:
+def list_scene_panels(folder: Path) -> list[PanelEntry]:
     """Build an entry for the last frame of each scene.
 
     It shows a successful run, if there is one: of the largest size, and of those the one with the lowest residual.

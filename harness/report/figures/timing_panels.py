@@ -37,7 +37,7 @@ def read_sweep_rows(folder: Path) -> pa.Table:
     return table
 
 
-def timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
+def list_timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
     """Build the panels of a sweep's times, for each scene.
 
     Args:
@@ -50,7 +50,7 @@ def timing_panels(folder: Path, find_stale: StaleFinder) -> list[PanelEntry]:
     return entries_from_panels(select_curve_plots(chart))
 
 
-def speed_panels(folder: Path) -> list[PanelEntry]:
+def list_speed_panels(folder: Path) -> list[PanelEntry]:
     """Build the panels of a speed report."""
     units = row_store.list_units(folder / "rows")
     table = parquet_rows.read_rows(units, required_columns=_REQUIRED_COLUMNS) if units else None

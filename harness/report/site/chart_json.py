@@ -20,7 +20,7 @@ from springbench.harness.report.charts.chart_description import (
 from springbench.harness.report.charts.figure_panels import AxisScale, CellMap, FloatArray
 from springbench.harness.report.plot_style import STALE_NOTE, contrasting_text_colour
 from springbench.harness.report.site.data_scripts import round_number
-from springbench.harness.report.site.plotly_styles import plotly_style
+from springbench.harness.report.site.plotly_styles import build_plotly_style
 from springbench.harness.report.site.run_table import format_references
 
 
@@ -38,7 +38,7 @@ def serialise_chart(chart: ChartDescription) -> dict[str, Any]:
         "frames": [_describe_frame(frame) for frame in chart.frames],
         "maps": [_describe_map(one) for one in chart.maps],
         "items": [_describe_series(chart, number, frame, series) for number, frame, series in pairs],
-        "styles": {series.label: plotly_style(series.style) for *_, series in reversed(pairs)},
+        "styles": {series.label: build_plotly_style(series.style) for *_, series in reversed(pairs)},
         "citations": format_references(chart.citations.items()),
         "command": chart.command,
     }
@@ -107,7 +107,7 @@ def _describe_series(chart: ChartDescription, number: int, frame: ChartFrame, se
     missing = {axis.column: [None] * length for axis in (*chart.x, *chart.y) if axis.column not in columns}
     return {
         "label": series.label,
-        "style": plotly_style(series.style),
+        "style": build_plotly_style(series.style),
         "description": series.description,
         chart.subject_key: frame.subject,
         "panel": frame.title,

@@ -18,7 +18,7 @@ _STATIC_FOLDER = _SITE_FOLDER / "static"
 
 
 @cache
-def page_version() -> str:
+def compute_page_version() -> str:
     """Return a version: 12 hexadecimal digits of SHA-256 over the files that determine a page."""
     parts = sorted(path for path in _SITE_FOLDER.rglob("*") if path.suffix in (".py", ".js", ".css", ".html"))
     return sha256(b"".join(path.read_bytes() for path in parts)).hexdigest()[:12]
@@ -30,15 +30,15 @@ def install_assets(results: Path) -> str:
     Files that are up to date are not written again.
     """
     site, stamp = results / "site", results / "site" / "version.txt"
-    if stamp.is_file() and stamp.read_text() == page_version() and (results / "index.html").is_file():
-        return page_version()
+    if stamp.is_file() and stamp.read_text() == compute_page_version() and (results / "index.html").is_file():
+        return compute_page_version()
     site.mkdir(exist_ok=True)
     for path in _STATIC_FOLDER.iterdir():
         _copy_file(path, results / path.name if path.name == "index.html" else site / path.name)
     _copy_file(plotly_path(), site / "plotly.js")
     with atomic_write(stamp) as partial:
-        partial.write_text(page_version())
-    return page_version()
+        partial.write_text(compute_page_version())
+    return compute_page_version()
 
 
 def plotly_path() -> Path:

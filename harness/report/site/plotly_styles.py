@@ -35,7 +35,7 @@ _PLOTLY_SYMBOLS: dict[Any, str] = {
 }  # fmt: skip
 
 
-def plotly_style(mark: SeriesStyle) -> dict[str, str]:
+def build_plotly_style(mark: SeriesStyle) -> dict[str, str]:
     """Return a style in Plotly's terms."""
     return {
         "color": mark.color,

@@ -13,7 +13,7 @@ from springbench.harness.errors import InputMistake
 from springbench.harness.report.citations import format_bibtex, format_citation
 from springbench.harness.report.plot_style import assign_label_styles
 from springbench.harness.report.site.data_scripts import encode_column
-from springbench.harness.report.site.plotly_styles import plotly_style
+from springbench.harness.report.site.plotly_styles import build_plotly_style
 from springbench.harness.report.site.sweep_folders import SweepFolder
 from springbench.harness.report.speed.speed_figures import MACHINE_SOLVER
 from springbench.harness.report.table_queries import query_records
@@ -120,7 +120,7 @@ def build_run_script(
         "relative_url": folder.relative_url,
         "num_rows": len(run_records),
         "columns": {name: encode_column(values) for name, values in columns.items()} | exact,
-        "styles": {label: plotly_style(mark) for label, mark in marks.items()},
+        "styles": {label: build_plotly_style(mark) for label, mark in marks.items()},
         "citations": format_references((run["solver"], run["citation"]) for run in run_records),
     }
 

@@ -26,7 +26,7 @@ from springbench.harness.report.charts.hard_case_chart import build_hard_case_ch
 from springbench.harness.report.charts.speed_chart import build_speed_chart
 from springbench.harness.report.charts.timing_chart import build_compared_timing_chart, build_run_accuracy_chart
 from springbench.harness.report.device_speedup import read_device_runs, summarise_runs
-from springbench.harness.report.robustness import has_verification, map_headline, read_verified_runs
+from springbench.harness.report.robustness import build_map_headline, has_verification, read_verified_runs
 from springbench.harness.report.site import (
     frame_scripts,
     row_provenance,
@@ -163,7 +163,7 @@ def _build_run_section(
         cells = read_verified_runs(folder.path)
         scripts["hard"] = serialise_chart(build_hard_case_chart(cells, stale_ids))
         outcomes = {cell.run_id: {"label": cell.outcome.label, "reason": cell.reason} for cell in cells}
-        findings = [{"text": f"{map_headline(cells, folder.name)}.", "plot": "hard"}, *findings[-1:]]
+        findings = [{"text": f"{build_map_headline(cells, folder.name)}.", "plot": "hard"}, *findings[-1:]]
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
     _mark_recordings(folder, data_folder, found, with_recordings, print_message)
     scripts["runs"] = run_table.build_run_script(folder, found, outcomes)
@@ -195,7 +195,7 @@ def _mark_recordings(
     """
     there = {part: {path.stem for path in (data_folder / part).glob("*.js")} for part in ("meshes", "recordings")}
     include_missing = include_missing and RECORDINGS.is_installed()
-    if include_missing and (recorded := {run["unit"]: run_title(run) for run in run_records if run["recording"]}):
+    if include_missing and (recorded := {run["unit"]: build_run_title(run) for run in run_records if run["recording"]}):
         from springbench.harness.report.site.mesh_scripts import write_last_frames, write_recordings
 
         there["meshes"] = write_last_frames(folder, data_folder, list(recorded), print_message)
@@ -244,12 +244,12 @@ def _build_accuracy_section(
         from springbench.harness.report.site.mesh_scripts import write_recordings, write_solves
 
         facts["solves"] = write_solves(folder, data_folder, without_short_curves(table), print_message)
-        scripts_by_name = {
+        titles_by_recording = {
             c.recording_path: f"{c.label}, {c.problem.problem_label}"
             for c in table.curves
             if c.recording_path in facts["solves"]
         }
-        facts["replays"] = write_recordings(folder, data_folder, scripts_by_name)
+        facts["replays"] = write_recordings(folder, data_folder, titles_by_recording)
     chapters = summarise_findings(table)
     findings = [{"text": w, "chapter": name} for name, some in chapters.items() if name != "Methods" for w in some]
     failed = [FailedRun(row["where"], row["solver"], row["status"], row["reason"]) for row in list_failures(table)]
@@ -319,7 +319,7 @@ def _report_skipped(print_message: PrintMessage) -> Callable[[InputMistake], Non
     return lambda mistake: print_message(f"not on the page: {mistake}")
 
 
-def run_title(run: dict[str, Any]) -> str:
+def build_run_title(run: dict[str, Any]) -> str:
     """Return the scene, size and label of a run."""
     return f"{run['scene']}{' ' + str(run['size']) if run['size'] else ''}, {run['label']}"
 
