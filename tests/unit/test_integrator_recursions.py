@@ -214,3 +214,10 @@ def test_the_same_steps_give_the_same_bits(name):
     made = by(build_test_scene(ChainMesh(), SpringsEffect(stretch=10.0), size=4, velocity=(0.0, 1.0, 0.0)), name)
     one, two = motions(made), motions(made)
     np.testing.assert_array_equal(np.array(one), np.array(two))
+
+
+@pytest.mark.parametrize("name", TABLEAUX)
+def test_an_explicit_first_stage_gives_a_stage_order_of_two(name: str):
+    method = INTEGRATORS[name]
+    assert isinstance(method, RungeKutta)
+    assert method.stage_order == (2 if method.needs_start_acceleration else 1)

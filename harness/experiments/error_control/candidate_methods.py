@@ -120,7 +120,7 @@ def list_candidate_methods() -> list[tuple[str, SolverSpec]]:
     stage order. They are also combined with the one-step integrator of fixed step size that has the highest order.
     """
     pairs = {name: one for name, one in INTEGRATORS.items() if isinstance(one, RungeKutta) and one.embedded_order}
-    best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].needs_start_acceleration))
+    best = max(pairs, key=lambda name: (pairs[name].order, pairs[name].stage_order))
     infos = {name: find_solver_info(load_target(target), name) for name, target in SOLVERS.items()}
     single = {
         name: one.order

@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from itertools import count
 
 import numpy as np
 from springbench.solvers.model.integrators.integrator_stages import (
@@ -75,6 +76,14 @@ class RungeKutta:
     def stage_times(self) -> TableauRow:
         """Times c_i of the stages."""
         return tuple(float(sum(row)) for row in self.a)
+
+    @property
+    def stage_order(self) -> int:
+        """Stage order: the largest q for which A c^(k-1) = c^k / k of all k up to q."""
+        A, c = np.zeros((len(self.a), len(self.a))), np.array(self.stage_times)
+        for i, row in enumerate(self.a):
+            A[i, : i + 1] = row
+        return next(q for q in count(1) if not np.allclose(A @ c**q, c ** (q + 1) / (q + 1)))
 
     @property
     def velocity_factor(self) -> float:
