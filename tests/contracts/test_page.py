@@ -249,6 +249,18 @@ def test_a_point_of_a_curve_leads_to_its_solve_by_keys(tab: Tab, page: str):
     assert not point.is_visible(), "the card goes when something else is shown"
 
 
+def test_iteration_0_is_left_of_iteration_1_on_a_logarithmic_axis(tab: Tab, page: str):
+    shown = tab.open(page, "plots?sweep=study&plot=convergence&x=iteration")
+    shown.wait_for_function("document.querySelector('.plot')?.data?.length")
+    first = "[one.meta.item.iteration[0], one.x[0]]"
+    starts = shown.evaluate(f"document.querySelector('.plot').data.filter(one => one.meta).map(one => {first})")
+    assert (0, 0.4) in {tuple(start) for start in starts}
+    assert all(x != 0 for _, x in starts), "zero has no place on a logarithmic axis"
+    ticks = shown.evaluate("document.querySelector('.plot')._fullLayout.xaxis.ticktext")
+    assert ticks[:2] == ["0", "1"]
+    assert shown.evaluate("document.querySelector('.plot')._fullLayout.xaxis.range[0] < Math.log10(0.4)")
+
+
 def test_points_of_other_code_are_hollow_and_reported(tab: Tab, page: str):
     shown = tab.open(page, "plots?sweep=made&plot=accuracy&scene=hanging-cloth")
     shown.wait_for_function("document.querySelector('.plot')?.data?.length")

@@ -65,7 +65,8 @@ def _describe_axis(axis: ChartAxis, names_layout: Mapping[str, Any] = MappingPro
     if axis.scale.division == "names":
         layout |= names_layout
     title = ", ".join(filter(None, (axis.scale.label, axis.title)))
-    return {"column": axis.column, "title": title, "format": axis.scale.tick_format, "axis": layout}
+    zero = {"shows_zero": True} if axis.scale.division == "iterations" else {}
+    return {"column": axis.column, "title": title, "format": axis.scale.tick_format, "axis": layout, **zero}
 
 
 _TIME_TICKS = {"tickformat": "$~s"}

@@ -18,6 +18,10 @@ springbench.chart = (() => {
     return [element("b", {}, item.label), item.description, element("table", {}, element("tbody", {}, ...rows.filter(Boolean)))];
   }
 
+  // Logarithmic axes of iterations show iteration 0 at this value, left of iteration 1.
+  const ZERO_PLACE = 0.4;
+  const drawnAt = (axis, v) => (axis.shows_zero && v === 0 ? ZERO_PLACE : v);
+
   // Plotly omits a tick suffix between powers of ten; so times are formatted with seconds as the currency, such as 5ms.
   const SECONDS = { en: { format: { currency: ["", "s"] } } };
 
@@ -44,7 +48,7 @@ springbench.chart = (() => {
     // Results of other code than the newest are hollow.
     const hollow = item[x.column].map((_, k) => older(item, k));
     return {
-      x: item[x.column], y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
+      x: item[x.column].map(v => drawnAt(x, v)), y: item[y.column], name: item.label, xaxis: `x${tail}`, yaxis: `y${tail}`, meta: { item },
       mode: mark.symbol === "none" ? "lines" : points ? "markers" : "lines+markers", hoverinfo: "none", error_x: bars(ends), error_y: bars(upright),
       line: { color: ink, dash: mark.dash, width: 1.7, shape: shape === "hv" ? "hv" : undefined },
       // The number of markers per line is limited, whatever the number of its points.
@@ -55,7 +59,7 @@ springbench.chart = (() => {
   function failed(item, x, y, tail, ink) {
     const k = item[y.column].findLastIndex((v, j) => v !== null && item[x.column][j] !== null);
     return k < 0 ? [] : [{
-      x: [item[x.column][k]], y: [item[y.column][k]], xaxis: `x${tail}`, yaxis: `y${tail}`, mode: "markers", hoverinfo: "skip",
+      x: [drawnAt(x, item[x.column][k])], y: [item[y.column][k]], xaxis: `x${tail}`, yaxis: `y${tail}`, mode: "markers", hoverinfo: "skip",
       marker: { symbol: "x-thin", size: 12, line: { width: 2.4, color: ink } },
     }];
   }
@@ -77,7 +81,7 @@ springbench.chart = (() => {
     }
     for (const item of y === chart.y?.[0] ? items : []) for (const [k, words] of Object.entries(item.callouts || {})) {
       const [left, up] = [item[x.column][k], item[y.column][k]];
-      if (left !== null && up !== null) annotations.push({ text: words, xref: `x${tail}`, yref: `y${tail}`, x: log(x, left), y: log(y, up), ax: 24, ay: -18, arrowcolor: css("--muted"), arrowhead: 0, font: { size: 12, color: css("--ink") } });
+      if (left !== null && up !== null) annotations.push({ text: words, xref: `x${tail}`, yref: `y${tail}`, x: log(x, drawnAt(x, left)), y: log(y, up), ax: 24, ay: -18, arrowcolor: css("--muted"), arrowhead: 0, font: { size: 12, color: css("--ink") } });
     }
     return { shapes, annotations };
   }
@@ -113,6 +117,12 @@ springbench.chart = (() => {
       let [low, high] = [Infinity, 0];
       for (const item of items) for (const v of item[axis.column]) if (v > 0) [low, high] = [Math.min(low, v), Math.max(high, v)];
       const decades = Math.log10(high / low);
+      if (axis.shows_zero && items.some(item => item[axis.column].includes(0))) {
+        // A tick at iteration 0 and at each power of ten; over few decades also at 2 and 5 times these.
+        const ticks = [0];
+        for (let power = 1; power <= high; power *= 10) for (const v of high < 100 ? [1, 2, 5] : [1]) if (v * power <= high) ticks.push(v * power);
+        return { ...axis.axis, tickmode: "array", tickvals: ticks.map(v => drawnAt(axis, v)), ticktext: ticks.map(v => number(v)) };
+      }
       if (axis.axis.tickmode === "array") {
         // A tick at each size, the largest first, if there is space for its label.
         const sizes = [...new Set(items.flatMap(item => item[axis.column]))].filter(v => v > 0).sort((a, b) => b - a), ticks = [];
@@ -178,7 +188,7 @@ springbench.chart = (() => {
         }
         const full = plot._fullData[curve], box = plot.getBoundingClientRect(), axes = [plot._fullLayout[full.xaxis.replace("x", "xaxis")], plot._fullLayout[full.yaxis.replace("y", "yaxis")]];
         show(axes[0]._offset + axes[0].d2p(one.x[k]) + box.left, axes[1]._offset + axes[1].d2p(one.y[k]) + box.top, describePoint(chart, one.meta.item, k));
-        springbench.announce(`${one.name}: ${figure(one.x[k], x.format)}, ${figure(one.y[k], y.format)}`);
+        springbench.announce(`${one.name}: ${figure(one.meta.item[x.column][k], x.format)}, ${figure(one.y[k], y.format)}`);
       } else return;
       event.preventDefault();
     };
