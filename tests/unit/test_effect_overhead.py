@@ -77,7 +77,7 @@ def test_overheads_are_those_of_the_integrator_and_the_initial_guess_of_the_run(
         return simulate_scene(scene, *rest, initial_guess=initial_guess, frames=frames)
 
     monkeypatch.setattr(iteration_overhead, "simulate_scene", simulate)
-    options = {"integrator": "midpoint", "initial_guess": "inertial"}
+    options: dict[str, Any] = {"integrator": "midpoint", "initial_guess": "inertial"}
     sweep = load_config(cloth, solvers=["newton"], rounds=1, rtol=1e-6, threads=1, **options)
     (path,) = measure_all_overheads(sweep, tmp_path, create_display(get_error_console()), print_message, isolated=False)
     assert {row["status"] for row in read_ablation(path)} == {"ok"}

@@ -139,8 +139,8 @@ def test_exact_pins_are_no_part_of_q_and_the_iteration_leaves_them_in_place(tmp_
 def test_the_first_guess_of_a_step_problem_is_one_that_exists(tmp_path):
     scene = build_graded_scene(load_scene(written_assignment(tmp_path)), 0)
     V = scene.mesh.rest_positions
-    guesses = [build_step_problem(scene, V, V, 0, name).initial_guess for name in ("coarse-to-fine", "previous")]
-    np.testing.assert_array_equal(*guesses)
+    coarse, previous = (build_step_problem(scene, V, V, 0, name) for name in ("coarse-to-fine", "previous"))
+    np.testing.assert_array_equal(coarse.initial_guess, previous.initial_guess)
     with pytest.raises(InputError, match=r"got 'previus'; expected one of .*; did you mean 'previous'"):
         build_step_problem(scene, V, V, 0, "previus")
 
