@@ -36,7 +36,7 @@
       line("status", rows.map(row => state(row.status))), line("ms a step, quartiles", rows.map(row => (row.step === null ? "–" : `${number(row.step)} (${number(row.lower)} to ${number(row.upper)})`))),
       rows.length > 1 && line("times as long as the first, 95 % by frames", against), line("least ms", rows.map(row => number(row.least))), line("prepare ms, cold, warm", rows.map(row => `${number(row.cold)}, ${number(row.warm)}`)),
       line("iterations, stopped by", rows.map(row => `${number(row.num_iterations)}, ${row.termination_reason || "–"}`)), line("last residual", rows.map(row => fixed(row.residual))), line("largest strain", rows.map(row => percent(row.max_strain))),
-      rows.length > 1 && line("last positions", rows.map((row, k) => (k ? (row.positions_digest && row.positions_digest === rows[0].positions_digest ? "equal to the bit" : "differ") : ""))),
+      rows.length > 1 && line("last positions", rows.map((row, k) => (k ? (row.positions_digest && row.positions_digest === rows[0].positions_digest ? "identical" : "differ") : ""))),
     ];
     const head = rows.map(row => element("th", { scope: "col" }, glyph(row.mark), " ", element("a", { href: address("runs", { sweep: row.slug, run: row.key }) }, title(row))));
     return [element("div.scroll", { tabIndex: 0, role: "region", "aria-label": "The runs side by side" }, element("table.plain", {}, element("thead", {}, element("tr", {}, element("td"), ...head)), element("tbody", {}, ...body.filter(Boolean)))),
@@ -82,7 +82,7 @@
       const q = floats(found.positions), far = new Float32Array(q.length / 3);
       for (let i = 0; i < far.length; i++) far[i] = Math.hypot(q[3 * i] - p[3 * i], q[3 * i + 1] - p[3 * i + 1], q[3 * i + 2] - p[3 * i + 2]);
       const most = far.reduce((a, b) => Math.max(a, b), 0), drawn = springbench.mesh(view, shape, `Last frame of ${title(row)}, coloured by its distance from the first run`);
-      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(base.mean_rest_length ? most / base.mean_rest_length : 0)} mean rest lengths${most < 1e-6 * view.radius ? "; recordings are of single precision, and tell no less" : ""}`),
+      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(base.mean_rest_length ? most / base.mean_rest_length : 0)} mean rest lengths${most < 1e-6 * view.radius ? "; recordings have single precision, which resolves no less" : ""}`),
         springbench.scaleBox("0", `${number(most || 0)} m`)));
       drawn.show(q, far.map(v => (most ? v / most : 0)));
     }

@@ -77,7 +77,7 @@ Object.assign(springbench, (() => {
       replay(row.run_id, recording(row), row.replay && `site/data/${encodeURIComponent(row.slug)}/recordings/${encodeURIComponent(row.unit)}.js`, title(row)),
       element("h3", {}, "Measured"), figures(row) || element("p.muted", {}, "Nothing: see its status."),
       element("h3", {}, "Settings"), settings(row),
-      element("h3", {}, "Do it again"), code(command(row), "Command that repeats the run"),
+      element("h3", {}, "Repeat"), code(command(row), "Command that repeats the run"),
       source && element("h3", {}, "Method"), method(source),
       element("h3", {}, "Made by"), list([
         ["code", element("span", {}, element("code", {}, commit(row.commit)), ` (sources ${row.source_fingerprint})`)], ["machine", `${row.cpu || "unknown"} (${(row.machine_id || "").slice(0, 6)})`],

@@ -101,7 +101,7 @@ Object.assign(springbench, (() => {
       settings && element("p.muted", {}, settings), scrub,
       element("div.cols", {},
         element("div", {}, element("h3", {}, "At this point"), figures),
-        element("div", {}, element("h3", {}, "Do it again"), springbench.commandBox(command, "Command that repeats the measurement"),
+        element("div", {}, element("h3", {}, "Repeat"), springbench.commandBox(command, "Command that repeats the measurement"),
           springbench.method(own(chart.citations, item.label)),
           file && element("h3", {}, `Recording of ${item.label}'s solve`), file && springbench.replayBox(item.recording_path, file, replay && link("site/data/", `${sweep.slug}/${replay}.js`), `${item.label}: ${item.description}`),
           element("p.muted", {}, `Made by code ${springbench.commit(made.commit)} on ${made.cpu || "an unknown machine"}${sweep.provenance.length > 1 && !item.provenance ? `, and by ${sweep.provenance.length - 1} more (see the overview)` : ""}.`)),
