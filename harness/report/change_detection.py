@@ -122,7 +122,7 @@ def build_histories(stored: Iterable[StoredBenchmarks]) -> list[BenchmarkHistory
         for benchmark in one.benchmarks:
             key = benchmark.fullname.rpartition("::")[2], _describe_machine(one), benchmark.extra_info.ratio is not None
             points[key].append(_build_point(one, benchmark))
-    found = [BenchmarkHistory(*key, tuple(of_gate), detect_changes(of_gate)) for key, of_gate in points.items()]
+    found = [BenchmarkHistory(*key, tuple(some), detect_changes(some)) for key, some in points.items()]
     return sorted(
         found, key=lambda s: (-max((abs(math.log(r)) for _, r in s.level_changes), default=0.0), s.benchmark_name)
     )
@@ -185,10 +185,10 @@ def estimate_noise(y: FloatArray) -> float:
     return max(float(np.median(differences)) / (0.6745 * math.sqrt(2)), NOISE_FLOOR)
 
 
-def build_history_table(gate_histories: Sequence[BenchmarkHistory]) -> Table:
+def build_history_table(histories: Sequence[BenchmarkHistory]) -> Table:
     """Build a table of the benchmarks, their last level and their changes."""
     table = Table("benchmark", "results", "level", "changes", box=SIMPLE_HEAD)
-    for series in gate_histories:
+    for series in histories:
         changes = [f"{100 * (r - 1):+.1f} % at {series.points[k].commit}" for k, r in series.level_changes]
         none = f"inconclusive: fewer than {MIN_RESULTS} results" if len(series.points) < MIN_RESULTS else "none"
         level = f"{series.segment_levels[-1]:.3g}" if series.is_ratio else f"{1e3 * series.segment_levels[-1]:.3g} ms"

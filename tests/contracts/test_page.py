@@ -31,7 +31,7 @@ VIEWS = {
     **{plot: f"plots?sweep={sweep}&plot={plot}" for sweep, plot in (("cases", "hard"), ("machine", "speed"))},
     **{plot: f"plots?sweep=effects&plot={plot}" for plot in ("ablation", "prices")},
     "engines": "plots?sweep=engines&plot=engines",
-    "gates": "plots?sweep=bench&plot=gates",
+    "benchmarks": "plots?sweep=bench&plot=benchmarks",
 }
 
 FITS = "document.documentElement.scrollWidth <= innerWidth"

@@ -172,14 +172,14 @@ def test_stored_gates_are_a_chart_with_their_changes(tmp_path: Path):
     update_page(tmp_path, print_message=messages.append)
     assert len(messages) == 1
     assert "0099_damaged.json" in messages[0]
-    chart = read(tmp_path, "bench/gates")
+    chart = read(tmp_path, "bench/benchmarks")
     slower = next(item for item in chart["items"] if item["label"].startswith("slower"))
     assert (slower["benchmark"], slower["commit"]) == ("solve", ["0000006"])
     levels = next(item["value"] for item in chart["items"] if item["label"] == "their level")
     assert levels[3] / levels[0] == pytest.approx(1.2, rel=0.02)
     (sweep,) = read(tmp_path, "index")["sweeps"]
     assert [said.get("filter") for said in sweep["findings"]] == [{"benchmark": "solve"}, None]
-    assert sweep["gates"] == 2
+    assert sweep["benchmarks"] == 2
     assert all(made["commit"] and made["cpu"] == "A processor" for made in sweep["provenance"])
 
 

@@ -11,11 +11,11 @@ from springbench.harness.report.charts.chart_description import ChartAxis, Chart
 from springbench.harness.report.charts.figure_panels import AxisScale
 from springbench.harness.report.plot_style import FASTER_COLOUR, MUTED_COLOUR, SLOWER_COLOUR, TEXT_COLOUR, SeriesStyle
 
-RATIO_CHART, TIME_CHART = "gates", "gate-times"
+RATIO_CHART, TIME_CHART = "benchmarks", "benchmark-times"
 """Names of the charts of ratios to a baseline and of minimum times."""
 
 _CHART_WORDS = {
-    RATIO_CHART: ("Gates by commit", AxisScale("times its baseline", "linear", "plain")),
+    RATIO_CHART: ("Benchmarks by commit", AxisScale("times its baseline", "linear", "plain")),
     TIME_CHART: ("Least times by commit", AxisScale("least time", "linear", "time")),
 }
 _CHART_NOTE = (
@@ -53,52 +53,54 @@ def build_benchmark_chart(name: str, histories: Sequence[BenchmarkHistory]) -> C
     )
 
 
-def _build_frame(gate: BenchmarkHistory, title: str) -> ChartFrame:
-    changed = [f"{format_level_change(ratio)} at {gate.points[at].commit}" for at, ratio in gate.level_changes]
-    if len(gate.points) < MIN_RESULTS:
+def _build_frame(history: BenchmarkHistory, title: str) -> ChartFrame:
+    changed = [f"{format_level_change(ratio)} at {history.points[at].commit}" for at, ratio in history.level_changes]
+    if len(history.points) < MIN_RESULTS:
         found = f"Of fewer than {MIN_RESULTS} results nothing is said."
     else:
         found = f"Changed by {', '.join(changed)}." if changed else "No change beyond noise."
-    is_dirty = any(DIRTY_MARK in point.commit for point in gate.points)
+    is_dirty = any(DIRTY_MARK in point.commit for point in history.points)
     return ChartFrame(
-        group=(gate.benchmark_name,),
+        group=(history.benchmark_name,),
         name=("history",),
-        subject=gate.benchmark_name,
+        subject=history.benchmark_name,
         title=title,
-        series=[*_build_series(gate)],
+        series=[*_build_series(history)],
         notes=[found, *([f"{DIRTY_MARK}: with changes beyond the commit."] if is_dirty else [])],
-        place_names={"commit": _distinguish_commits(gate.points)},
+        place_names={"commit": _distinguish_commits(history.points)},
     )
 
 
-def _build_series(gate: BenchmarkHistory) -> Iterator[ChartSeries]:
+def _build_series(history: BenchmarkHistory) -> Iterator[ChartSeries]:
     """Yield the results, the levels of the segments with gaps between them, and the changes."""
 
     def link_commits(places: Sequence[float]) -> dict[str, object]:
-        commits = [None if np.isnan(at) else gate.points[round(at)].commit for at in places]
-        return {"provenance": [{"commit": commit, "cpu": gate.machine_words} for commit in commits]}
+        commits = [None if np.isnan(at) else history.points[round(at)].commit for at in places]
+        return {"provenance": [{"commit": commit, "cpu": history.machine_words} for commit in commits]}
 
-    places = [float(at) for at in range(len(gate.points))]
-    columns = {f"value{end}": [getattr(p, part) for p in gate.points] for end, part in _INTERVAL_SUFFIXES}
+    places = [float(at) for at in range(len(history.points))]
+    columns = {f"value{end}": [getattr(p, part) for p in history.points] for end, part in _INTERVAL_SUFFIXES}
     yield ChartSeries(
         "results, with their 95 % intervals",
         _RESULTS_STYLE,
         {"commit": places, **columns},
-        description=gate.benchmark_name,
+        description=history.benchmark_name,
         is_connected=False,
         links=link_commits(places),
     )
-    ends = (*gate.segment_starts[1:], len(places))
-    across = [x for a, b in zip(gate.segment_starts, ends, strict=True) for x in (a - 0.35, b - 0.65, np.nan)]
-    levels = [y for level in gate.segment_levels for y in (level, level, np.nan)]
+    ends = (*history.segment_starts[1:], len(places))
+    across = [x for a, b in zip(history.segment_starts, ends, strict=True) for x in (a - 0.35, b - 0.65, np.nan)]
+    levels = [y for level in history.segment_levels for y in (level, level, np.nan)]
     yield ChartSeries(
         "their level",
         _LEVEL_STYLE,
         {"commit": across, "value": levels},
-        description=gate.benchmark_name,
+        description=history.benchmark_name,
         links=link_commits(across),
     )
-    changes = [(*change, level) for change, level in zip(gate.level_changes, gate.segment_levels[1:], strict=True)]
+    changes = [
+        (*change, level) for change, level in zip(history.level_changes, history.segment_levels[1:], strict=True)
+    ]
     for (label, style), is_slower in zip(_CHANGE_STYLES.items(), (True, False), strict=True):
         some = [(float(at), ratio, level) for at, ratio, level in changes if (ratio > 1) == is_slower]
         if some:
@@ -107,7 +109,7 @@ def _build_series(gate: BenchmarkHistory) -> Iterator[ChartSeries]:
                 label,
                 style,
                 {"commit": at, "value": levels, "change": [format_level_change(ratio) for ratio in ratios]},
-                description=gate.benchmark_name,
+                description=history.benchmark_name,
                 is_connected=False,
                 marker_scale=_CHANGE_MARKER_SCALE,
                 links=link_commits(at),

@@ -10,7 +10,7 @@ from springbench.harness.report.charts.chart_description import select_curve_plo
 from springbench.harness.report.figures.panel_selection import PanelEntry, entries_from_panels
 
 REQUIRED_RESULTS = (
-    f"{MIN_RESULTS} stored results of a gate, by `pytest tests/bench --benchmark-only` at as many commits"
+    f"{MIN_RESULTS} stored results of a benchmark, by `pytest tests/bench --benchmark-only` at as many commits"
 )
 
 

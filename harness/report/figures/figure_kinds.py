@@ -197,7 +197,7 @@ FIGURE_KINDS: dict[str, FigureKind] = {
         prepare_panels=_prepare_scene_sheet,
     ),
     "history": FigureKind(
-        "Results of a gate, by commit",
+        "Results of a benchmark, by commit",
         benchmark_panels.REQUIRED_RESULTS,
         _without_stale(benchmark_panels.benchmark_panels),
     ),

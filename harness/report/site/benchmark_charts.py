@@ -65,8 +65,8 @@ def collect_benchmark_provenance(stored: Sequence[StoredBenchmarks]) -> list[Cha
     return sorted(items, key=lambda one: str(one["last_started_at"]), reverse=True)
 
 
-def _describe_changes(gate_histories: Sequence[BenchmarkHistory]) -> Iterable[ChartItem]:
-    for one in gate_histories:
+def _describe_changes(histories: Sequence[BenchmarkHistory]) -> Iterable[ChartItem]:
+    for one in histories:
         if one.level_changes:
             words = ", then ".join(
                 f"{format_level_change(ratio)} at {one.points[at].commit}" for at, ratio in one.level_changes
@@ -77,11 +77,11 @@ def _describe_changes(gate_histories: Sequence[BenchmarkHistory]) -> Iterable[Ch
                 "plot": plot,
                 "filter": {"benchmark": one.benchmark_name},
             }
-    known = [one for one in gate_histories if len(one.points) >= MIN_RESULTS]
+    known = [one for one in histories if len(one.points) >= MIN_RESULTS]
     still = sum(not one.level_changes for one in known)
-    if not gate_histories:
+    if not histories:
         return
-    words = f"{still} of {len(gate_histories)} gates show no change beyond noise."
-    if few := len(gate_histories) - len(known):
+    words = f"{still} of {len(histories)} benchmarks show no change beyond noise."
+    if few := len(histories) - len(known):
         words = f"{words[:-1]}; {few} have fewer than the {MIN_RESULTS} results that a verdict needs."
     yield {"text": words}

@@ -133,8 +133,8 @@ def _sweep_state(folder: SweepFolder, code: str, with_recordings: bool) -> str:
         own = [(home / f"{unit}.parquet").stat().st_mtime_ns for unit in row_store.list_unit_files(home)]
         packed = row_store.build_packed_path(home)
         state += [len(own), max(own, default=0), packed.stat().st_mtime_ns if packed.exists() else 0]
-    of_gates = [path.stat().st_mtime_ns for path in find_benchmark_files(folder.path)]
-    state += [len(of_gates), max(of_gates, default=0)]
+    of_benchmarks = [path.stat().st_mtime_ns for path in find_benchmark_files(folder.path)]
+    state += [len(of_benchmarks), max(of_benchmarks, default=0)]
     for part in ("pictures", "recordings", "report"):
         state.append(sum(1 for _ in (folder.path / part).glob("*")))
     return sha256(repr(state).encode()).hexdigest()[:16]

@@ -85,10 +85,10 @@ def build_overview(
         "rows": _build_run_section,
         "accuracy": _build_accuracy_section,
         "ablation": _build_ablation_section,
-        "gates": _build_benchmark_section,
+        "benchmarks": _build_benchmark_section,
     }
-    there = [kind for kind in kinds if kind != "gates" and row_store.list_units(folder.path / kind)]
-    there += ["gates"] if find_benchmark_files(folder.path) else []
+    there = [kind for kind in kinds if kind != "benchmarks" and row_store.list_units(folder.path / kind)]
+    there += ["benchmarks"] if find_benchmark_files(folder.path) else []
     sections = [
         _build_section(kind, kinds[kind], folder, data_folder, with_recordings, print_message) for kind in there
     ]
@@ -303,7 +303,7 @@ def _build_benchmark_section(
     known = benchmark_charts.read_benchmark_files(find_benchmark_files(folder.path), print_message)
     scripts, found = benchmark_charts.build_benchmark_charts(known)
     plots = [(name, chart["title"]) for name, chart in scripts.items()]
-    facts = {"gates": len({item["benchmark"] for chart in scripts.values() for item in chart["items"]})}
+    facts = {"benchmarks": len({item["benchmark"] for chart in scripts.values() for item in chart["items"]})}
     return _PageSection(scripts, plots, found, [], benchmark_charts.collect_benchmark_provenance(known), facts)
 
 

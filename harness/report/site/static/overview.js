@@ -9,7 +9,7 @@
     if (sweep.curves) parts.push(many(sweep.curves, "solve"));
     if (sweep.work_points) parts.push(many(sweep.work_points, "simulation"));
     if (sweep.ablations) parts.push(many(sweep.ablations, "verdict"));
-    if (sweep.gates) parts.push(many(sweep.gates, "gate"));
+    if (sweep.benchmarks) parts.push(many(sweep.benchmarks, "benchmark"));
     if (sweep.sizes?.length) parts.push(`size${sweep.sizes.length > 1 ? `s ${sweep.sizes[0]} to ${sweep.sizes.at(-1)}` : ` ${sweep.sizes[0]}`}`);
     if (sweep.total_seconds) parts.push(`${duration(sweep.total_seconds)} timed`);
     return parts.join(" · ");
@@ -57,7 +57,7 @@
         + (some.length > 4 ? ` and ${some.length - 4} more` : "");
       const link = cause.run_id && address("runs", { sweep: sweep.slug, status: cause.status, run: `${sweep.slug}/${cause.run_id}` });
       return element("tr", {}, element("td.num", {}, count(cause.count)), element("td", {}, state(cause.status)),
-        element("td.reason", {}, cause.reason, cause.has_varied_reasons && element("span.muted", {}, " and the like"), link && " ", link && element("a", { href: link }, "show")),
+        element("td.reason", {}, cause.reason, cause.has_varied_reasons && element("span.muted", {}, " and similar"), link && " ", link && element("a", { href: link }, "show")),
         element("td", {}, names(cause.solvers)), element("td", {}, names(cause.scenes)));
     });
     const head = ["runs", "status", "cause", "solvers", "where"].map((words, k) => element(k ? "th" : "th.num", { scope: "col" }, words));
@@ -91,7 +91,7 @@
       `written ${index.written_at.slice(0, 16).replace("T", " ")} UTC`].filter(Boolean).join(" · ");
     put(content, element("div.page", {}, element("h1", {}, index.title), element("p.muted", {}, line),
       ...index.sweeps.map(card),
-      index.unwritten_sweeps.length > 0 && element("p.muted", {}, `Not on this page yet: ${index.unwritten_sweeps.join(", ")}. `, element("code", {}, "springbench report"), " takes them in.")));
+      index.unwritten_sweeps.length > 0 && element("p.muted", {}, `Not on this page yet: ${index.unwritten_sweeps.join(", ")}. `, element("code", {}, "springbench report"), " adds them.")));
     return { update() {} };
   };
 })();
