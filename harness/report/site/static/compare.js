@@ -82,7 +82,10 @@
       const q = floats(found.positions), far = new Float32Array(q.length / 3);
       for (let i = 0; i < far.length; i++) far[i] = Math.hypot(q[3 * i] - p[3 * i], q[3 * i + 1] - p[3 * i + 1], q[3 * i + 2] - p[3 * i + 2]);
       const most = far.reduce((a, b) => Math.max(a, b), 0), drawn = springbench.mesh(view, shape, `Last frame of ${title(row)}, coloured by its distance from the first run`);
-      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(base.mean_rest_length ? most / base.mean_rest_length : 0)} mean rest lengths${most < 1e-6 * view.radius ? "; recordings have single precision, which resolves no less" : ""}`),
+      const ratio = base.mean_rest_length ? most / base.mean_rest_length : 0;
+      const doubt = most < 1e-6 * view.radius ? "; recordings have single precision, which resolves no less" : "";
+      const caption = `${title(row)}: at most ${number(most)} m from ${title(first)}, ${number(ratio)} mean rest lengths${doubt}`;
+      box.append(element("figure", {}, drawn.canvas, element("figcaption", {}, caption),
         springbench.scaleBox("0", `${number(most || 0)} m`)));
       drawn.show(q, far.map(v => (most ? v / most : 0)));
     }
