@@ -1,4 +1,4 @@
-"""Factorisation of H = S + V V' for a sparse S and a few columns V.
+"""Factorisation of H = S + V V', the rank update of a sparse S by a few columns V.
 
 Sources: Woodbury 1950; Sherman and Morrison 1950. It serves energies that couple all their vertices by a few scalars c,
 as gas does by its volume:
@@ -28,7 +28,7 @@ from springbench.solvers.objective.hessian_pattern import BlockMatrix
 
 @runtime_checkable
 class RankUpdateEnergy(Energy, Protocol):
-    """An energy whose Hessian is sparse plus a product of a few columns."""
+    """An energy whose Hessian is sparse plus a low-rank update V V'."""
 
     def sparse_hessian(self, p: Positions) -> csr_array:
         """Return the Hessian minus V V' [N/m], shape (3n, 3n)."""

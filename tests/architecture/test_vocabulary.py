@@ -66,7 +66,7 @@ REQUIRED = _split_words(
     "dot3 cross3 subtract3 start stop refresh"
 )
 """Methods whose names a base class of a library prescribes, and operations of vector registers and of LLVM."""
-NOUN_PROPERTIES = _split_words("verdict scene rows columns kill info speedup motion")
+NOUN_PROPERTIES = _split_words("verdict scene columns kill info speedup motion")
 """Attributes of small classes, whose class name says the rest."""
 ONE_WORD = SYMBOLS | PROPER | NOUNS | COMMANDS | REQUIRED | NOUN_PROPERTIES
 

@@ -57,7 +57,7 @@ def test_the_net_of_the_page_is_a_net_from_a_file(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_the_gates_of_the_page_compare_equal_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_the_gates_of_the_page_compare_equal_solutions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     tutorial = (ROOT / "configs" / "tutorials" / "3-your-solver-and-ours.md").read_text(encoding="utf-8")
     names = {"mine.py": r"'{3}(.*?)'{3}", "cloth.yaml": r'"{3}\n(mesh.*?)"{3}'}

@@ -134,7 +134,7 @@ def test_a_study_that_is_too_large_leaves_the_published_one_as_it_is(
     assert {path: path.read_bytes() for path in study.parent.rglob("*") if path.is_file()} == before
 
 
-def test_an_interrupted_publication_keeps_the_published_tables(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_publication_removes_no_published_table(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     study = checkout / "results" / "published" / "dummy"
     before = {path.name: path.read_bytes() for path in study.glob("*.parquet")}
 

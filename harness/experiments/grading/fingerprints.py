@@ -49,7 +49,7 @@ CONVERGED_FACTOR = 1.5
 MINIMUM_FACTOR = 10.0
 """Largest ratio to that deviation at which the minima of the steps explain a submission as well.
 
-They are compared more leniently, since a program that stops near the minimum lies beside it.
+They are compared more leniently, since a program may stop before it is at the minimum.
 """
 MAX_ITERATIONS = 100
 """Number of iterations whose iterates are compared, unless more are required."""
