@@ -53,6 +53,27 @@ def test_the_output_of_the_compiler_is_the_reason(tmp_path: Path, monkeypatch: p
     assert list((tmp_path / "build").iterdir()) == []
 
 
+def test_the_cached_program_is_of_this_compiler_version_and_processor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    compiler = tmp_path / "compiler"
+    compiler.write_text(
+        '#!/bin/sh\ntest "$1" = --version && cat "$0.version" && exit\nfor last; do :; done\n: > "$last"\n'
+    )
+    compiler.chmod(0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+
+    def compile_with(version: str) -> Path:
+        (tmp_path / "compiler.version").write_text(version)
+        cpp_backend._read_compiler_version.cache_clear()
+        return compile_baseline(tmp_path / "build")
+
+    first = compile_with("compiler 12")
+    assert first.exists()
+    assert compile_with("compiler 12") == first
+    assert compile_with("compiler 13") != first
+    monkeypatch.setattr(cpp_backend.llvmlite.binding, "get_host_cpu_name", lambda: "another")
+    assert compile_with("compiler 12") != first
+
+
 def test_it_is_queried_line_by_line(echo: Path, tmp_path: Path):
     made = build_cloth(4)
     running = CppBaseline(echo, build_first_problem(made), made.all_springs, tmp_path, "")

@@ -14,10 +14,11 @@ import shutil
 import subprocess
 import weakref
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TypeVar
 
+import llvmlite.binding
 import numpy as np
 from scipy.sparse import csr_array
 from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
@@ -38,7 +39,8 @@ def compile_cpp(
 ) -> Path:
     """Compile a source into `folder` and return the program or library.
 
-    An earlier result is returned if the source, the headers and the options are unchanged.
+    An earlier result is returned if the source, the headers, the options, the compiler's version and the processor are
+    unchanged: machines may share the folder, and `-march=native` code runs on processors of one kind only.
 
     Args:
         source: C++ source.
@@ -56,10 +58,9 @@ def compile_cpp(
     included = ["-I", str(HEADER_FOLDER), *(part for path in SYSTEM_INCLUDE_FOLDERS for part in ("-isystem", path))]
     command = [compiler, *COMPILER_FLAGS, *options, *included, str(source), *libraries]
     content = b"".join(path.read_bytes() for path in (source, *sorted(HEADER_FOLDER.glob("*.hpp"))))
-    name = hashlib.sha256(" ".join([compiler, *COMPILER_FLAGS, *options, *libraries]).encode() + content).hexdigest()[
-        :12
-    ]
-    made = folder.resolve() / f"{source.stem}-{name}"
+    key = [compiler, _read_compiler_version(compiler), *_describe_processor(), *COMPILER_FLAGS, *options, *libraries]
+    digest = hashlib.sha256(" ".join(key).encode() + content).hexdigest()[:12]
+    made = folder.resolve() / f"{source.stem}-{digest}"
     if not made.exists():
         folder.mkdir(parents=True, exist_ok=True)
         partial = made.with_suffix(f".{os.getpid()}.partial")
@@ -69,6 +70,16 @@ def compile_cpp(
             raise Unsupported(f"{source.name} does not compile: {first.strip()}; it needs {requirements}")
         os.replace(partial, made)
     return made
+
+
+@cache
+def _read_compiler_version(compiler: str) -> str:
+    return subprocess.run([compiler, "--version"], capture_output=True, text=True).stdout
+
+
+def _describe_processor() -> tuple[str, str]:
+    """Return the processor's kind and instruction sets, on which `-march=native` depends."""
+    return llvmlite.binding.get_host_cpu_name(), llvmlite.binding.get_host_cpu_features().flatten()
 
 
 def load_library(source: Path, requirements: str, libraries: Sequence[str] = ()) -> ctypes.CDLL:
