@@ -56,7 +56,7 @@ from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.spring_stiffness import compute_modulus_exponent
 from springbench.harness.simulation.auto_tolerance import build_stop_rule
-from springbench.harness.simulation.device_stepping import build_device_columns as device_columns
+from springbench.harness.simulation.device_stepping import build_device_columns
 from springbench.harness.simulation.energy_balance import EnergyGrowth
 from springbench.harness.simulation.instrumentation_pass import observe_run, require_finite
 from springbench.harness.simulation.time_loop import prepare
@@ -232,7 +232,7 @@ def _time_rounds(job: RunJob, setup: RunSetup) -> TimedRounds:
             measured, rows = prepare_untimed(setup.scene, setup.build_solver()), None
         else:
             measured, rows = measure_rows(setup.scene, setup.build_solver(), setup.settings, job.tick)
-        return TimedRounds(measured, rows, device_columns(measured.prepared) | lock_columns)
+        return TimedRounds(measured, rows, build_device_columns(measured.prepared) | lock_columns)
 
 
 def _build_rows(run: RunSpec, setup: RunSetup, timed: TimedRounds, observed: ObservedRun) -> list[dict[str, Any]]:

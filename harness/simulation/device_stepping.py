@@ -103,5 +103,6 @@ def compute_event_seconds(marks: SolveEvents | None) -> dict[str, float]:
 
 
 def build_device_columns(prepared: PreparedSolver) -> dict[str, Any]:
-    """Build the device columns of a prepared solver; empty for one on the processor."""
-    return dict(prepared.usual.device_columns) if isinstance(prepared, DevicePreparedSolver) else {}
+    """Build the device columns of a prepared solver, wrapped or not; empty for one on the processor."""
+    usual = prepared.usual if isinstance(prepared, (AlternatingSolver, DevicePreparedSolver)) else prepared
+    return dict(usual.device_columns) if isinstance(usual, PreparedDeviceSolver) else {}

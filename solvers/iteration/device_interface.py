@@ -103,12 +103,6 @@ class PreparedDeviceSolver(Protocol):
         ...
 
 
-def device_columns_of(prepared: object) -> dict[str, Any]:
-    """Return the columns that describe a prepared solver's device; empty for one on the processor."""
-    usual = getattr(prepared, "usual", prepared)  # a solver of two systems has the device solver as this attribute
-    return dict(usual.device_columns) if isinstance(usual, PreparedDeviceSolver) else {}
-
-
 _DEVICE_FAILURES: list[str] = []
 
 

@@ -22,8 +22,8 @@ from springbench.harness.reference.reference_evaluator import ReferenceEvaluator
 from springbench.harness.reference.reference_store import ReferenceStore
 from springbench.harness.reference.step_snapshot import StepSnapshot, build_exact_scene
 from springbench.harness.scenes.scene_builder import Scene
+from springbench.harness.simulation.device_stepping import build_device_columns
 from springbench.harness.simulation.time_loop import apply_initial_guess
-from springbench.solvers.iteration import device_interface
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solver, System
 from springbench.solvers.registry import SOLVER_TABLE, load_target
 
@@ -181,7 +181,7 @@ def build_curve_rows(
     try:
         with machine_info.limit_threads(spec.measurement.threads):
             prepared, row = _time_preparation(solver, step, spec.measurement.rounds)
-            shared |= device_interface.device_columns_of(prepared)
+            shared |= build_device_columns(prepared)
             found = [shared | row]
             for first_guess in spec.initial_guesses:
                 found += [shared | row for row in _measure_curve(spec, prepared, step, first_guess, results_folder)]
