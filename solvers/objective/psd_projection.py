@@ -58,14 +58,22 @@ class PsdProjection:
         Args:
             use_absolute: whether eigenvalues are replaced by absolute values instead of clamped.
             vertex_mask: mask of the vertices (n,) whose elements are projected; None for all.
+
+        Raises:
+            ValueError: absolute values of a part of the elements.
         """
+        if use_absolute and vertex_mask is not None:
+            raise ValueError(
+                "use_absolute=True with a vertex_mask: springs have one factor of all negative transverse parts; "
+                "omit the mask, or clamp"
+            )
         self.use_absolute, self._vertex_mask = use_absolute, vertex_mask
         self.num_examined = self.num_projected = 0
 
-    def select_elements(self, vertices: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return the mask of the elements (m, k) with a selected vertex.
+    def mark_examined(self, vertices: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return the mask of the elements (m, k) with a selected vertex, and add them to `num_examined`.
 
-        The vertex -1 is none. The elements are added to `num_examined`.
+        The vertex -1 is none.
         """
         if self._vertex_mask is None:
             met = np.ones(len(vertices), np.bool_)
@@ -87,7 +95,7 @@ class PsdProjection:
             Fraction of the negative transverse parts, -1 for absolute values and 1 otherwise, and tensions (m,) [N],
             which are zero for clamped springs.
         """
-        bent = self.select_elements(edges) & (tension < 0.0)
+        bent = self.mark_examined(edges) & (tension < 0.0)
         self.num_projected += int(bent.sum())
         return (-1.0, tension) if self.use_absolute else (1.0, np.where(bent, 0.0, tension))
 
@@ -119,7 +127,7 @@ class PsdProjection:
         Returns:
             Blocks (m, k, k) [N/m], of which only those with a negative eigenvalue differ.
         """
-        met = np.flatnonzero(self.select_elements(vertices))
+        met = np.flatnonzero(self.mark_examined(vertices))
         size, axes = np.linalg.eigh(blocks[met])
         bent = size[:, 0] < -_EIGENVALUE_ROUNDOFF * np.abs(size).max(axis=1, initial=0.0)
         self.num_projected += int(bent.sum())

@@ -101,6 +101,11 @@ def test_a_block_is_filtered_in_its_own_axes(name):
     assert (by.num_examined, by.num_projected) == (2, 1)
 
 
+def test_absolute_values_of_a_part_of_the_elements_are_refused():
+    with pytest.raises(ValueError, match="omit the mask, or clamp"):
+        PsdProjection(use_absolute=True, vertex_mask=np.ones(3, np.bool_))
+
+
 @filters
 def test_pairs_of_surfaces_are_filtered_too(name):
     energy, p, _ = build_touching_sheets()
