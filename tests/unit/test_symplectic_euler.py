@@ -220,3 +220,8 @@ def test_it_is_done_after_one_iteration_and_has_no_residual():
     solution = SymplecticEuler().prepare(problem.system).solve(problem, StopRule(50, 1e-3))
     assert (solution.num_iterations, solution.termination_reason) == (1, "max-iter")
     assert np.isnan([solution.residual, solution.initial_residual]).all()
+
+
+def test_a_solve_without_iterations_counts_none():
+    solution = ready(FREE.system).solve(build_first_problem(FREE), StopRule(0))
+    assert solution.num_iterations == 0

@@ -147,5 +147,5 @@ class SingleIterateState(SolverState):
         return True
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Return one iteration without a residual, whatever the limits are."""
-        return 1, float("nan"), REASON_ITERATIONS
+        """Return one iteration, or none if the limits allow none, without a residual."""
+        return min(1, limits.max_iterations), float("nan"), REASON_ITERATIONS
