@@ -24,6 +24,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.iteration.solver_info import Citation, SolverInfo
 from springbench.solvers.jit.typed_kernel import TypedKernel
@@ -198,7 +199,7 @@ class _AdmmState(SolverState):
         for energy in problem.energies:
             if isinstance(energy, Quadratic):
                 energy.add_projection(problem.inertial_target, self._constant_term)
-        self.positions = self._local_global.apply_exact_pins(guess, problem)
+        self.positions = vertex_terms.apply_exact_pins(guess, problem)
         self._right_hand_side, self._scaled_dual = np.empty_like(self.positions), np.zeros((len(edges.edges), 3))
 
     def step_state(self) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState
 from springbench.solvers.linalg.direct_solvers import SparseLU
 from springbench.solvers.methods.local_global.prefactored import (
@@ -103,7 +104,7 @@ class PreparedFixedPoint(IterativeSolver):
 class _FixedPointState(SolverState):
     def __init__(self, ready: PreparedFixedPoint, problem: StepProblem, guess: Positions) -> None:
         self._ready, self._problem = ready, problem
-        self.positions = self._previous_positions = ready.base.apply_exact_pins(guess, problem)
+        self.positions = self._previous_positions = vertex_terms.apply_exact_pins(guess, problem)
         self._correction = np.full_like(guess, np.nan)
 
     def step_state(self) -> bool:

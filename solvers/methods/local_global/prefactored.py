@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 from scipy.sparse import csr_array
+from springbench.solvers.iteration import vertex_terms
 from springbench.solvers.iteration.iterative_solver import IterativeSolver, SolverState, compute_max_coordinate
 from springbench.solvers.linalg.direct_solvers import DenseCholesky, LinearSolver
 from springbench.solvers.model import system_matrix_assembly
@@ -84,7 +85,7 @@ class PreparedLocalGlobal(IterativeSolver):
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
         """Return the local and the global step at the initial guess, as callables."""
         constant, b = self.constant_right_hand_side(problem), np.empty_like(problem.inertial_target)
-        p = self.apply_exact_pins(problem.initial_guess, problem)
+        p = vertex_terms.apply_exact_pins(problem.initial_guess, problem)
         out, project = p.copy(), self.local_step_of(problem)
 
         def local() -> Positions:
@@ -148,18 +149,6 @@ class PreparedLocalGlobal(IterativeSolver):
         self.solve_correction(left, out)
         out[free] += p[free]
 
-    def apply_exact_pins(self, p: Positions, problem: StepProblem) -> Positions:
-        """Return a copy of p with the exactly pinned vertices on their targets.
-
-        Args:
-            p: positions (n, 3) [m].
-            problem: step with the targets of the pins.
-        """
-        placed = np.array(p, order="C")
-        exact = self.system.pins.exact_mask
-        placed[self.system.pins.vertices[exact]] = problem.pin_targets[exact]
-        return placed
-
     def correction_residual(self, e: Positions) -> float:
         """Return |e|_Q [J^(1/2)] of a displacement (n, 3) [m] over the unpinned vertices.
 
@@ -180,8 +169,8 @@ class LocalGlobalState(SolverState):
         self.base, self._local_step = base, base.local_step_of(problem)
         self.right_hand_side, self._b = base.constant_right_hand_side(problem), np.empty_like(problem.inertial_target)
         self.positions, self._previous_positions = (
-            base.apply_exact_pins(guess, problem),
-            base.apply_exact_pins(problem.current_positions, problem),
+            vertex_terms.apply_exact_pins(guess, problem),
+            vertex_terms.apply_exact_pins(problem.current_positions, problem),
         )
         self._has_stepped = False
 
