@@ -14,10 +14,10 @@ import numpy as np
 from springbench.solvers.contact.half_space.vertex_contact import without_vertex_contact
 from springbench.solvers.iteration.solver_info import LIU_2013, LOCAL_GLOBAL_FAMILY, SolverInfo
 from springbench.solvers.kernels import spring_local_step as kernels
+from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.linalg.solver_selection import LinearSolverName, Precision, build_linear_solver
 from springbench.solvers.methods.local_global.fused_local_global import (
-    PADDING_COORDINATE,
     PreparedCompiledLocalGlobal,
     compile_iterations,
 )

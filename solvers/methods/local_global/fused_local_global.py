@@ -23,6 +23,7 @@ from springbench.solvers.jit.typed_kernel import TypedKernel, as_kernel_array
 from springbench.solvers.kernels import local_global_iteration, step_setup
 from springbench.solvers.kernels import spring_local_step as kernels
 from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, LoopLimits, iteration_limit
+from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.linalg.cholesky.supernodal_cholesky import SupernodalCholesky
 from springbench.solvers.linalg.cholesky.thread_team import ThreadTeam
 from springbench.solvers.linalg.dense_inverse import DenseInverse
@@ -49,9 +50,6 @@ it."""
 
 _USUAL_EXTENT = 100.0
 """Distance [m] from the origin within which most scenes stay."""
-
-PADDING_COORDINATE = 1e100
-"""Coordinate of the ends of padding springs, far from any vertex in any unit of length."""
 
 SCHEDULE_BUILDERS: dict[type, Callable[[Any], EliminationSchedule]] = {
     SupernodalCholesky: schedule_supernodal,

@@ -25,6 +25,7 @@ from springbench.solvers.kernels import step_setup
 from springbench.solvers.kernels.accelerated_descent import AccelerationWindow
 from springbench.solvers.kernels.acceleration_coefficients import require_history_size
 from springbench.solvers.kernels.iteration_loop import ONE_ITERATION, LoopLimits, iteration_limit
+from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.linalg.memory import allocate_aligned
 from springbench.solvers.linalg.solver_selection import LinearSolverName, Precision, build_linear_solver
@@ -36,7 +37,6 @@ from springbench.solvers.methods.local_global.accelerated_local_global import (
     allocate_window,
 )
 from springbench.solvers.methods.local_global.fused_local_global import (
-    PADDING_COORDINATE,
     PreparedCompiledLocalGlobal,
     compile_iterations,
 )

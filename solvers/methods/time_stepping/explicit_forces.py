@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import ArpackError, eigsh
 from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.kernels.iteration_loop import REASON_ITERATIONS, LoopLimits
+from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.kernels.quadratic_form_kernels import QuadraticForm
 from springbench.solvers.kernels.spring_local_step import SpringPackets
 from springbench.solvers.linalg.memory import allocate_aligned
@@ -109,10 +110,6 @@ class ExplicitForces:
         )
 
 
-_PADDING_COORDINATE = 1e100
-"""Coordinate of the ends of padding springs, far from any vertex in any unit of length."""
-
-
 def pad_rows(x: Positions, *, pad_far: bool = False) -> NDArray[np.float64]:
     """Return vectors in rows of four, with two padding rows.
 
@@ -126,7 +123,7 @@ def pad_rows(x: Positions, *, pad_far: bool = False) -> NDArray[np.float64]:
     out = allocate_aligned(4 * (len(x) + 2))
     out.reshape(-1, 4)[: len(x), :3] = x
     if pad_far:
-        out[4 * (len(x) + 1)] = _PADDING_COORDINATE
+        out[4 * (len(x) + 1)] = PADDING_COORDINATE
     return out
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from springbench.solvers.contact.half_space.half_space_steps import build_vertex_move, half_space_energy
 from springbench.solvers.jit.kernel_compilation import jit_inner, jit_kernel
+from springbench.solvers.kernels.padding_coordinate import PADDING_COORDINATE
 from springbench.solvers.kernels.spring_local_step import SpringPackets, add_degenerate_packet
 from springbench.solvers.kernels.spring_objective import ObjectiveWeights
 from springbench.solvers.kernels.spring_objective import value_and_descent as objective
@@ -53,10 +54,6 @@ class SweepScratch(NamedTuple):
     packet_sums: NDArray[np.float64]
     omega: NDArray[np.float64]
     objective_value: NDArray[np.float64]
-
-
-PADDING_COORDINATE = 1e100
-"""Coordinate at which padding springs of a packet end: far from all vertices, whatever the unit of length."""
 
 
 @jit_kernel
