@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 from springbench.solvers.jit.typed_kernel import as_kernel_array
 from springbench.solvers.kernels import objective_kernels, quadratic_form_kernels, spring_hessian
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
-from springbench.solvers.model.barrier_energy import BarrierEnergy, is_barrier_energy, max_step_size
+from springbench.solvers.model.barrier_energy import BarrierEnergy, PairBlocks, is_barrier_energy, max_step_size
 from springbench.solvers.model.energies.element_energies import JoinedElements, add_blocks
 from springbench.solvers.model.step_problem import Energy, Positions, StepProblem
 from springbench.solvers.objective import woodbury
@@ -143,6 +143,11 @@ class StepObjective:
             if self.barrier_energies
             else initial_step
         )
+
+    def compute_active_blocks(self, p: Positions) -> list[PairBlocks]:
+        """Compute the Hessian blocks of the barrier energies' pairs that are active at p (n, 3) [m]."""
+        found = (energy.hessian_blocks(p, 0.0) for energy in self.barrier_energies)
+        return [blocks for blocks in found if len(blocks.vertices)]
 
     def apply_exact_pins(self, p: Positions) -> Positions:
         """Return a copy of p with the exactly pinned vertices on their targets."""

@@ -108,17 +108,12 @@ class _BarrierState(SolverState):
 
     def step_state(self) -> bool:
         """Perform one iteration."""
-        blocks = self._active_blocks(self.positions)
+        blocks = self._step.compute_active_blocks(self.positions)
         return self._step_with_contact(blocks) if blocks else self._step_without_contact()
 
     def residual(self) -> float:
         """Return the residual of the previous positions."""
         return self._residual()
-
-    def _active_blocks(self, p: Positions) -> list[PairBlocks]:
-        """Return the Hessian blocks of the pairs active at p."""
-        found = (energy.hessian_blocks(p, 0.0) for energy in self._step.barrier_energies)
-        return [blocks for blocks in found if len(blocks.vertices)]
 
     def _step_without_contact(self) -> bool:
         """Perform an iteration without contact, as far as its step is collision-free."""
@@ -127,7 +122,7 @@ class _BarrierState(SolverState):
         far, p = self._contact_free_state, self.positions
         self._residual, moved = far.residual, far.step_state()
         q = far.positions.copy()
-        if self._step.max_step_size(p, q - p) == 1.0 and not self._active_blocks(q):
+        if self._step.max_step_size(p, q - p) == 1.0 and not self._step.compute_active_blocks(q):
             self.positions = q
             return moved
         self._contact_free_state = None

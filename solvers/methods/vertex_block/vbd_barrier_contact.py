@@ -122,10 +122,10 @@ class BarrierVbdState(SolverState):
 
     def step_state(self) -> bool:
         """Perform one iteration."""
-        p, blocks = self.positions, self._active_blocks(self.positions)
+        p, blocks = self.positions, self._step.compute_active_blocks(self.positions)
         if not blocks:
             q = self._sweeps.sweep_without_contact(p)
-            if self._step.max_step_size(p, q - p) == 1.0 and not self._active_blocks(q):
+            if self._step.max_step_size(p, q - p) == 1.0 and not self._step.compute_active_blocks(q):
                 self.positions, self._previous_positions, self._factor = q, p, 0.0
                 return True
         at, model = DescentPoint(p, self._step.gradient(p)), self._build_model(p, blocks)
@@ -137,10 +137,6 @@ class BarrierVbdState(SolverState):
             return False
         self.positions, self._previous_positions = self._extrapolate(found.positions), p
         return True
-
-    def _active_blocks(self, p: Positions) -> list[PairBlocks]:
-        found = (energy.hessian_blocks(p, 0.0) for energy in self._step.barrier_energies)
-        return [blocks for blocks in found if len(blocks.vertices)]
 
     def _build_model(self, p: Positions, blocks: list[PairBlocks]) -> SeparableModel:
         gradient, total, known = np.zeros_like(p), np.zeros((len(p), 3, 3)), np.zeros(len(p), bool)
