@@ -77,8 +77,11 @@ class StepObjective:
         Raises:
             ValueError: the system of the problem has another number of energies.
         """
-        if len(problem.system.energies) != len(fixed_objective.system.energies):
-            raise ValueError("the objective was made for a system of other energies than the step's")
+        built, given = len(fixed_objective.system.energies), len(problem.system.energies)
+        if built != given:
+            raise ValueError(
+                f"objective of a system with {built} energies, step with {given}: build it for the step's system"
+            )
         self.fixed_objective, self.problem = fixed_objective, problem
         self._step_data: objective_kernels.StepData | None = None
         self._pins: objective_kernels.ExactPins | None = None
