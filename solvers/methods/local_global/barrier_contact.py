@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +29,10 @@ from springbench.solvers.iteration.idle_contact import skip_idle_contact
 from springbench.solvers.iteration.iterative_solver import SolverState
 from springbench.solvers.methods.local_global.half_space_contact import (
     ContactCorrections,
+    ContactFreeSolver,
     ContactQuadraticModel,
     PreparedHalfSpaceLocalGlobal,
 )
-from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
 from springbench.solvers.model.barrier_energy import PairBlocks, without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solver, StepProblem, System, Unsupported
 from springbench.solvers.objective.fixed_objective import FixedObjective
@@ -57,10 +57,9 @@ def prepare_with_barriers(solver: Solver, system: System) -> PreparedSolver:
             "local-global: vertex contact (HalfSpaceContact) and barrier contact of pairs are not supported together; "
             "use surface-contact"
         )
-    idle: Any = solver.prepare(without_barriers(system))
-    base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base
+    idle = cast("ContactFreeSolver", solver.prepare(without_barriers(system)))
     found = PreparedBarrierLocalGlobal(
-        replace(base, system=system), idle, FixedObjective(system), ContactCorrections(base)
+        replace(idle.base, system=system), idle, FixedObjective(system), ContactCorrections(idle.base)
     )
     return skip_idle_contact(found, system, lambda: idle)
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,11 @@ _MAX_CG_ITERATIONS, _CG_RTOL = 60, 1e-3
 class ContactFreeSolver(PreparedSolver, Protocol):
     """A prepared local-global method of a system without contact."""
 
+    @property
+    def base(self) -> PreparedLocalGlobal:
+        """The iteration through Python."""
+        ...
+
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Return the initial state of the iteration of a step.
 
@@ -77,10 +82,9 @@ def prepare_with_half_spaces(solver: Solver, system: System) -> PreparedHalfSpac
     Raises:
         Unsupported: if the solver does not support the system without contact.
     """
-    idle: Any = solver.prepare(without_vertex_contact(system))
-    base = idle if isinstance(idle, PreparedLocalGlobal) else idle.base
+    idle = cast("ContactFreeSolver", solver.prepare(without_vertex_contact(system)))
     return PreparedHalfSpaceLocalGlobal(
-        replace(base, system=system), idle, FixedObjective(system), ContactCorrections(base)
+        replace(idle.base, system=system), idle, FixedObjective(system), ContactCorrections(idle.base)
     )
 
 
