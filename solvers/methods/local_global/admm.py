@@ -91,9 +91,9 @@ class Admm:
             replace(e, stiffness=self.penalty_weight * e.stiffness) if isinstance(e, EdgeEnergy) else e
             for e in energies
         ]
-        base = measure = prepare_local_global(system, weighted, lambda Q: build_linear_solver(Q))
+        base = measure = prepare_local_global(system, weighted, build_linear_solver)
         if self.penalty_weight != 1.0:
-            measure = prepare_local_global(system, energies, lambda Q: build_linear_solver(Q))
+            measure = prepare_local_global(system, energies, build_linear_solver)
         return PreparedAdmm(
             base, measure, FixedObjective(system), _ProjectedEdges.from_energies(system.energies), self.penalty_weight
         )
