@@ -70,7 +70,7 @@ class FixedPointSolver(ABC):
             inspect.signature(self.next_iterate).bind(None, None, None)
         except TypeError:
             raise PluginContractError(
-                f"{source_line_of(self.next_iterate)}: `next_iterate` should take p, before and correction"
+                f"{describe_source_line(self.next_iterate)}: `next_iterate` should take p, before and correction"
             ) from None
         return PreparedFixedPoint(
             prepare_local_global(system, require_projective(system, name), lambda Q: (SparseLU(Q), "SuperLU")),
@@ -122,7 +122,7 @@ class _FixedPointState(SolverState):
         if isinstance(found, np.ndarray) and found.shape == expected and found.dtype == np.float64:
             return found
         got = f"{found.dtype} of shape {found.shape}" if isinstance(found, np.ndarray) else f"a {type(found).__name__}"
-        line = source_line_of(self._ready.next_iterate)
+        line = describe_source_line(self._ready.next_iterate)
         raise PluginContractError(f"{line}: `next_iterate` gave {got}; expected float64 of shape {expected}")
 
     def residual(self) -> float:
@@ -130,7 +130,7 @@ class _FixedPointState(SolverState):
         return self._ready.base.correction_residual(self._correction.copy())
 
 
-def source_line_of(function: Callable[..., Any]) -> str:
+def describe_source_line(function: Callable[..., Any]) -> str:
     """Return `file:line` of the definition of a function.
 
     For a function that is not written in Python, it is the name.

@@ -258,7 +258,7 @@ def prepare_local_global(
         csr_array(rows[:, exact]),
         lambda e: system_matrix_assembly.energy_norm(Q, e),
         float(Q.diagonal()[system.unpinned_mask].sum()),
-        factor_stats(Q.nnz, factor),
+        collect_factor_stats(Q.nnz, factor),
         choice,
         (lambda problem: _build_local_step(problem.energies)) if lagged else None,
         inner if is_low_precision else None,
@@ -285,7 +285,7 @@ def _build_local_step(energies: Iterable[Energy]) -> LocalStep:
     return project
 
 
-def factor_stats(entries: int, factor: LinearSolver) -> dict[str, float]:
+def collect_factor_stats(entries: int, factor: LinearSolver) -> dict[str, float]:
     """Return the number of entries of Q, and the statistics that the factor provides.
 
     Args:

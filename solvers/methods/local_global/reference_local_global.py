@@ -26,7 +26,7 @@ from springbench.solvers.linalg import memory
 from springbench.solvers.linalg.direct_solvers import DenseCholesky, SparseLU
 from springbench.solvers.methods.local_global.prefactored import (
     PreparedLocalGlobal,
-    factor_stats,
+    collect_factor_stats,
     prepare_local_global,
     require_only_springs,
     require_projective,
@@ -109,7 +109,7 @@ class DenseLocalGlobal:
             csr_array(Q[np.ix_(free, exact)]),
             lambda e: system_matrix_assembly.energy_norm(Q, e),
             float(np.diag(Q)[system.unpinned_mask].sum()),
-            factor_stats(int(np.count_nonzero(Q)), factor),
+            collect_factor_stats(int(np.count_nonzero(Q)), factor),
             "dense Cholesky",
         )
 

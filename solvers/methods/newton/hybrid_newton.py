@@ -84,7 +84,7 @@ from springbench.solvers.methods.newton.negative_curvature import (
     probe_negative_curvature,
 )
 from springbench.solvers.methods.newton.newton_direct import NewtonIteration
-from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, objective_decrease
+from springbench.solvers.methods.newton.predicted_tension import PredictedTensionNewton, compute_objective_decrease
 from springbench.solvers.methods.quasi_newton.lbfgs import Lbfgs
 from springbench.solvers.methods.quasi_newton.windowed_acceleration import (
     CompiledAccelerationState,
@@ -444,7 +444,7 @@ class _MeasuredRule(ShiftScheduleRule):
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
         slope = inner_product(at.gradient, at.positions - to.positions)
-        fall, (low, high) = objective_decrease(step, at, to), _MODEL_RANGE
+        fall, (low, high) = compute_objective_decrease(step, at, to), _MODEL_RANGE
         if self._name == "shift":
             self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
         if self._level:
@@ -752,7 +752,7 @@ class _Approach:
 
         This also determines when the exact method is tried next.
         """
-        fall = objective_decrease(self._step, self._point, to)
+        fall = compute_objective_decrease(self._step, self._point, to)
         cost = self._method.newton_cost * num_factorisations
         self._control.add_phase(name, int(to.positions is not self._point.positions), num_factorisations)
         if fall == 0.0:

@@ -84,7 +84,7 @@ class PredictedTensionNewton:
             return at, 0.0, False
         self._slope = -inner_product(at.gradient, descent)
         following = backtracking_line_search(step, at, -descent, uses_rounded_slope=True) or at
-        is_accurate = objective_decrease(step, at, following) > -MODEL_DECREASE_FRACTION * self._slope
+        is_accurate = compute_objective_decrease(step, at, following) > -MODEL_DECREASE_FRACTION * self._slope
         self._shift.can_reduce = is_accurate
         curvature = probe_negative_curvature(step, following, hessian, self._method.system_diagonal)
         following = curvature or following
@@ -93,7 +93,7 @@ class PredictedTensionNewton:
                 None,
                 step.linearise_tensions(following.positions, np.zeros_like(descent)),
             )
-        return following, objective_decrease(step, at, following), curvature is not None
+        return following, compute_objective_decrease(step, at, following), curvature is not None
 
     def compute_next_step(self, point: DescentPoint) -> tuple[DescentPoint, float, bool]:
         """Do a step with predicted tensions.
@@ -122,7 +122,7 @@ class PredictedTensionNewton:
             return point, 0.0, True
         self._shift.can_reduce = is_sufficient or self._shift.value == np.inf
         self._predicted_tensions += length * (predicted - self._predicted_tensions)
-        gain = objective_decrease(step, point, following)
+        gain = compute_objective_decrease(step, point, following)
         if gain == 0.0:
             return point, 0.0, at is point
         return following, gain, self._shift.value == 0.0 and is_sufficient and slope >= _QUADRATIC_SLOPE_RATIO * before
@@ -154,7 +154,7 @@ class PredictedTensionNewton:
         return length, self._method.relax_point(step, found.positions), False
 
 
-def objective_decrease(step: StepObjective, before: DescentPoint, after: DescentPoint) -> float:
+def compute_objective_decrease(step: StepObjective, before: DescentPoint, after: DescentPoint) -> float:
     """Return the decrease of the objective [J]; 0 if it increases or is below round-off.
 
     Args:

@@ -54,7 +54,7 @@ class VertexBlocks(NamedTuple):
         """
         n = system.num_vertices
         coloured = colouring.colour_vertices(
-            np.concatenate([parts.system_pairs.edges, vertex_elements.vertex_pairs()]), n
+            np.concatenate([parts.system_pairs.edges, vertex_elements.list_vertex_pairs()]), n
         )
         colour = np.empty(n, np.int64)
         colour[coloured.item_order] = np.repeat(np.arange(coloured.num_colours), np.diff(coloured.colour_starts))

@@ -96,13 +96,13 @@ class LagrangeMultipliers:
         return csr_array(coo_array((values[there], (rows[there], columns[there])), shape=shape))
 
     def _solve_kkt(
-        self, J: csr_array, k: NDArray[np.float64], downhill: NDArray[np.float64], open: NDArray[np.float64]
+        self, J: csr_array, k: NDArray[np.float64], downhill: NDArray[np.float64], length_changes: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Solve the linear system for d [m] and t [N]."""
         if not len(k):
             return np.asarray(splu(csc_array(self._Q)).solve(downhill)), np.empty(0)
         K = csc_array(block_array([[self._Q, J.T], [J, None]]))
-        right = np.concatenate([downhill, open])
+        right = np.concatenate([downhill, length_changes])
         compliance = np.concatenate([np.zeros(len(downhill)), -_COMPLIANCE / k])
         factor, x = splu(csc_array(K + diags_array(compliance))), np.zeros_like(right)
         for _ in range(_REFINEMENT_STEPS):

@@ -53,7 +53,7 @@ class VertexElements:
         """The selected energies."""
         return [self.system.energies[k] for k in self.energy_indices]
 
-    def vertex_pairs(self) -> NDArray[np.int64]:
+    def list_vertex_pairs(self) -> NDArray[np.int64]:
         """Return all vertex pairs of all elements, (k, 2)."""
         found = [np.empty((0, 2), np.int64)]
         for energy in self.energies:
