@@ -260,14 +260,14 @@ class PreparedRosenbrock(IterativeSolver):
         p, v = within.initial_motion()
         if not self.error_tolerance:
             for k in range(self.refinement_factor):
-                p, v, _ = within.try_step(
-                    p, v, frame / self.refinement_factor, require_exact=False
-                ) or within.raise_failure(k * frame / self.refinement_factor)
-            return (
-                within.apply_pins(p, 1.0),
-                v,
-                AdaptiveStepStats(self.refinement_factor, 0, frame / self.refinement_factor, frame),
-            )
+                made = within.try_step(p, v, length, require_exact=False)
+                if made is None:
+                    raise NotPositiveDefinite(
+                        f"after {k * frame / self.refinement_factor:.6g} s of the frame the Hessian is not finite, or "
+                        "nothing balances it"
+                    )
+                p, v = made.positions, made.velocity
+            return within.apply_pins(p, 1.0), v, AdaptiveStepStats(self.refinement_factor, 0, length, frame)
         t, accepted, rejected, h, before = 0.0, 0, 0, min(frame, h or frame), 1.0
         error_order = 1.0 + min(self.coefficients.order, self.coefficients.embedded_order)
         control = build_pi_controller(error_order, _MAX_STEP_FACTOR, _FAILURE_FACTOR)
@@ -333,11 +333,6 @@ class _FrameIntegration:
         with np.errstate(over="ignore", invalid="ignore"):
             found = (sum(float((x**2).sum()) for x in parts) / max(1, 3 * len(self._free))) ** 0.5
         return found if np.isfinite(found) else np.inf
-
-    @staticmethod
-    def raise_failure(time: float) -> _StepResult:
-        """Raise NotPositiveDefinite for a step at a time of the frame [s]."""
-        raise NotPositiveDefinite(f"after {time:.6g} s of the frame the Hessian is not finite, or nothing balances it")
 
     def try_step(self, p: Positions, v: Positions, h: float, *, require_exact: bool = True) -> _StepResult | None:
         """Attempt one step.
