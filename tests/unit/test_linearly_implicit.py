@@ -183,6 +183,18 @@ def test_what_has_no_exact_derivative_is_refused_by_name(name, effect):
         prepare(build_unit_scene(SOFT, GravityEffect(), FIRST_PIN, more), load_target(SOLVERS[name])())
 
 
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"refinement_factor": 0}, "refinement_factor: should be at least 1, not 0"),
+        ({"error_tolerance": 2.0}, r"error_tolerance: should be from 0 to 1, not 2\.0"),
+    ],
+)
+def test_parameters_out_of_range_are_refused(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        load_target(SOLVERS["ros2"])(**parameters)
+
+
 def test_the_linearised_step_refuses_contact_and_stages():
     with pytest.raises(Unsupported, match="Contact"):
         prepare(

@@ -119,6 +119,11 @@ class _FixedStepSolver(ExplicitSolver):
 
     refinement_factor: int = 1
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if a parameter is out of range."""
+        if not self.refinement_factor >= 1:
+            raise ValueError(f"refinement_factor: should be at least 1, not {self.refinement_factor}")
+
     def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
@@ -126,8 +131,6 @@ class _FixedStepSolver(ExplicitSolver):
             Unsupported: for energies other than springs, constant quadratic forms and drag on vertices; for integrators
                 other than `substepping` and implicit Euler; for unpinned vertices without mass; for too many substeps.
         """
-        if not self.refinement_factor >= 1:
-            raise Unsupported(f"{self.solver_name}: refinement_factor is {self.refinement_factor}; expected 1 or more")
         return self._prepare_explicit(system, self.refinement_factor, 0.0)
 
 
@@ -142,16 +145,17 @@ class _AdaptiveStepSolver(ExplicitSolver):
 
     error_tolerance: float = 1e-6
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if a parameter is out of range."""
+        if not 1e-14 <= self.error_tolerance <= 1.0:
+            raise ValueError(f"error_tolerance: should be from 1e-14 to 1, not {self.error_tolerance}")
+
     def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
 
         Raises:
-            Unsupported: as for fixed substeps, and for a tolerance outside [1e-14, 1].
+            Unsupported: as for fixed substeps.
         """
-        if not 1e-14 <= self.error_tolerance <= 1.0:
-            raise Unsupported(
-                f"{self.solver_name}: error_tolerance is {self.error_tolerance}; expected a number from 1e-14 to 1"
-            )
         return self._prepare_explicit(system, 1, self.error_tolerance)
 
 

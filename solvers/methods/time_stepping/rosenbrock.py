@@ -72,6 +72,13 @@ class _RosenbrockSolver:
     solver_name: ClassVar[str]
     coefficients: ClassVar[RosenbrockTableau]
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if a parameter is out of range."""
+        if not self.refinement_factor >= 1:
+            raise ValueError(f"refinement_factor: should be at least 1, not {self.refinement_factor}")
+        if not 0.0 <= self.error_tolerance <= 1.0:
+            raise ValueError(f"error_tolerance: should be from 0 to 1, not {self.error_tolerance}")
+
     def prepare(self, system: System) -> PreparedRosenbrock:
         """Prepare the method for a system.
 
@@ -79,12 +86,6 @@ class _RosenbrockSolver:
             Unsupported: for integrators other than `substepping` and implicit Euler, for unpinned vertices without
                 mass, and for energies that depend on the start of a step, except drag on vertices.
         """
-        if self.refinement_factor < 1 or not 0.0 <= self.error_tolerance <= 1.0:
-            raise Unsupported(
-                f"{self.solver_name}: refinement_factor is {self.refinement_factor} and error_tolerance as "
-                f"{self.error_tolerance}; expected 1 or more, and a number "
-                "from 0 to 1"
-            )
         vertex_terms.require_implicit_euler(system, self.solver_name)
         vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), self.solver_name)
         drag, remaining_energies = np.zeros(system.num_vertices), list[Any]()
@@ -93,9 +94,8 @@ class _RosenbrockSolver:
                 drag += c
             elif is_lagged(energy) or is_barrier_energy(energy):
                 raise Unsupported(
-                    f"{self.solver_name}: needs the exact derivatives of all forces, "
-                    "and supports energies of the positions "
-                    f"alone and drag on vertices; the scene has {type(energy).__name__} as well"
+                    f"{self.solver_name}: needs the exact derivatives of all forces, and supports energies of the "
+                    f"positions alone and drag on vertices; the scene has {type(energy).__name__} as well"
                 )
             else:
                 remaining_energies.append(energy)
