@@ -47,18 +47,18 @@ from springbench.solvers.methods.time_stepping.explicit_tableaus import (
     compute_max_steps,
     integrate_drag,
 )
-from springbench.solvers.methods.time_stepping.substep_choice import PreparedSubstepping, SubstepChoice
+from springbench.solvers.methods.time_stepping.substep_choice import (
+    STABILITY_SAFETY,
+    PreparedSubstepping,
+    SubstepChoice,
+    format_step_failure,
+    require_few_evaluations,
+)
 from springbench.solvers.model.integrators.step_size_controller import build_pi_controller
-from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System, Unsupported
+from springbench.solvers.model.step_problem import Positions, PreparedSolver, StepProblem, System
 
 _MAX_STEP_FACTOR, _FAILURE_FACTOR = 5.0, 0.2
 """Largest increase of the step size after one step; its decrease after a step that is not finite."""
-
-_STABILITY_SAFETY = 0.95
-"""Fraction of the stability limit: at the limit a vibration neither grows nor decays, and springs are nonlinear."""
-
-_MAX_SPRING_EVALUATIONS = 1e9
-"""Maximum number of spring evaluations in a step, some seconds: compiled code cannot be interrupted meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,8 @@ class ExplicitSolver:
         method, parts = self.build_coefficients(), ExplicitForces.from_system(system, self.solver_name)
         omega = estimate_max_frequency(system)
         rate = omega + float(parts.drag_rate.max(initial=0.0))
-        needed = substeps * max(1.0, ceil(system.time_step * rate / (_STABILITY_SAFETY * method.stability_limit)))
-        if needed * method.num_evaluations * max(1, len(parts.springs.edges)) > _MAX_SPRING_EVALUATIONS:
-            raise Unsupported(
-                f"{self.solver_name}: is stable with {needed:.3g} substeps a step of "
-                f"{method.num_evaluations} evaluations, which "
-                f"for {len(parts.springs.edges)} springs are beyond the {_MAX_SPRING_EVALUATIONS:.0e} "
-                "allowed; take a shorter time step"
-            )
+        needed = substeps * max(1.0, ceil(system.time_step * rate / (STABILITY_SAFETY * method.stability_limit)))
+        require_few_evaluations(self.solver_name, needed, method.num_evaluations, len(parts.springs.edges))
         soft = int((~system.pins.exact_mask).sum())
         exact = f"; {soft} pins by penalty taken as exact" if soft else ""
         description = (
@@ -399,9 +393,7 @@ class PreparedExplicit(PreparedSubstepping, IterativeSolver):
         integrate_adaptive(forces, stages, steps, p, v, StageScratch.from_sizes(len(method.a), len(p)), step_stats)
         if step_stats[3] < frame:
             raise RuntimeError(
-                method.format_step_failure(
-                    step_stats[0] + step_stats[1], step_stats[2], step_stats[3], frame, taken.tolerance
-                )
+                format_step_failure(step_stats[0] + step_stats[1], step_stats[2], step_stats[3], frame, taken.tolerance)
             )
 
 

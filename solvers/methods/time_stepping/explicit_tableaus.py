@@ -83,22 +83,6 @@ class ExplicitTableau:
         """Evaluations of the forces per step."""
         return len(self.a) - 1
 
-    def format_step_failure(self, tried: float, h: float, reached: float, frame: float, tolerance: float) -> str:
-        """Format the error message of a frame that was not finished.
-
-        Args:
-            tried: number of steps.
-            h: size of the last step [s].
-            reached: time reached in the frame [s].
-            frame: length of the frame [s].
-            tolerance: error tolerance [m].
-        """
-        return (
-            f"the error of {tolerance:.3g} m was not reached within {tried:.0f} steps, the last of {h:.3g} s: after "
-            f"{reached:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off is larger; use a "
-            "larger error"
-        )
-
     def amplification_factor(self, y: float) -> complex:
         """Return the stability function R(i y)."""
         s = len(self.a)

@@ -29,6 +29,7 @@ from springbench.solvers.methods.time_stepping.rosenbrock_tableaus import (
     ROS3P_TABLEAU,
     RosenbrockTableau,
 )
+from springbench.solvers.methods.time_stepping.substep_choice import format_step_failure
 from springbench.solvers.model.barrier_energy import is_barrier_energy
 from springbench.solvers.model.energies.quadratic_energy import drag_of_vertices
 from springbench.solvers.model.integrators.step_size_controller import (
@@ -259,6 +260,7 @@ class PreparedRosenbrock(IterativeSolver):
         within = _FrameIntegration(self, problem)
         p, v = within.initial_motion()
         if not self.error_tolerance:
+            length = frame / self.refinement_factor
             for k in range(self.refinement_factor):
                 made = within.try_step(p, v, length, require_exact=False)
                 if made is None:
@@ -285,12 +287,7 @@ class PreparedRosenbrock(IterativeSolver):
                 rejected += 1
                 h = length * compute_rejection_factor(control, ratio)
             if h < _MIN_STEP_FRACTION * frame or accepted + rejected >= _MAX_STEPS:
-                raise RuntimeError(
-                    f"the error of {self.error_tolerance:.3g} m was not reached within "
-                    f"{accepted + rejected} steps, the last of "
-                    f"{h:.3g} s: after {t:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off "
-                    "is larger; use a larger error"
-                )
+                raise RuntimeError(format_step_failure(accepted + rejected, h, t, frame, self.error_tolerance))
         return p, v, AdaptiveStepStats(accepted, rejected, h, t)
 
 

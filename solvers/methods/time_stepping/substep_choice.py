@@ -1,4 +1,4 @@
-"""The substeps of an explicit method, which have a fixed number or an error tolerance."""
+"""The substeps of a method that divides the step, which have a fixed number or an error tolerance."""
 
 from __future__ import annotations
 
@@ -8,6 +8,49 @@ from typing import ClassVar, Self
 
 from springbench.solvers.methods.time_stepping.explicit_tableaus import ExplicitTableau, SplittingMethod
 from springbench.solvers.model.step_problem import ResidualIterate, Unsupported
+
+STABILITY_SAFETY = 0.95
+"""Fraction of the stability limit: at the limit a vibration neither grows nor decays, and springs are nonlinear."""
+
+_MAX_SPRING_EVALUATIONS = 1e10
+"""Maximum number of spring evaluations in a step, tens of seconds: compiled code cannot be interrupted meanwhile."""
+
+
+def require_few_evaluations(solver: str, num_substeps: float, num_evaluations: int, num_springs: int) -> None:
+    """Check that a step of fixed substeps is not too long to compute.
+
+    Args:
+        solver: name of the solver, for the message.
+        num_substeps: number of substeps in a step.
+        num_evaluations: evaluations of the forces per substep.
+        num_springs: number of springs.
+
+    Raises:
+        Unsupported: the step needs too many evaluations of springs.
+    """
+    if num_substeps * num_evaluations * max(1, num_springs) > _MAX_SPRING_EVALUATIONS:
+        raise Unsupported(
+            f"{solver}: is stable with {num_substeps:.3g} substeps a step, each with {num_evaluations} evaluations of "
+            f"{num_springs} springs, beyond the {_MAX_SPRING_EVALUATIONS:.0e} evaluations of springs allowed in a "
+            "step; take a shorter time step"
+        )
+
+
+def format_step_failure(tried: float, h: float, reached: float, frame: float, tolerance: float) -> str:
+    """Format the error message of a frame that was not finished.
+
+    Args:
+        tried: number of steps.
+        h: size of the last step [s].
+        reached: time reached in the frame [s].
+        frame: length of the frame [s].
+        tolerance: error tolerance [m].
+    """
+    return (
+        f"the error of {tolerance:.3g} m was not reached within {tried:.0f} steps, the last of {h:.3g} s: after "
+        f"{reached:.6g} of {frame:.6g} s of the frame the forces are too sudden, or round-off is larger; use a "
+        "larger error"
+    )
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from springbench.solvers.jit.typed_kernel import TypedKernel
 from springbench.solvers.kernels.spring_local_step import SpringPackets
 from springbench.solvers.methods.local_global.prefactored import require_only_springs
 from springbench.solvers.methods.time_stepping.explicit_forces import SingleIterateState, pad_rows
+from springbench.solvers.methods.time_stepping.substep_choice import STABILITY_SAFETY, require_few_evaluations
 from springbench.solvers.methods.time_stepping.symplectic_euler_kernel import run_symplectic_euler
 from springbench.solvers.model.energies.spring_energy import Springs
 from springbench.solvers.model.step_problem import (
@@ -36,14 +37,7 @@ from springbench.solvers.model.step_problem import (
     ResidualIterate,
     StepProblem,
     System,
-    Unsupported,
 )
-
-_STABILITY_SAFETY = 0.95
-"""Fraction of the stability limit: at the limit a vibration neither grows nor decays, and springs are nonlinear."""
-
-_MAX_SPRING_EVALUATIONS = 1e10
-"""Maximum number of spring evaluations in a step, tens of seconds: compiled code cannot be interrupted meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +75,8 @@ class SymplecticEuler:
         vertex_terms.require_implicit_euler(system, "symplectic-euler")
         vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), "symplectic-euler")
         omega = bound_max_frequency(system, springs)
-        needed = max(1.0, ceil(system.time_step * omega / (2.0 * _STABILITY_SAFETY)))
-        if needed * max(1, len(springs.edges)) > _MAX_SPRING_EVALUATIONS:
-            raise Unsupported(
-                f"symplectic-euler: is stable with {needed:.3g} substeps a step, which for {len(springs.edges)} "
-                f"springs are more than the {_MAX_SPRING_EVALUATIONS:.0e} evaluations "
-                "that are allowed; take a shorter time step"
-            )
+        needed = max(1.0, ceil(system.time_step * omega / (2.0 * STABILITY_SAFETY)))
+        require_few_evaluations("symplectic-euler", needed, 1, len(springs.edges))
         soft = int((~system.pins.exact_mask).sum())
         taken = f"; {soft} pins by penalty taken as exact" if soft else ""
         choice = f"{needed:.0f} substeps for vibrations of at most {omega:.3g} rad/s{taken}"
