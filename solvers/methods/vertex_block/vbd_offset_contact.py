@@ -246,7 +246,7 @@ class OffsetContactState(SweepState):
     def run_unchecked(self, num_iterations: int) -> int:
         """Run sweeps over all vertices, with detections between them; return their number."""
         made, done = self._prepared, 0
-        sweep = _select_kernel(made)
+        sweep = kernels.build_offset_sweeps(*made.vertex_elements.element_kinds)
         while done < num_iterations:
             if self._needs_detection:
                 self._read_positions()
@@ -311,11 +311,6 @@ class OffsetContactState(SweepState):
             bound=bound,
             step_start=self._step_start,
         )
-
-
-def _select_kernel(sweeps: PreparedVertexBlockDescent) -> Any:
-    """Return the compiled sweeps for the elements of a system."""
-    return kernels.build_offset_sweeps(*sweeps.vertex_elements.element_kinds)
 
 
 @jit_inner
