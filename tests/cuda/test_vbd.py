@@ -148,5 +148,5 @@ def test_a_residual_may_end_it_after_each_few_iterations() -> None:
 
 
 def test_unsupported_features_are_named() -> None:
-    with pytest.raises(Unsupported, match=r"StrainLimits.*without `device: cuda`"):
+    with pytest.raises(Unsupported, match=r"StrainLimits.*use `device: cpu`"):
         on_device(build_first_problem(cloth_with(STRAIN_LIMIT_EFFECT)))

@@ -109,7 +109,7 @@ def test_effects_that_the_rest_shape_does_not_determine_are_refused_by_name(scen
 
 def test_responses_that_do_not_fit_in_memory_are_refused_beforehand(monkeypatch):
     monkeypatch.setattr(memory, "compute_memory_limit", lambda: 5e4)
-    with pytest.raises(Unsupported, match=r"within 4 rings .* KiB of memory.*take fewer rings"):
+    with pytest.raises(Unsupported, match=r"within 4 rings .* KiB of memory.*use fewer"):
         compute_responses(csr_array(np.eye(300)), chain(100), 4)
 
 

@@ -107,7 +107,7 @@ def test_with_a_sparse_matrix_residuals_are_those_of_q() -> None:
     [
         ({"jacobi_sweeps": 9}, "jacobi_sweeps: should be from 1 to 8"),
         ({"linear_solver": "cg"}, "a-jacobi solves no system"),
-        ({"precision": "float32"}, "is of a factor's entries"),
+        ({"precision": "float32"}, "float32 is for `preconditioner: cholesky`; remove it"),
     ],
 )
 def test_what_has_no_meaning_with_a_sparse_matrix_is_refused(given: dict[str, object], said: str) -> None:
@@ -116,5 +116,5 @@ def test_what_has_no_meaning_with_a_sparse_matrix_is_refused(given: dict[str, ob
 
 
 def test_with_a_sparse_matrix_contact_is_refused() -> None:
-    with pytest.raises(Unsupported, match="no rows for what begins to touch"):
+    with pytest.raises(Unsupported, match="does not include contact"):
         Lbfgs(preconditioner="a-jacobi").prepare(EFFECTS["contact"]().system)

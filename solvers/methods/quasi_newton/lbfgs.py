@@ -89,7 +89,7 @@ class Lbfgs(WindowedAcceleration):
                 f"linear_solver: {self.linear_solver} is for `preconditioner: cholesky`; a-jacobi solves no system"
             )
         if self.precision != "float64":
-            raise ValueError(f"precision: {self.precision} is of a factor's entries")
+            raise ValueError(f"precision: {self.precision} is for `preconditioner: cholesky`; remove it")
 
     def prepare(self, system: System) -> PreparedSolver:
         """Prepare the method for a system.
@@ -100,8 +100,8 @@ class Lbfgs(WindowedAcceleration):
         """
         if self.preconditioner == "a-jacobi" and without_barriers(without_vertex_contact(system)) is not system:
             raise Unsupported(
-                "lbfgs, preconditioner: a-jacobi: its matrix, which is made once, has no rows for what begins to "
-                "touch; take preconditioner: cholesky"
+                "lbfgs, preconditioner: a-jacobi: its matrix is built once and does not include contact; use "
+                "`preconditioner: cholesky`"
             )
         if self.preconditioner == "cholesky":
             return prepare_accelerated(system, self._acceleration_scheme, self.linear_solver, self.precision)

@@ -63,8 +63,8 @@ def prepare_vbd(
     others = sorted({type(energy).__name__ for energy in system.energies if not isinstance(energy, taken)})
     if others:
         raise Unsupported(
-            "vbd: on a device it takes springs, quadratic forms and contact of vertices with obstacles alone, not "
-            f"{', '.join(others)}; without `device: cuda` it takes these too"
+            "vbd: `device: cuda` supports only springs, quadratic forms and contact of vertices with obstacles, not "
+            f"{', '.join(others)}; use `device: cpu`"
         )
     order = np.searchsorted(system.free_vertices, np.argsort(vertex_blocks.row_of_vertex)[: vertex_blocks.num_free])
     network = DeviceNetwork.from_system("vbd", without_vertex_contact(system), order)  # in the rows of the colours

@@ -99,8 +99,8 @@ class Jgs2:
         }
         if unknown:
             raise Unsupported(
-                f"jgs2: what answers to a vertex is computed once, from the rest shape, and that says nothing of "
-                f"{', '.join(sorted(unknown))}; take newton, lbfgs or hybrid"
+                f"jgs2: responses are precomputed from the rest shape, which does not cover "
+                f"{', '.join(sorted(unknown))}; use newton, lbfgs or hybrid"
             )
         metric, objective = ResidualMetric(system), FixedObjective(system)
         patches = compute_responses(
@@ -110,9 +110,8 @@ class Jgs2:
         )
         mean = len(patches.patch_vertices) / max(1, len(patches.patch_starts) - 1)
         choice = (
-            f"on average {mean:.1f} vertices answer to one, in "
-            f"{memory.format_bytes(patches.response.nbytes)}; residuals "
-            f"by {metric.description}{objective.interpreted_energies}"
+            f"responses of {mean:.1f} vertices on average, in {memory.format_bytes(patches.response.nbytes)}; "
+            f"residuals by {metric.description}{objective.interpreted_energies}"
         )
         return PreparedDescent(
             objective, metric, _Jgs2Iteration(metric, objective.springs, patches), choice, metric.stats
@@ -169,8 +168,8 @@ def compute_responses(H: csr_array, graph: csr_array, rings: int) -> VertexPatch
     needs, free = 72.0 * reach.nnz, memory.compute_memory_limit()
     if needs > free:
         raise Unsupported(
-            f"jgs2: the vertices within {rings} rings of each answer to it in {memory.format_bytes(needs)} of memory, "
-            f"where {memory.format_bytes(free)} may be taken; take fewer rings, or a coarser mesh"
+            f"jgs2: the responses within {rings} rings of each vertex need {memory.format_bytes(needs)} of memory, of "
+            f"which {memory.format_bytes(free)} are available; use fewer `neighbour_rings` or a coarser mesh"
         )
     start, near = np.asarray(reach.indptr, np.int64), np.asarray(reach.indices, np.int64)
     response, known = np.zeros((len(near), 3, 3)), _PatchFactor(H)

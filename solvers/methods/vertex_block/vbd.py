@@ -134,9 +134,8 @@ def decompose_system(system: System, solver: str) -> tuple[SpringForm, VertexEle
     unknown = {*parts.unsupported_energies} - {type(energy).__name__ for energy in vertex_elements.energies}
     if unknown:
         raise Unsupported(
-            f"{solver}: {', '.join(sorted(unknown))} states no elements of a projective energy, and so neither whose "
-            "neighbours its vertices are nor a bound of the second derivatives; a vertex's step needs both, the "
-            "neighbours for the colouring and the bound for the fallback step that cannot raise the energy"
+            f"{solver}: {', '.join(sorted(unknown))} has no element-wise projective form, which the colouring and the "
+            "majorant need; use lbfgs or newton"
         )
     return parts, vertex_elements, VertexBlocks.from_system(system, parts, vertex_elements)
 

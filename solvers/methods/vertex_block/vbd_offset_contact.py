@@ -118,7 +118,7 @@ class OffsetContactDescent:
             )
         unknown = [type(energy).__name__ for energy in barriers if not is_supported_contact(energy)]
         if unknown:
-            raise Unsupported(f"vbd-ogc: {', '.join(unknown)} has no collision mesh, from which it takes its contacts")
+            raise Unsupported(f"vbd-ogc: {', '.join(unknown)} has no collision mesh; use surface-contact")
         parts, vertex_elements, blocks = decompose_system(system, "vbd-ogc")
         sweeps = PreparedUncheckedDescent.from_blocks(
             without_barriers(system), parts, vertex_elements, blocks, self.spectral_radius, _NO_RESIDUAL
