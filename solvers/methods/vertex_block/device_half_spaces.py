@@ -43,7 +43,7 @@ class ObstacleBodies(NamedTuple):
 
     Attributes:
         low, high: (o, 3) [m], corners of the rounded boxes.
-        spectral_radius: (o,) [m], radius of the rounded boxes, including the thickness.
+        radius: (o,) [m], radius of the rounded boxes, including the thickness.
         force_margin: (o,) [m], distance within which an obstacle gets a half-space.
         friction_coefficient: (o,), Coulomb coefficients.
         eps_v: (o,) [m/s], sliding speed below which friction counts as sticking.
@@ -52,7 +52,7 @@ class ObstacleBodies(NamedTuple):
 
     low: Any
     high: Any
-    spectral_radius: Any
+    radius: Any
     force_margin: Any
     friction_coefficient: Any
     eps_v: Any
@@ -160,13 +160,13 @@ def build_half_spaces(vertex, p, v, dt, when, square, frames, bodies, found, rou
         spaces: receives the half-spaces.
     """
     work = cuda.local.array((5, 3), np.float64)
-    i, many = cuda.grid(1), bodies.spectral_radius.shape[0]
+    i, many = cuda.grid(1), bodies.radius.shape[0]
     travel = dt * math.sqrt(square[0])
     while i < spaces.has_half_space.shape[0]:
         spaces.has_half_space[i] = False
         x = vertex[i]
         for o in range(many):
-            k, body = many * i + o, _Rounded(bodies.low[o], bodies.high[o], bodies.spectral_radius[o])
+            k, body = many * i + o, _Rounded(bodies.low[o], bodies.high[o], bodies.radius[o])
             if _plane(p, v, x, dt, frames[o], body, bodies.force_margin[o] + travel, found, k, work):
                 before, lagged, taken, stiffness = 0.0, 0.0, 0.0, bodies.stiffness[o, i]
                 for c in range(3):
@@ -204,13 +204,13 @@ class HalfSpaceKernels(NamedTuple):
 def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
     """Build the kernels for the floating-point type of the displacements."""
     of_springs = device_vbd_kernels.build_vbd_kernels(real)
-    gathered, lowering = (
+    gather_force_and_block, lowering = (
         of_springs.gather_force_and_block,
         share_with_device(half_space_steps.build_block_step(of_springs.vertex_energy_change)),
     )
 
     @cuda.jit
-    def push(
+    def push_with_model(
         begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
         padding_row, far, anchor_stiffness, majorant, force, u, before, x, spaces,
     ):  # fmt: skip
@@ -225,7 +225,7 @@ def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
         i, b = own[t], t // device_vbd_kernels.LANES
         first, last = start[b], start[b + 1]
         u0, u1, u2 = before[i, 0], before[i, 1], before[i, 2]
-        f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless = gathered(
+        f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless = gather_force_and_block(
             t,
             first,
             last,
@@ -254,7 +254,7 @@ def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
         u[i, 0], u[i, 1], u[i, 2] = real(u0 + d[0]), real(u1 + d[1]), real(u2 + d[2])
 
     @cuda.jit
-    def press(spaces, x, u, sequence_number, control, first, out):
+    def evaluate_penalty(spaces, x, u, sequence_number, control, first, out):
         """Write the change of the half-space energy from the reference to u [J].
 
         It is a sum per thread block. The sums are stored in `out` from `first` on; see `sum_objective` in
@@ -274,4 +274,4 @@ def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
         if cuda.threadIdx.x == 0:
             out[first + cuda.blockIdx.x] = total
 
-    return HalfSpaceKernels(push, press)
+    return HalfSpaceKernels(push_with_model, evaluate_penalty)
