@@ -115,18 +115,18 @@ def prepare_newton_cg(
 class PreparedNewtonCG(MinimisingSolver):
     """Newton-CG, prepared on a device, with the levels of the preconditioner on host and device.
 
-    `forcing` has the upper and lower bound of eta, `most` is the maximum number of conjugate gradient iterations, and
-    `device_columns` are the columns of the device in rows.
+    `eta_bounds` has the upper and lower bound of eta, `max_cg_iterations` is the maximum number of conjugate gradient
+    iterations, and `device_columns` are the columns of the device in rows.
     """
 
     uploaded_network: UploadedNetwork
     metric: ResidualMetric
     objective: FixedObjective
     levels: list[SchwarzLevel]
-    on_device: list[UploadedLevel]
+    device_levels: list[UploadedLevel]
     real_dtype: Real
-    forcing: tuple[float, float]
-    most: int
+    eta_bounds: tuple[float, float]
+    max_cg_iterations: int
     device_columns: dict[str, Any]
     description: str
 
@@ -165,7 +165,7 @@ class _NewtonCGState(DeviceSolverState):
             objective_kernels.build_hessian_kernels(real),
             build_conjugate_gradient_kernels(real),
         )
-        self._preconditioner = DeviceAdditiveSchwarz(made.levels, made.on_device, stream, rows, real)
+        self._preconditioner = DeviceAdditiveSchwarz(made.levels, made.device_levels, stream, rows, real)
         self._linear = stream.allocate_zeros((4, len(network.edge_entries.neighbour_rows)), real)
         self._g = stream.allocate_zeros((rows, 3), np.float64)
         self._z, self._d, self._s, self._y, self._w = (stream.allocate_zeros((rows, 3), real) for _ in range(5))
@@ -181,7 +181,7 @@ class _NewtonCGState(DeviceSolverState):
             stream.cuda_stream,
         )
         self._linearisation, self._first_cg_iterations, self._cg_iterations = (LaunchGraph(stream) for _ in range(3))
-        self._max_eta, self._min_eta = made.forcing
+        self._max_eta, self._min_eta = made.eta_bounds
         self._floor = self._eta = self._residual_product = 0.0
 
     def load_step(self, step: DeviceStep) -> None:
@@ -199,14 +199,14 @@ class _NewtonCGState(DeviceSolverState):
     def launch_iterations(self, num_iterations: int) -> int:
         """Run iterations; each waits for the numbers of its trial."""
         for number in range(num_iterations):
-            if self.stalled or not self._advanced():
+            if self.stalled or not self._iterate_once():
                 return number
         return num_iterations
 
-    def _advanced(self) -> bool:
+    def _iterate_once(self) -> bool:
         """Do one iteration; return False if no direction descends."""
         if not self._residual_product > self._floor or not (
-            self._search(self._compute_direction()) or self._search(self._z)
+            self._line_search(self._compute_direction()) or self._line_search(self._z)
         ):
             return False
         before, self._residual_product = self._residual_product, self._linearise_at_point()
@@ -233,7 +233,7 @@ class _NewtonCGState(DeviceSolverState):
             count, self._partials, device_sums.count_blocks(terms), self._sums
         )
 
-    def _search(self, direction: Any) -> bool:
+    def _line_search(self, direction: Any) -> bool:
         """Line search by step halving along a direction (f, 3); return success."""
         t, network = 1.0, self._made.uploaded_network.host_network
         for _ in range(MAX_HALVINGS):
@@ -253,7 +253,7 @@ class _NewtonCGState(DeviceSolverState):
 
     def _compute_direction(self) -> Any:
         """Solve for -H^-1 g approximately by conjugate gradients."""
-        limit, most = self._eta**2 * self._residual_product, self._made.most
+        limit, most = self._eta**2 * self._residual_product, self._made.max_cg_iterations
         if self._residual_product <= limit:
             return self._d
         now = np.zeros(6)
@@ -363,7 +363,7 @@ def build_conjugate_gradient_kernels(real: type[np.float32] | type[np.float64]) 
     """Build the kernels that compute in `real`."""
 
     @cuda.jit
-    def turn(z, p, now):
+    def update_direction(z, p, now):
         """Update the direction: p = z + r'z / (r'z before) p."""
         if now[STATUS] != RUNNING:
             return
@@ -375,7 +375,7 @@ def build_conjugate_gradient_kernels(real: type[np.float32] | type[np.float64]) 
             i += cuda.gridsize(1)
 
     @cuda.jit
-    def go(p, y, d, r, now):
+    def update_iterate(p, y, d, r, now):
         """Update the iterate: d += t p, r -= t y."""
         if now[STATUS] != RUNNING:
             return
@@ -388,7 +388,7 @@ def build_conjugate_gradient_kernels(real: type[np.float32] | type[np.float64]) 
                 r[i, c] -= length * y[i, c]
             i += cuda.gridsize(1)
 
-    return ConjugateGradientKernels(turn, go)
+    return ConjugateGradientKernels(update_direction, update_iterate)
 
 
 @cuda.jit
