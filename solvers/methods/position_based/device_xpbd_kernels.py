@@ -35,7 +35,7 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
     zero, one, short = real(0.0), real(1.0), real(MIN_SQUARED_LENGTH[real])
 
     @cuda.jit
-    def anchor(places, target, force, pins, x, u, compliance):
+    def write_anchors(places, target, force, pins, x, u, compliance):
         """Write the positions without springs, y/q, to x; set u to 0."""
         i = cuda.grid(1)
         while i < x.shape[0]:
@@ -50,7 +50,7 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
             i += cuda.gridsize(1)
 
     @cuda.jit
-    def soften(places, h, u, compliance, gives):
+    def write_compliance(places, h, u, compliance, gives):
         """Write 1/q for a step of h [s], and set u to 0.
 
         1/q is written in `real` and in float64.
@@ -64,7 +64,7 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
             i += cuda.gridsize(1)
 
     @cuda.jit
-    def linearise(x, count, springs):
+    def linearise_constraints(x, count, springs):
         """Write D and |D| - r of `count` springs, and zero tensions."""
         e = cuda.grid(1)
         while e < count:
@@ -81,7 +81,7 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
             e += cuda.gridsize(1)
 
     @cuda.jit
-    def project(begin, end, springs, compliance, u):
+    def project_colour(begin, end, springs, compliance, u):
         """Project the springs from `begin` to `end`, all of one colour, by moving both ends."""
         e = begin + cuda.grid(1)
         while e < end:
@@ -112,7 +112,7 @@ def build_xpbd_kernels(real: RealType) -> XpbdKernels:
             u[j, 0], u[j, 1], u[j, 2] = u[j, 0] + b * v0, u[j, 1] + b * v1, u[j, 2] + b * v2
             e += cuda.gridsize(1)
 
-    return XpbdKernels(anchor, soften, linearise, project)
+    return XpbdKernels(write_anchors, write_compliance, linearise_constraints, project_colour)
 
 
 @cuda.jit

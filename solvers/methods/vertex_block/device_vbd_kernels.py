@@ -61,7 +61,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
     tiny = ZERO_LENGTH_SQUARED
 
     @cuda.jit(device=True)
-    def gathered(
+    def gather_force_and_block(
         t, first, last, u0, u1, u2, neighbour, kind, weights, spring, direction, arrows, far, anchor_stiffness,
         force, u,
     ):  # fmt: skip
@@ -99,7 +99,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         return f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless
 
     @cuda.jit(device=True)
-    def risen(
+    def lane_energy_change(
         t, first, last, u0, u1, u2, x0, x1, x2, f0, f1, f2, neighbour, kind, weights, arrows, far, anchor_stiffness, u,
     ):  # fmt: skip
         """Return the energy change [J] of a step x0, x1, x2 of a lane's vertex.
@@ -127,21 +127,21 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         return rise
 
     @cuda.jit(device=True)
-    def risen_there(d, lane):
+    def vertex_energy_change(d, lane):
         """Return the energy change in float64 for a step d.
 
         `lane` has the lane's index, its displacement and force, and the arrays.
         """
         t, first, last, at, pull, neighbour, kind, weights, arrows, far, anchor_stiffness, u = lane
         return float64(
-            risen(
+            lane_energy_change(
                 t, first, last, at[0], at[1], at[2], real(d[0]), real(d[1]), real(d[2]), pull[0], pull[1], pull[2],
                 neighbour, kind, weights, arrows, far, anchor_stiffness, u,
             )
         )  # fmt: skip
 
     @cuda.jit
-    def sweep(
+    def sweep_colour(
         begin, end, own, start, neighbour, kind, weights, spring, direction, arrows,
         padding_row, far, anchor_stiffness, majorant, force, u, before,
     ):  # fmt: skip
@@ -171,7 +171,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         first, last = start[b], start[b + 1]
         u0, u1, u2 = u[i, 0], u[i, 1], u[i, 2]
         before[i, 0], before[i, 1], before[i, 2] = u0, u1, u2
-        f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless = gathered(
+        f0, f1, f2, b00, b01, b02, b11, b12, b22, lengthless = gather_force_and_block(
             t,
             first,
             last,
@@ -203,7 +203,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             x2 = (f2 - l2 * f0 - l3 * y1) / third
             x1 = y1 / second - l3 * x2
             x0 = f0 / b00 - l1 * x1 - l2 * x2
-            rise = risen(
+            rise = lane_energy_change(
                 t,
                 first,
                 last,
@@ -229,7 +229,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
         u[i, 0], u[i, 1], u[i, 2] = u0 + s0, u1 + s1, u2 + s2
 
     @cuda.jit
-    def extrapolate(u, older, control):
+    def extrapolate_iterate(u, older, control):
         """Extrapolate `older`, the iterate before the last one, to w (u - older) + older."""
         i = cuda.grid(1)
         w = real(control[EXTRAPOLATION])
@@ -238,7 +238,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
                 older[i, c] += w * (u[i, c] - older[i, c])
 
     @cuda.jit
-    def level(
+    def sum_objective(
         own, start, neighbour, kind, weights, spring, direction, arrows,
         padding_row, far, free, anchor_stiffness, force, u, condition, control, sums,
     ):  # fmt: skip
@@ -311,7 +311,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             sums[cuda.blockIdx.x] = shared_sums[0]
 
     @cuda.jit
-    def decide(radius, at_before, at_new, control):
+    def decide_extrapolation(radius, at_before, at_new, control):
         """Decide in one block whether an extrapolation is accepted, and compute the next weight.
 
         Args:
@@ -361,7 +361,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
             control[IS_REQUESTED] = 1.0 if following > 1.0 and math.isnan(known) else 0.0
 
     @cuda.jit
-    def finish(u, before, older, control):
+    def finish_extrapolation(u, before, older, control):
         """Apply the extrapolation if accepted; store where the iteration started."""
         i = cuda.grid(1)
         taken = control[IS_ACCEPTED] > 0.0
@@ -372,7 +372,7 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
                 older[i, c] = before[i, c]
 
     @cuda.jit
-    def rebase(x, u, older, control):
+    def rebase_reference(x, u, older, control):
         """Add the displacement to the reference.
 
         The objective there is 0 by definition, if it was known.
@@ -386,4 +386,13 @@ def build_vbd_kernels(real: Any) -> VbdKernels:
                 older[i, c] -= u[i, c]
                 u[i, c] = zero
 
-    return VbdKernels(gathered, risen_there, sweep, extrapolate, level, decide, finish, rebase)
+    return VbdKernels(
+        gather_force_and_block,
+        vertex_energy_change,
+        sweep_colour,
+        extrapolate_iterate,
+        sum_objective,
+        decide_extrapolation,
+        finish_extrapolation,
+        rebase_reference,
+    )

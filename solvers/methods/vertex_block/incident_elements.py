@@ -124,23 +124,23 @@ class VertexFunctions(NamedTuple):
         """Build the functions of all kinds together."""
         if not kinds:
             return cls(_no_energy, _no_contribution, _no_energy_change)
-        own_total, own_felt, own_risen = cls._from_kind(*kinds[0])
-        others_total, others_felt, others_risen = cls.from_kinds(kinds[1:])
+        own_energy, add_own, own_change = cls._from_kind(*kinds[0])
+        other_energy, add_others, other_change = cls.from_kinds(kinds[1:])
 
         @jit_closure
-        def total(around, p):
-            return own_total(around[0], p) + others_total(around[1:], p)
+        def total_energy(around, p):
+            return own_energy(around[0], p) + other_energy(around[1:], p)
 
         @jit_inlined_closure
-        def felt(around, i, p, gradient, block):
-            gradient, block = own_felt(around[0], i, p, gradient, block)
-            return others_felt(around[1:], i, p, gradient, block)
+        def add_gradient_block(around, i, p, gradient, block):
+            gradient, block = add_own(around[0], i, p, gradient, block)
+            return add_others(around[1:], i, p, gradient, block)
 
         @jit_inlined_closure
-        def risen(around, i, p, d):
-            return own_risen(around[0], i, p, d) + others_risen(around[1:], i, p, d)
+        def energy_change(around, i, p, d):
+            return own_change(around[0], i, p, d) + other_change(around[1:], i, p, d)
 
-        return cls(total, felt, risen)
+        return cls(total_energy, add_gradient_block, energy_change)
 
     @classmethod
     def _from_kind(cls, law: ElementLaw, width: int) -> VertexFunctions:
@@ -153,7 +153,7 @@ class VertexFunctions(NamedTuple):
         )
 
         @jit_closure
-        def total(around, p):
+        def total_energy(around, p):
             energy = 0.0
             for e in range(len(around.element_rows)):
                 z0 = z1 = z2 = 0.0
@@ -164,7 +164,7 @@ class VertexFunctions(NamedTuple):
             return energy
 
         @jit_inlined_closure
-        def seen(around, entry, i, p):
+        def element_argument(around, entry, i, p):
             c = around.own_coefficient[entry]
             z0, z1, z2 = c * p[4 * i], c * p[4 * i + 1], c * p[4 * i + 2]
             for a in range(width - 1):
@@ -173,11 +173,11 @@ class VertexFunctions(NamedTuple):
             return z0, z1, z2
 
         @jit_inlined_closure
-        def felt(around, i, p, gradient, block):
+        def add_gradient_block(around, i, p, gradient, block):
             g0, g1, g2 = gradient
             xx, xy, xz, yy, yz, zz = block
             for entry in range(around.row_starts[i], around.row_starts[i + 1]):
-                z0, z1, z2 = seen(around, entry, i, p)
+                z0, z1, z2 = element_argument(around, entry, i, p)
                 f0, f1, f2 = gradients(around.parameters, around.element_index[entry], z0, z1, z2)
                 h0, h1, h2, h3, h4, h5 = curvature(around.parameters, around.element_index[entry], z0, z1, z2)
                 c = around.own_coefficient[entry]
@@ -188,19 +188,19 @@ class VertexFunctions(NamedTuple):
             return (g0, g1, g2), (xx, xy, xz, yy, yz, zz)
 
         @jit_inlined_closure
-        def risen(around, i, p, d):
+        def energy_change(around, i, p, d):
             energy = 0.0
             for entry in range(around.row_starts[i], around.row_starts[i + 1]):
-                z0, z1, z2 = seen(around, entry, i, p)
+                z0, z1, z2 = element_argument(around, entry, i, p)
                 c = around.own_coefficient[entry]
                 energy += rise(around.parameters, around.element_index[entry], z0, z1, z2, c * d[0], c * d[1], c * d[2])
             return energy
 
         @jit_inlined_closure
-        def felt_by_constant(around, i, p, gradient, block):
+        def add_constant_block(around, i, p, gradient, block):
             g0 = g1 = g2 = 0.0
             for entry in range(around.row_starts[i], around.row_starts[i + 1]):
-                z0, z1, z2 = seen(around, entry, i, p)
+                z0, z1, z2 = element_argument(around, entry, i, p)
                 f0, f1, f2 = gradients(around.parameters, around.element_index[entry], z0, z1, z2)
                 c = around.own_coefficient[entry]
                 g0, g1, g2 = g0 + c * f0, g1 + c * f1, g2 + c * f2
@@ -212,8 +212,8 @@ class VertexFunctions(NamedTuple):
             )  # fmt: skip
 
         if law.has_constant_hessian:
-            return cls(total, felt_by_constant, _constant_energy_change)
-        return cls(total, felt, risen)
+            return cls(total_energy, add_constant_block, _constant_energy_change)
+        return cls(total_energy, add_gradient_block, energy_change)
 
 
 @jit_inlined_closure
