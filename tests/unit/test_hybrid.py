@@ -18,7 +18,7 @@ from springbench.solvers.kernels import descent_rounds
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
 from springbench.solvers.methods.newton import hybrid_newton
-from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, PreparedHybrid, _MeasuredRule
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, MeasuredRule, PreparedHybrid
 from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
@@ -133,7 +133,7 @@ def test_a_solve_by_lbfgs_alone_prepares_nothing_for_the_other_methods(monkeypat
     given, prepared = stiff(0.1), HybridNewton().prepare(stiff(0.1).system)
     wanted = prepared.residual_at(given, given.current_positions)
     monkeypatch.setattr(hybrid_newton, "StepObjective", None)
-    monkeypatch.setattr(hybrid_newton, "_Approach", None)
+    monkeypatch.setattr(hybrid_newton, "MethodChoice", None)
     found = prepared.solve(given, StopRule(50, 1e-3))
     assert found.solver_phases is not None
     assert set(found.solver_phases) == {"lbfgs"}
@@ -316,7 +316,7 @@ def test_only_a_step_by_the_unmodified_hessian_agrees_with_its_model(is_definite
     while -step.objective_change(p, p - length * at.gradient)[0] > 0.6 * length * slope:
         length *= 1.1
     hessian: Any = ShiftedHessian(is_definite)
-    rule = _MeasuredRule(inertia, hessian)
+    rule = MeasuredRule(inertia, hessian)
     assert rule.factorise_hessian(hessian, at, inertia) == (0 if is_definite else 1)
     rule.record_step(step, hessian, at, DescentPoint(p - length * at.gradient, at.gradient))
-    assert rule.is_delivered == is_definite
+    assert rule.agrees_with_model == is_definite

@@ -21,14 +21,14 @@ One rule decides which of the three methods continues: that with the largest dec
 last steps. A method that was not yet measured is credited with the decrease that L-BFGS leaves, extrapolated from its
 last two groups of iterations (`springbench.solvers.kernels.descent_rounds`). The exact Hessian is tried first. If it
 has no Cholesky factor, predicted tensions follow, and the exact method is tried again after a cost that doubles with
-each attempt that decreases the objective less than the others did meanwhile. A step of the exact method delivers if the
-Hessian is unmodified and the decrease agrees with the quadratic model; then the next step is predicted to gain more
-than any other method, and the exact method continues until a step does not deliver. An indefinite Hessian gets the
-smallest multiple of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative
-stiffness (`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per
-factorisation when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the
-numbers of springs, entries and operations of the factors and from the factorisations made. So equal solves make equal
-decisions and have bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them.
+each attempt that decreases the objective less than the others did meanwhile. If the Hessian of a step of the exact
+method is unmodified and the decrease agrees with the quadratic model, the next step is predicted to gain more than any
+other method, and the exact method continues until a step does not agree. An indefinite Hessian gets the smallest
+multiple of inertia that has a factor (`springbench.solvers.methods.newton.inertia_shift`), or loses negative stiffness
+(`springbench.solvers.methods.newton.hessian_regularisation`), whichever decreased the objective more per factorisation
+when last used. Costs are counted, not measured by a clock: in groups of L-BFGS iterations, from the numbers of springs,
+entries and operations of the factors and from the factorisations made. So equal solves make equal decisions and have
+bitwise equal results, on any machine and under any load. `Solution.solver_phases` explains them.
 
 If a point that satisfies the tolerance has an indefinite Hessian, the step leaves along a direction of negative
 curvature: symmetric initial guesses lead to saddles.
@@ -118,7 +118,7 @@ _MEASURED_STEPS = 3
 _MAX_SHIFT = 1e3
 """Largest multiple of the inertia that is added to an exact Hessian; then its negative parts are reduced instead."""
 
-_NO_GRADIENT = np.empty((0, 3))
+NO_GRADIENT = np.empty((0, 3))
 """Placeholder for the gradient at a point of L-BFGS: the residual there is known, and the gradient is not used."""
 
 _LBFGS_NANOSECONDS, _NEWTON_NANOSECONDS = (1e3, 17.0, 2.0), (2e5, 0.023, 20.0)
@@ -205,7 +205,7 @@ class PreparedHybrid(PreparedDescent):
             initial_guess: positions (n, 3) [m], not modified.
         """
         starts_lower = self.hybrid_iteration.starts_lower
-        return (_LbfgsFirstState if starts_lower else _HybridState)(self, problem, initial_guess)
+        return (LbfgsFirstState if starts_lower else HybridState)(self, problem, initial_guess)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
         """Return the residual [J^(1/2)], by L-BFGS if its residuals are those of the metric.
@@ -251,8 +251,12 @@ class SolveControl:
         self.num_iterations = num_iterations
 
 
-class _HybridState(SolverState):
-    """The state of a solve, which does many rounds of L-BFGS at once."""
+class HybridState(SolverState):
+    """The state of a solve, which does many rounds of L-BFGS at once.
+
+    Attributes:
+        positions: current positions (n, 3) [m].
+    """
 
     def __init__(self, prepared: PreparedHybrid, problem: StepProblem, guess: Positions) -> None:
         self._prepared, self._problem, self._control = prepared, problem, SolveControl()
@@ -270,6 +274,7 @@ class _HybridState(SolverState):
         return StepObjective(self._prepared.fixed_objective, self._problem)
 
     def step_state(self) -> bool:
+        """Do one iteration; return False if the positions do not change."""
         return self._advance(ONE_ITERATION)
 
     def _advance(self, limits: LoopLimits) -> bool:
@@ -281,6 +286,7 @@ class _HybridState(SolverState):
         return self.positions is not before
 
     def residual(self) -> float:
+        """Return the residual [J^(1/2)] at the current positions."""
         if self._control.residual is not None:
             return self._control.residual
         return self._prepared.metric.residual(self._current_point().gradient)
@@ -289,6 +295,7 @@ class _HybridState(SolverState):
         return self._point or DescentPoint(self.positions, self._step.gradient(self.positions))
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Iterate up to the limits; return count, residual and reason."""
         count, found, ended = 0, np.nan, REASON_ITERATIONS
         while ended == REASON_ITERATIONS and count < limits.max_iterations:
             moved = self._advance(limits._replace(max_iterations=limits.max_iterations - count) if count else limits)
@@ -304,6 +311,7 @@ class _HybridState(SolverState):
         return count, found, ended
 
     def can_terminate(self) -> bool:
+        """Return whether the current positions are a minimum; the next iteration leaves a saddle."""
         control = self._control
         control.must_escape = not (
             control.is_minimum
@@ -318,7 +326,7 @@ class _HybridState(SolverState):
         return self._control.solver_phases
 
 
-class _LbfgsFirstState(_HybridState):
+class LbfgsFirstState(HybridState):
     """The state of a solve by L-BFGS alone, until another method is needed.
 
     Nothing is prepared for the other methods before that. Most steps of small meshes end with L-BFGS alone, and the
@@ -333,6 +341,7 @@ class _LbfgsFirstState(_HybridState):
         """Do nothing; the first round starts the solve."""
 
     def compute_start_residual(self) -> float:
+        """Start L-BFGS and return the residual [J^(1/2)] at the initial guess."""
         return self._start_run(measures_guess=True).guess_residual
 
     def _start_run(self, *, measures_guess: bool) -> CompiledAccelerationState:
@@ -341,10 +350,11 @@ class _LbfgsFirstState(_HybridState):
         run = self._run = method.start_lower(self._problem, self.positions, measures_guess=measures_guess)
         self._start, self._rounds = run.positions.copy(), method.init_rounds()
         self._floor = method.round_off(self._start)
-        self._one_round = _limit_rounds(ONE_ITERATION, self._floor)
+        self._one_round = limit_rounds(ONE_ITERATION, self._floor)
         return run
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
+        """Iterate up to the limits; return count, residual and reason."""
         if self._num_rounds == 0 and limits.max_iterations == 0:
             self.positions = self._step.apply_exact_pins(self.positions)
         return super().run_iterations(limits)
@@ -357,7 +367,7 @@ class _LbfgsFirstState(_HybridState):
         if control.must_escape:
             self._end_lbfgs_alone(run, np.inf, REASON_ITERATIONS)
             return super()._advance(limits)
-        limits = self._one_round if limits is ONE_ITERATION else _limit_rounds(limits, self._floor)
+        limits = self._one_round if limits is ONE_ITERATION else limit_rounds(limits, self._floor)
         count, residual, ended = run.run_rounds(self._rounds, limits)
         control.num_iterations, control.residual = count, residual
         self._num_rounds += count
@@ -370,11 +380,11 @@ class _LbfgsFirstState(_HybridState):
         """End the phase of L-BFGS alone, and continue with the choice between the methods."""
         method, control = self._prepared.hybrid_iteration, self._control
         control.solver_phases, self._is_lbfgs_alone, self._run = dict(self.solver_phases), False, None
-        self._point = DescentPoint(run.positions.copy(), _NO_GRADIENT)
+        self._point = DescentPoint(run.positions.copy(), NO_GRADIENT)
         self.positions = self._point.positions
-        approach = _Approach(method, self._step, self._start, run, control, self._rounds, self._point)
-        approach.record_rounds(residual, ended)
-        self._points = method.continue_from(self._step, self._point, control, approach)
+        method_choice = MethodChoice(method, self._step, self._start, run, control, self._rounds, self._point)
+        method_choice.record_rounds(residual, ended)
+        self._points = method.continue_from(self._step, self._point, control, method_choice)
 
     @property
     def solver_phases(self) -> dict[str, tuple[int, float]]:
@@ -385,7 +395,7 @@ class _LbfgsFirstState(_HybridState):
         return {"lbfgs": (self._num_rounds, groups / self._prepared.hybrid_iteration.newton_cost)}
 
 
-def _limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
+def limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
     """Return the limits of rounds.
 
     Rounds also end where the residual is due to rounded positions.
@@ -398,13 +408,13 @@ def _limit_rounds(limits: LoopLimits, floor: float) -> LoopLimits:
     return LoopLimits(limits.max_iterations, limit, max(floor, limits.residual_floor), RESIDUAL_EACH)
 
 
-class _MeasuredRule(ShiftScheduleRule):
+class MeasuredRule(ShiftScheduleRule):
     """The smallest multiple of the inertia, or the shift schedule.
 
     The rule also measures the steps of the exact method.
 
     Attributes:
-        is_delivered: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
+        agrees_with_model: whether the Hessian of the last step was unmodified and its decrease agreed with the model.
         is_exact_only: whether only the unmodified Hessian may be factorised.
     """
 
@@ -419,10 +429,20 @@ class _MeasuredRule(ShiftScheduleRule):
         self._shift, self._level, self._before = InertiaShift(0.0, _MAX_SHIFT), cast(int | None, None), 0.0
         self._gains = {"shift": np.inf, "schedule": np.inf}  # [J] per factorisation, when last used
         self._name = "shift"
-        self.is_delivered = self.is_exact_only = False
+        self.agrees_with_model = self.is_exact_only = False
 
     def factorise_hessian(self, hessian: Hessian, at: DescentPoint, diagonal: NDArray[np.float64]) -> int | None:
-        self.is_delivered, self._before = False, self._factor.num_factorisations
+        """Factorise the exact Hessian or, unless `is_exact_only`, a shifted one.
+
+        Args:
+            hessian: exact Hessian at the point.
+            at: not used.
+            diagonal: diagonal of the shift schedule (3f,) [N/m].
+
+        Returns:
+            0 if nothing was added, more for other factors, None for no factor.
+        """
+        self.agrees_with_model, self._before = False, self._factor.num_factorisations
         self._name = max(self._gains, key=lambda name: self._gains[name])
         if self.is_exact_only:
             self._level = 0 if hessian.factorise() else None
@@ -443,13 +463,21 @@ class _MeasuredRule(ShiftScheduleRule):
         return int(shift > 0.0) if hessian.factorise(1.0, added) else None
 
     def record_step(self, step: StepObjective, hessian: Hessian, at: DescentPoint, to: DescentPoint) -> None:
+        """Compare the decrease in a step with its quadratic model, and record it per factorisation.
+
+        Args:
+            step: objective of the step.
+            hessian: not used.
+            at: first point.
+            to: point at which the line search ended.
+        """
         slope = inner_product(at.gradient, at.positions - to.positions)
         fall, (low, high) = compute_objective_decrease(step, at, to), _MODEL_RANGE
         if self._name == "shift":
             self._shift.can_reduce = fall >= MODEL_DECREASE_FRACTION * slope or self._shift.value == np.inf
         if self._level:
             self._gains[self._name] = fall / (self._factor.num_factorisations - self._before)
-        self.is_delivered = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
+        self.agrees_with_model = self._level == 0 and (fall == 0.0 or low * slope <= fall <= high * slope)
 
 
 class HybridIteration:
@@ -516,10 +544,10 @@ class HybridIteration:
             p: positions (n, 3) [m]; the inertial prediction replaces them if it is lower.
             control: limits of the next iterations, read for each point; counts and costs are recorded there.
         """
-        yield from self.continue_from(step, DescentPoint(lower_start_positions(step, p), _NO_GRADIENT), control)
+        yield from self.continue_from(step, DescentPoint(lower_start_positions(step, p), NO_GRADIENT), control)
 
     def continue_from(
-        self, step: StepObjective, start: DescentPoint, control: SolveControl, approach: _Approach | None = None
+        self, step: StepObjective, start: DescentPoint, control: SolveControl, method_choice: MethodChoice | None = None
     ) -> Iterator[DescentPoint]:
         """Yield the points after a point; restart after an escape from a saddle.
 
@@ -527,13 +555,15 @@ class HybridIteration:
             step: objective of the step.
             start: point from which the iteration continues, of which only the positions are used.
             control: as in `iterate_from`.
-            approach: choice between the methods that continues from there; a new one is started if omitted.
+            method_choice: choice between the methods that continues from there; a new one is started if omitted.
         """
-        p, point = start.positions, start if approach else None
+        p, point = start.positions, start if method_choice else None
         while point is None or not point.is_stalled:
             if not (step.has_contact_elements or has_active_barrier(step, p)):
-                approach = approach or _Approach(self, step, p, self.start_lbfgs(step, p), control, self.init_rounds())
-                points, approach = approach.iterate_points(), None
+                method_choice = method_choice or MethodChoice(
+                    self, step, p, self.start_lbfgs(step, p), control, self.init_rounds()
+                )
+                points, method_choice = method_choice.iterate_points(), None
                 for following in points:
                     if not _is_collision_free(step, p, following.positions):
                         break
@@ -601,10 +631,10 @@ class HybridIteration:
         """
         run = self.start_lbfgs(step, p)
         run.run_iterations(LoopLimits(_RELAXATION_ITERATIONS, 0.0, 0.0, RESIDUAL_NEVER))
-        return _current_point(run)
+        return compute_current_point(run)
 
 
-class _Approach:
+class MethodChoice:
     """The choice between the methods in one solve, without active contacts."""
 
     def __init__(
@@ -623,9 +653,9 @@ class _Approach:
         """
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = run
-        self._point, self._rounds = at or DescentPoint(start, _NO_GRADIENT), rounds
+        self._point, self._rounds = at or DescentPoint(start, NO_GRADIENT), rounds
         self._num_lbfgs_iterations, self._rival_gain = 0, 0.0  # last values read from and written to `rounds`
-        self._measured_rule: _MeasuredRule | None = None
+        self._measured_rule: MeasuredRule | None = None
         self._steepest = 0.0
         self._floor = method.round_off(start)
         self._predicting: PredictedTensionNewton | None = None
@@ -654,23 +684,23 @@ class _Approach:
                     point = self._take_newton_step() if name == "newton" else self._take_predicted_step()
                     self._record_step(name, point, self._method.factor.num_factorisations - before)
             if point is not self._point:
-                self._point, self._control.is_minimum = point, self._is_delivered
+                self._point, self._control.is_minimum = point, self._agrees_with_model
                 yield point
 
     @property
-    def _rule(self) -> _MeasuredRule:
+    def _rule(self) -> MeasuredRule:
         """The regularisation of the exact method; a solve by L-BFGS alone needs none."""
         if self._measured_rule is None:
-            self._measured_rule = _MeasuredRule(self._method.inertia_diagonal, self._method.factor)
+            self._measured_rule = MeasuredRule(self._method.inertia_diagonal, self._method.factor)
         return self._measured_rule
 
     @property
-    def _is_delivered(self) -> bool:
-        """Whether the last step of the exact method delivered."""
-        return self._measured_rule is not None and self._measured_rule.is_delivered
+    def _agrees_with_model(self) -> bool:
+        """Whether the last step of the exact method agreed with its quadratic model."""
+        return self._measured_rule is not None and self._measured_rule.agrees_with_model
 
     def _choose_method(self) -> str:
-        if self._is_delivered or self._is_trial_due or not any(self._gains.values()):
+        if self._agrees_with_model or self._is_trial_due or not any(self._gains.values()):
             return "newton"
         if self._gains["lbfgs"] == np.inf:
             return "lbfgs"
@@ -688,13 +718,13 @@ class _Approach:
         rival_gain = max(self._gains["predicted tensions"], self._gains["newton"])
         if rival_gain != self._rival_gain:
             rounds["rival_gain"] = self._rival_gain = rival_gain
-        count, residual, ended = self._run.run_rounds(rounds, _limit_rounds(limits, self._floor))
+        count, residual, ended = self._run.run_rounds(rounds, limit_rounds(limits, self._floor))
         done = int(rounds["num_iterations"][0]) - self._num_lbfgs_iterations
         self._control.add_phase("lbfgs", count, done / GROUP_ITERATIONS / self._method.newton_cost)
         if self._method.exact_lbfgs:
-            point, self._control.residual = DescentPoint(self._run.positions.copy(), _NO_GRADIENT), residual
+            point, self._control.residual = DescentPoint(self._run.positions.copy(), NO_GRADIENT), residual
         else:
-            point = _current_point(self._run)
+            point = compute_current_point(self._run)
         self.record_rounds(residual, ended)
         return point
 
@@ -763,7 +793,7 @@ class _Approach:
             self._gains[name] = total_fall / total_cost if total_cost > 0.0 else 0.0
         if name == "newton":
             others = self._fallen / self._spent if self._spent > 0.0 else 0.0
-            is_better = self._is_delivered or self._gains["newton"] > others
+            is_better = self._agrees_with_model or self._gains["newton"] > others
             self._patience = _FIRST_PATIENCE if is_better else 2.0 * self._patience
             self._is_trial_due, self._spent, self._fallen = False, 0.0, 0.0
             rounds = self._rounds
@@ -777,7 +807,7 @@ class _Approach:
         """Return a lower point next to the current saddle point, or None."""
         self._control.must_escape = False
         step, diagonal = self._step, self._method.system_diagonal
-        at = _current_point(self._run) if self._run is not None else self._point
+        at = compute_current_point(self._run) if self._run is not None else self._point
         hessian = step.hessian(at.positions)
         if not hessian.factorise(0.0):
             return None
@@ -794,5 +824,6 @@ def _is_collision_free(step: StepObjective, before: Positions, after: Positions)
     return step.max_step_size(before, after - before) == 1.0 and not has_active_barrier(step, after)
 
 
-def _current_point(run: AcceleratedState) -> DescentPoint:
+def compute_current_point(run: AcceleratedState) -> DescentPoint:
+    """Return the current point of L-BFGS, with its gradient."""
     return DescentPoint(run.positions.copy(), run.gradient())
