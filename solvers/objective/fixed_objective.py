@@ -150,7 +150,7 @@ class FixedObjective:
         )
         free = csr_array(csr_array(pattern[s.free_vertices])[:, s.free_vertices])
         known: list[Any] = [s.energies[k].elements for k in self.element_energy_indices]  # pyright: ignore[reportAttributeAccessIssue]
-        ends = [self.springs.edges, *(list_vertex_pairs(elements.vertices) for elements in known)]
+        ends = [self.springs.edges, *(list_element_pairs(elements.vertices) for elements in known)]
         if self.quadratic_form is not None:
             ends.append(self.quadratic_form.pairs)
         i, j = np.concatenate(ends).T  # entries without stiffness, or that cancel, remain in the pattern
@@ -206,7 +206,7 @@ class FixedObjective:
         return self._extended_matrix
 
 
-def list_vertex_pairs(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
+def list_element_pairs(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return all vertex pairs of each element (m, k), as rows (m k^2, 2)."""
     k = vertices.shape[1]
     return np.column_stack([np.repeat(vertices, k, axis=1).ravel(), np.tile(vertices, k).ravel()])

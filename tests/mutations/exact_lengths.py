@@ -30,7 +30,7 @@ EXACT_LENGTHS = (
     Mutation(
         "multipliers-of-lengths-unmended",
         _MULTIPLIERS,
-        "right = np.concatenate([downhill, open])",
+        "right = np.concatenate([downhill, length_changes])",
         "right = np.concatenate([downhill, 0.0 * open])",
         (_TESTS,),
     ),

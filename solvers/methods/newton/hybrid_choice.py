@@ -173,6 +173,15 @@ class MethodChoice:
         """Start at positions (n, 3) [m], or continue at a point `at`.
 
         Rounds of L-BFGS have led from the positions to that point.
+
+        Args:
+            method: iteration for the system.
+            step: objective of the step.
+            start: positions at which the solve starts (n, 3) [m].
+            run: state of L-BFGS.
+            control: limits of the next iterations; counts and costs are recorded there.
+            rounds: state of the rounds of L-BFGS.
+            at: point from which the iteration continues; the start if omitted.
         """
         self._method, self._step, self._start, self._control = method, step, start, control
         self._run: AcceleratedState | None = run
