@@ -32,6 +32,7 @@ from springbench.solvers.methods.local_global.half_space_contact import (
     ContactFreeSolver,
     ContactQuadraticModel,
     PreparedHalfSpaceLocalGlobal,
+    find_prefactored,
 )
 from springbench.solvers.model.barrier_energy import PairBlocks, without_barriers
 from springbench.solvers.model.step_problem import Positions, PreparedSolver, Solver, StepProblem, System, Unsupported
@@ -58,8 +59,9 @@ def prepare_with_barriers(solver: Solver, system: System) -> PreparedSolver:
             "use surface-contact"
         )
     idle = cast("ContactFreeSolver", solver.prepare(without_barriers(system)))
+    base = find_prefactored(idle)
     found = PreparedBarrierLocalGlobal(
-        replace(idle.base, system=system), idle, FixedObjective(system), ContactCorrections(idle.base)
+        replace(base, system=system), idle, FixedObjective(system), ContactCorrections(base)
     )
     return skip_idle_contact(found, system, lambda: idle)
 

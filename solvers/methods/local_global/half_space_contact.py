@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol, cast
+from typing import Any, ClassVar, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,11 +53,6 @@ _MAX_CG_ITERATIONS, _CG_RTOL = 60, 1e-3
 class ContactFreeSolver(PreparedSolver, Protocol):
     """A prepared local-global method of a system without contact."""
 
-    @property
-    def base(self) -> PreparedLocalGlobal:
-        """The iteration through Python."""
-        ...
-
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Return the initial state of the iteration of a step.
 
@@ -83,9 +78,16 @@ def prepare_with_half_spaces(solver: Solver, system: System) -> PreparedHalfSpac
         Unsupported: if the solver does not support the system without contact.
     """
     idle = cast("ContactFreeSolver", solver.prepare(without_vertex_contact(system)))
+    base = find_prefactored(idle)
     return PreparedHalfSpaceLocalGlobal(
-        replace(idle.base, system=system), idle, FixedObjective(system), ContactCorrections(idle.base)
+        replace(base, system=system), idle, FixedObjective(system), ContactCorrections(base)
     )
+
+
+def find_prefactored(prepared: PreparedSolver) -> PreparedLocalGlobal:
+    """Return the iteration through Python of a prepared local-global method: itself, or the one that it compiles."""
+    compiled: Any = prepared
+    return prepared if isinstance(prepared, PreparedLocalGlobal) else compiled.base
 
 
 class ContactCorrections:

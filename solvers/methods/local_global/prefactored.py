@@ -69,11 +69,6 @@ class PreparedLocalGlobal(IterativeSolver):
     correction_matrix: csr_array | None = None
     diagonal_dominance_ratio: float = 1.0
 
-    @property
-    def base(self) -> PreparedLocalGlobal:
-        """The iteration itself, as the methods that build on one provide theirs."""
-        return self
-
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve from an initial guess.
 
