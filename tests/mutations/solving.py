@@ -49,14 +49,14 @@ _TABLE = (
     ),
     (
         "hybrid-ends-at-saddles",
-        "solvers/methods/newton/hybrid_state.py",
+        "solvers/methods/newton/hybrid_newton.py",
         "            control.is_minimum\n            or self._prepared",
         "            True\n            or self._prepared",
         _ENDS,
     ),
     (
         "hybrid-shifted-steps-agree",
-        "solvers/methods/newton/hybrid_choice.py",
+        "solvers/methods/newton/hybrid_newton.py",
         "self.agrees_with_model = self._level == 0 and (",
         "self.agrees_with_model = (",
         f"{_U}/test_hybrid.py::test_only_a_step_by_the_unmodified_hessian_agrees_with_its_model",

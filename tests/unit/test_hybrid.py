@@ -17,9 +17,8 @@ from springbench.solvers.iteration.descent_method import DescentPoint, ResidualM
 from springbench.solvers.kernels import descent_rounds
 from springbench.solvers.linalg.cholesky import symbolic_factorisation
 from springbench.solvers.linalg.cholesky.block_cholesky import BlockCholesky
-from springbench.solvers.methods.newton import hybrid_state
-from springbench.solvers.methods.newton.hybrid_choice import MeasuredRule
-from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, PreparedHybrid
+from springbench.solvers.methods.newton import hybrid_newton
+from springbench.solvers.methods.newton.hybrid_newton import HybridNewton, MeasuredRule, PreparedHybrid
 from springbench.solvers.methods.newton.inertia_shift import InertiaShift
 from springbench.solvers.methods.newton.negative_curvature import probe_negative_curvature
 from springbench.solvers.methods.newton.newton_direct import NewtonSolver
@@ -133,8 +132,8 @@ def test_soft_springs_are_left_to_lbfgs(guess):
 def test_a_solve_by_lbfgs_alone_prepares_nothing_for_the_other_methods(monkeypatch):
     given, prepared = stiff(0.1), HybridNewton().prepare(stiff(0.1).system)
     wanted = prepared.residual_at(given, given.current_positions)
-    monkeypatch.setattr(hybrid_state, "StepObjective", None)
-    monkeypatch.setattr(hybrid_state, "MethodChoice", None)
+    monkeypatch.setattr(hybrid_newton, "StepObjective", None)
+    monkeypatch.setattr(hybrid_newton, "MethodChoice", None)
     found = prepared.solve(given, StopRule(50, 1e-3))
     assert found.solver_phases is not None
     assert set(found.solver_phases) == {"lbfgs"}
