@@ -183,7 +183,7 @@ def test_a_run_enters_few_modules_and_seldom_changes_them(walk: list[Call]):
         if "springbench.harness.report" not in call.by and "springbench.harness.report" not in call.of
     ]
     modules = {call.of for call in before}
-    assert len(modules) <= 99, "99 when this was counted last"
+    assert len(modules) <= 100, "100 when this was counted last, the location of results on the command line among them"
     assert len(before) <= 1555, "1,550 when this was counted last, friction and the balances of energy among them"
 
 
