@@ -1,6 +1,6 @@
 """Lists of the tests that take long: `slow.txt`, which the CI runs after the quick ones, and `long.txt`, run on demand.
 
-    pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.3 --find-long 4     on an idle machine, all kernels compiled
+    pytest -n 2 --dist loadfile -m 'not long' --find-slow 0.5 --find-long 5     on an idle machine, all kernels compiled
 
 rewrites `slow.txt` and adds to `long.txt`. A line names a test, with or without its parameters, or a whole file. It
 names a file where its tests share an expensive fixture, because the next of them would set it up. `compiling.txt` names

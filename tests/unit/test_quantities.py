@@ -22,7 +22,7 @@ from springbench.harness.report.charts.published_curves import PUBLISHED_LABEL
 from springbench.harness.report.drawable_frames import max_recorded_strain, strain_extremes
 from springbench.harness.report.equal_accuracy import compare_runs
 from springbench.harness.report.equal_accuracy import describe_comparison as compared
-from springbench.harness.report.figures.timing_panels import timing_panels
+from springbench.harness.report.figures.timing_panels import list_timing_panels
 from springbench.harness.report.median_times import write_medians
 from springbench.harness.report.recorded_strain import mean_rest_length
 from springbench.harness.report.robustness import CORRECT, classify_run
@@ -109,7 +109,7 @@ def test_every_place_states_the_same_numbers_of_a_run(tmp_path: Path):
             {"sparse": 3.5e-3, "numba": 1.25e-3}
         )
     plot: Any = next(
-        entry for entry in timing_panels(tmp_path / "made", lambda rows: ()) if "step" in entry.name
+        entry for entry in list_timing_panels(tmp_path / "made", lambda rows: ()) if "step" in entry.name
     ).build_panel()
     own = [series for series in plot.series if series.label != PUBLISHED_LABEL]
     assert sorted(float(series.x[0]) for series in own) == pytest.approx([1.25e-3, 3.5e-3])
