@@ -1,6 +1,6 @@
-"""What Rerun has no public call for, and why `harness/record` goes round it.
+"""What Rerun has no public call for, and what `harness/recording` does instead.
 
-Each test fails as soon as the public way works: then the way round is to go.
+Each test fails as soon as a public call works: then the workaround can be removed.
 """
 
 import subprocess
@@ -12,7 +12,7 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 STREAM = """
-import gc, os, resource, signal, sys
+import gc, os, resource, signal, sys, time
 import rerun as rr, rerun.blueprint as rrb, rerun_bindings
 
 def write(path, layout=False, clean=False):
@@ -32,7 +32,10 @@ def left(**how):
     write(sys.argv[1], clean=True)  # what the library keeps for good is there now
     before = len(os.listdir("/proc/self/task"))
     write(sys.argv[1], **how)
-    return len(os.listdir("/proc/self/task")) - before
+    end = time.monotonic() + 2.0  # a thread that was ended may still be listed for a moment
+    while (count := len(os.listdir("/proc/self/task")) - before) > 0 and time.monotonic() < end:
+        time.sleep(0.02)
+    return count
 """
 
 DEAD = """
@@ -64,7 +67,7 @@ def run_program(program: str, path: Path) -> int:
 
 
 def test_a_stream_that_is_gone_leaves_threads_which_no_public_call_ends(tmp_path: Path):
-    # Way round: `flush_and_cleanup_orphaned_recordings` of the bindings.
+    # Workaround: `flush_and_cleanup_orphaned_recordings` of the bindings.
     assert count_threads_left("left(clean=True)", tmp_path / "a.rrd") == 0
     assert count_threads_left("left()", tmp_path / "a.rrd") > 0, (
         "streams end their threads by themselves: leave the bindings alone"
@@ -72,20 +75,20 @@ def test_a_stream_that_is_gone_leaves_threads_which_no_public_call_ends(tmp_path
 
 
 def test_the_public_call_for_layouts_leaves_threads_that_nothing_ends(tmp_path: Path):
-    # Way round: `PartialFile.lay_out`.
+    # Workaround: `PartialFile.lay_out`.
     found = count_threads_left("left(layout=True, clean=True)", tmp_path / "a.rrd")
     assert found > 0, "send_blueprint leaves no threads any more: call it instead"
 
 
 def test_no_public_call_releases_a_stream_whose_writer_has_died(tmp_path: Path):
-    # Way round: `PartialFile` retains such a stream, by `Py_IncRef`, and takes back its clean-up at exit.
+    # Workaround: `PartialFile` retains such a stream, by `Py_IncRef`, and takes back its clean-up at exit.
     assert run_program(DEAD, tmp_path / "a.rrd"), (
         "disconnect does not wait for a dead writer any more: call it, and keep nothing"
     )
 
 
 def test_a_file_that_was_cut_within_a_message_is_not_read_at_all(tmp_path: Path):
-    # Way round: `whole_messages` finds where the last whole message ends.
+    # Workaround: `whole_messages` finds where the last whole message ends.
     path = tmp_path / "a.rrd"
     stream = rr.RecordingStream("app", batcher_config=rr.ChunkBatcherConfig.NEVER(), send_properties=False)
     stream.save(path)
