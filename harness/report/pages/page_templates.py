@@ -127,7 +127,7 @@ class _PageFields:
         about = self.queries.find_study(study).metadata
         started = about["started"]
         date = started[-1][:10] if started else "undated"
-        commits = ", ".join(commit[:9] for commit in about["commits"]) or "unknown"
+        commits = ", ".join(map(_abbreviate_commit, about["commits"])) or "unknown"
         machines = [f"{one['cpu']}, {one['cores']} core{'s' * (one['cores'] != 1)}" for one in about["machines"]]
         where = " and ".join(dict.fromkeys(machines))  # machines may differ only in their operating system
         requested = about.get("requested_runs")
@@ -212,6 +212,11 @@ def _format_percent(value: float, digits: int = 0) -> str:
 
 def _format_significant(value: float, digits: int = 3) -> str:
     return f"{float(f'{value:.{digits}g}'):g}"  # 250 instead of 2.5e+02
+
+
+def _abbreviate_commit(commit: str) -> str:
+    """Return the first digits of a commit, with the mark of uncommitted changes if it has one."""
+    return commit[:9] + ("-dirty" if commit.endswith("-dirty") else "")
 
 
 def _format_count(value: int) -> str:
