@@ -39,6 +39,7 @@ from springbench.harness.report.figures.figure_options import FigureOptions
 from springbench.harness.report.figures.panel_selection import select_entries
 from springbench.harness.report.pages.page_charts import ChartForm, ChartPoint, PageChartOptions, build_page_panel
 from springbench.harness.report.pages.published_queries import PublishedQueries
+from springbench.harness.report.provenance_words import abbreviate_commit
 from springbench.harness.results.published_set import open_study_folder
 
 TEMPLATE_SUFFIX = ".md.j2"
@@ -127,7 +128,7 @@ class _PageFields:
         about = self.queries.find_study(study).metadata
         started = about["started"]
         date = started[-1][:10] if started else "undated"
-        commits = ", ".join(map(_abbreviate_commit, about["commits"])) or "unknown"
+        commits = ", ".join(map(abbreviate_commit, about["commits"])) or "unknown"
         machines = [f"{one['cpu']}, {one['cores']} core{'s' * (one['cores'] != 1)}" for one in about["machines"]]
         where = " and ".join(dict.fromkeys(machines))  # machines may differ only in their operating system
         requested = about.get("requested_runs")
@@ -212,11 +213,6 @@ def _format_percent(value: float, digits: int = 0) -> str:
 
 def _format_significant(value: float, digits: int = 3) -> str:
     return f"{float(f'{value:.{digits}g}'):g}"  # 250 instead of 2.5e+02
-
-
-def _abbreviate_commit(commit: str) -> str:
-    """Return the first digits of a commit, with the mark of uncommitted changes if it has one."""
-    return commit[:9] + ("-dirty" if commit.endswith("-dirty") else "")
 
 
 def _format_count(value: int) -> str:
