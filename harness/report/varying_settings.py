@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -15,3 +16,15 @@ def find_varying_keys(settings: Iterable[Mapping[str, Any]]) -> set[str]:
     listed = list(settings)
     keys = {key for one in listed for key in one}
     return {key for key in keys if any(one.get(key) != listed[0].get(key) for one in listed)}
+
+
+def find_varying_by_solver(settings: Iterable[tuple[str, Mapping[str, Any]]]) -> dict[str, set[str]]:
+    """Find the keys whose values differ among the settings of each solver.
+
+    Args:
+        settings: name of the solver and settings of each run.
+    """
+    by_solver: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+    for solver, own in settings:
+        by_solver[solver].append(own)
+    return {solver: find_varying_keys(some) for solver, some in by_solver.items()}

@@ -19,7 +19,7 @@ from springbench.harness.report.accuracy.accuracy_data import (
     WorkPoint,
 )
 from springbench.harness.report.provenance_words import describe_commits, describe_processors
-from springbench.harness.report.varying_settings import find_varying_keys
+from springbench.harness.report.varying_settings import find_varying_by_solver
 from springbench.harness.results import row_store
 from springbench.harness.results.parquet_rows import read_rows
 
@@ -219,10 +219,7 @@ def _build_row_labeller(rows: Sequence[_ResultRow]) -> _RowLabeller:
     def settings(row: _ResultRow) -> _ResultRow:
         return {**json.loads(row["parameters"] or "{}"), "threads": row["threads"]}
 
-    by_solver: dict[str, list[_ResultRow]] = defaultdict(list)
-    for row in rows:
-        by_solver[row["solver"]].append(settings(row))
-    varying = {solver: find_varying_keys(own) for solver, own in by_solver.items()}
+    varying = find_varying_by_solver((row["solver"], settings(row)) for row in rows)
 
     def label(row: _ResultRow) -> str:
         shown = [f"{key} {value}" for key, value in settings(row).items() if key in varying[row["solver"]]]

@@ -22,7 +22,7 @@ from springbench.harness.report.charts.figure_panels import (
 from springbench.harness.report.number_format import format_quantity
 from springbench.harness.report.plot_style import STALE_NOTE, SeriesStyle, assign_label_styles, build_indexed_style
 from springbench.harness.report.provenance_words import describe_provenance, is_stale
-from springbench.harness.report.varying_settings import find_varying_keys
+from springbench.harness.report.varying_settings import find_varying_by_solver
 
 _ERROR_LABELS = {"solver": "error of the solver", "time-step": "error of the time step"}
 _MIN_DISPLACEMENT = 1e-6
@@ -170,10 +170,7 @@ def build_overhead_chart(rows: Sequence[ResultRow], newest_fingerprint: str | No
 def _label_rows(rows: Sequence[ResultRow]) -> list[ResultRow]:
     """Add a `label` to rows: the solver with its varying parameters."""
     parameters: list[dict[str, Any]] = [json.loads(row["parameters"] or "{}") for row in rows]
-    by_solver: dict[str, list[dict[str, Any]]] = {}
-    for row, own in zip(rows, parameters, strict=True):
-        by_solver.setdefault(row["solver"], []).append(own)
-    varying = {solver: find_varying_keys(some) for solver, some in by_solver.items()}
+    varying = find_varying_by_solver((row["solver"], own) for row, own in zip(rows, parameters, strict=True))
     labels = [
         ", ".join([row["solver"], *(f"{key} {value}" for key, value in own.items() if key in varying[row["solver"]])])
         for row, own in zip(rows, parameters, strict=True)

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from springbench.harness.report.speed.operation_counts import OperationCount, count_operations
-from springbench.harness.report.varying_settings import find_varying_keys
+from springbench.harness.report.varying_settings import find_varying_by_solver
 from springbench.harness.results.bootstrap_statistics import ConfidenceInterval, estimate_ratio
 
 MACHINE_SOLVER, CPP_BASELINE = "machine", "eigen"
@@ -208,10 +208,7 @@ def _label_candidates(first_rows: Sequence[ResultRow]) -> dict[str, str]:
 
     A label has the solver, its varying parameters, and its threads if several.
     """
-    by_solver: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for row in first_rows:
-        by_solver[row["solver"]].append(json.loads(row["parameters"]))
-    varying = {solver: find_varying_keys(some) for solver, some in by_solver.items()}
+    varying = find_varying_by_solver((row["solver"], json.loads(row["parameters"])) for row in first_rows)
     return {
         row["run_id"]: " ".join(
             [row["solver"]]
