@@ -36,8 +36,17 @@ class TypedKernel:
 
     def _call_first(self, *arguments: Any) -> Any:
         """Call the kernel, and select the compiled code for the types of the arguments."""
-        kernel = self.kernel
-        types = tuple(typeof(argument, Purpose.argument) for argument in arguments)
-        answer = kernel(*arguments)
-        self.call = kernel.overloads[types].entry_point
+        answer = self.kernel(*arguments)
+        self.call = self._find_compiled_code(arguments).entry_point
         return answer
+
+    def _find_compiled_code(self, arguments: tuple[Any, ...]) -> Any:
+        """Return what the kernel was compiled to for arguments with which it has been called.
+
+        Numba takes 2 ms to determine the types of a state of 60 arrays, which most kernels make unnecessary: they have
+        been called with one set of types.
+        """
+        overloads = self.kernel.overloads
+        if len(overloads) == 1:
+            return next(iter(overloads.values()))
+        return overloads[tuple(typeof(argument, Purpose.argument) for argument in arguments)]
