@@ -140,7 +140,10 @@ def make_scene(
 
 
 def _list_effect_keys(effect: Any, *, has_fabric: bool) -> dict[str, Any] | None:
-    """Return the keys that an effect has in a file; None for an object, unless a fabric may complete its material."""
+    """Return the keys that an effect has in a file; None for an object.
+
+    An object has keys only if a fabric may complete its material.
+    """
     if isinstance(effect, Mapping):
         return dict(cast(Mapping[str, Any], effect))
     of = cast(object, effect).__class__

@@ -122,7 +122,7 @@ def print_message(line: str) -> None:
 
 
 def show_activity(words: str) -> None:
-    """Show on a terminal what is being done; the next line of output replaces the words."""
+    """Show an activity on a terminal until the next line of output replaces it."""
     if sys.stderr is not None and sys.stderr.isatty():
         sys.stderr.write(f"{words} ...".ljust(_ACTIVITY_WIDTH) + "\r")
         sys.stderr.flush()

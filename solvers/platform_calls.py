@@ -64,7 +64,7 @@ def wait_for_lock(handle: int, mode: LockMode) -> None:
 
 
 def unlock_file(handle: int) -> None:
-    """Release the lock of an open file, also for forks of this process that share it."""
+    """Release the lock of an open file, also for forked processes that share it."""
     if fcntl is not None:
         fcntl.flock(handle, fcntl.LOCK_UN)
 
@@ -120,7 +120,7 @@ def measure_memory() -> float:
 
 
 def read_load_average() -> float:
-    """Return the mean number of busy processes in the last minute; NaN where it is unavailable."""
+    """Return the mean number of busy processes in the last minute; NaN if unavailable."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
 
 

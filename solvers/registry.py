@@ -77,12 +77,15 @@ def is_minimiser(solver: Any) -> bool:
 
 
 def is_engine(solver: Any) -> bool:
-    """Return whether a solver, or its class, is an external engine, whose iterations are its substeps."""
+    """Return whether a solver or its class is an external engine.
+
+    The iterations of an external engine are its substeps.
+    """
     return hasattr(solver, "write_script")
 
 
 def find_solver_name(solver: Any) -> str:
-    """Return the name of a solver: the registered one, or else the name of its class."""
+    """Return the registered name of a solver, or else the name of its class."""
     kind: type = solver if isinstance(solver, type) else solver.__class__
     named = {target: name for name, target in (SOLVERS | OPTIONAL_SOLVERS).items()}
     return named.get(f"{kind.__module__}:{kind.__qualname__}", kind.__name__)

@@ -1,1 +1,1 @@
-"""The command line: one module for each command, which imports what it needs when it runs."""
+"""Command line: one module for each command, with imports deferred until the command runs."""

@@ -1,4 +1,4 @@
-"""Locations of results on the command line: a local folder, or the URL of remote results."""
+"""Locations of results on the command line: a local folder or a remote URL."""
 
 from __future__ import annotations
 

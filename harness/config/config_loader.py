@@ -63,7 +63,7 @@ ASSIGNMENT_SOLVER = "numba"
 
 
 class ConfigKind(NamedTuple):
-    """A kind of config: its name, the keys that identify it, and the commands that read it."""
+    """A kind of config: its name, identifying keys, and commands that read it."""
 
     name: str
     keys: tuple[str, ...]
@@ -85,7 +85,7 @@ CONFIG_KINDS = (ACCURACY, GATES, SWEEP, SCENE)
 
 
 def find_config_kind(keys: Iterable[str]) -> ConfigKind | None:
-    """Find the kind of a config by its top-level keys; None if no key identifies one."""
+    """Find the kind of a config by its top-level keys; None if unknown."""
     present = set(keys)
     return next((kind for kind in CONFIG_KINDS if present & {*kind.keys}), None)
 
@@ -328,7 +328,10 @@ def build_scene_from_document(document: ConfigDocument) -> SceneSpec:
 
 
 def _fill_from_fabric(document: ConfigDocument, fields: SceneFile, listed: list[Any]) -> list[Any]:
-    """Complete the effects with the material of the scene's fabric; an unused fabric is a mistake."""
+    """Complete the effects with the material of the scene's fabric.
+
+    A fabric that provides no value is a mistake.
+    """
     if fields.fabric is None:
         return listed
     name, warp = _split_fabric(fields.fabric)

@@ -1,4 +1,4 @@
-"""Expansion of a sweep into its runs: the grid of all combinations without `exclude`, plus `include`."""
+"""Expansion of a sweep into runs: the grid of all combinations without `exclude`, plus `include`."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class GridExpansion:
         return remaining
 
     def _is_match(self, entry: ExcludeEntry, run: RunSpec) -> bool:
-        """Return whether a run matches all keys of an entry; null matches the value of the scene."""
+        """Return whether a run matches all keys of an entry; null matches the scene's value."""
         named = {"scene": run.scene_name, "size": run.size, "solver": run.solver.name}
         allowed = {key: entry.get_values(key) for key in (*named, *RUN_OPTIONS)}
         for name in SCENE_OPTIONS:
@@ -175,7 +175,7 @@ class GridExpansion:
 def select_sizes(
     document: ConfigDocument, scene_name: str, scene: SceneSpec, requested: Sequence[int], at: ConfigKey
 ) -> Sequence[int]:
-    """Return the requested mesh sizes, else the scene's default; 0 for a mesh from a file.
+    """Return the requested mesh sizes, else the scene's default; 0 for a mesh file.
 
     Args:
         document: config, which collects mistakes.

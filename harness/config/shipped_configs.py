@@ -33,13 +33,13 @@ def list_template_files() -> list[Path]:
 
 
 def find_shipped_scene(name: str) -> Path | None:
-    """Find a shipped scene by its name, with or without the folder; None if it is missing."""
+    """Find a shipped scene by its name, with or without the folder; None if missing."""
     shipped = list_shipped_configs()
     return shipped.get(f"{SCENE_FOLDER}/{name}") or (shipped.get(name) if "/" in name else None)
 
 
 def resolve_scene_path(name: str, folder: Path) -> Path:
-    """Return the path of a scene that a config names: a file, else a shipped scene.
+    """Return the path of a config's scene: a file, else a shipped scene.
 
     Args:
         name: path of a file, relative to the folder; or name of a shipped scene.
@@ -53,7 +53,7 @@ def resolve_scene_path(name: str, folder: Path) -> Path:
 
 
 def suggest_shipped_scene(name: str) -> str:
-    """Suggest a shipped scene with a name close to a missing one; empty if there is none."""
+    """Suggest a shipped scene with a name close to a missing one; empty if none."""
     near = get_close_matches(name, _list_short_names(), n=1)
     return f", and no shipped scene of this name; did you mean {near[0]!r}?" if near else ""
 

@@ -1,6 +1,6 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # Dask and ruamel.yaml have no type annotations.
-"""Provide a Dask scheduler: remote, on this machine, or on a batch system that a file describes."""
+"""Dask scheduler: remote, on this machine, or on a batch system described by a file."""
 
 from __future__ import annotations
 

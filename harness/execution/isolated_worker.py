@@ -363,7 +363,7 @@ class _TaskOutput:
         self._tail = (self._tail + output)[-_MAX_TAIL_BYTES:]
 
     def close_output(self) -> None:
-        """Show the rest of the output, and write output that was too long to the log."""
+        """Show the remaining output, and write output above the display limit to the log."""
         self._show_output(bytes(self._pending))
         self._pending.clear()
         if self._count <= _MAX_PRINTED_BYTES:

@@ -43,7 +43,7 @@ NOTEBOOKS = OptionalPart("notebook", "the viewer in a notebook", "rerun-notebook
 
 
 def find_part(error: ModuleNotFoundError) -> OptionalPart | None:
-    """Return the part that an import error shows to be missing; None for any other module."""
+    """Return the missing part that caused an import error; None for any other module."""
     module = (error.name or "").partition(".")[0]
     return next((part for part in OPTIONAL_PARTS if module in part.modules and not part.is_installed()), None)
 

@@ -48,7 +48,7 @@ def _iterate_descendants(process: int) -> Iterator[int]:
 
 
 def _read_proc_bytes(process: int, file: str, names: tuple[str, ...]) -> int:
-    """Sum the lines `name: ... kB` of a /proc file [bytes]; 0 for a process that has ended."""
+    """Sum the lines `name: ... kB` of a /proc file [bytes]; 0 if the process has ended."""
     with suppress(OSError), open(f"/proc/{process}/{file}") as lines:
         return sum(1024 * int(line.split()[1]) for line in lines if line.startswith(names))
     return 0

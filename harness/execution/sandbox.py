@@ -93,7 +93,13 @@ def _call_unlimited(function: Callable[..., Any], arguments: tuple[Any, ...]) ->
 
 
 def _describe_exit(code: int, limits: CallLimits, *, timed_out: bool) -> str:
-    """Describe why the subprocess ended; timed_out: whether it was killed at the limit of wall time."""
+    """Describe why the subprocess ended.
+
+    Args:
+        code: exit code, negative for a signal.
+        limits: limits of the call.
+        timed_out: whether it was killed at the limit of wall time.
+    """
     if code == -signal.SIGXCPU:
         return f"reading it takes more than {limits.cpu_seconds:.3g} s of processor time"
     if timed_out:

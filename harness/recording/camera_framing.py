@@ -1,4 +1,4 @@
-"""Selection of the vertices that a camera frames: all, unless some are far from the others.
+"""Selection of the vertices that a camera frames: all but those far from the others.
 
 A runaway vertex or an unsupported part would reduce the rest of the mesh to a dot. The radius of a vertex is its
 initial distance from the centre of the vertices that moved least, plus its displacement. Vertices are framed up to the

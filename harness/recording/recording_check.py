@@ -1,4 +1,4 @@
-"""Check of a recording, read back from its file: the last frame and a few random frames.
+"""Check of a recording file: the last frame and a few random frames.
 
 Recorded positions must be those of the run, rounded to single precision relative to the recording's origin. The
 rounding is bounded by the mesh size, wherever the mesh is: an origin that does not resolve the mesh is an error.

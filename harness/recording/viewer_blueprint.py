@@ -1,4 +1,4 @@
-"""Viewer layout of a recording: the mesh and its colour scale, plots by frame, and the run's metadata."""
+"""Viewer layout of a recording: mesh with colour scale, plots by frame, and run metadata."""
 
 from __future__ import annotations
 

@@ -81,7 +81,10 @@ def _is_shipped(energy: Energy) -> bool:
 
 
 def _sample_points(scene: Scene, frames: int) -> Iterator[tuple[System, _SamplePoint]]:
-    """Yield points near the start and near the rest positions; every fifth is in the first frame."""
+    """Yield points near the start and near the rest positions, each with its system.
+
+    Every fifth point is in the first frame.
+    """
     rng, rest = np.random.default_rng(0), scene.mesh.rest_positions
     begun = build_initial_state(scene).motion
     for k in range(NUM_POINTS):
@@ -128,7 +131,10 @@ def measure_gradient_error(
 
 
 def _complex_step_derivative(energy: Any, x: Positions, direction: NDArray[np.float64]) -> float:
-    """Return the derivative of the value by a complex step, nan if the value does not support complex positions."""
+    """Return the derivative of the value by a complex step.
+
+    The result is nan if the value does not support complex positions.
+    """
     try:
         with warnings.catch_warnings(action="error", category=np.exceptions.ComplexWarning):
             return complex(energy.value(x + 1j * _COMPLEX_STEP * direction)).imag / _COMPLEX_STEP
@@ -139,7 +145,7 @@ def _complex_step_derivative(energy: Any, x: Positions, direction: NDArray[np.fl
 def _difference_derivative(
     energy: Energy, x: Positions, direction: NDArray[np.float64], h: float, coordinate_scale: float
 ) -> tuple[float, float]:
-    """Return the derivative of the value by central differences of step h [m], and a bound of its error."""
+    """Return the derivative of the value by central differences (step h [m]) and an error bound."""
     values = [float(energy.value(x + s * h * direction)) for s in (-1.0, -0.5, 0.5, 1.0)]
     coarse, fine = (values[3] - values[0]) / (2 * h), (values[2] - values[1]) / h
     roundoff = max(map(abs, values)) / h + coordinate_scale / h * abs(fine)

@@ -1,4 +1,4 @@
-"""Growth of a perturbation of the start: the estimate of the predictability horizon for all commands.
+"""Growth of a perturbation of the start, which estimates the predictability horizon for all commands.
 
 Every free coordinate of the start is perturbed by `START_PERTURBATION` of the mesh size, with random sign. Both motions
 are integrated with the same steps: by a symplectic composition of order 6 (Blanes and Moan 2002) where it supports the

@@ -1,4 +1,4 @@
-"""Reference evaluator of stationarity: the norm of the gradient at a point, and the share due to round-off.
+"""Reference evaluator of stationarity: the norm of the gradient and the share due to round-off.
 
     residual(p)     = |Q^-1 grad g(p)|_Q over the unpinned vertices, so that a heavy pin does not mask the rest
     stationarity(p) = residual(p) / initial,   initial = max(residual(current positions), floor(current positions))

@@ -282,14 +282,14 @@ class ReferenceStore:
         return found
 
     def _compute_contact_fingerprint(self, spec: SceneSpec, size: int, t_end: float) -> Positions:
-        """Compute the positions (n, 3) [m] after a short step, the same for every time step of the scene."""
+        """Compute the positions (n, 3) [m] after a short step, independently of the scene's time step."""
         short = build_exact_scene(spec.with_time_step(t_end / _NUM_FINGERPRINT_STEPS), size, show_warnings=False)
         return next(iter(run_reference(short, self.solver, 1, [1])[0].values())).positions
 
     def load_contact_horizon(
         self, spec: SceneSpec, size: int, t_end: float, *, error: float
     ) -> tuple[SelfConvergedTrajectory, str]:
-        """Load the motion with contact at the longest time at which an error can be measured.
+        """Load the motion with contact at the longest time with a measurable error.
 
         Eighths of t_end are tried, then those of a quarter of it, and so on, within MAX_SECONDS altogether.
 
@@ -415,7 +415,10 @@ def _save_self_converged(path: Path, found: SelfConvergedTrajectory, witness: Po
 
 
 def _read_self_converged(path: Path, witness: Positions) -> tuple[SelfConvergedTrajectory, float] | None:
-    """Read a stored motion and the error that it was computed for; None without one of the same scene."""
+    """Read a stored motion and the error that it was computed for.
+
+    The result is None if there is no motion of the same scene, whose fingerprint is `witness`.
+    """
     stored = _read_arrays(path, [*_SELF_CONVERGED_FIELDS, "fingerprint", "error"])
     if not stored or not is_equal_to_roundoff(stored.pop("fingerprint"), witness):
         return None
@@ -430,7 +433,7 @@ def _build_minima(arrays: Arrays) -> KnownMinima:
 
 
 def _read_arrays(path: Path, names: Collection[str]) -> dict[str, Any]:
-    """Read the arrays of a file; none if there is no file, or if it lacks one of the names.
+    """Read the arrays of a file; none if it is missing or lacks a name.
 
     Files of another version of the code may lack names.
     """

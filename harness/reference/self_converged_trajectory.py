@@ -85,11 +85,14 @@ class SelfConvergedTrajectory(ReferenceTrajectory):
         return float(self.disagreement[-1]) > _DISAGREEMENT_FACTOR * self.last_change
 
     def count_known_times(self, max_disagreement: float) -> int:
-        """Return the number of times before the first one at which the limits disagree by more than this."""
+        """Return the number of times before the limits first disagree by more than `max_disagreement`."""
         return int(np.argmin(np.append(self.disagreement <= max_disagreement, False)))
 
     def find_last_known_time(self, max_disagreement: float) -> int | None:
-        """Return the index of the last time at which the limits disagree by at most this; None for none."""
+        """Return the index of the last time at which the limits agree within `max_disagreement`.
+
+        The result is None if there is no such time.
+        """
         known = np.flatnonzero(self.disagreement <= max_disagreement)
         return int(known[-1]) if len(known) else None
 

@@ -1,4 +1,4 @@
-"""Snapshots of single steps of a reference run, so that all solvers solve the same problem.
+"""Snapshots of single steps of a reference run, as common problems for all solvers.
 
 The reference run takes converged steps by Newton's method, with all pins exact, also those that the scene declares as
 penalties. Accuracy is measured on three snapshots:

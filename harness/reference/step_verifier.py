@@ -1,4 +1,4 @@
-"""Verifier of steps: stationarity, whether the solution is a minimum, and distance from a reference run.
+"""Verifier of steps: stationarity, minimality of the solution, and distance from a reference run.
 
 Stationarity is measured by `springbench.harness.reference.reference_evaluator` with a matrix that it assembles and
 factorises itself, independently of the solver. A stationary point is a minimum where the smallest eigenvalue of its

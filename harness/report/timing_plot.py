@@ -1,4 +1,4 @@
-"""Sheet of step and preparation times by number of vertices, for each scene of a sweep."""
+"""Sheet of a sweep's step and preparation times by number of vertices, for each scene."""
 
 from __future__ import annotations
 

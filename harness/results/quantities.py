@@ -1,4 +1,6 @@
-"""Quantities of a run in tables, pictures, figures and pages, each with one definition and one name.
+"""Quantities of a run in tables, pictures, figures and pages.
+
+Each quantity has one definition and one name:
 
     ms a step         median wall time of the timed steps, over all frames and rounds [ms]
     least             the smallest of the same times [ms]

@@ -31,7 +31,7 @@ _FOOTER_BYTES = 2**15
 
 
 def build_packed_path(folder: Path) -> Path:
-    """Return the path of the packed file of a folder of rows; it may not exist."""
+    """Return the path of the packed file of a row folder; it may not exist."""
     return folder.parent / f"{folder.name}.parquet"  # with_name rejects "."
 
 

@@ -144,7 +144,7 @@ class ConvergenceStudy:
         return min(within, key=lambda result: result.frame_seconds, default=None)
 
     def is_setting_converged(self, assessment: SettingAssessment) -> bool:
-        """Return whether the error, and the changes of the motion, are at most what is requested."""
+        """Return whether the error and the motion's changes are at most the requested error."""
         changes = [one.change for one in assessment.known_changes.values()]
         return max([self.find_result(assessment.setting).error, *changes]) <= self.error_requested
 
@@ -291,7 +291,7 @@ def list_settings(given: Sequence[StepSetting], num_doublings: int) -> list[Step
 
 
 def find_doubled(settings: Iterable[StepSetting], given: StepSetting, name: str) -> StepSetting | None:
-    """Find a setting with one number at least twice that of a given one, and the other equal.
+    """Find a setting with one number at least doubled, and the other equal.
 
     Args:
         settings: settings of a map.

@@ -51,7 +51,7 @@ class RunAgreement(NamedTuple):
 
 
 def group_runs(rows: Iterable[Mapping[str, Any]]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
-    """Group the rows that state the results of runs, by `RUN_KEYS` and the number of frames.
+    """Group the rows with results of runs by `RUN_KEYS` and the number of frames.
 
     Each run is sorted by frame (`springbench.harness.results.parquet_rows.group_result_rows`).
     """
@@ -183,7 +183,7 @@ def _read_curve(rows: RunRows) -> dict[int, float]:
 
 
 def _find_first_iteration(curve: Mapping[int, float], level: float) -> tuple[float, float]:
-    """Find the first iteration at a level or below, and its distance to the sample before it.
+    """Find the first iteration at or below `level`, and its distance to the previous sample.
 
     The iteration is infinite if the curve does not reach the level.
     """

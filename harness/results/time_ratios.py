@@ -1,4 +1,4 @@
-"""Ratios of times to a reference method on the same task, which are comparable between machines.
+"""Ratios of times to a reference method on the same task, comparable between machines.
 
 A ratio has an interval. For runs it is the 95 % interval over the steps (`bootstrap_statistics.estimate_slowdown`), for
 accuracy studies the range over the rounds. On another machine the ratio may exceed the interval by
@@ -96,7 +96,7 @@ def list_step_times(rows: Iterable[Mapping[str, Any]]) -> list[MethodTimes]:
 
 
 def compute_time_ratios(times: Iterable[MethodTimes]) -> list[MethodTimeRatio]:
-    """Compute the ratio of each method of a task to the reference method of that task."""
+    """Compute the time ratio of each method to the reference method of its task."""
     tasks: dict[tuple[Any, ...], list[MethodTimes]] = {}
     for one in times:
         tasks.setdefault(one.task, []).append(one)

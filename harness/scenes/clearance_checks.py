@@ -34,7 +34,7 @@ def find_first_violation(
     point_motion: KeyFrameMotion | None,
     min_distance: float,
 ) -> tuple[float, NDArray[np.float64]] | None:
-    """Find the first time at which points are closer to an obstacle than a minimum distance.
+    """Find the first time at which points violate the minimum distance from an obstacle.
 
     Args:
         obstacle: the obstacle.

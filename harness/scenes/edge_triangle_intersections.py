@@ -92,7 +92,7 @@ def find_edge_triangle_intersections(p: FloatArray, edges: IndexArray, triangles
 def _overlapping_box_pairs(
     p: FloatArray, edges: IndexArray, triangles: IndexArray
 ) -> Iterator[tuple[IndexArray, IndexArray]]:
-    """Yield chunks of edges and triangles, by index, that share no vertex and have overlapping boxes."""
+    """Yield chunks of edge-triangle pairs, by index, with overlapping boxes and no common vertex."""
     a, b = p[edges], p[triangles]
     middle, centre = a.mean(axis=1), b.mean(axis=1)
     half = np.linalg.norm(a - middle[:, None], axis=2).max(axis=1)
@@ -142,7 +142,10 @@ def _intersects_certainly(p: FloatArray, edges: IndexArray, triangles: IndexArra
 
 
 def _certain_sign(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray) -> FloatArray:
-    """Return the signs (k,) of the volumes of tetrahedra with corners (k, 3); 0 where round-off could change one."""
+    """Return the signs (k,) of the volumes of tetrahedra with corners (k, 3).
+
+    A sign is 0 where round-off could change it.
+    """
     u, v, w = b - a, c - a, d - a
     volume = np.einsum("ij,ij->i", u, np.cross(v, w))
     products = np.abs(v[:, [1, 2, 0]] * w[:, [2, 0, 1]]) + np.abs(v[:, [2, 0, 1]] * w[:, [1, 2, 0]])

@@ -110,7 +110,7 @@ FABRIC_EFFECTS = ("springs", "bending")
 
 
 def fill_effect(effect: Any, name: str, warp: Vector3 | None = None) -> Any:
-    """Complete the data of an effect that states no material with the values of a fabric.
+    """Complete the data of an effect that states no material with a fabric's values.
 
     Args:
         effect: data of an effect as read from a scene; only FABRIC_EFFECTS have a material.

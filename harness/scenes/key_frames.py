@@ -98,7 +98,9 @@ class KeyFrameMotion(ConfigModel):
         return self.interpolation == "linear" and len({key.angle for key in self.key_frames}) == 1
 
     def bound_speed(self, start_time: float, end_time: float, points: Positions, *, slack: float = 0.0) -> float:
-        """Return an upper bound of the speed [m/s] between two times without a key frame in between.
+        """Return an upper bound of the speed [m/s] between two times.
+
+        There is no key frame between the two times.
 
         Args:
             start_time: [s].

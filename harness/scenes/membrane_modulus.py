@@ -190,7 +190,7 @@ class _SurfaceNetwork:
 
 
 def _find_inner_vertices(mesh: Mesh) -> NDArray[np.bool_]:
-    """Return which vertices are in a surface and not on its boundary, or inside a solid, (n,)."""
+    """Return a mask (n,) of the vertices in the interior of a surface or solid."""
     surface = np.zeros(len(mesh.rest_positions), np.bool_)
     surface[mesh.triangles.ravel()] = True
     if mesh.dimension == 3:
@@ -201,7 +201,7 @@ def _find_inner_vertices(mesh: Mesh) -> NDArray[np.bool_]:
 
 
 def _is_planar(mesh: Mesh) -> bool:
-    """Return whether the vertices lie in a plane, within a thousandth of the extent of the mesh."""
+    """Return whether the mesh is planar within a thousandth of its extent."""
     centred = mesh.rest_positions - mesh.rest_positions.mean(axis=0)
     sizes = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0.0))
     return bool(sizes[0] <= _PLANE_RATIO * sizes[2])

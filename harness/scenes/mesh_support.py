@@ -1,4 +1,4 @@
-"""Supports of a mesh in a scene: pinned and attached vertices, and seams that effects sew."""
+"""Supports of a mesh in a scene: pinned and attached vertices, and sewn seams."""
 
 from __future__ import annotations
 
@@ -98,7 +98,10 @@ def describe_membranes(scene: SceneSpec, mesh: Mesh) -> list[str]:
 
 
 def _describe_stretch(stretch: StretchConstant | None) -> str | None:
-    """Describe what an effect states along the lines; None for exact lengths, which have no modulus."""
+    """Describe the stiffness that an effect states along the lines; None for exact lengths.
+
+    Exact lengths have no modulus.
+    """
     if stretch == "exact":
         return None
     if isinstance(stretch, OrthotropicStiffness):

@@ -114,7 +114,7 @@ class Scene:
         return self.alternate_scene if self.alternate_scene and step_index % 2 else self
 
     def compute_time(self, step_index: int) -> float:
-        """Return the time [s] at which step `step_index` ends and the next starts; 0 is the start."""
+        """Return the time [s] at which step `step_index` ends; index 0 is the start."""
         if not self.alternate_scene:
             return step_index * self.system.time_step
         return (step_index + 1) // 2 * self.system.time_step + step_index // 2 * self.alternate_scene.system.time_step
@@ -213,7 +213,7 @@ def build_scene(spec: SceneSpec, size: int, integrator: str = "implicit-euler", 
 def _make_coarser_builder(
     spec: SceneSpec, size: int, integrator: str, *, log_warnings: bool
 ) -> Callable[[], Scene] | None:
-    """Return a builder of the scene on a mesh of half the size; None if there is none.
+    """Return a builder of the scene on a mesh of half the size, or None.
 
     There is none for meshes of fixed size, for the coarsest meshes, and for effects and starts that select vertices by
     index.
@@ -277,7 +277,7 @@ def _require_unique(spec: SceneSpec, parts: list[EffectContribution]) -> None:
 
 
 def _require_end_of_step_stages(parts: list[EffectContribution], method: integrators.AnyIntegrator, name: str) -> None:
-    """Raise InputError if an effect requires stages at the end of the step, unlike the integrator."""
+    """Raise InputError unless the integrator has the end-of-step stages that an effect requires."""
     there = [
         n
         for n, known in integrators.INTEGRATORS.items()

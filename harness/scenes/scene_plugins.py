@@ -1,4 +1,4 @@
-"""Effects and meshes from plug-ins: named by a scene, and imported in the process that uses them.
+"""Effects and meshes from plug-ins: named by a scene, imported where they are used.
 
 A loaded scene contains `PluginEffect` and `PluginMesh`, which have only a name and parameters. `SceneSpec.load_plugins`
 replaces them in the process that uses them. Results of plug-in code are checked, and error messages name the plug-in.

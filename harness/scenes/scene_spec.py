@@ -123,7 +123,7 @@ class SceneFields(ConfigModel):
 
 
 class SceneFile(SceneFields):
-    """A scene: a mesh, its mass and time step, and the effects that act on it."""
+    """A scene: a mesh, its mass and time step, and the effects on it."""
 
     mesh: Any  # checked, like the effects, by the class that its kind names
     """The mesh; `kind` selects its type."""

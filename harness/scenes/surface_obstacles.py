@@ -262,7 +262,10 @@ def _count_subdivisions(radius: float, sag: float) -> int:
 
 
 def _triangulate_capsule(one: CapsuleObstacle, sag: float) -> SurfaceMesh:
-    """Triangulate a capsule as rings between two poles, with one angular spacing along and across the rings."""
+    """Triangulate a capsule as rings between two poles.
+
+    The angular spacing is the same along and across the rings.
+    """
     around = 2 * int(np.ceil(np.pi / 2 / np.arccos(max(0.5, 1.0 - 0.5 * sag / one.radius))))
     turn, half = np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(0, np.pi, around // 2 + 1)
     half = np.insert(half, len(half) // 2, 0.5 * np.pi)  # the top end of the cylinder; the next ring is its bottom

@@ -85,7 +85,10 @@ class VertexSelection(ConfigModel):
 
     @model_serializer(mode="wrap")
     def _dump_used_selectors(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Dump without unused optional selectors, so that new selectors do not change the ids of existing runs."""
+        """Dump the selectors without unused optional ones.
+
+        New selectors therefore do not change the ids of existing runs.
+        """
         contents: dict[str, Any] = dump(self)
         return {key: value for key, value in contents.items() if value or key not in _OPTIONAL_SELECTORS}
 

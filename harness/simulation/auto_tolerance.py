@@ -1,4 +1,6 @@
-"""Automatic tolerance of a step's solve: the residual may add little to the step's local error.
+"""Automatic tolerance of a step's solve, relative to the local error of the step.
+
+The residual may add little to the local error:
 
     rate |dp|_M <= |residual|_Q,    |dp|_M + T rate |dp|_M <= PART (|e_p|_M + T |e_v|_M),    T the simulated time
 

@@ -77,7 +77,7 @@ class ReplayingDeviceSolver(DelegatingSolver):
 
 
 def wrap_device_solver(prepared: PreparedSolver) -> DevicePreparedSolver | None:
-    """Wrap a prepared solver for replay on its device; None for a solver on the processor."""
+    """Wrap a prepared solver for replay on its device; None for one on the processor."""
     usual = prepared.usual if isinstance(prepared, AlternatingSolver) else prepared
     return DevicePreparedSolver(prepared, usual) if isinstance(usual, PreparedDeviceSolver) else None
 
@@ -103,6 +103,9 @@ def compute_event_seconds(marks: SolveEvents | None) -> dict[str, float]:
 
 
 def build_device_columns(prepared: PreparedSolver) -> dict[str, Any]:
-    """Build the device columns of a prepared solver, wrapped or not; empty for one on the processor."""
+    """Build the device columns of a prepared solver; empty for one on the processor.
+
+    The solver may be wrapped.
+    """
     usual = prepared.usual if isinstance(prepared, (AlternatingSolver, DevicePreparedSolver)) else prepared
     return dict(usual.device_columns) if isinstance(usual, PreparedDeviceSolver) else {}

@@ -172,7 +172,7 @@ class EnergyGrowth(NamedTuple):
 
 
 class _StepAccount:
-    """Data of both balances of a run: scene, motion so far, and potentials after the last step."""
+    """Data of both balances of a run: scene, motion so far, and latest potentials."""
 
     def __init__(self, scene: Scene, mass: NDArray[np.float64]) -> None:
         """Start at the scene's start.
@@ -387,7 +387,7 @@ class StepDissipation(NamedTuple):
 
 
 class _StagePower(NamedTuple):
-    """Power [W] of each kind of force at a stage; or, multiplied by a time, their work [J]."""
+    """Power [W] of each kind of force at a stage; multiplied by a time, its work [J]."""
 
     inertia: float = 0.0
     potentials: float = 0.0
@@ -438,7 +438,10 @@ class DissipationBudget(_StepAccount):
         return found
 
     def _place_start(self, step: SimulationStep, end: float) -> None:
-        """Set the pin positions from which the first step, which ends at a time [s], moves the pins."""
+        """Set the pin positions from which the first step moves the pins.
+
+        The step ends at the time `end` [s].
+        """
         system, targets = self._scene.system, self._scene.compute_pin_targets(0.0)
         pinned, (soft, vertices, _) = system.pins.vertices, system.penalty_pins
         away = targets - self._first[pinned]
@@ -532,7 +535,10 @@ class DissipationBudget(_StepAccount):
         )
 
     def _integrate_work(self, step: SimulationStep, led: Positions) -> tuple[_StagePower, _StagePower]:
-        """Return the work [J] in a frame by Boole's and by Simpson's rule; pinned vertices move by `led` [m]."""
+        """Return the work [J] in a frame by Boole's and by Simpson's rule.
+
+        Pinned vertices move by `led` [m].
+        """
         problem, system, start = step.problem, step.problem.system, step.problem.step_start
         dt, pinned, rate = system.time_step, system.pins.vertices, system.velocity_rate
         power = list[_StagePower]()
@@ -553,7 +559,10 @@ class DissipationBudget(_StepAccount):
         return found[0], found[1]
 
     def _sum_work(self, step: SimulationStep, moved: Positions) -> _StagePower:
-        """Return the work [J] of each kind of force in a step, in which pin targets are displaced by `moved` [m]."""
+        """Return the work [J] of each kind of force in a step.
+
+        Pin targets are displaced by `moved` [m] in the step.
+        """
         method, dt = self._scene.integrator, step.problem.system.time_step
         count, work = len(step.stages), _StagePower()
         weights = method.a[-1][-count:] if isinstance(method, RungeKutta) else (1.0 / count,) * count
@@ -566,7 +575,10 @@ class DissipationBudget(_StepAccount):
         return work
 
     def _start_power(self, step: SimulationStep) -> _StagePower:
-        """Return the power at the start of the run, where the acceleration is that of all forces."""
+        """Return the power at the start of the run.
+
+        The acceleration at the start is that of all forces.
+        """
         start = step.problem.step_start
         scene = self._scene.find_step_scene(0)
         stages = StageSequence(scene, self._motion._replace(velocity=start.velocity), None, start.time)
@@ -660,7 +672,7 @@ class DissipationBudget(_StepAccount):
     def _parameter_work(
         self, problem: StepProblem, after: NDArray[np.float64], before: Positions, p: Positions
     ) -> float:
-        """Return the work [J] that changing parameters of energies do in a step from positions `before` to p.
+        """Return the work [J] of changing energy parameters in a step from positions `before` to p.
 
         It is the mean of the change at the two ends, so that it is that of the mean force.
         """
@@ -688,7 +700,10 @@ class DissipationBudget(_StepAccount):
         )
 
     def _set_start(self, potentials: NDArray[np.float64]) -> None:
-        """Set the potentials of the start, at which penalty pins that act as exact ones store none."""
+        """Set the potentials of the start.
+
+        Penalty pins that act as exact ones store no energy at the start.
+        """
         if self._are_pins_driven:
             potentials[-2] = 0.0
         self._potentials = potentials
@@ -799,5 +814,5 @@ def _stored_energy(energy: Energy, x: Positions, p: Positions) -> float:
 
 
 def _is_driven(energy: Energy) -> bool:
-    """Return whether an energy's parameters may change from step to step, other than by damping or contact."""
+    """Return whether an energy's parameters may change between steps, except by damping or contact."""
     return is_lagged(energy) and not getattr(energy, "is_dissipative", False) and not isinstance(energy, ContactEnergy)

@@ -1,7 +1,7 @@
-"""Wrapper of prepared solvers, and the check of a solver's contract: types of results, and no writes to inputs.
+"""Wrapper of prepared solvers, and the check of a solver's contract.
 
-The check is outside of timed code. Error messages state the line of the solver that its author can correct, not the
-line of the harness that failed.
+The contract prescribes the types of results, and permits no writes to inputs. The check is outside of timed code. Error
+messages state the line of the solver that its author can correct, not the line of the harness that failed.
 """
 
 from __future__ import annotations

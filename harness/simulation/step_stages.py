@@ -1,4 +1,4 @@
-"""A step in stages: the integrator defines them in turn, and a prepared solver solves each.
+"""A step in stages, which the integrator defines and a prepared solver solves in turn.
 
 All forces, pins and energies are evaluated at the time of the stage. Lagged quantities, which are forces that
 depend on the motion and directions of dashpots, are evaluated at the expected position of the stage first. The stage is

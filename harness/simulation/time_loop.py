@@ -335,7 +335,10 @@ def _place_pins(system: System, p: Positions, targets: Positions) -> Positions:
 
 
 def _guess_assignment(step_problem: StepProblem) -> StepProblem:
-    """Guess the positions at the start of the step; pinned vertices are not moved to their targets."""
+    """Guess the positions at the start of the step.
+
+    Pinned vertices are not moved to their targets.
+    """
     return replace(step_problem, initial_guess=step_problem.step_start.positions)
 
 

@@ -1,4 +1,4 @@
-"""Wall times of a run and their rows: preparation, whole steps, and phases of an iteration.
+"""Wall times of a run and their rows: preparation, steps, and phases of an iteration.
 
 The timed passes record nothing. They follow a warm-up pass, in which the phases of each frame and an iteration of its
 solve are timed separately, and which runs all code that the steps use. The timed passes then repeat the whole

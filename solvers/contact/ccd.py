@@ -94,7 +94,10 @@ def collision_free_step_size(candidates, p, displacement, max_step, local_indice
 
 @jit_inner
 def _needs_ccd(candidates, p, displacement, max_step, first, last, edges):
-    """Return as bits which of eight pairs can reach each other, by distances and displacement lengths."""
+    """Return which of eight pairs require continuous collision detection, as a bit mask.
+
+    The distances and displacement lengths of the other pairs exclude a collision for step sizes up to `max_step`.
+    """
     x = candidates.vertices
     a, b, c, d = (
         gather_rows(p, x, first, last, 0),

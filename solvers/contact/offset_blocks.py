@@ -83,7 +83,10 @@ def _is_in_vertex_block(adjacency, x, i, p):
 
 @jit_inner
 def _is_in_edge_block(adjacency, x, i, j, p):
-    """Return whether p is in the block of edge ij, given a closest point inside it."""
+    """Return whether p is in the block of edge ij.
+
+    The closest point to p must be in the interior of the edge.
+    """
     begin = load_point(x, i)
     u = subtract3(load_point(x, j), begin)
     length = dot3(u, u)

@@ -1,4 +1,4 @@
-"""Base classes of device solvers: one stream, events, and copies to the host only on demand.
+"""Base classes of device solvers: one stream, events, and copies to the host on demand.
 
     start: upload | launch, launch, ... | positions: download                       all in one stream, in this order
 
@@ -201,7 +201,10 @@ class DeviceSolver(IterativeSolver):
         self._finished_states.append(run)
 
     def iterates_without_copy(self, problem: StepProblem) -> Iterator[Callable[[], Positions]]:
-        """Yield a function per iterate that copies it; each iterate is complete when it is yielded."""
+        """Yield a function per iterate that copies it.
+
+        Each iterate is complete when its function is yielded.
+        """
         with cuda_device.guard_device_errors():
             run = self.init_state(problem, problem.initial_guess)
             while True:

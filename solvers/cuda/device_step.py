@@ -1,4 +1,4 @@
-"""Step data on a device: upload of a host's step problem, and kernels that convert it to rows.
+"""Step data on a device: uploaded step problems, and kernels that convert them to rows.
 
     centre_i = (c m/dt^2 target + w pin) / (c m/dt^2 + w),     force_i = f_i - h_i centre_i        h: of forms
     n = v/|v| and n'(A origin) of dashpots, v = A p at the step's start

@@ -23,13 +23,19 @@ files than the kernel's also require a block of one thread."""
 
 
 def count_blocks(n: int) -> int:
-    """Return the number of blocks of a launch for n terms, over which threads loop with a stride."""
+    """Return the number of blocks of a launch for n terms.
+
+    Threads loop over the terms with a stride.
+    """
     return int(max(1, min(MAX_BLOCKS, -(-n // THREADS_PER_BLOCK))))
 
 
 @cuda.jit(device=True)
 def sum_block(value):
-    """Return the sum of a float64 over the threads of the block, to all of them."""
+    """Return the sum of a float64 over the threads of the block.
+
+    All threads of the block return the sum.
+    """
     shared = cuda.shared.array(THREADS_PER_BLOCK, np.float64)
     thread = cuda.threadIdx.x
     cuda.syncthreads()

@@ -22,7 +22,10 @@ def _compile_for_device(function: Any) -> Any:
 
 
 def share_with_device(function: Any) -> Any:
-    """Return a device copy of a CPU function: an inner function, a kernel or a plain Python function."""
+    """Return a device copy of a CPU function.
+
+    The function is an inner function, a kernel or a plain Python function.
+    """
     plain = getattr(function, "py_func", function)
     if plain not in _DEVICE_COPIES:
         names = {name for code in _nested_codes(plain.__code__) for name in code.co_names}

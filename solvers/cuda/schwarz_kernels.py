@@ -100,7 +100,10 @@ def build_schwarz_kernels(real: RealType, patch: int) -> SchwarzKernels:
 
     @cuda.jit
     def invert(level, stiff, nodes, inverses):
-        """Write the inverses of a level's subdomains, packed by rows; blocks of threads loop over subdomains."""
+        """Write the inverses of a level's subdomains, packed by rows.
+
+        Blocks of threads loop over the subdomains.
+        """
         a = cuda.shared.array(half, np.float64)
         column = cuda.shared.array(rows, np.float64)  # the simulator identifies shared arrays by their line
         b = cuda.blockIdx.x

@@ -30,7 +30,13 @@ _ACCELERATION_RTOL = 1e-12
 
 
 class EnginePackage(NamedTuple):
-    """The package of an engine: imported module, distribution, and the extra of springbench that installs it."""
+    """The Python package of an external engine.
+
+    Attributes:
+        module_name: the module that is imported.
+        distribution_name: the distribution that contains it.
+        extra_name: the extra of springbench that installs it.
+    """
 
     module_name: str
     distribution_name: str
@@ -159,7 +165,10 @@ class EngineNetwork:
 
 
 def _concatenate_edges(parts: list[SpringDashpots], unpinned: NDArray[np.bool_]) -> SpringDashpots:
-    """Concatenate edges that act: distinct ends, at least one of them free, and a stiffness or a damping."""
+    """Concatenate the edges that can exert a force on an unpinned vertex.
+
+    These have distinct ends, at least one of them unpinned, and a stiffness or a damping.
+    """
     none = SpringDashpots(np.empty((0, 2), np.int64), np.empty(0), np.empty(0), np.empty(0))
     ends, *rest = (np.concatenate(arrays) for arrays in zip(none, *parts, strict=True))
     acts = (ends[:, 0] != ends[:, 1]) & unpinned[ends].any(axis=1) & ((rest[0] > 0.0) | (rest[2] > 0.0))

@@ -211,7 +211,10 @@ class NewtonPhysicsEngine(ExternalEngine, DeviceOptions):
 
 
 class _NewtonPhysicsStepper:
-    """A model, its solver and two alternating states. On the CPU its arrays are accessed in place."""
+    """A model, its solver and two alternating states.
+
+    On the CPU, the arrays of the states are accessed in place.
+    """
 
     def __init__(self, warp: Any, model: Any, solver: Any, network: EngineNetwork, *, explicit: bool) -> None:
         self._warp, self._solver, self._network, self._explicit = warp, solver, network, explicit

@@ -1,10 +1,10 @@
-"""Implicit Euler of a spring network in Taichi: Newton's method with conjugate gradients, on one core.
+"""Implicit Euler of a spring network in Taichi: Newton's method with conjugate gradients.
 
     g(x) = |x - y|^2_M / 2h^2 + sum of k (|x_i - x_j| - r)^2 / 2,    y = x + h v + h^2 M^-1 f
 
 As in Taichi's own implicit cloth example (`implicit_mass_spring`), the Hessian is stored as one block per spring, not
 as a matrix. In addition, the eigenvalues of the blocks are clamped, the preconditioner is block Jacobi, and steps are
-halved until g does not increase. The program does not depend on springbench.
+halved until g does not increase. The program runs on one core and does not depend on springbench.
 """
 
 from types import SimpleNamespace

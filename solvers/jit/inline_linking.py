@@ -30,7 +30,10 @@ class LinkedLibrary(_LIBRARY_CLASS):
     """Code for linking only: lowered, with everything that it calls, and without an address."""
 
     def add_ir_module(self, ir_module: Any) -> None:
-        """Add a module of code, but no wrapper for calls from C, which need an address."""
+        """Add a module of code, unless it is the wrapper for calls from C.
+
+        Such a wrapper requires an address.
+        """
         if ir_module.name != _C_WRAPPER_NAME:
             super().add_ir_module(ir_module)
 

@@ -37,7 +37,11 @@ class KernelSignature(NamedTuple):
 
 
 def describe_type(kind: Any) -> Any:
-    """Return a Numba type as plain data; raise ValueError for a type that has no such form."""
+    """Return a Numba type as plain data.
+
+    Raises:
+        ValueError: the type has no such form.
+    """
     if isinstance(kind, _TYPES.Array):
         return "array", describe_type(kind.dtype), kind.ndim, kind.layout, kind.mutable, kind.aligned
     if isinstance(kind, _TYPES.Record):

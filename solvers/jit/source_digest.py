@@ -284,7 +284,10 @@ def _parse_imports(source: str) -> set[str]:
 
 
 def _imported_names(text: str) -> Iterator[tuple[str, str]]:
-    """Yield each imported name as a pair (module, name); the module is "" if the name is a module itself."""
+    """Yield each imported name as a pair (module, name).
+
+    The module is "" if the name is a module itself.
+    """
     for found in _IMPORT_PATTERN.finditer(text):
         listed = re.sub(r"#.*|[()\\]", "", found["names"] or found["whole"])
         for entry in listed.split(","):

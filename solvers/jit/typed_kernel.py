@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 
 
 def as_kernel_array(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return x if it is contiguous and writable, else a copy; kernels are compiled for such arrays."""
+    """Return x if it is contiguous and writable, else a copy.
+
+    Kernels are compiled for contiguous, writable arrays.
+    """
     return x if x.flags.carray else np.array(x, np.float64, order="C")
 
 

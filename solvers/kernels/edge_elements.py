@@ -234,7 +234,7 @@ def _rank_repeated(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 @jit_kernel
 def _write_dashpots(edges, axis, offset, data, blocks):
-    """Write m and q of all entries, and the sums of m m' of the packets.
+    """Write m and q of all entries, and the packets' sums of m m'.
 
     axis: m (d, 3); offset: q (d,).
     """

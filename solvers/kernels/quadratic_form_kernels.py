@@ -1,4 +1,4 @@
-"""All constant quadratic forms of a system as one: weights of vertex pairs and of vertices.
+"""The sum of a system's constant quadratic forms: weights of vertex pairs and of vertices.
 
     x'Lx/2 = sum over i < j of w_ij/2 |x_i - x_j|^2 + sum over i of h_i/2 |x_i|^2,     w_ij = -L_ij,  h = L 1
 

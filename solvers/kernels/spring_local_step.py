@@ -261,7 +261,7 @@ def add_scalar_springs(bundles, b, p, out, correct):
 
 @jit_inner
 def _add_edges(bundles, edges, i, entry, lane, p, correct, force):
-    """Add an entry's edges to the force on the vertex at offset i, if there are any."""
+    """Add an entry's edges, if any, to the force on the vertex at offset i."""
     if edges is None:
         return force
     e = LANES * entry + lane

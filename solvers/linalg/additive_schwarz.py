@@ -112,7 +112,7 @@ def _build_aggregation_matrix(of: NDArray[np.int64]) -> csr_array:
 
 @jit_kernel
 def grow_subdomains(pointers, neighbours, order, state, queue, border):
-    """Order the nodes of a graph so that subdomains grow from the border of earlier ones.
+    """Order a graph's nodes so that subdomains grow from the border of earlier ones.
 
     Args:
         pointers, neighbours: graph in CSR form.

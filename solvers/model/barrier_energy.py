@@ -57,7 +57,7 @@ class PairBlocks(Protocol):
 
 @runtime_checkable
 class BarrierEnergy(Energy, Protocol):
-    """An energy that is infinite beyond a surface and whose active vertex pairs depend on the positions."""
+    """An energy, infinite beyond a surface, whose active vertex pairs depend on the positions."""
 
     def collision_free_step_size(self, p: Positions, direction: Positions) -> float:
         """Return the largest collision-free step size up to 1 from p along a direction.
@@ -81,7 +81,10 @@ class BarrierEnergy(Energy, Protocol):
         ...
 
     def at_fraction(self, fraction: float) -> BarrierEnergy:
-        """Return this energy with obstacles at a fraction of their displacement in the step, 1 at its end."""
+        """Return this energy with obstacles at a fraction of their displacement in the step.
+
+        The fraction is 1 at the end of the step.
+        """
         ...
 
     def comoving_positions(self, p: Positions) -> list[Positions]:

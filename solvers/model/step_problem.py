@@ -61,7 +61,9 @@ class PluginContractError(Exception):
 
 
 class Unsupported(Exception):
-    """An error for a system that a solver cannot minimise; the message states the part and the reason.
+    """An error for a system that a solver cannot minimise.
+
+    The message states the unsupported part of the system and the reason.
 
     Example:
         >>> str(springbench.Unsupported("mine: supports springs only; the scene has Bending"))
@@ -232,7 +234,7 @@ class System:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepStart:
-    """The state at the start of a step, for lagged energies and for methods that do not minimise.
+    """The state at the start of a step, for lagged energies and non-minimising methods.
 
     Attributes:
         positions: p^t (n, 3) [m].
@@ -283,9 +285,10 @@ class StepStart:
 
 
 class LaggedEnergy(Energy, Protocol):
-    """An energy that depends on the start of the step, such as damping, friction or moving obstacles.
+    """An energy that depends on the start of the step.
 
-    The stiffness of a projective energy may depend on the `velocity_rate` of the start only, because Q is built once.
+    Examples are damping, friction and moving obstacles. The stiffness of a projective energy may depend on the
+    `velocity_rate` of the start only, because Q is built once.
     """
 
     def begin_step(self, start: StepStart) -> Energy:
@@ -342,7 +345,10 @@ class StepProblem:
         return tuple(e.begin_step(self.step_start) if is_lagged(e) else e for e in self.system.energies)
 
     def evaluate_terms(self, p: Positions) -> dict[str, float]:
-        """Return the terms [J] of the objective at p by name: inertia, force, pins, and energies by their class."""
+        """Return the terms [J] of the objective at p by name.
+
+        The terms are inertia, force, pins, and the energies by the names of their classes in lower case.
+        """
         s, values, away = self.system, dict[str, float](), p - self.inertial_target
         for energy in self.energies:
             name = type(energy).__name__.lower()  # a class may have the name of one of the terms below
@@ -360,7 +366,7 @@ class StepProblem:
         return sum(self.evaluate_terms(p).values())
 
     def value_scale(self, p: Positions) -> float:
-        """Return the sum of the absolute terms [J], which is the scale of rounding errors in `value`."""
+        """Return the sum of absolute terms [J], the scale of rounding errors in `value`."""
         return sum(abs(term) for term in self.evaluate_terms(p).values())
 
     def gradient(self, p: Positions) -> Positions:
@@ -472,7 +478,10 @@ class PreparedSolver(Protocol):
         ...
 
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
-        """Yield one iterate after another; a yielded array may be overwritten, so copy it to store it."""
+        """Yield one iterate after another.
+
+        A yielded array may be overwritten and must be copied to be stored.
+        """
         ...
 
     def solve(self, problem: StepProblem, stop: StopRule) -> Solution:
@@ -488,9 +497,9 @@ class PreparedSolver(Protocol):
         ...
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:
-        """Return the residual |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices; nan if it is not defined.
+        """Return the residual |Q^-1 grad g|_Q [J^(1/2)] over the unpinned vertices.
 
-        The evaluation may cost an iteration.
+        It is nan if it is not defined. The evaluation may cost an iteration.
 
         Args:
             problem: the step.
@@ -499,7 +508,10 @@ class PreparedSolver(Protocol):
         ...
 
     def iteration_phases(self, problem: StepProblem) -> dict[str, Callable[[], object]]:
-        """Return the phases of an iteration by name, if any, as callables that return what they compute."""
+        """Return the phases of an iteration by name, if any.
+
+        The phases are callables that return what they compute.
+        """
         ...
 
 

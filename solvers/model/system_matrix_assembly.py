@@ -69,7 +69,10 @@ def mass_matrix_dense(mass: ArrayLike) -> FloatArray:
 
 
 def mass_matrix_sparse(mass: ArrayLike) -> scipy.sparse.csr_array:
-    """Return the sparse M of masses (n,) [kg], shape (n, n), with one entry for each vertex that has mass."""
+    """Return the sparse M of masses (n,) [kg], shape (n, n).
+
+    It has one entry for each vertex that has mass.
+    """
     return diagonal_matrix(np.asarray(mass, float))
 
 
@@ -244,7 +247,7 @@ def diagonal_matrix(values: FloatArray) -> scipy.sparse.csr_array:
 
 
 def compute_row_starts(rows: NDArray[np.int64], num_rows: int) -> NDArray[np.int64]:
-    """Return the start of each row among entries that are sorted by row, as in compressed sparse rows.
+    """Return the start of each row among entries sorted by row, as in CSR form.
 
     Args:
         rows: row of each entry (k,), in any order.

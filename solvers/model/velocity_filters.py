@@ -1,9 +1,10 @@
-"""Velocity filters that act before a step; any other function of the velocity can be one.
+"""Velocity filters that act before a step.
 
     decay            v <- k v                      of dv/dt = -c v, k = exp(-c dt)
     quadratic drag   v <- m v / (m + c dt |v|)     of m dv/dt = -c |v| v
 
-Both are exact solutions over the step and therefore stable for any step size.
+Both are exact solutions over the step and therefore stable for any step size. Any other function of the velocity can
+also be a filter.
 """
 
 from __future__ import annotations

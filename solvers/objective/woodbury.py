@@ -1,7 +1,7 @@
-"""Factorisation of H = S + V V', the rank update of a sparse S by a few columns V.
+"""Factorisation of the low-rank update H = S + V V' of a sparse S.
 
-Sources: Woodbury 1950; Sherman and Morrison 1950. It serves energies that couple all their vertices by a few scalars c,
-as gas does by its volume:
+V has few columns. Sources: Woodbury 1950; Sherman and Morrison 1950. The update serves energies that couple all their
+vertices by a few scalars c, as gas does by its volume:
 
     E = S(p) + phi(c(p)),   Hess E = sparse + V V'
 

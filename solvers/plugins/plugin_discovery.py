@@ -1,4 +1,4 @@
-"""Resolution of names in a config to code: built-in, of an installed package, or named by the config.
+"""Resolution of names in a config to code: built-in, installed, or named by the config.
 
     hybrid                        built-in: an entry of a built-in table
     my-method                     installed: an entry point of the table's group, such as `springbench.solvers`
@@ -31,7 +31,7 @@ PLUGIN_PATTERN = r"^(\./[^:]+\.py|[A-Za-z_][\w.]*):[A-Za-z_]\w*$"
 
 
 class InvalidPluginName(ValueError):
-    """An error for a name without code, or with code that a config must not name."""
+    """An error for a name without code, or with code that configs must not name."""
 
 
 class PluginName(str):

@@ -24,7 +24,10 @@ _NUM_ACCUMULATORS = 4
 
 
 def _dot_products_code(*pairs: tuple[int, int]) -> Callable[..., Any]:
-    """Return the code of the dot products of pairs of arrays, over their first `count` entries."""
+    """Return the code of the dot products of pairs of arrays.
+
+    The products are over the first `count` entries of the arrays.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         *arrays, count = unpack_arguments(context, builder, signature, args)

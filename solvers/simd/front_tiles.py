@@ -105,9 +105,9 @@ def _subtract_tile_product_code(
 def _solve_tile_triangle_code(
     typingctx: Any, L: Any, at: Any, stride: Any, triangle: Any, strips: Any, columns: Any
 ) -> Any:
-    """Replace the rows X of a tile, in strips of eight from `at` on, by X T^-T.
+    """Replace the rows X of a tile by X T^-T.
 
-    triangle (TILE_COLUMNS, TILE_COLUMNS): T with inverted diagonal.
+    The rows are in strips of eight, from `at` on. triangle (TILE_COLUMNS, TILE_COLUMNS): T with inverted diagonal.
     """
     declared = literal_signature(L, at, stride, triangle, strips, columns)
 
@@ -168,7 +168,7 @@ def _factorise_tile_code(typingctx: Any, L: Any, at: Any, stride: Any, least: An
 def _forward_solve_tile_code(
     typingctx: Any, L: Any, at: Any, stride: Any, x: Any, to: Any, strips: Any, columns: Any
 ) -> Any:
-    """Perform a tile's forward substitution: solve for x[to + j], j < columns, with its diagonal block at `at`.
+    """Perform a tile's forward substitution for x[to + j], j < columns, with its diagonal block at `at`.
 
     The contributions are subtracted from the rows below, in strips of eight.
     """

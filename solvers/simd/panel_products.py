@@ -1,4 +1,4 @@
-"""Products of a panel with four interleaved right-hand sides, and of its transpose, in explicit LLVM vectors.
+"""Products of a panel and its transpose with four interleaved right-hand sides, in LLVM vectors.
 
 A panel W has 4 m columns (m = 1 to 4). Its rows are grouped in tiles of four, stored by columns: a lane of four numbers
 is a column of a tile. A work vector has rows of 4: x, y, z and zero. The factor of an entry of W is equal either within
@@ -28,7 +28,10 @@ _PREFETCH_BYTES = 4096
 
 
 class _TileBuilder(VectorBuilder):
-    """Builder for tiles of 4 m columns in 512-bit vectors; `element_type` is the work vector's type."""
+    """Builder for tiles of 4 m columns in 512-bit vectors.
+
+    The attribute `element_type` is the element type of the work vector.
+    """
 
     def __init__(self, context: Any, builder: Any, element: types.Float, m: int) -> None:
         super().__init__(context, builder)

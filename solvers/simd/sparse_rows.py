@@ -15,7 +15,10 @@ from springbench.solvers.simd.llvm_vectors import I32, I64, VectorBuilder, unpac
 
 
 def _sparse_row_product_code(typingctx: Any, values: Any, columns: Any, begin: Any, end: Any, x: Any) -> Any:
-    """Return the sum over begin <= e < end of values[e] x[columns[e]], as four numbers of x's type."""
+    """Return the sum of values[e] x[columns[e]] over begin <= e < end.
+
+    The sum consists of four numbers of x's type.
+    """
     number = x.dtype
     declared = types.UniTuple(number, 4)(values, columns, types.int64, types.int64, x)
 

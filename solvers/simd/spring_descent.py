@@ -27,7 +27,10 @@ SHORT_SPRING = float("-inf")
 
 
 def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any, x: Any, right: Any, out: Any) -> Any:
-    """Write a packet's rows of `out` and return its energy; only return SHORT_SPRING if a spring is too short."""
+    """Write a packet's rows of `out` and return its energy.
+
+    If a spring is too short, nothing is written and SHORT_SPRING is returned.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bundles, shares, number, x, right, out = unpack_arguments(context, builder, signature, args)
@@ -37,7 +40,10 @@ def _spring_gradient_code(typingctx: Any, bundles: Any, shares: Any, number: Any
         sums, shortest = v.allocate_sums(4), cgutils.alloca_once_value(builder, constant_packet(MAX_SQUARED_LENGTH))
 
         def read(entry: Any) -> list[Any]:
-            """Load the data of an entry's springs: the entry, k r, k, 1/(4 k), the vector from their other ends."""
+            """Load the data of an entry's springs.
+
+            They are the entry, k r, k, 1/(4 k), and the vector from the other ends of the springs.
+            """
             numbers = [
                 entry,
                 *v.load_packets(springs.weights, springs.weight_offset, entry),

@@ -56,7 +56,10 @@ def _spring_force_code(subtract_position: bool) -> Callable[..., Any]:
 def _sum_spring_forces(
     v: PacketBuilder, springs: SpringPacket, x: Any, centre: list[Any], correct: bool
 ) -> tuple[list[Any], Any]:
-    """Return the sums of a packet's springs, (k r/|v| - k) v or k r/|v| v, and whether a spring is too short."""
+    """Return the sums of a packet's springs, and whether a spring is too short.
+
+    The terms are (k r/|v| - k) v if `correct`, else k r/|v| v.
+    """
     builder: Any = v.builder
     sums, shortest = v.allocate_sums(3), cgutils.alloca_once_value(builder, constant_packet(MAX_SQUARED_LENGTH))
     if springs.edges is not None:
@@ -64,7 +67,10 @@ def _sum_spring_forces(
         return [builder.load(total) for total in sums], v.has_short_spring(shortest)
 
     def read(entry: Any) -> list[Any]:
-        """Load the data of an entry's springs: k r, k, and the vector from their other ends with its square."""
+        """Load the data of an entry's springs.
+
+        They are k r, k, the squared length of the vector from the other ends of the springs, and the vector.
+        """
         arrow = v.compute_spring_vectors(x, centre, springs.neighbour_offset, entry)
         return [*v.load_packets(springs.weights, springs.weight_offset, entry), v.squared_norm(arrow), *arrow]
 

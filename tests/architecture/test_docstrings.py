@@ -71,17 +71,44 @@ def test_the_described_arguments_are_the_parameters(functions: list[DocumentedFu
     assert not [(*one[:2], names) for one, names in named if sorted(names) != sorted(one.parameters)]
 
 
+def list_docstrings() -> Iterator[tuple[str, str]]:
+    """Yield all docstrings of the product, each with its file."""
+    for one in parse_sources():
+        for node in ast.walk(one.tree):
+            documentable = isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef | ast.Module)
+            if documentable and (docstring := ast.get_docstring(node)):
+                yield one.path.relative_to(ROOT).as_posix(), docstring
+
+
 def test_sections_have_one_form() -> None:
     """A section follows a blank line, and its text is indented below its title."""
     inline = re.compile(rf"^(?:{'|'.join(SECTIONS)}): |(?<!\n)\n(?:{'|'.join(SECTIONS)}):$", re.MULTILINE)
     assert not [
-        f"{one.path.relative_to(ROOT)}: {docstring.splitlines()[0]}"
-        for one in parse_sources()
-        for node in ast.walk(one.tree)
-        if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef | ast.Module)
-        and (docstring := ast.get_docstring(node) or "")
-        and inline.search(docstring)
+        f"{file}: {docstring.splitlines()[0]}" for file, docstring in list_docstrings() if inline.search(docstring)
     ]
+
+
+MAX_SUMMARY_WORDS = 15
+
+
+def count_summary_words(docstring: str) -> int:
+    """Count the words of the first paragraph, without shapes, units and formulas in brackets."""
+    summary = re.sub(r"\([^()]*\)|\[[^\[\]]*\]", "", docstring.partition("\n\n")[0])
+    return len(re.findall(r"\S*\w\S*", summary))
+
+
+def test_docstrings_begin_with_a_short_summary() -> None:
+    docstrings = [*list_docstrings()]
+    assert len(docstrings) > 5000
+    assert not [
+        f"{file}: {docstring.partition(chr(10))[0]}"
+        for file, docstring in docstrings
+        if count_summary_words(docstring) > MAX_SUMMARY_WORDS
+    ]
+
+
+def test_brackets_of_a_summary_are_no_words() -> None:
+    assert count_summary_words("Compute lengths (m, 3) of springs [m] at p = x.\n\nArgs:\n    p: positions.") == 7
 
 
 def test_described_attributes_are_defined() -> None:

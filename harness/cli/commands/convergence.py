@@ -49,9 +49,9 @@ def convergence(
     search_time: Annotated[float, typer.Option(help="Wall time after which no further setting starts [s].")] = 200.0,
     results: ResultsOption = Path("results"),
 ) -> None:
-    """Check whether substeps x iterations of a solver or engine are converged, and find what would be.
+    """Check whether substeps x iterations of a solver or engine are converged.
 
-    Settings around the given ones are simulated, and compared with the reference motion.
+    Settings around the given ones are simulated, and compared with the reference motion, to find one that is converged.
     """
     from springbench.harness.config.config_loader import load_scene
     from springbench.harness.errors import format_allowed_names
@@ -149,7 +149,7 @@ def _study_setting(
     options: dict[str, float],
     print_message: Callable[[str], None],
 ) -> ConvergenceStudy:
-    """Run the study, and write its table, its picture and the commands or scripts of its settings."""
+    """Run the study, and write its table, picture, and commands or scripts of its settings."""
     from springbench.harness.config.config_loader import find_scene_mistakes
     from springbench.harness.experiments.accuracy.accuracy_units import open_reference_store
     from springbench.harness.experiments.accuracy.method_recommendation import DEFAULT_T_END, find_default_t_end

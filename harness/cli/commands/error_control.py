@@ -195,7 +195,7 @@ def _execute_error_control(
 
 
 def _describe_dissipation(trial: Trial, error_target: ErrorTarget, energies: StepDissipation) -> str:
-    """Describe the energy balance of the motion; empty where it is unknown or none was provided."""
+    """Describe the energy balance of the motion; empty if unknown or no energy was provided."""
     if not energies.provided_energy or energies.dissipation_integrator is None:
         return ""
     name = trial.method.solver if trial.method.integrator == "substepping" else trial.method.integrator

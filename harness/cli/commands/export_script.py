@@ -1,4 +1,7 @@
-"""Command `springbench export-script`: export a point of an accuracy config as a script for an external engine."""
+"""Command `springbench export-script`: export a point of an accuracy config as an engine script.
+
+The script repeats the simulation with the external engine alone.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +91,7 @@ def write_engine_script(
     folder: Path,
     end: Positions | None = None,
 ) -> dict[str, str]:
-    """Write a script that repeats a simulation with an engine alone, and return the texts of its files by name.
+    """Write a script that repeats a simulation with an engine alone.
 
     Args:
         name: stem of the files.
@@ -98,6 +101,9 @@ def write_engine_script(
         frames: number of frames.
         folder: folder of the files, made if it is missing.
         end: positions (n, 3) [m] in which the simulation ends; simulated if None.
+
+    Returns:
+        The texts of the files by name.
 
     Raises:
         RunFailed: the script cannot repeat what changes between frames, or the engine does not support the scene.

@@ -51,7 +51,10 @@ def grade(
     ] = 30.0,
     csv: Annotated[Path | None, typer.Option(help="File (.csv) for all steps, or for all students.")] = None,
 ) -> None:
-    """Grade positions: does each step minimise its objective, how large is the error, which mistake explains it."""
+    """Grade positions by whether each step minimises its objective, and by their error.
+
+    A mistake that explains the error is reported, if one is found.
+    """
     require_output_file(csv, ".csv", "--csv")
     if isnan(budget):
         raise InputError("--budget: got nan; expected seconds")

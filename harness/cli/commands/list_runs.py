@@ -50,7 +50,7 @@ def list_command(
 
 
 def _print_shipped_configs() -> None:
-    """Print the shipped configs and scenes with descriptions, then the names of those in other folders."""
+    """Print shipped configs and scenes with descriptions, then the names of those in other folders."""
     from springbench.harness.config.config_loader import ACCURACY, SCENE, find_config_kind
     from springbench.harness.config.shipped_configs import SCENE_FOLDER, list_shipped_configs
     from springbench.harness.schema.yaml_loader import read_yaml

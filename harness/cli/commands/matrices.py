@@ -31,7 +31,10 @@ def matrices(
         Path | None, typer.Option("-o", "--output", help="Folder for the files; SCENE-matrices by default.")
     ] = None,
 ) -> None:
-    """Print E, A, C, M, Q, y, d and b of a scene, and write them as .npz, Matrix Market and a picture."""
+    """Print the matrices and vectors of a scene, and write them with a picture.
+
+    These are E, A, C, M, Q, y, d and b. They are written as .npz and as Matrix Market files.
+    """
     folder = output or Path(f"{scene.stem}-matrices")
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--output: got {folder}, a file; expected a folder, which is made if it is missing")

@@ -35,7 +35,7 @@ def mesh(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON, with all places.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 if anything is suspicious.")] = False,
 ) -> None:
-    """Report on a mesh file: contents, extent, parts, seams, faults of faces and edges, what can be selected."""
+    """Report on a mesh file: contents, extent, parts, seams, face and edge faults, possible selections."""
     require_output_file(output, ".png", "--output")
     from springbench.harness.scenes.mesh.mesh_report import build_mesh_report
 
@@ -56,7 +56,10 @@ def mesh(
 
 
 def _load_source(file: Path, options: dict[str, Any]) -> tuple[FileMesh, MeshSupport | None]:
-    """Load a mesh file, or that of a scene with its supports; options override the keys of the scene."""
+    """Load a mesh file, or that of a scene with its supports.
+
+    Options override the keys of the scene.
+    """
     from springbench.harness.scenes.mesh.file_mesh import FileMesh
 
     if file.suffix.lower() not in _SCENE_SUFFIXES:

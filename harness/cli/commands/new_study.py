@@ -14,7 +14,7 @@ from springbench.harness.errors import InputError, InputMistake
 def new_study(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder to create; its name is the study's.")],
 ) -> None:
-    """Write a first study: a scene, a sweep, a solver, a performance test and a README."""
+    """Write a first study: scene, sweep, solver, performance test and README."""
     from springbench.harness.config.json_schema import build_json_schema
     from springbench.harness.config.shipped_configs import list_template_files
 

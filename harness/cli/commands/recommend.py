@@ -42,7 +42,10 @@ def recommend(
     search_time: Annotated[float, typer.Option(help="Limit of the wall time of all simulations [s].")] = 60.0,
     results: ResultsOption = Path("results"),
 ) -> None:
-    """Find and check the cheapest method for an error, or the most accurate one for a wall time a frame."""
+    """Recommend the cheapest method for an error, or the most accurate one for a budget.
+
+    The budget is the wall time of a frame. The recommended method is checked by a repeated measurement.
+    """
     from rich.table import Table
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.accuracy.method_recommendation import recommend_method as find

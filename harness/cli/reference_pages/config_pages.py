@@ -68,7 +68,7 @@ def _list_shared(definitions: Schema) -> list[str]:
 
 
 def _find_mesh_kind(definition: Schema) -> str:
-    """Return the mesh kind of a mesh class that is also defined under its kind; "" for other definitions."""
+    """Return the kind of a mesh class that is also defined under its kind, else ""."""
     kind = definition.get("properties", {}).get("kind", {}).get("const", "")
     return kind if kind in MESH_CLASSES and definition["title"].endswith("Mesh") else ""
 
@@ -154,7 +154,7 @@ class SchemaWriter:
 
 
 def _describe_formula(effect: Any) -> list[str]:
-    """Return the module docstring of an effect, with formula and source, and its limit of the order."""
+    """Return the module docstring of an effect (formula and source) and its limit of the order."""
     order = getattr(effect, "max_convergence_order", math.inf)
     limit = "" if order == math.inf else f"Every integrator has at most order {order:g} with it."
     return [format_docstring(sys.modules[effect.__module__].__doc__), limit]

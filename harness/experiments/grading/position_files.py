@@ -111,7 +111,7 @@ def read_rest_positions(path: Path, num_vertices: int) -> NDArray[np.float64]:
 
 
 def is_submission(path: Path) -> bool:
-    """Return whether a path can be a file of positions or a folder of mesh files.
+    """Return whether a path can be a position file or a folder of mesh files.
 
     Only its name and its entries are read.
     """

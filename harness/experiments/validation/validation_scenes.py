@@ -1,4 +1,4 @@
-"""Scenes and flat sheets of the validation, and their simulation to a time or to rest."""
+"""Scenes and flat sheets of the validation, with simulation to a time or to rest."""
 
 from __future__ import annotations
 

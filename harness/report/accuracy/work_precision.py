@@ -89,5 +89,5 @@ def is_same_method(work: WorkPoint, base: WorkPoint | None) -> bool:
 
 
 def is_complete(work: WorkPoint) -> bool:
-    """Return whether a simulation succeeded, and has an error and a time that can be drawn."""
+    """Return whether a simulation succeeded, with an error and a time that can be drawn."""
     return work.status == "ok" and 0.0 < work.error < np.inf and 0.0 < work.seconds_per_simulated_second < np.inf

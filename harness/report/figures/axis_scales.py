@@ -189,7 +189,7 @@ def _labels_overlap(boxes: Sequence[Bbox]) -> bool:
 
 
 def measure_overlap(one: Bbox, other: Bbox) -> tuple[float, float]:
-    """Return by how much two boxes overlap, across and up; negative where there is a gap.
+    """Return the horizontal and vertical overlap of two boxes, negative where there is a gap.
 
     Args:
         one, other: the boxes, in the same unit.

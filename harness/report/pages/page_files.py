@@ -118,7 +118,7 @@ def _looks_equal(picture: PagePicture) -> bool:
 
 
 def _find_orphans(pages: list[RenderedPage]) -> list[Path]:
-    """Find the picture files that no page shows, in the folder of pictures next to each page."""
+    """Find picture files that no page shows, in the picture folder next to each page."""
     shown = {picture.path for page in pages for picture in page.pictures}
     folders = {page.path.parent / PICTURE_FOLDER for page in pages}
     return sorted(path for folder in folders for path in folder.glob("*.png") if path not in shown)

@@ -232,7 +232,10 @@ def digest_panels(panels: Sequence[FigurePanel], title: str, width: float) -> st
 
 
 def _encode_for_digest(value: Any) -> Any:
-    """Encode a panel or one of its parts; what renders a mesh is known by the mesh."""
+    """Encode a panel or one of its parts for a digest.
+
+    The renderer of a mesh is omitted, because the mesh determines it.
+    """
     if is_dataclass(value):
         return {one.name: getattr(value, one.name) for one in fields(value) if one.name != "render"}
     return value.tolist() if isinstance(value, np.ndarray) else str(value)

@@ -11,7 +11,10 @@ from springbench.harness.schema.base_model import ConfigModel, Vector3
 
 
 class ConstantForceEffect(ConfigModel):
-    """One force on every vertex. It equals gravity only if all vertices have the same mass."""
+    """One force on every vertex.
+
+    It equals gravity only if all vertices have the same mass.
+    """
 
     max_convergence_order: ClassVar[float] = inf
 

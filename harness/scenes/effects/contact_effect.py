@@ -34,7 +34,9 @@ _MARGIN_FRACTION = 0.1
 
 
 class ContactEffect(ConfigModel):
-    """Prevents vertices of the mesh from entering obstacles; thin obstacles cannot be tunnelled within a step.
+    """Contact that prevents vertices of the mesh from entering obstacles.
+
+    Thin obstacles cannot be tunnelled within a step.
 
     The stiffness k of contact follows from the penetration tolerance. A vertex that arrives with the speed v ends at
     most v dt Q_ii / k deep, where Q_ii is the resistance of inertia and springs: k_i = 4 Q_ii max(1, v dt / tolerance).
@@ -101,7 +103,7 @@ class ContactEffect(ConfigModel):
         return EffectContribution(derived_energies=(derived,), scene_checks=(partial(self._check_start, mesh),))
 
     def _check_start(self, mesh: Mesh, start: Positions, pins: Sequence[PinGroup]) -> None:
-        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, or for planes without a gap."""
+        """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, or planes without a gap."""
         limit = self.min_distance - self.max_penetration
         for k, given in enumerate(self.obstacles):
             obstacle = given.build_obstacle()

@@ -17,7 +17,7 @@ from springbench.solvers.model.energies import dashpot_energy
 
 
 class DashpotsEffect(ConfigModel):
-    """Damping of the rate of change of spring lengths; rigid motion of the mesh is not damped."""
+    """Damping of the rate of change of spring lengths, but not of rigid motion."""
 
     max_convergence_order: ClassVar[float] = inf
     is_dissipative: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""Pins: Dirichlet conditions at rest positions, which may move, by a penalty w/2 |p - q|^2 or exactly."""
+"""Pins: Dirichlet conditions at rest positions that may move, exact or by a penalty (w/2 |p - q|^2)."""
 
 from math import inf
 from typing import ClassVar, Literal

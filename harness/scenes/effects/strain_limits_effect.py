@@ -22,7 +22,10 @@ RUBBERY_STRAIN = 0.1
 
 
 class StrainLimitsEffect(ConfigModel):
-    """Limits the stretch and compression of the springs along and across cells, by a stiffness or exactly."""
+    """Limits of the stretch and compression of the springs along and across cells.
+
+    They are enforced by a stiffness or exactly.
+    """
 
     max_convergence_order: ClassVar[float] = 1.0
 

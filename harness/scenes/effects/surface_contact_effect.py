@@ -1,4 +1,4 @@
-"""Contact of points, edges and triangles of the mesh with the surfaces of obstacles, including meshes."""
+"""Contact of the mesh's points, edges and triangles with the surfaces of obstacles, including meshes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wind: a force field on the vertices, or an air velocity field with drag and lift on the triangles.
+"""Wind: a force field on vertices, or an air velocity field on triangles (drag and lift).
 
 On triangles (Keckeisen et al. 2004), with the air velocity u relative to the triangle, its area A, its normal n on the
 downstream side, and the air density rho:

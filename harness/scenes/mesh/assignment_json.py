@@ -32,7 +32,11 @@ class AssignmentJson(ConfigModel):
 
 
 def read_assignment_json(path: Path) -> AssignmentJson:
-    """Read a scene from a JSON file; raise InputError with file, line and key of each mistake."""
+    """Read a scene from a JSON file.
+
+    Raises:
+        InputError: for an invalid file, with the file, line and key of each mistake.
+    """
     check_mesh_file(path, max_bytes=MAX_SCENE_BYTES)
     try:
         text = path.read_text(encoding="utf-8-sig").rstrip()

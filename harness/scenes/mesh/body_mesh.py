@@ -42,12 +42,12 @@ _HORIZONTAL_OUTLINE = np.array(
 
 
 class BodyMesh(MeshGenerator):
-    """A closed surface that stands on y = 0 and looks along +z: head, neck, shoulders, waist and hips.
+    """A closed surface that stands on y = 0: head, neck, shoulders, waist and hips.
 
-    `size` vertices around, ring by ring from the crown, which is one vertex, down to the last one, in the middle of the
-    base. Cells are about square at the waist. Springs: along rings and down (STRETCH), then the diagonals down
-    forwards and down backwards (SHEAR). Triangles face outwards. Parts: crown, base (one vertex each). Mass is
-    proportional to area. Dimension 2.
+    The front faces +z. `size` vertices around, ring by ring from the crown, which is one vertex, down to the last one,
+    in the middle of the base. Cells are about square at the waist. Springs: along rings and down (STRETCH), then the
+    diagonals down forwards and down backwards (SHEAR). Triangles face outwards. Parts: crown, base (one vertex each).
+    Mass is proportional to area. Dimension 2.
     """
 
     kind: Literal["body"] = "body"

@@ -1,4 +1,7 @@
-"""The boundary of a surface: loops of edges with one triangle, and their classification as holes."""
+"""Boundary loops of a surface, and their classification as holes.
+
+A boundary loop consists of edges with one triangle.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,10 @@ class BoundaryLoop(NamedTuple):
 
 
 def find_boundary_loops(mesh: Mesh) -> list[BoundaryLoop]:
-    """Find the boundary loops of a mesh at rest, longest first; ties by the lowest vertex."""
+    """Find the boundary loops of a mesh at rest, longest first.
+
+    Loops of equal length are ordered by their lowest vertex.
+    """
     return trace_boundary_loops(mesh.rest_positions, mesh.triangles)
 
 

@@ -1,4 +1,7 @@
-"""A chain of vertices on a straight line with springs between neighbours; a rope also resists bending."""
+"""A chain of vertices on a straight line, and a rope that also resists bending.
+
+Springs connect neighbouring vertices.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes from files: OBJ, the assignment's JSON scenes, PLY, VTP, glTF, and all formats that meshio reads."""
+"""Meshes from files: OBJ, the assignment's JSON scenes, PLY, VTP, glTF, and meshio's formats."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class FileMesh(SpringValueKeys):
         return self._add_spring_properties(build_spring_network(cells, rule, path), cells)
 
     def _add_spring_properties(self, mesh: Mesh, cells: MeshCells) -> Mesh:
-        """Add the values of springs from the table, or from the cell data of the file's lines."""
+        """Add spring values from the table, or from the cell data of the file's lines."""
         columns, has_table = dict[str, NDArray[np.float64]](), self.spring_table is not None
         if self.spring_table is not None:
             table = read_data_table(self.spring_table)
@@ -112,7 +112,7 @@ class FileMesh(SpringValueKeys):
         return replace(mesh, spring_properties=properties)
 
     def find_geometry_path(self) -> Path:
-        """Return the path of the file with the geometry: that of the OBJ for a JSON scene."""
+        """Return the path of the geometry file: the OBJ file for a JSON scene."""
         if self.path.suffix.lower() != ".json":
             return self.path
         return self.path.parent / read_assignment_json(self.path).obj
@@ -131,12 +131,20 @@ class FileMesh(SpringValueKeys):
 
 
 def read_cells(path: Path) -> MeshCells:
-    """Read the cells of a mesh file of any format as they are; raise InputError on failure."""
+    """Read the cells of a mesh file of any format, unmodified.
+
+    Raises:
+        InputError: for a file that is invalid or cannot be read.
+    """
     return read_obj(path) if path.suffix.lower() == ".obj" else _read_other_cells(path)
 
 
 def _read_other_cells(path: Path) -> MeshCells:
-    """Read the cells of a file in a subprocess, except OBJ; raise InputError on any failure."""
+    """Read the cells of a file of any format but OBJ in a subprocess.
+
+    Raises:
+        InputError: for any failure, also of the subprocess.
+    """
     check_mesh_file(path)
     state = path.stat()
     found = _read_cached(path, state.st_mtime_ns, state.st_size)
@@ -185,7 +193,7 @@ def _find_group_problem(found: MeshFileContent) -> str:
 
 
 def _find_cell_problem(points: np.ndarray, blocks: list[tuple[str, IndexArray]]) -> str:
-    """Describe what is wrong with the points and cells of a file; empty if they are valid."""
+    """Describe what is wrong with the points and cells; empty if they are valid."""
     if points.ndim != 2 or not 1 <= points.shape[1] <= 3:
         return f"has points of shape {points.shape}; expected 1 to 3 coordinates each"
     if not np.all(np.abs(points) <= MAX_COORDINATE):

@@ -53,7 +53,10 @@ def guess_truncation(suffix: str, content: bytes) -> str:
 
 
 def _find_open_gmsh_section(content: bytes) -> str:
-    """Find an open section of a Gmsh file; the ANSYS format of the same suffix has no sections."""
+    """Describe an open section of a Gmsh file; empty if there is none.
+
+    The ANSYS format of the same suffix has no sections.
+    """
     open_sections: dict[bytes, int] = {}
     for end, name in _GMSH_SECTION.findall(content):
         open_sections[name] = open_sections.get(name, 0) + (-1 if end else 1)
@@ -100,7 +103,10 @@ class _VtkScan:
         return line
 
     def skip_values(self, count: int, kind: str, first: int = 0) -> bool:
-        """Skip `count` numbers, `first` of them in the line that was read; return whether they exist."""
+        """Skip `count` numbers; return whether they exist.
+
+        In a text file, `first` of them are in the line that was read.
+        """
         if self.is_binary:
             self.place += count * _VTK_SIZES[kind]
             return self.place <= len(self.content)
@@ -110,10 +116,11 @@ class _VtkScan:
 
 
 def _find_cut_vtk(content: bytes) -> str:
-    """Compare the counts that the sections of a legacy VTK file declare with the numbers that follow.
+    """Compare the counts declared in a legacy VTK file with the numbers that follow.
 
-    The format is that of https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html. The check ends at
-    the first section of an unknown name.
+    Each section declares its counts. The format is that of
+    https://docs.vtk.org/en/latest/vtk_file_formats/vtk_legacy_file_format.html. The check ends at the first section of
+    an unknown name.
     """
     if not content.startswith(b"# vtk DataFile"):
         return ""

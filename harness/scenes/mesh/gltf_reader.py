@@ -1,6 +1,6 @@
 # pyright: reportUnknownVariableType=false, reportUnknownArgumentType=false, reportUnknownMemberType=false
 # JSON and YAML have no types.
-"""Reader of the geometry of glTF 2.0 files, `.gltf` and `.glb`: triangles and lines of the default scene.
+"""Reader of the geometry of glTF 2.0 files (`.gltf`, `.glb`): triangles and lines of the default scene.
 
 The specification is https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html (Khronos). Positions are transformed to
 the scene by the nodes. Materials, skins, morph targets and animations are skipped. Compressed and sparse data are

@@ -53,11 +53,11 @@ def _name_sides(top: IndexArray, bottom: IndexArray, left: IndexArray, right: In
 
 
 class GridMesh(_SheetMesh):
-    """A cloth of near-square cells, `size` vertices along its width, numbered row by row from the top.
+    """A cloth of near-square cells, `size` vertices along its width.
 
-    Springs: along rows, along columns (STRETCH); the diagonals down to the right, then down to the left
-    (SHEAR); from a vertex to the next but one along rows, then along columns (BEND). 81 x 81 vertices with
-    one diagonal and skip-one springs have the 32,158 springs of the curtain of Liu et al. 2013.
+    Vertices are numbered row by row from the top. Springs: along rows, along columns (STRETCH); the diagonals down to
+    the right, then down to the left (SHEAR); from a vertex to the next but one along rows, then along columns (BEND).
+    81 x 81 vertices with one diagonal and skip-one springs have the 32,158 springs of the curtain of Liu et al. 2013.
     Parts: top, bottom, left, right, boundary, corners, top_corners. Mass is proportional to area. Dimension 2.
     """
 
@@ -101,13 +101,13 @@ class GridMesh(_SheetMesh):
 
 
 class NetMesh(_SheetMesh):
-    """A net of ropes: square meshes that stand on a corner, and a rope along the boundary; no triangles.
+    """A net of ropes: diagonal square meshes, and a rope along the boundary.
 
-    `size` knots along its top. Rows of `size` knots alternate with rows of `size - 1` knots half a mesh
-    lower; knots are numbered row by row. Springs, all STRETCH: from each knot of the short rows up
-    left, up right, down left, down right (one direction after another), then along top, bottom, left, right.
-    Parts: top, bottom, left, right, boundary, corners, top_corners. Mass is proportional to length. Dimension 2, so
-    that a net with finer meshes has the same stretch: its ropes are thinner.
+    The meshes stand on a corner. The net has no triangles. `size` knots along its top. Rows of `size` knots alternate
+    with rows of `size - 1` knots half a mesh lower; knots are numbered row by row. Springs, all STRETCH: from each knot
+    of the short rows up left, up right, down left, down right (one direction after another), then along top, bottom,
+    left, right. Parts: top, bottom, left, right, boundary, corners, top_corners. Mass is proportional to length.
+    Dimension 2, so that a net with finer meshes has the same stretch: its ropes are thinner.
     """
 
     kind: Literal["net"] = "net"

@@ -304,7 +304,10 @@ def _pair_sides(table: EdgeTable) -> tuple[IndexArray, IndexArray, NDArray[np.bo
 
 
 def _find_pinched_vertices(triangles: IndexArray, table: EdgeTable) -> IndexArray:
-    """Find vertices whose triangles are not connected through edges at them: surfaces that touch in a point."""
+    """Find vertices whose triangles are not connected through edges at them.
+
+    Surfaces touch in a point there.
+    """
     sides = table.side_edges.ravel()
     order = np.argsort(sides, kind="stable")
     follows = sides[order[1:]] == sides[order[:-1]]  # triangles around one edge, also where it has three or more

@@ -1,4 +1,4 @@
-"""Cleaning of the cells of a mesh file: unit and up axis, welding, degenerate faces, unused vertices.
+"""Cleaning of mesh cells from a file: unit, up axis, welding, degenerate faces, unused vertices.
 
 Each step is omitted unless an option requests it. The steps run in this order, and each logs how many cells it changed.
 All lengths are in metres, after scaling.
@@ -163,7 +163,10 @@ def _weld_vertices(cells: MeshCells, distance: float, path: Path) -> MeshCells:
 
 
 def _renumber_vertices(cells: MeshCells, remains: NDArray[np.bool_], number: IndexArray) -> MeshCells:
-    """Reduce cells to the vertices `remains` (n,), under new numbers (n,), -1 for vertices that no cell uses."""
+    """Reduce cells to the vertices `remains` (n,), renumbered by `number` (n,).
+
+    The number is -1 for vertices that no cell uses.
+    """
     groups = {name: number[group] for name, group in cells.vertex_groups.items()}
     groups = {name: sort_unique_vertices(group[group >= 0], int(remains.sum())) for name, group in groups.items()}
     return replace(
@@ -199,7 +202,9 @@ def find_flat_faces(points: PointArray, polygons: IndexArray) -> NDArray[np.bool
 
 
 def drop_degenerate_cells(cells: MeshCells) -> tuple[MeshCells, dict[str, int]]:
-    """Join repeated corners of faces, and drop faces without area and other cells that name a vertex twice.
+    """Join repeated corners of faces, and drop degenerate cells.
+
+    Degenerate cells are faces without area, and other cells that name a vertex twice.
 
     Returns:
         The other cells, and the numbers of changes with their descriptions.
@@ -248,7 +253,10 @@ def drop_degenerate_cells(cells: MeshCells) -> tuple[MeshCells, dict[str, int]]:
 
 
 def _join_repeated_corners(corners: list[int]) -> list[int]:
-    """Join equal neighbours around a face and remove spikes, corners between two visits of one vertex."""
+    """Join equal neighbours around a face, and remove spikes.
+
+    A spike is a corner between two visits of one vertex.
+    """
     around = deque[int]()
     for corner in corners:
         if len(around) >= 2 and around[-2] == corner:

@@ -172,7 +172,11 @@ def _restrict_file_access(path: Path) -> Generator[None]:
 
 
 def _read_with_meshio(path: Path) -> _MeshioMesh:
-    """Read a file with meshio; raise ValueError with the reason if meshio prints it and exits."""
+    """Read a file with meshio.
+
+    Raises:
+        ValueError: if meshio exits, with the reason that it printed.
+    """
     output = io.StringIO()
     try:
         with warnings.catch_warnings(), redirect_stdout(output):
@@ -222,7 +226,10 @@ _VTK_HEAD_BYTES = 2_000
 
 
 def _convert_legacy_polydata(path: Path) -> bytes:
-    """Convert a legacy VTK file of surfaces, which meshio does not support, to the contents of a .vtp."""
+    """Convert a legacy VTK file of surfaces to the contents of a .vtp file.
+
+    meshio does not support legacy files of surfaces.
+    """
     try:
         from vtkmodules.vtkIOLegacy import vtkPolyDataReader
         from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter

@@ -1,4 +1,4 @@
-"""Base class of the mesh generators: physical parameters, from which meshes of any size are built."""
+"""Base class of mesh generators, which build meshes of any size from physical parameters."""
 
 from __future__ import annotations
 
@@ -89,7 +89,11 @@ class MeshGenerator(ConfigModel):
 
     @abstractmethod
     def count_vertices(self, size: int) -> int:
-        """Return the number of vertices for a size from MIN_SIZE to MAX_VERTICES; nondecreasing in the size."""
+        """Return the number of vertices of a mesh; nondecreasing in its size.
+
+        Args:
+            size: from MIN_SIZE to MAX_VERTICES.
+        """
 
     @abstractmethod
     def generate_mesh(self, size: int) -> Mesh:

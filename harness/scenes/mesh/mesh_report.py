@@ -75,7 +75,10 @@ class MeshReport(NamedTuple):
         return any(finding.is_suspicious for finding in self.findings)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the report as data for JSON; vertices are counted from 0, faces as in the file."""
+        """Return the report as data for JSON.
+
+        Vertices are counted from 0, and faces as in the file.
+        """
         found = [
             {
                 "name": one.name,
@@ -93,7 +96,10 @@ class MeshReport(NamedTuple):
         return {"file": str(self.path), **self.facts, "findings": found}
 
     def format_facts(self) -> list[tuple[str, str]]:
-        """Return the contents of the file as pairs of a name and a text; the counts come first."""
+        """Return the contents of the file as pairs of a name and a text.
+
+        The first pair contains the counts.
+        """
         return [("contents", _format_counts(self.facts)), *_format_facts(self.facts)]
 
     def format_lines(self) -> Iterator[str]:
@@ -172,7 +178,9 @@ def find_mesh_remarks(mesh: Mesh, support: MeshSupport | None) -> list[MeshFindi
 
 
 def format_finding(finding: MeshFinding, numbering: Mesh | MeshCells) -> str:
-    """Format a finding with its first places, in which vertices have their numbers in the file.
+    """Format a finding with its first places.
+
+    Vertices have their numbers in the file.
 
     Args:
         finding: fault or remark, with its vertices, edges, triangles or faces.

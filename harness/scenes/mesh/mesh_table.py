@@ -1,4 +1,7 @@
-"""Table of the mesh types as `module:Class`; a run imports only the type that it uses."""
+"""Table of the mesh types as `module:Class`.
+
+A run imports only the type that it uses.
+"""
 
 from springbench.solvers.plugins.plugin_discovery import PluginTable
 

@@ -132,7 +132,9 @@ def lump_areas(rest: PointArray, triangles: IndexArray) -> PointArray:
 
 
 def compute_area_normals(rest: PointArray, triangles: IndexArray) -> tuple[PointArray, PointArray]:
-    """Compute the normals of triangles (f, 3), of twice their area in length, and their sums at vertices (n, 3) [m^2].
+    """Compute the area normals (f, 3) of triangles, and their sums at vertices (n, 3) [m^2].
+
+    The length of a normal is twice the area of its triangle.
 
     Args:
         rest: rest positions (n, 3) [m].
@@ -183,7 +185,10 @@ def compute_signed_volumes(rest: PointArray, tetrahedra: IndexArray) -> PointArr
 
 
 def find_box_parts(rest: PointArray) -> dict[str, IndexArray]:
-    """Find the vertices on the sides of the bounding box, within a millionth of its diagonal."""
+    """Find the vertices on the sides of the bounding box.
+
+    The tolerance is a millionth of its diagonal.
+    """
     low, high = rest.min(axis=0), rest.max(axis=0)
     near = 1e-6 * np.linalg.norm(high - low)
     names = (("left", "right"), ("bottom", "top"), ("back", "front"))

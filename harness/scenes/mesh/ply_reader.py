@@ -202,7 +202,7 @@ class _TextBody:
         return self._read_unequal_rows(element, expected, begun)
 
     def _locate_properties(self, element: PlyElement) -> tuple[dict[str, int], int]:
-        """Locate the properties of the row at the current position, and the end of the row."""
+        """Locate the properties and the end of the row at the current position."""
         places, at, begun = dict[str, int](), self._position, self._position
         for one in element.properties:
             places.setdefault(one.name, at - begun)

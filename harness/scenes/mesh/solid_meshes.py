@@ -76,12 +76,12 @@ _DIAGONAL_OFFSETS: dict[str, tuple[tuple[int, int, int], ...]] = {
 
 
 class BlockMesh(MeshGenerator):
-    """A soft block of near-cubic cells on the ground y = 0, `size` vertices along its longest side.
+    """A soft block on the ground y = 0, `size` vertices along its longest side.
 
-    Vertices are numbered with z fastest and x slowest. Springs: along x, y, z (STRETCH); the diagonals of
-    the faces in x-y, x-z and y-z, then the four diagonals through each cell (SHEAR). Triangles: the surface,
-    facing outwards. Parts: left, right, bottom, top, back, front, corners. Mass is proportional to the volume of the
-    cells. Dimension 3.
+    Cells are near-cubic. Vertices are numbered with z fastest and x slowest. Springs: along x, y, z (STRETCH); the
+    diagonals of the faces in x-y, x-z and y-z, then the four diagonals through each cell (SHEAR). Triangles: the
+    surface, facing outwards. Parts: left, right, bottom, top, back, front, corners. Mass is proportional to the volume
+    of the cells. Dimension 3.
     """
 
     kind: Literal["block"] = "block"
@@ -135,7 +135,7 @@ class BlockMesh(MeshGenerator):
 
 
 def _lumped_lengths(n: int) -> PointArray:
-    """Return the length that each of n vertices on a line represents, relative to a cell, (n,).
+    """Return the length (n,) that each vertex on a line represents, relative to a cell.
 
     The product over the axes is the volume that a vertex represents.
     """

@@ -1,4 +1,4 @@
-"""Contents of a mesh file as points and cells, and their conversion to a spring network."""
+"""Points and cells of a mesh file, and their conversion to a spring network."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def describe_repeated_corner(num_corners: int) -> str:
 
 
 def check_mesh_file(path: Path, *, max_bytes: int = MAX_FILE_BYTES) -> None:
-    """Check that a file can be read, has a valid size, and is no pointer or web page.
+    """Check that a file can be read and may contain a mesh.
 
     Args:
         path: the file.

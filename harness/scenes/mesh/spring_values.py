@@ -37,7 +37,7 @@ VALUE_KEYS = ("stiffness", "axial_stiffness", "rest_length", "tension", "force_d
 
 
 class SpringValueKeys(ConfigModel):
-    """Values of the springs of a mesh, each a number, a list, or the name of a column."""
+    """Spring values of a mesh, each a number, a list, or a column name."""
 
     stiffness: SpringNumbers | None = None
     """Stiffness k [N/m] of each spring: one number, a list in the order of the springs, or the name of a column."""
@@ -79,7 +79,10 @@ class SpringValueKeys(ConfigModel):
         return _resolve_values(distances, k, ea, r, t, q, flags)
 
     def _collect_values(self, key: str, m: int, columns: Columns, reads_unnamed: bool) -> NDArray[np.float64] | None:
-        """Return the values (m,) of a key, NaN where none is given; None if there are none."""
+        """Return the values (m,) of a key; None if there are none.
+
+        The value of a spring is NaN where none is given.
+        """
         given = getattr(self, key)
         if given is None:
             return columns.get(key) if reads_unnamed else None

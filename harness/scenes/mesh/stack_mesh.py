@@ -12,10 +12,10 @@ from springbench.harness.scenes.mesh.mesh_topology import IndexArray, PointArray
 
 
 class StackMesh(GridMesh):
-    """Unconnected layers of a grid, from the lowest to the highest, each numbered like a grid.
+    """Unconnected layers of a grid, from the lowest to the highest.
 
-    `size` vertices along the width of each. Springs: those of all layers, by family. Parts: those of a grid in
-    all layers, and lowest, highest. Mass is proportional to area. Dimension 2.
+    Each layer is numbered like a grid, with `size` vertices along its width. Springs: those of all layers, by family.
+    Parts: those of a grid in all layers, and lowest, highest. Mass is proportional to area. Dimension 2.
     """
 
     kind: Literal["stack"] = "stack"  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -11,7 +11,7 @@ from springbench.harness.scenes.mesh.mesh_topology import assemble_mesh, lump_le
 
 
 class StarMesh(MeshGenerator):
-    """A hub at the origin, and springs from it to `size` vertices on a horizontal circle.
+    """A hub at the origin with springs to `size` vertices on a horizontal circle.
 
     The hub is vertex 0. Parts: hub, rim. Mass is proportional to length, so the hub has half of it. Dimension 1.
     """

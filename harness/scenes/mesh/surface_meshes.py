@@ -21,11 +21,11 @@ from springbench.harness.scenes.mesh.mesh_topology import (
 
 
 class SkirtMesh(MeshGenerator):
-    """A truncated cone that hangs from y = 0, `size` vertices around, numbered ring by ring from the waist.
+    """A truncated cone that hangs from y = 0, `size` vertices around.
 
-    Rings run counter-clockwise as viewed from above. Springs: along rings, down (STRETCH), then the diagonals down
-    forwards and down backwards (SHEAR). Triangles face outwards. Cells are near-square at half height.
-    Parts: top (the waist), bottom (the hem). Mass is proportional to area. Dimension 2.
+    Vertices are numbered ring by ring from the waist. Rings run counter-clockwise as viewed from above. Springs: along
+    rings, down (STRETCH), then the diagonals down forwards and down backwards (SHEAR). Triangles face outwards. Cells
+    are near-square at half height. Parts: top (the waist), bottom (the hem). Mass is proportional to area. Dimension 2.
     """
 
     kind: Literal["skirt"] = "skirt"

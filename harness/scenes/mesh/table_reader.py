@@ -92,7 +92,7 @@ class DataTable:
 
 
 def read_data_table(path: Path) -> DataTable:
-    """Read a table from a `.parquet` file, or from a CSV file with a header line.
+    """Read a table from a Parquet file or a CSV file with a header line.
 
     Raises:
         InputError: if the file is missing, too large, malformed or has no rows.

@@ -1,7 +1,8 @@
-"""Reader of VTK's XML files of surfaces and lines (.vtp): text, base64 or raw, compressed or not.
+"""Reader of VTK's XML files of surfaces and lines (.vtp).
 
-The format is that of https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html. The reader returns
-polygons, strips and lines of all pieces, point data, and the cell data of lines; vertex cells are ignored.
+Data arrays are text, base64 or raw, compressed or not. The format is that of
+https://docs.vtk.org/en/latest/vtk_file_formats/vtkxml_file_format.html. The reader returns polygons, strips and lines
+of all pieces, point data, and the cell data of lines; vertex cells are ignored.
 """
 
 from __future__ import annotations
@@ -98,7 +99,10 @@ def _read_piece(piece: Element, arrays: _DataArrays) -> VtpContent:
 
 
 def _read_line_attributes(piece: Element, num_lines: int, arrays: _DataArrays) -> dict[str, FloatArray]:
-    """Read the cell data of lines; cells are numbered vertices first, then lines, then polygons and strips."""
+    """Read the cell data of lines.
+
+    Cells are numbered in the order of vertices, lines, polygons and strips.
+    """
     counts = [int(piece.get(f"NumberOf{kind}", "0")) for kind in ("Verts", "Lines", "Polys", "Strips")]
     found: dict[str, FloatArray] = {}
     for array in piece.iterfind("CellData/DataArray"):

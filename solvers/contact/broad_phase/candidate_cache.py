@@ -292,12 +292,15 @@ def _store_cache(before: list[CachedCandidates], found: CachedCandidates, caches
 
 
 def compute_roundoff_margin(p: Positions) -> float:
-    """Return the distance [m] that rounding errors of positions may amount to; bounding boxes are inflated by it."""
+    """Return the distance [m] that rounding errors of positions may amount to.
+
+    Bounding boxes are inflated by it.
+    """
     return _ROUNDOFF_INFLATION * float(np.abs(p).max(initial=0.0))
 
 
 def _max_displacement_from_mean(p: Positions, q: Positions) -> float:
-    """Return the largest displacement [m] of a vertex relative to the mean displacement from p to q."""
+    """Return the largest displacement [m] of a vertex from p to q, relative to the mean."""
     shift = q - p
     shift -= shift.mean(axis=0)
     return float(np.sqrt(np.einsum("ij,ij->i", shift, shift)).max(initial=0.0))

@@ -194,7 +194,10 @@ def _separated_mask(begin, end, pairs, basis, first, last, query, min_end_distan
 
 @jit_inner
 def _deviation_bounds(poses, pairs, first, last, e1, e2):
-    """Return z of eight pairs with and without E; both exclude the residual of the first clusters."""
+    """Return z of eight pairs with and without E.
+
+    Both exclude the residual of the first clusters.
+    """
     room, x = len(pairs.rest_distance), pairs.clusters
     f1, f2 = gather_rows(poses.f1, x, first, last, 0), gather_rows(poses.f2, x, first, last, 0)
     c = subtract3(gather_rows(poses.centre, x, first, last, 1), gather_rows(poses.centre, x, first, last, 0))

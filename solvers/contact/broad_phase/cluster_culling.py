@@ -271,7 +271,7 @@ class ClusterCulling:
     def _find_primitive_pairs(
         self, patches: IndexArray, x: FloatArray, y: FloatArray, query: CollisionQuery
     ) -> Candidates | None:
-        """Return the primitive pairs whose boxes may violate the limits; None if there are too many.
+        """Return primitive pairs whose boxes may violate the limits; None if there are too many.
 
         patches: cluster pairs (k, 2).
         """
@@ -332,7 +332,7 @@ class _ClusterSnapshot(NamedTuple):
 
 @jit_kernel
 def keep_new_pairs(pairs, starts, num_new_pairs):
-    """Remove new pairs that are close at rest, which are stored already, and compact the others.
+    """Remove new pairs that are already stored as close at rest, and compact the others.
 
     Args:
         pairs: cluster pairs (k, 2), those close at rest first; updated.

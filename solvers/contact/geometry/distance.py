@@ -62,9 +62,9 @@ def cross3(a, b):
 
 @jit_inner
 def _project_onto_edge(w, u):
-    """Return the parameter of the closest point on an edge u to w, and the squared distance.
+    """Return the parameter of an edge's closest point to w, and the squared distance.
 
-    The parameter is in [0, 1]. The vectors w and u start at the same end of the edge.
+    The parameter is in [0, 1]. The vector w and the edge u start at the same point.
     """
     length, t = dot3(u, u), dot3(u, w)
     t = where(t <= 0.0, 0.0, where(t >= length, 1.0, divide_packet(t, length)))

@@ -138,10 +138,11 @@ def _add_outer_product(block, weight, n0, n1, n2):
 
 @jit_inner
 def insert_index(key, k):
-    """Return the key of a set of half-spaces after the insertion of one that it does not contain.
+    """Return the key of a set of half-spaces after the insertion of a new one.
 
-    The keys of two sets of the first `_NUM_KEY_BITS` half-spaces of a row differ. Of larger ones they may be equal, but
-    rarely are; the search for active half-spaces then ends a pass early.
+    The set must not contain the inserted half-space. The keys of two sets of the first `_NUM_KEY_BITS` half-spaces of
+    a row differ. Of larger ones they may be equal, but rarely are; the search for active half-spaces then ends a pass
+    early.
 
     Args:
         key: key of the set, 0 if it is empty.
@@ -273,7 +274,7 @@ def add_half_space_change(s, i, x, d, total):
 
 
 def build_block_step(energy_change: Any) -> Any:
-    """Build a function that finds a step of row i that does not increase its energy.
+    """Build a function that finds a step that does not increase a row's energy.
 
     The function tries increasingly large blocks; if none succeeds, the step is zero. A device compiles it separately.
 

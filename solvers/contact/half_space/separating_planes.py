@@ -83,7 +83,7 @@ def find_nearby_obstacles(p, v, dt, frames, low, high, out):
 
 @jit_inner
 def _project_box(frame, c, x0, x1, x2, y0, y1, y2):
-    """Return the range of coordinate c, in a frame, of the box from x to y."""
+    """Return the range of a frame's coordinate c in the box from x to y."""
     e0, e1, e2, o = frame[1 + c, 0], frame[1 + c, 1], frame[1 + c, 2], frame[0]
     middle = e0 * (0.5 * (x0 + y0) - o[0]) + e1 * (0.5 * (x1 + y1) - o[1]) + e2 * (0.5 * (x2 + y2) - o[2])
     half = 0.5 * (abs(e0) * (y0 - x0) + abs(e1) * (y1 - x1) + abs(e2) * (y2 - x2))

@@ -262,9 +262,9 @@ def _solve_tile(to, at, triangle, strips, columns):
 
 @jit_inner
 def _subtract_lower_product(panels, left, stride, depth, head, target, to, size, first, end, part, parts):
-    """Subtract the lower triangle of L L' of panel columns L from columns of a matrix.
+    """Subtract the lower triangle of L L' from columns of a matrix.
 
-    head: offset of the rows that are multiplied; first, end: range of the matrix columns.
+    L: columns of the panel; head: offset of the rows that are multiplied; first, end: range of the matrix columns.
     """
     begin = first // TILE_ROWS * TILE_ROWS
     height = _part_height(size - begin, parts)

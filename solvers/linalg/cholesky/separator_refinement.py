@@ -164,7 +164,7 @@ def _apply_move(cut, i, to, at, listed):
 
 @jit_inner
 def _assign_side(cut, i, side, at):
-    """Assign a vertex to a side and log the change; return the end of the log."""
+    """Assign a vertex to a side and log the change; return the log's end."""
     was = cut.side[i]
     cut.move_log[at, 0], cut.move_log[at, 1] = i, was
     cut.side_counts[was] -= 1

@@ -152,7 +152,10 @@ def find_separator(pointers, neighbours, owner, number, piece, dist, field, queu
 
 @jit_inner_allocating
 def _assign_sides(pointers, neighbours, owner, number, piece, field, cut):
-    """Return the side of each vertex: 0 up to the cut, 1 above, 2 on the separator."""
+    """Return the side of each vertex.
+
+    It is 0 up to the cut, 1 above it, and 2 on the separator.
+    """
     side = np.empty(len(piece), np.int8)
     for i in range(len(piece)):
         v = piece[i]

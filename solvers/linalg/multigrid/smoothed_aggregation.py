@@ -75,7 +75,9 @@ class MultigridLevel:
 
 
 class Multigrid:
-    """A V-cycle for Q: z is linear in r, symmetric and positive definite up to rounding.
+    """A V-cycle for Q: a linear operator, symmetric and positive definite up to rounding.
+
+    It maps the residual r to the correction z.
 
     Attributes:
         nonzeros: entries of all levels' matrices, including the coarsest level's factor.

@@ -85,7 +85,10 @@ def prepare_with_half_spaces(solver: Solver, system: System) -> PreparedHalfSpac
 
 
 def find_prefactored(prepared: PreparedSolver) -> PreparedLocalGlobal:
-    """Return the iteration through Python of a prepared local-global method: itself, or the one that it compiles."""
+    """Return the iteration through Python of a prepared local-global method.
+
+    This is the method itself, or the iteration that it compiles.
+    """
     compiled: Any = prepared
     return prepared if isinstance(prepared, PreparedLocalGlobal) else compiled.base
 

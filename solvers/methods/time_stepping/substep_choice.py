@@ -1,4 +1,4 @@
-"""The substeps of a method that divides the step, which have a fixed number or an error tolerance."""
+"""Substeps of a method that divides the step: a fixed number or an error tolerance."""
 
 from __future__ import annotations
 

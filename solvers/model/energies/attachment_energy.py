@@ -44,5 +44,5 @@ class Attachments(Quadratic):
         return cls(selection_matrix_sparse(vertices, n), stiffness, anchor_positions_at(0.0), anchor_positions_at)
 
     def begin_step(self, start: StepStart) -> Attachments:
-        """Return the energy of a step, with the anchor points at the time of the stage."""
+        """Return the energy of a step, with the anchor points at the stage time."""
         return replace(self, d=self.anchor_positions_at(start.stage_time))

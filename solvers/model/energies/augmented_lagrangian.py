@@ -32,7 +32,7 @@ _LIMIT_FUNCTIONS = StrainLimits.element_law.element_functions
 
 @jit_inner
 def _hessian(numbers, e, z0, z1, z2):
-    """Return the Hessian of a strain limit without the negative transverse part of a compressed edge."""
+    """Return the Hessian of a strain limit without a compressed edge's negative transverse part."""
     length = np.sqrt(z0 * z0 + z1 * z1 + z2 * z2)
     force = numbers[e, 0] * strain_limit_energy.length_excess(numbers, e, length)
     if force == 0.0 and numbers[e, 1] < numbers[e, 2]:

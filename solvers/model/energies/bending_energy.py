@@ -37,11 +37,11 @@ class Bending(Quadratic):
 
     @classmethod
     def from_rest_shape(cls, rest: Positions, triangles: IndexArray, stiffness: float) -> Bending:
-        """Return the bending energy of triangles with areas, of which at most two share an edge.
+        """Return the bending energy of a triangulated surface.
 
         Args:
             rest: rest positions (n, 3) [m].
-            triangles: (f, 3).
+            triangles: (f, 3), with positive areas; at most two share an edge.
             stiffness: flexural rigidity B [N m].
         """
         parts = [_flap_stencils(rest, find_flaps(cut)) for cut in _triangulations(rest, triangles)]
@@ -60,7 +60,10 @@ def find_flaps(triangles: IndexArray) -> IndexArray:
 
 
 def _triangulations(rest: Positions, triangles: IndexArray) -> Iterator[IndexArray]:
-    """Yield the triangles, and the triangulation with the other diagonal of all rectangles if there are any."""
+    """Yield the triangles, then the triangulation with the other diagonal of all rectangles.
+
+    The second one is omitted if there are no rectangles.
+    """
     yield triangles
     a, b, c, d = find_flaps(triangles).T
     diagonal, other = (np.linalg.norm(rest[i] - rest[j], axis=1) for i, j in ((a, b), (c, d)))

@@ -1,4 +1,4 @@
-"""Dashpots: the force f = -c n n'(v_i - v_j) opposes the rate of change of an edge's length.
+"""Dashpots: the force f = -c n n'(v_i - v_j) opposes the rate of change of edge lengths.
 
 The direction n is that at the start of the step, so the force is linear. Integrators of order 2 evaluate n at positions
 that are extrapolated to the time of the stage, and preserve their order. Since the stage moves with the velocity

@@ -1,4 +1,7 @@
-"""Shared parts of energies along vertex pairs: v = A p, forces A'f, the matrix A'KA, and 3 x 3 blocks."""
+"""Shared parts of energies along vertex pairs.
+
+They are the edge vectors v = A p, the forces A'f, the matrix A'KA, and Hessians of 3 x 3 blocks.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +63,7 @@ class EdgeEnergy:
         out[: self._num_vertices] += self._incidence[1] @ x
 
     def _scatter_absolute_terms(self, terms: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-        """Add k times the terms (m,) [m] of each edge to `out` (n,) at both ends, except for self-loops."""
+        """Add k times the terms (m,) [m] of edges to `out` (n,) at both ends, except for self-loops."""
         (i, j), terms = self.edges.T, self.stiffness * terms
         terms = np.where(i != j, terms, 0.0)
         for end in (i, j):

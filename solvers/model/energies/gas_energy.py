@@ -1,4 +1,6 @@
-"""A fixed amount of gas at constant temperature in a closed surface: p V = p0 V0.
+"""A fixed amount of gas at constant temperature in a closed surface.
+
+Its pressure p and volume V satisfy p V = p0 V0. Its energy is
 
     E(x) = -p0 V0 ln(V/V0),   V = sum over triangles of a.(b x c)/6,   grad E = -(p0 V0/V) grad V
     Hess E = p/V grad V grad V' - p Hess V,   p = p0 V0/V

@@ -129,4 +129,4 @@ class EtherDrag(ViscousDamping):
 
 
 class RayleighDamping(ViscousDamping):
-    """The part of Rayleigh damping proportional to the masses, or to the matrix of a quadratic energy."""
+    """The part of Rayleigh damping proportional to the masses, or to a quadratic energy's matrix."""

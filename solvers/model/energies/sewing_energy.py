@@ -49,5 +49,5 @@ class Sewing(StrainLimits):
         )
 
     def begin_step(self, start: StepStart) -> Sewing:
-        """Return the energy of a step, with the maximum lengths at the time of the stage."""
+        """Return the energy of a step, with the maximum lengths at the stage time."""
         return replace(self, max_length=self.max_length_at(start.stage_time))

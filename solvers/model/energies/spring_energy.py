@@ -125,7 +125,10 @@ class Springs(EdgeEnergy):
 
 
 def _merge_lengths(lengths: NDArray[np.float64], round_off: float) -> NDArray[np.float64]:
-    """Return the lengths (m,) [m], each replaced by the smallest of its group with gaps up to `round_off` [m]."""
+    """Return lengths (m,) [m], each replaced by the smallest of its group.
+
+    Consecutive lengths of a group, in ascending order, differ by at most `round_off` [m].
+    """
     order = np.argsort(lengths, kind="stable")
     ascending = lengths[order]
     first = np.diff(ascending, prepend=-np.inf) > round_off

@@ -18,7 +18,7 @@ from springbench.solvers.model.energies.strain_limit_energy import StrainLimits
 
 @dataclass(frozen=True, eq=False)
 class TensionOnlySprings(StrainLimits):
-    """Springs without any force while they are shorter than their rest length, which is the maximum length."""
+    """Springs without any force below their rest length, which is the maximum length."""
 
     @classmethod
     def from_springs(cls, springs: Springs) -> TensionOnlySprings:

@@ -79,7 +79,7 @@ class RungeKutta:
 
     @property
     def stage_order(self) -> int:
-        """Stage order: the largest q for which A c^(k-1) = c^k / k of all k up to q."""
+        """Stage order: the largest q with A c^(k-1) = c^k / k for all k <= q."""
         A, c = np.zeros((len(self.a), len(self.a))), np.array(self.stage_times)
         for i, row in enumerate(self.a):
             A[i, : i + 1] = row
