@@ -42,6 +42,7 @@ def mark_slow_tests(items: list[pytest.Item]) -> None:
         name = item.nodeid
         lines = {name, name.partition("[")[0], name.partition("::")[0]}
         if long & lines:
+            item.own_markers[:] = [mark for mark in item.own_markers if mark.name != "slow"]  # marked so in its file
             item.add_marker(pytest.mark.long)
         elif slow & lines or find_compiling(name):
             item.add_marker(pytest.mark.slow)
