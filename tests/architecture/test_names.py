@@ -1,6 +1,7 @@
 """A public name has one meaning, and no file uses two classes of one name."""
 
 import ast
+import functools
 import re
 from collections import defaultdict
 from collections.abc import Iterable
@@ -60,15 +61,19 @@ def parse_modules(texts: Iterable[tuple[str, str]]) -> Trees:
     return {module: ast.parse(text) for module, text in texts}
 
 
-def test_no_file_refers_to_two_classes_of_one_name() -> None:
-    modules = (
+@functools.cache
+def parse_product() -> Trees:
+    return parse_modules(
         (".".join(("springbench", *path.relative_to(ROOT).with_suffix("").parts)), path.read_text()) for path in FILES
     )
-    assert find_class_clashes(parse_modules(modules)) == [], "give one of them a name of its own"
+
+
+def test_no_file_refers_to_two_classes_of_one_name() -> None:
+    assert find_class_clashes(parse_product()) == [], "give one of them a name of its own"
 
 
 def test_a_public_name_is_defined_once() -> None:
-    homonyms = find_homonyms(parse_modules((str(path), path.read_text()) for path in FILES))
+    homonyms = find_homonyms(parse_product())
     assert homonyms - set(REPEATED_NAMES) == set(), "give one of them a name of its own"
     assert set(REPEATED_NAMES) - homonyms == set(), "these are defined once now"
 
