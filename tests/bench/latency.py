@@ -97,6 +97,7 @@ _WITHOUT_KERNELS: Any = {"cold": "compiled kernels", "environment": {"NUMBA_CACH
 _IN_PROCESS = ("-m", "tests.bench.latency", "--in-process")
 
 _OF_A_RERUN = "half in the processes that draw, with PyVista and Matplotlib; most of the rest imports"
+_OF_A_FIRST_RUN = "three quarters compile kernels, on all cores; the rest is that of a warm run"
 
 LATENCY_ROWS = {
     "sweep-again": LatencyRow(
@@ -141,8 +142,15 @@ LATENCY_ROWS = {
         ("preview", "hanging-cloth", "-o", "RESULTS/quickstart/preview.png"),
         (_SWEEP,),
         cold="the picture",
+        limit="three quarters import PyVista with VTK, Matplotlib, NumPy and Pydantic; a sixth opens the renderer",
     ),
-    "error-search": LatencyRow("run --error 1e-4, hanging cloth of 17", 1.5, (*_TO_ERROR, "--rerun"), (_TO_ERROR,)),
+    "error-search": LatencyRow(
+        "run --error 1e-4, hanging cloth of 17",
+        1.5,
+        (*_TO_ERROR, "--rerun"),
+        (_TO_ERROR,),
+        limit="three quarters import Numba, SciPy, Pydantic and Typer; a seventh loads compiled kernels",
+    ),
     "recommend-chain": LatencyRow(
         "recommend, chain", 12.0, ("recommend", "chain", "--error", "1e-2", "--results", "RESULTS"), cold="results"
     ),
@@ -153,7 +161,11 @@ LATENCY_ROWS = {
         cold="results",
     ),
     "chain-motion": LatencyRow(
-        "chain of 9, 0.5 s to 1e-4, the chosen motion", 0.3e-3, (*_IN_PROCESS, "chain-motion"), value_key="seconds"
+        "chain of 9, 0.5 s to 1e-4, the chosen motion",
+        0.3e-3,
+        (*_IN_PROCESS, "chain-motion"),
+        value_key="seconds",
+        limit="nine tenths Python between compiled steps, once a frame",
     ),
     "verlet-substep": LatencyRow(
         "velocity Verlet, cloth of 17 a side, a substep",
@@ -174,6 +186,7 @@ LATENCY_ROWS = {
         8.0,
         _AGAIN_NUMBA,
         is_long=True,
+        limit=_OF_A_FIRST_RUN,
         **_WITHOUT_KERNELS,
     ),
     "first-run-hybrid": LatencyRow(
@@ -181,6 +194,7 @@ LATENCY_ROWS = {
         12.0,
         _AGAIN_HYBRID,
         is_long=True,
+        limit=_OF_A_FIRST_RUN,
         **_WITHOUT_KERNELS,
     ),
     "first-error-search": LatencyRow(
