@@ -90,9 +90,9 @@ def order_into_subdomains(Q: csr_array) -> NDArray[np.int64]:
     orders, graph = list[NDArray[np.int64]](), csr_array(Q)
     while (n := len(graph.indptr) - 1) > SUBDOMAIN_SIZE:
         order = np.empty(n, np.int64)
-        grow_subdomains(
-            np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int64), order, *np.zeros((3, n), int)
-        )
+        pointers, neighbours = np.asarray(graph.indptr, np.int64), np.asarray(graph.indices, np.int64)
+        # The size is an argument: compiled code is cached with the constants of its module, and tests change this one.
+        grow_subdomains(SUBDOMAIN_SIZE, pointers, neighbours, order, *np.zeros((3, n), int))
         orders.append(order)
         of = np.empty(n, np.int64)
         of[order] = np.arange(n) // SUBDOMAIN_SIZE
@@ -111,10 +111,11 @@ def _build_aggregation_matrix(of: NDArray[np.int64]) -> csr_array:
 
 
 @jit_kernel
-def grow_subdomains(pointers, neighbours, order, state, queue, border):
+def grow_subdomains(size, pointers, neighbours, order, state, queue, border):
     """Order a graph's nodes so that subdomains grow from the border of earlier ones.
 
     Args:
+        size: number of nodes of a subdomain.
         pointers, neighbours: graph in CSR form.
         order: output (n,).
         state, queue, border: scratch (n,), zero initially. state is 0 for an unvisited node, 1 in the queue of the
@@ -122,7 +123,7 @@ def grow_subdomains(pointers, neighbours, order, state, queue, border):
     """
     n, done, first, left, right = len(order), 0, 0, 0, 0
     while done < n:
-        head, tail, most = 0, 0, min(n, done + SUBDOMAIN_SIZE)
+        head, tail, most = 0, 0, min(n, done + size)
         while done < most:
             if head == tail:
                 seed = -1
