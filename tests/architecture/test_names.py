@@ -1,14 +1,12 @@
 """A public name has one meaning, and no file uses two classes of one name."""
 
 import ast
-import functools
 import re
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
-FILES = [path for package in ("harness", "solvers") for path in sorted((ROOT / package).rglob("*.py"))]
+from tests.architecture.test_vocabulary import FILES, ROOT, parse_sources
 
 ENERGY_CLASS = "Energy"
 """As what an effect's file imports the energy of the effect's name, which is its other half."""
@@ -61,19 +59,18 @@ def parse_modules(texts: Iterable[tuple[str, str]]) -> Trees:
     return {module: ast.parse(text) for module, text in texts}
 
 
-@functools.cache
-def parse_product() -> Trees:
-    return parse_modules(
-        (".".join(("springbench", *path.relative_to(ROOT).with_suffix("").parts)), path.read_text()) for path in FILES
-    )
+def name_product_trees() -> Trees:
+    """The trees of all files of the product, by the dotted names of their modules."""
+    places = ((one.path.relative_to(ROOT).with_suffix(""), one.tree) for one in parse_sources())
+    return {".".join(("springbench", *place.parts)): tree for place, tree in places}
 
 
 def test_no_file_refers_to_two_classes_of_one_name() -> None:
-    assert find_class_clashes(parse_product()) == [], "give one of them a name of its own"
+    assert find_class_clashes(name_product_trees()) == [], "give one of them a name of its own"
 
 
 def test_a_public_name_is_defined_once() -> None:
-    homonyms = find_homonyms(parse_product())
+    homonyms = find_homonyms(name_product_trees())
     assert homonyms - set(REPEATED_NAMES) == set(), "give one of them a name of its own"
     assert set(REPEATED_NAMES) - homonyms == set(), "these are defined once now"
 
