@@ -224,7 +224,11 @@ class ResidualMetric:
 
         The round-off is due to the rounding of the positions p (n, 3).
         """
-        return (EPS * objective_kernels.compute_max_magnitude(p)) ** 2 * self.unpinned_trace
+        return self.bound_energy_roundoff(objective_kernels.compute_max_magnitude(p))
+
+    def bound_energy_roundoff(self, max_magnitude: float) -> float:
+        """Return the bound of `energy_roundoff` for positions with this largest absolute coordinate [m]."""
+        return (EPS * max_magnitude) ** 2 * self.unpinned_trace
 
     def significant_vertices(self, p: Positions, decrease: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which vertices are of connected components whose decrease exceeds round-off.

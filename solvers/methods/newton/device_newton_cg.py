@@ -189,8 +189,7 @@ class _NewtonCGState(DeviceSolverState):
         self._begun.load_step(step, self._p, self._q)
         self.stream.overwrite_array(np.zeros(1), self._largest)
         measure_max_coordinate[self._over_all](self._p, self._largest)
-        farthest = np.tile(self.stream.download_array(self._largest), (1, 3))  # a point with the largest coordinate
-        self._floor = self._made.metric.energy_roundoff(farthest)
+        self._floor = self._made.metric.bound_energy_roundoff(float(self.stream.download_array(self._largest)[0]))
         self._eta, self._residual_product = self._max_eta, self._linearise_at_point()
 
     def position_rows(self) -> Any:
