@@ -3,9 +3,9 @@
     python -m tests.bench.latency [--repeats 5] [--only WORD ...] [--publish results/published/latency]
 
 Each measurement is a process of its own. Its wall time counts, its processor time (user and system, with all its child
-processes), and the wall time until its first output. A table shows the medians. Commands that take minutes are measured
-only where `--only` names them. A row states what was cold; bytecode and the file cache of the system are warm unless
-it says otherwise.
+processes), and the wall time until its first output on a terminal. A table shows the medians. Commands that take
+minutes are measured only where `--only` names them. A row states what was cold; bytecode and the file cache of the
+system are warm unless it says otherwise.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import pty
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from select import select
 from statistics import median
 from tempfile import TemporaryDirectory
 from time import perf_counter, process_time
@@ -237,7 +239,9 @@ MEASUREMENT_SCHEMA = run_schema.build_schema(
         run_schema.ColumnSpec("value", pa.float64(), "s", "wall time, or what the row measures"),
         run_schema.ColumnSpec("wall_seconds", pa.float64(), "s", "wall time of the process"),
         run_schema.ColumnSpec("cpu_seconds", pa.float64(), "s", "processor time of the process and its children"),
-        run_schema.ColumnSpec("first_output_seconds", pa.float64(), "s", "wall time until the first output"),
+        run_schema.ColumnSpec(
+            "first_output_seconds", pa.float64(), "s", "wall time until the first output on a terminal"
+        ),
     )
 )
 
@@ -261,25 +265,44 @@ def measure_command(
     with TemporaryDirectory() as empty:
         variables = {key: value.replace("FOLDER", empty) for key, value in (environment or {}).items()}
         began = perf_counter()
+        terminal, terminal_of_process = pty.openpty()  # progress is shown on terminals
         process = subprocess.Popen(
             arguments,
             cwd=CHECKOUT,
             env=os.environ | {"PYTHONDONTWRITEBYTECODE": ""} | variables,  # bytecode is warm after one start
             stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
+            stderr=terminal_of_process,
         )
+        os.close(terminal_of_process)
         assert process.stdout is not None
-        output = os.read(process.stdout.fileno(), 1 << 16)
-        first = perf_counter() - began
-        output += process.stdout.read()
+        first, output, shown = _read_streams(process.stdout.fileno(), terminal)
+        os.close(terminal)
         _, status, used = os.wait4(process.pid, 0)  # with all children that the process has waited for
         wall = perf_counter() - began
         process.returncode = os.waitstatus_to_exitcode(status)
-    text = output.decode(errors="replace")
     if checked and process.returncode:
+        text = (shown + output).decode(errors="replace")
         raise RuntimeError(f"{' '.join(arguments)} ended with exit code {process.returncode}:\n{text[-2000:]}")
     cpu = used.ru_utime + used.ru_stime
-    return {"wall_seconds": wall, "cpu_seconds": cpu, "first_output_seconds": first, "output": text}
+    times = {"wall_seconds": wall, "cpu_seconds": cpu, "first_output_seconds": first - began}
+    return {**times, "output": output.decode(errors="replace")}
+
+
+def _read_streams(pipe: int, terminal: int) -> tuple[float, bytes, bytes]:
+    """Read a pipe and a terminal to their ends; return the time of the first bytes [s], and what both contained."""
+    first, contents = 0.0, {pipe: b"", terminal: b""}
+    still_open = set(contents)
+    while still_open:
+        for stream in select(still_open, (), ())[0]:
+            try:
+                chunk = os.read(stream, 1 << 16)
+            except OSError:  # all processes closed the terminal
+                chunk = b""
+            first = first or perf_counter()
+            contents[stream] += chunk
+            if not chunk:
+                still_open.discard(stream)
+    return first, contents[pipe], contents[terminal]
 
 
 def measure_row(name: str, repeats: int, warm: Path) -> list[dict[str, Any]]:
