@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import DOP853
 from springbench.harness.reference.reference_trajectory import ReferenceTrajectory, integrate_motion
 from springbench.harness.scenes.effects.air_drag_effect import AirDragEffect
 from springbench.harness.scenes.effects.bending_effect import BendingEffect
@@ -29,6 +30,7 @@ from springbench.solvers.methods.time_stepping.explicit_forces import estimate_m
 from springbench.solvers.methods.time_stepping.explicit_integrators import PreparedExplicit
 from springbench.solvers.methods.time_stepping.explicit_tableaus import (
     BLANES_MOAN_4,
+    DORMAND_PRINCE_8,
     RUNGE_KUTTA_4,
     TSITOURAS_5,
     VELOCITY_VERLET,
@@ -201,3 +203,11 @@ def test_a_minimiser_has_nothing_to_do_where_the_solver_should_integrate():
     scene = build_unit_scene(SOFT, GravityEffect(), FIRST_PIN)
     with pytest.raises(Unsupported, match="substepping"):
         run(scene, prepare(scene, NewtonSolver()))
+
+
+def test_the_coefficients_of_order_8_are_those_of_scipy():
+    a = DORMAND_PRINCE_8.a
+    np.testing.assert_array_equal(a[:12, :12], DOP853.A)
+    np.testing.assert_array_equal(a[12, :12], DOP853.B)
+    assert not a[:, 12].any()
+    np.testing.assert_array_equal(DORMAND_PRINCE_8.error_weights, [DOP853.E5, DOP853.E3])

@@ -38,12 +38,12 @@ from springbench.solvers.methods.time_stepping.explicit_integrator_kernels impor
 from springbench.solvers.methods.time_stepping.explicit_tableaus import (
     BLANES_MOAN_4,
     BLANES_MOAN_6,
+    DORMAND_PRINCE_8,
     RUNGE_KUTTA_4,
     TSITOURAS_5,
     VELOCITY_VERLET,
     ExplicitTableau,
     SplittingMethod,
-    build_dormand_prince_8,
     compute_max_steps,
     integrate_drag,
 )
@@ -70,10 +70,6 @@ class ExplicitSolver:
     solver_name: ClassVar[str]
     coefficients: ClassVar[SplittingMethod | ExplicitTableau]
 
-    def build_coefficients(self) -> SplittingMethod | ExplicitTableau:
-        """Return the coefficients of the method."""
-        return self.coefficients
-
     def _prepare_explicit(self, system: System, substeps: int, error: float) -> PreparedSolver:
         """Prepare the method for a system.
 
@@ -84,7 +80,7 @@ class ExplicitSolver:
         """
         vertex_terms.require_implicit_euler(system, self.solver_name)
         vertex_terms.require_mass(system, np.where(system.unpinned_mask, system.mass, np.inf), self.solver_name)
-        method, parts = self.build_coefficients(), ExplicitForces.from_system(system, self.solver_name)
+        method, parts = self.coefficients, ExplicitForces.from_system(system, self.solver_name)
         omega = estimate_max_frequency(system)
         rate = omega + float(parts.drag_rate.max(initial=0.0))
         needed = substeps * max(1.0, ceil(system.time_step * rate / (STABILITY_SAFETY * method.stability_limit)))
@@ -273,10 +269,7 @@ class DormandPrince8(_AdaptiveStepSolver):
         formula="Runge-Kutta method of orders 8(5,3)",
         cost="12 passes per substep",
     )
-
-    def build_coefficients(self) -> SplittingMethod | ExplicitTableau:
-        """Return the coefficients, taken from SciPy."""
-        return build_dormand_prince_8()
+    coefficients: ClassVar[SplittingMethod | ExplicitTableau] = DORMAND_PRINCE_8
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,13 +4,13 @@ Splitting methods alternate drifts a and kicks b, a_0 b_0 a_1 ... b_(k-1) a_k, a
 "Practical symplectic partitioned Runge-Kutta and Runge-Kutta-Nystrom methods", S6 of order 4 and S10 of order 6). The
 Runge-Kutta methods are Kutta's of order 4; Tsitouras 2011, "Runge-Kutta pairs of order 5(4) satisfying only the first
 column simplifying assumption"; and Dormand and Prince's of order 8, with errors of order 5 and 3 (Hairer, Norsett and
-Wanner, Solving Ordinary Differential Equations I, section II.5), whose coefficients are those of SciPy.
+Wanner, Solving Ordinary Differential Equations I, section II.5).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -181,11 +181,54 @@ TSITOURAS_5 = ExplicitTableau(
 )
 
 
-@cache
-def build_dormand_prince_8() -> ExplicitTableau:
-    """Return the method of order 8."""
-    from scipy.integrate import DOP853  # imported only for this tableau
-
-    a = np.zeros((13, 13))
-    a[:12, :12], a[12, :12] = DOP853.A, DOP853.B
-    return ExplicitTableau(8, a, np.array([DOP853.E5, DOP853.E3]), 8.0)
+DORMAND_PRINCE_8 = ExplicitTableau(
+    8,
+    _lower_triangular(
+        [],
+        [0.05260015195876773],
+        [0.0197250569845379, 0.0591751709536137],
+        [0.02958758547680685, 0.0, 0.08876275643042054],
+        [0.2413651341592667, 0.0, -0.8845494793282861, 0.924834003261792],
+        [0.037037037037037035, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242],
+        [0.037109375, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -0.017578125],
+        [
+            *(0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328, -0.015319437748624402),
+            0.008273789163814023,
+        ],
+        [
+            *(0.6241109587160757, 0.0, 0.0, -3.3608926294469414, -0.868219346841726, 27.59209969944671),
+            *(20.154067550477894, -43.48988418106996),
+        ],
+        [
+            *(0.47766253643826434, 0.0, 0.0, -2.4881146199716677, -0.590290826836843, 21.230051448181193),
+            *(15.279233632882423, -33.28821096898486, -0.020331201708508627),
+        ],
+        [
+            *(-0.9371424300859873, 0.0, 0.0, 5.186372428844064, 1.0914373489967295, -8.149787010746927),
+            *(-18.52006565999696, 22.739487099350505, 2.4936055526796523, -3.0467644718982196),
+        ],
+        [
+            *(2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188),
+            *(27.94888452941996, -2.8589982771350235, -8.87285693353063, 12.360567175794303, 0.6433927460157636),
+        ],
+        [
+            *(0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003),
+            *(-5.801203960010585, 0.3111643669578199, -0.1521609496625161, 0.20136540080403034, 0.04471061572777259),
+        ],
+    ),
+    np.array(
+        [
+            [
+                *(0.01312004499419488, 0.0, 0.0, 0.0, 0.0, -1.2251564463762044, -0.4957589496572502),
+                *(1.6643771824549864, -0.35032884874997366, 0.3341791187130175, 0.08192320648511571),
+                *(-0.022355307863886294, 0.0),
+            ],
+            [
+                *(-0.18980075407240762, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003),
+                *(-5.801203960010585, -0.4226823213237919, -0.1521609496625161, 0.20136540080403034),
+                *(0.02265179219836082, 0.0),
+            ],
+        ]
+    ),
+    8.0,
+)
