@@ -311,7 +311,7 @@ def run_config(
     """
     from springbench.harness.console import get_error_console
     from springbench.harness.execution.progress_display import create_display
-    from springbench.harness.experiments.sweep_runner import run_sweep
+    from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
     from springbench.harness.report.report_plugins import run_reports
     from springbench.harness.results.folder_ownership import claim_folder
 
@@ -325,7 +325,12 @@ def run_config(
         sweep = config_loader.load_config(path)
     place = claim_folder(Path(results) / sweep.name, path)
     table = run_sweep(
-        sweep.name, sweep.list_runs(), place, create_display(get_error_console()), lambda line: None, rerun=rerun
+        sweep.name,
+        sweep.list_runs(),
+        place,
+        create_display(get_error_console()),
+        lambda line: None,
+        ExecutionOptions(rerun=rerun),
     ).table
     run_reports(sweep.reports, table, place, sweep.options.time_limit)
     return _to_dataframe(table)

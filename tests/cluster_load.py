@@ -39,7 +39,7 @@ from springbench.harness.experiments.provenance import (
     collect_source_parts,
     compute_source_fingerprint,
 )
-from springbench.harness.experiments.sweep_runner import run_sweep
+from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
 from springbench.harness.results import parquet_rows
 
 from tests.plugin_solvers import SCENE_SOURCE
@@ -219,7 +219,8 @@ def simulate_cluster(count: int, runs: int, folder: Path, seconds: float) -> dic
     )
     values["ended"] = "all runs are done"
     try:
-        swept = run_sweep("sweep", found, folder / "r", display, print, scheduler_address=address)
+        execution = ExecutionOptions(scheduler_address=address)
+        swept = run_sweep("sweep", found, folder / "r", display, print, execution)
         values["rows"] = len(swept.table)
     except TimeIsUp:
         values["ended"] = f"after {seconds:g} s; the same command, with the same folder, does the rest"

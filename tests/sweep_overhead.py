@@ -88,7 +88,7 @@ def run_timed_sweep(runs: list[RunSpec], folder: Path, workers: int | None) -> S
 def _run_in_child(answer: Any, runs: list[RunSpec], folder: Path, workers: int | None) -> None:
     began = monotonic()
     from springbench.harness.experiments import run_pipeline as runs_of
-    from springbench.harness.experiments.sweep_runner import run_sweep
+    from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
 
     timed, note = runs_of._acquire_timing_lock, folder / "timed"
 
@@ -103,7 +103,8 @@ def _run_in_child(answer: Any, runs: list[RunSpec], folder: Path, workers: int |
 
     runs_of._acquire_timing_lock = noting
     weighed = MemoryDisplay()
-    run_sweep("costs", runs, folder, weighed, lambda said: None, num_workers=workers, isolated=workers != 0)
+    execution = ExecutionOptions(num_workers=workers, isolated=workers != 0)
+    run_sweep("costs", runs, folder, weighed, lambda said: None, execution)
     wall = monotonic() - began
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     cpu = sum(one.ru_utime + one.ru_stime for one in used)

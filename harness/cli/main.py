@@ -125,7 +125,7 @@ def run(
     """Run the missing runs of a sweep, or of one scene."""
     from springbench.harness.config.config_loader import load_config
     from springbench.harness.execution.progress_display import create_display
-    from springbench.harness.experiments.sweep_runner import run_sweep
+    from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
     from springbench.harness.results.folder_ownership import claim_folder
 
     require_output_file(positions, ".npz", "--positions")
@@ -162,12 +162,14 @@ def run(
         folder,
         create_display(get_error_console()),
         print_message,
-        rerun=rerun,
-        rerun_stale=rerun_stale,
-        positions=positions,
-        isolated=not in_process,
-        num_workers=workers,
-        scheduler_address=scheduler,
+        ExecutionOptions(
+            rerun=rerun,
+            rerun_stale=rerun_stale,
+            positions=positions,
+            isolated=not in_process,
+            num_workers=workers,
+            scheduler_address=scheduler,
+        ),
         background_call=_preload_reports,
     )
     raise typer.Exit(1 if _report_sweep(sweep, swept, config, results, folder) else 0)

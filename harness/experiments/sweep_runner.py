@@ -63,19 +63,39 @@ class SweepResults(NamedTuple):
     stale_ids: set[str]
 
 
+class ExecutionOptions(NamedTuple):
+    """Which runs of a sweep are executed, and by which processes.
+
+    Attributes:
+        rerun: whether to repeat all runs; `positions` implies it.
+        rerun_stale: whether to repeat runs whose rows come from other source code.
+        positions: where to store the positions of the sweep's only run.
+        isolated: whether runs are executed in worker processes with limits, or in this process.
+        num_workers: number of worker processes; chosen by cores and memory if None.
+        scheduler_address: scheduler of other machines that execute the runs; None for this machine
+            (`springbench.harness.experiments.dask_cluster`).
+    """
+
+    rerun: bool = False
+    rerun_stale: bool = False
+    positions: Path | None = None
+    isolated: bool = True
+    num_workers: int | None = None
+    scheduler_address: str | None = None
+
+
+DEFAULT_EXECUTION = ExecutionOptions()
+"""Missing runs only, in worker processes of this machine."""
+
+
 def run_sweep(
     name: str,
     runs: Sequence[RunSpec],
     folder: Path,
     display: ProgressDisplay,
     print_message: Callable[[str], None],
+    execution: ExecutionOptions = DEFAULT_EXECUTION,
     *,
-    rerun: bool = False,
-    rerun_stale: bool = False,
-    positions: Path | None = None,
-    isolated: bool = True,
-    num_workers: int | None = None,
-    scheduler_address: str | None = None,
     background_call: Callable[[], object] = int,
 ) -> SweepResults:
     """Execute the missing runs of a sweep, draw its pictures and return its results.
@@ -86,13 +106,7 @@ def run_sweep(
         folder: its folder in the results.
         display: shows progress.
         print_message: prints a remark.
-        rerun: whether to repeat all runs; `positions` implies it.
-        rerun_stale: whether to repeat runs whose rows come from other source code.
-        positions: where to store the positions of the sweep's only run.
-        isolated: whether runs are executed in worker processes with limits, or in this process.
-        num_workers: number of worker processes; chosen by cores and memory if left out.
-        scheduler_address: scheduler of other machines that execute the runs; None for this machine
-            (`springbench.harness.experiments.dask_cluster`).
+        execution: which runs are executed, and by which processes.
         background_call: called while another process draws.
 
     Returns:
@@ -102,6 +116,7 @@ def run_sweep(
         InputError: the options contradict each other, or the input is invalid.
         RunFailed: the drawing process was lost.
     """
+    positions, isolated, scheduler_address = execution.positions, execution.isolated, execution.scheduler_address
     if scheduler_address and (positions or not isolated):
         given = [name for name, is_set in (("--positions", positions), ("--in-process", not isolated)) if is_set]
         raise InputError(
@@ -125,7 +140,11 @@ def run_sweep(
         )
         planned = plan_runs(runs, folder, machines)
         todo = select_missing_units(
-            planned, "runs", print_message, rerun=rerun or positions is not None, rerun_stale=rerun_stale
+            planned,
+            "runs",
+            print_message,
+            rerun=execution.rerun or positions is not None,
+            rerun_stale=execution.rerun_stale,
         )
         drawing: IsolatedWorker | None = None
         here = isolated and not away
@@ -141,7 +160,7 @@ def run_sweep(
                 load_target(SOLVER_TABLE[solver])
             if isolated:
                 compile_missing_kernels({p.run.solver.name for p in todo}, print_message)
-        many = min(num_workers or choose_num_workers(), max(1, len(todo)))
+        many = min(execution.num_workers or choose_num_workers(), max(1, len(todo)))
         units = [RunUnit(p.run, p.files, positions, 1 if p.run.timing == "exclusive" else many) for p in todo]
         if away:
             execute_unclaimed(units, claims, partial(away.execute_units, folder, display), print_message)

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from springbench.harness.config.config_loader import load_config
-from springbench.harness.experiments.sweep_runner import run_sweep
+from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
 from springbench.harness.results import parquet_rows
 
 from tests.plugin_solvers import SCENE_SOURCE
@@ -74,7 +74,7 @@ def test_runs_are_done_by_jobs_that_are_submitted_and_cancelled(tmp_path: Path, 
         tmp_path / "r",
         SilentDisplay(),
         messages.append,
-        scheduler_address=str(tmp_path / "slurm.yaml"),
+        ExecutionOptions(scheduler_address=str(tmp_path / "slurm.yaml")),
     ).table
     assert set(table["status"].to_pylist()) == {"ok"}
     assert len(set(table["run_id"].to_pylist())) == 3

@@ -20,7 +20,7 @@ from springbench.harness.config.config_loader import load_config
 from springbench.harness.execution.dask_scheduler import open_scheduler
 from springbench.harness.execution.machine_info import compute_node_id
 from springbench.harness.experiments.machine_calibration import CALIBRATION_COLUMNS as MACHINE
-from springbench.harness.experiments.sweep_runner import run_sweep
+from springbench.harness.experiments.sweep_runner import ExecutionOptions, run_sweep
 
 from tests.plugin_solvers import SCENE_SOURCE, SOLVER_SOURCE, write_plugin_solver
 from tests.progress_displays import SilentDisplay
@@ -29,7 +29,8 @@ from tests.progress_displays import SilentDisplay
 def run_on_cluster(sweep: Path, results: Path, address: str) -> pa.Table:
     found = load_config(sweep)
     results.mkdir(exist_ok=True)
-    return run_sweep(found.name, found.list_runs(), results, SilentDisplay(), print, scheduler_address=address).table
+    execution = ExecutionOptions(scheduler_address=address)
+    return run_sweep(found.name, found.list_runs(), results, SilentDisplay(), print, execution).table
 
 
 def test_runs_are_done_by_workers_and_a_crash_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
