@@ -38,7 +38,11 @@ from springbench.harness.config.config_loader import load_scene
 from springbench.harness.errors import RunFailed
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
 from springbench.harness.experiments.accuracy.candidate_grids import StudyCandidates
-from springbench.harness.experiments.accuracy.method_recommendation import build_study, recommend_method
+from springbench.harness.experiments.accuracy.method_recommendation import (
+    RecommendationOptions,
+    build_study,
+    recommend_method,
+)
 from springbench.harness.experiments.accuracy.recommendation_goal import BUDGET_REFERENCE_ERROR, RecommendationGoal
 from springbench.harness.experiments.accuracy.setting_grid import compute_setting_cost, is_measured
 from springbench.harness.experiments.accuracy.work_precision import build_work_rows
@@ -161,11 +165,9 @@ def evaluate_question(question: Question, rounds: int, search_time: float, resul
     """Recommend a method, and measure the fixed choices."""
     path, budget, t_end = SCENES / f"{question.scene}.yaml", question.budget, question.t_end
     scene, store = load_scene(path), open_reference_store(results)
-    options = {"size": question.size or None, "t_end": t_end, "time_limit": 5.0, "search_time": search_time}
+    options = RecommendationOptions(question.size or None, t_end, time_limit=5.0, search_time=search_time)
     goal = RecommendationGoal(frame_seconds=budget)
-    found = recommend_method(
-        path, goal, results=results, display=SilentDisplay(), print_message=lambda line: None, **options
-    )
+    found = recommend_method(path, goal, options, results, SilentDisplay(), lambda line: None)
     grid = build_grid()
     names = dict.fromkeys(name for entry in grid for name in entry["solver"])
     candidates = StudyCandidates([{"name": name} for name in names], grid, REFINEMENTS)

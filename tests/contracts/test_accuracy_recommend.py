@@ -23,7 +23,11 @@ from springbench.harness.experiments.accuracy import method_recommendation as mo
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
 from springbench.harness.experiments.accuracy.accuracy_units import load_reference_trajectory, open_reference_store
 from springbench.harness.experiments.accuracy.candidate_grids import StudyCandidates
-from springbench.harness.experiments.accuracy.method_recommendation import MethodRecommendation, recommend_method
+from springbench.harness.experiments.accuracy.method_recommendation import (
+    MethodRecommendation,
+    RecommendationOptions,
+    recommend_method,
+)
 from springbench.harness.experiments.accuracy.recommendation_goal import MeasuredMethod, RecommendationGoal
 from springbench.harness.experiments.accuracy.setting_grid import compute_setting_cost
 from springbench.harness.reference.reference_store import ReferenceStore
@@ -68,10 +72,10 @@ def scene(tmp_path: Path) -> Path:
 def recommend(scene: Path, error: float, **more: Any) -> tuple[MethodRecommendation, int]:
     """The answer, and how many simulations were measured for it."""
     display, results = SilentDisplay(), scene.parent / "results"
-    options: dict[str, Any] = {"size": None, "t_end": 0.2, "time_limit": 60.0} | more
-    options = {"print_message": lambda line: None} | options
-    goal = options.pop("goal", RecommendationGoal(max_error=error))
-    found = recommend_method(scene, goal, results=results, display=display, **options)
+    given: dict[str, Any] = {"size": None, "t_end": 0.2, "time_limit": 60.0} | more
+    print_message = given.pop("print_message", lambda line: None)
+    goal = given.pop("goal", RecommendationGoal(max_error=error))
+    found = recommend_method(scene, goal, RecommendationOptions(**given), results, display, print_message)
     return found, display.finished_units
 
 

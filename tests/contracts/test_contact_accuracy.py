@@ -10,7 +10,7 @@ from springbench.harness.cli.main import app
 from springbench.harness.config.accuracy_loader import load_accuracy
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.experiments.accuracy.accuracy_schema import ACCURACY_SCHEMA
-from springbench.harness.experiments.accuracy.method_recommendation import recommend_method
+from springbench.harness.experiments.accuracy.method_recommendation import RecommendationOptions, recommend_method
 from springbench.harness.experiments.accuracy.recommendation_goal import RecommendationGoal
 from springbench.harness.reference import reference_store
 from springbench.harness.reference.reference_store import ReferenceStore
@@ -130,13 +130,10 @@ def test_the_recommended_method_meets_the_error_whatever_the_error_of_the_refere
     found = recommend_method(
         drop,
         RecommendationGoal(max_error=0.1),
-        size=None,
-        t_end=None,
-        time_limit=20.0,
-        results=results,
-        display=SilentDisplay(),
-        print_message=lines.append,
-        search_time=20.0,
+        RecommendationOptions(size=None, t_end=None, time_limit=20.0, search_time=20.0),
+        results,
+        SilentDisplay(),
+        lines.append,
     )
     assert found.checked_method.reference_kind == "self-converged"
     assert found.goal.max_error is not None

@@ -48,7 +48,7 @@ def recommend(
     """
     from rich.table import Table
     from springbench.harness.execution.progress_display import create_display
-    from springbench.harness.experiments.accuracy.method_recommendation import recommend_method as find
+    from springbench.harness.experiments.accuracy.method_recommendation import RecommendationOptions, recommend_method
     from springbench.harness.experiments.accuracy.recommendation_goal import RecommendationGoal
     from springbench.harness.report.charts.recommendation_chart import (
         CandidatePoint,
@@ -60,18 +60,8 @@ def recommend(
     if (error is None) == (budget is None):
         raise InputError("recommend: give one of --error and --budget")
     goal = RecommendationGoal(error, None if budget is None else parse_duration(budget, "--budget"))
-    found = find(
-        scene,
-        goal,
-        size=size,
-        t_end=t_end,
-        time_limit=time_limit,
-        engine=engine,
-        search_time=search_time,
-        results=results,
-        display=create_display(get_error_console()),
-        print_message=print_message,
-    )
+    options = RecommendationOptions(size, t_end, time_limit, engine, search_time)
+    found = recommend_method(scene, goal, options, results, create_display(get_error_console()), print_message)
     integrated = found.checked_method.reference_kind == "integrated"
     rows: list[tuple[str, MeasuredMethod | None]] = [
         ("predicted", found.best_method),

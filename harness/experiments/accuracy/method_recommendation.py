@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 from springbench.harness.config.accuracy_config import AccuracyConfig, BenchmarkCase, MeasurementSettings, WorkSpec
 from springbench.harness.config.accuracy_loader import AccuracyPlan, expand_studies
@@ -77,6 +77,32 @@ _MESSAGE_INTERVAL = 2.0
 """Interval between two messages about the reference [s]."""
 _ERROR_RTOL, _MAX_TIME_RATIO = 1e-6, 1.3
 """Relative difference of two errors of one simulation that compilers may cause; accepted ratio of its two times."""
+
+
+class RecommendationOptions(NamedTuple):
+    """Which simulations a recommendation considers, and how long they may take.
+
+    Attributes:
+        size: mesh size; the scene's default if None.
+        t_end: simulated time [s]. If None, DEFAULT_T_END, or the longest time at which the error can be measured, if
+            that is shorter.
+        time_limit: wall-time limit of a simulation [s].
+        engine: name of the only solver or engine to consider; None for all.
+        search_time: limit for the wall time of all measurements together [s].
+    """
+
+    size: int | None
+    t_end: float | None
+    time_limit: float
+    engine: str | None = None
+    search_time: float = SEARCH_TIME
+
+
+class _StoredMeasurements(NamedTuple):
+    """Measured methods, the cheapest first, and the rows of those that have no error."""
+
+    methods: list[MeasuredMethod]
+    failed_rows: list[dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,32 +165,22 @@ class MethodRecommendation:
 def recommend_method(
     path: Path,
     goal: RecommendationGoal,
-    *,
-    size: int | None,
-    t_end: float | None,
-    time_limit: float,
+    options: RecommendationOptions,
     results: Path,
     display: ProgressDisplay,
     print_message: Callable[[str], None],
-    engine: str | None = None,
-    search_time: float = SEARCH_TIME,
 ) -> MethodRecommendation:
     """Recommend the cheapest method for an error, or the most accurate for a wall time.
 
-    The error is relative, at `t_end`. A repeated measurement checks the method.
+    The error is relative, at the end of the simulated time. A repeated measurement checks the method.
 
     Args:
         path: file of the scene.
         goal: error, or wall time of a frame.
-        size: mesh size; the scene's default if None.
-        t_end: simulated time [s]. If None, DEFAULT_T_END, or the longest time at which the error can be measured, if
-            that is shorter.
-        time_limit: wall-time limit of a simulation [s].
+        options: which simulations are considered, and how long they may take.
         results: folder that contains a folder for each config.
         display: shows progress.
         print_message: prints a remark.
-        engine: name of the only solver or engine to consider; None for all.
-        search_time: limit for the wall time of all measurements together [s].
 
     Returns:
         The recommended method, its repeated measurement, and all measured methods.
@@ -173,19 +189,20 @@ def recommend_method(
         InputError: an option is invalid.
         RunFailed: no method reaches the goal.
     """
-    options = {
+    engine, search_time = options.engine, options.search_time
+    positive_values = {
         "--error": goal.max_error,
         "--budget": goal.frame_seconds,
-        "--t-end": t_end,
-        "--time-limit": time_limit,
+        "--t-end": options.t_end,
+        "--time-limit": options.time_limit,
         "--search-time": search_time,
     }
-    for key, value in options.items():
+    for key, value in positive_values.items():
         if value is not None and not 0 < value < math.inf:
             raise InputError(InputMistake(f"got {value:g}; expected a number above 0", key=key))
     scene = load_scene(path)
     scene.require_fixed_time_step()
-    size = (size or scene.default_size or 0) if isinstance(scene.mesh, MeshGenerator) else 0
+    size = (options.size or scene.default_size or 0) if isinstance(scene.mesh, MeshGenerator) else 0
     isolated = partial(
         run_isolated,
         user_code=scene.find_plugins(),
@@ -195,7 +212,7 @@ def recommend_method(
     store = open_reference_store(results)
     candidates = StudyCandidates.from_goal(goal, engine)
     planned: tuple[AccuracyPlan, RecommendationGoal, float] = isolated(
-        partial(_plan_study, path, scene, size, goal, candidates, t_end, time_limit, store)
+        partial(_plan_study, path, scene, size, goal, candidates, options, store)
     )
     study, goal, reference_error = planned
     if goal.max_error and reference_error:
@@ -205,26 +222,27 @@ def recommend_method(
         )
     t_end, frame = study.work[0].t_end, scene.time_step
 
-    def read_methods() -> tuple[list[MeasuredMethod], list[dict[str, Any]]]:
-        methods, failed_rows = _read_measured_methods(path.stem, scene, size, t_end, results, goal.reference_error)
-        return [one for one in methods if engine in (None, one.work_spec.solver.name)], failed_rows
+    def read_methods() -> _StoredMeasurements:
+        stored = _read_measured_methods(path.stem, scene, size, t_end, results, goal.reference_error)
+        chosen = [one for one in stored.methods if engine in (None, one.work_spec.solver.name)]
+        return stored._replace(methods=chosen)
 
-    methods, failed_rows = read_methods()
+    stored = read_methods()
     summary: SearchSummary[Any] | None = None
-    if goal.max_error is None or not any(one.sweep != study.name for one in goal.select_methods(methods, frame)):
+    if goal.max_error is None or not any(one.sweep != study.name for one in goal.select_methods(stored.methods, frame)):
         folder = claim_folder(results / study.name, path)
-        summary = _measure_study(study, methods, failed_rows, goal, frame, folder, display, print_message, search_time)
+        summary = _measure_study(study, stored, goal, frame, folder, display, print_message, search_time)
         print_message(f"{path.stem} {size or ''}: {summary}")
-        methods, failed_rows = read_methods()
+        stored = read_methods()
         if goal.frame_seconds is not None:
             left = (1.0 - _SEARCH_FRACTION) * search_time
             _tune_time_steps(read_methods, goal.frame_seconds / frame, t_end, folder, display, print_message, left)
-            methods, failed_rows = read_methods()
-    within = goal.select_methods(methods, frame)
+            stored = read_methods()
+    within = goal.select_methods(stored.methods, frame)
     if not within:
-        raise RunFailed(_explain_no_method(methods, failed_rows, goal, frame, t_end, summary))
+        raise RunFailed(_explain_no_method(stored, goal, frame, t_end, summary))
     checked = isolated(partial(_check_method, within[0], goal.reference_error, store))
-    return MethodRecommendation(goal, frame, tuple(methods), within[0], checked)
+    return MethodRecommendation(goal, frame, tuple(stored.methods), within[0], checked)
 
 
 def _plan_study(
@@ -233,8 +251,7 @@ def _plan_study(
     size: int,
     goal: RecommendationGoal,
     candidates: StudyCandidates,
-    t_end: float | None,
-    time_limit: float,
+    options: RecommendationOptions,
     reference_store: ReferenceStore,
     print_message: Callable[[str], None],
 ) -> tuple[AccuracyPlan, RecommendationGoal, float]:
@@ -249,6 +266,7 @@ def _plan_study(
         RunFailed: the motion has no reference.
     """
     print_message("estimating how far ahead the motion can be predicted")
+    t_end, time_limit = options.t_end, options.time_limit
     if t_end is not None:
         _build_valid_study(path, scene, size, candidates, t_end, time_limit)
     elif mistakes := find_scene_mistakes(scene, [size]):
@@ -366,8 +384,7 @@ def _compute_reference(
 
 def _measure_study(
     study: AccuracyPlan,
-    methods: list[MeasuredMethod],
-    failed_rows: list[dict[str, Any]],
+    stored: _StoredMeasurements,
     goal: RecommendationGoal,
     frame: float,
     folder: Path,
@@ -382,10 +399,10 @@ def _measure_study(
             "error": method.error,
             "seconds_per_simulated_second": method.seconds_per_simulated_second,
         }
-        for method in methods
+        for method in stored.methods
     }
-    failed, here = {row["unit_id"]: row for row in failed_rows}, machine_info.describe_machine().machine_id
-    within = [method.seconds_per_simulated_second for method in goal.select_methods(methods, frame)]
+    failed, here = {row["unit_id"]: row for row in stored.failed_rows}, machine_info.describe_machine().machine_id
+    within = [method.seconds_per_simulated_second for method in goal.select_methods(stored.methods, frame)]
     best, error, end = min(within, default=math.inf), goal.reference_error, f"{SLOWER:g} times as slow as the best"
     if goal.frame_seconds is not None:  # no error is small enough, so that only the cost ends the search
         best, error = BUDGET_RANGE * goal.frame_seconds / frame / SLOWER, 0.0
@@ -404,7 +421,7 @@ def _measure_study(
 
 
 def _tune_time_steps(
-    read_methods: Callable[[], tuple[list[MeasuredMethod], list[dict[str, Any]]]],
+    read_methods: Callable[[], _StoredMeasurements],
     cost_limit: float,
     t_end: float,
     folder: Path,
@@ -419,7 +436,7 @@ def _tune_time_steps(
     """
     end, done = monotonic() + search_time, set[str]()
     for _ in range(_TUNING_ROUNDS):
-        methods, _ = read_methods()
+        methods = read_methods().methods
         known = {method.work_spec.build_file_stem() for method in methods} | done
         specs = [one for one in list_tuned_specs(methods, cost_limit, t_end) if one.build_file_stem() not in known]
         if not specs or monotonic() > end:
@@ -500,11 +517,8 @@ def _convert_to_option(mistake: InputMistake) -> InputMistake:
 
 def _read_measured_methods(
     name: str, scene: SceneSpec, size: int, t_end: float, results: Path, reference_error: float
-) -> tuple[list[MeasuredMethod], list[dict[str, Any]]]:
-    """Read the rows of this scene on this machine.
-
-    Returns the methods that have an error, cheapest first, and the rows of those that have none.
-    """
+) -> _StoredMeasurements:
+    """Read the rows of this scene on this machine."""
     here, methods, without = machine_info.describe_machine().machine_id, list[MeasuredMethod](), list[dict[str, Any]]()
     units = (
         unit
@@ -520,7 +534,7 @@ def _read_measured_methods(
             methods.append(_build_measured_method(spec, row, reference_error))
         else:
             without.append(row)
-    return sorted(methods, key=lambda method: method.seconds_per_simulated_second), without
+    return _StoredMeasurements(sorted(methods, key=lambda method: method.seconds_per_simulated_second), without)
 
 
 def _build_work_spec(row: dict[str, Any], name: str, scene: SceneSpec) -> WorkSpec:
@@ -558,14 +572,14 @@ def _build_measured_method(spec: WorkSpec, row: dict[str, Any], reference_error:
 
 
 def _explain_no_method(
-    methods: list[MeasuredMethod],
-    failed_rows: list[dict[str, Any]],
+    stored: _StoredMeasurements,
     goal: RecommendationGoal,
     frame: float,
     t_end: float,
     summary: SearchSummary[Any] | None,
 ) -> str:
     """Explain why no method reaches the goal, and suggest what to change."""
+    methods, failed_rows = stored
     condition = f"reaches an error of {goal.reference_error:g} over {t_end:g} s"
     if goal.frame_seconds is not None:
         condition = f"takes at most {1e3 * goal.frame_seconds:g} ms for a frame of {frame:.6g} s"
