@@ -58,7 +58,7 @@ from springbench.harness.scenes.spring_stiffness import compute_modulus_exponent
 from springbench.harness.simulation.auto_tolerance import build_stop_rule
 from springbench.harness.simulation.device_stepping import build_device_columns
 from springbench.harness.simulation.energy_balance import EnergyGrowth
-from springbench.harness.simulation.instrumentation_pass import observe_run, require_finite
+from springbench.harness.simulation.instrumentation_pass import RunObservers, observe_run, require_finite
 from springbench.harness.simulation.time_loop import prepare
 from springbench.harness.simulation.timing_pass import (
     RunMeasurement,
@@ -130,11 +130,8 @@ class RunSetup:
             self.scene,
             prepare(self.scene, self.build_solver()),
             replace(self.settings, frames=count),
-            recorder=recorder,
-            convergence_frames=(),
-            positions_out=None,
-            verify_step=None,
-            tick=lambda name: None,
+            RunObservers(recorder),
+            lambda name: None,
         )
 
 
@@ -335,18 +332,14 @@ def _observe_run(job: RunJob, setup: RunSetup, measured: RunMeasurement) -> Obse
             recorder = _open_recorder(job, scene, facts, measured.final_positions)
             cleanup.callback(recorder.abandon_recording)
         graded = AuditedSolver(measured.prepared, setup.build_solver(), middle_frames)
-        found = observe_run(
-            scene,
-            graded,
-            setup.settings,
-            recorder=recorder,
+        observers = RunObservers(
+            recorder,
             convergence_frames=middle_frames if run.convergence_frames is None else run.convergence_frames,
             positions_out=stored,
             sample_frame=samples.add_frame if recorder else None,
             verify_step=_build_verifier(run, setup),
-            tick=job.tick,
-            clock=measured.clock,
         )
+        found = observe_run(scene, graded, setup.settings, observers, job.tick, measured.clock)
         if measured.final_positions is not None and found[run.frames]["positions_digest"] != hash_positions(
             measured.final_positions
         ):

@@ -12,7 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,16 +97,29 @@ _REASON_ORDER = ("max-iter", "saddle", "stalled", "converged", "roundoff")
 """Termination reasons of a solve, least desirable first."""
 
 
+class RunObservers(NamedTuple):
+    """What observes the steps of a run.
+
+    Attributes:
+        recorder: recorder of every frame and of the convergence in the frames `convergence_frames`; None for none.
+        convergence_frames: frames whose convergence is recorded.
+        positions_out: output array for the positions after each step, (frames, n, 3) [m]; None for none.
+        sample_frame: called with each frame and its positions (n, 3) [m]; None for none.
+        verify_step: returns the accuracy columns of each step; None for none.
+    """
+
+    recorder: RunRecorder | None = None
+    convergence_frames: Collection[int] = ()
+    positions_out: NDArray[np.float64] | None = None
+    sample_frame: Callable[[int, Positions], None] | None = None
+    verify_step: Callable[[SimulationStep], dict[str, Any]] | None = None
+
+
 def observe_run(
     scene: Scene,
     prepared: PreparedSolver,
     settings: SteppingSettings,
-    *,
-    recorder: RunRecorder | None,
-    convergence_frames: Collection[int],
-    positions_out: NDArray[np.float64] | None,
-    sample_frame: Callable[[int, Positions], None] | None = None,
-    verify_step: Callable[[SimulationStep], dict[str, Any]] | None,
+    observers: RunObservers,
     tick: Callable[[str], None],
     clock: AbstractContextManager[None] = NO_CLOCK,
 ) -> dict[int, dict[str, Any]]:
@@ -116,17 +129,14 @@ def observe_run(
         scene: scene that is stepped.
         prepared: prepared solver.
         settings: settings of the time stepping.
-        recorder: recorder of every frame and of the convergence in the frames `convergence_frames`.
-        convergence_frames: frames whose convergence is recorded.
-        positions_out: output array for the positions after each step, (frames, n, 3) [m].
-        sample_frame: called with each frame and its positions (n, 3) [m].
-        verify_step: returns the accuracy columns of each step.
+        observers: what observes the steps.
         tick: called with the name of the pass after each step.
         clock: context within which each step is computed.
 
     Raises:
         StepError: a step failed, or, caused by DivergenceError, the energy diverges.
     """
+    recorder, convergence_frames, positions_out, sample_frame, verify_step = observers
     found: dict[int, dict[str, Any]] = {}
     energy = EnergyBalance(scene)
     budget = DissipationBudget(scene, has_inner_solves=getattr(prepared, "has_inner_solves", False))

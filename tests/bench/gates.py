@@ -25,7 +25,7 @@ from springbench.harness.scenes.effects.springs_effect import SpringsEffect
 from springbench.harness.scenes.mesh.grid_mesh import GridMesh
 from springbench.harness.scenes.scene_builder import Scene, build_scene
 from springbench.harness.scenes.scene_spec import SceneSpec
-from springbench.harness.simulation.instrumentation_pass import observe_run
+from springbench.harness.simulation.instrumentation_pass import RunObservers, observe_run
 from springbench.harness.simulation.time_loop import SimulationStep, simulate_scene
 from springbench.harness.simulation.timing_pass import SteppingSettings
 from springbench.solvers.methods.local_global.prefactored import PreparedLocalGlobal
@@ -149,16 +149,7 @@ def record(scene: Scene, prepared: PreparedSolver, frames: int, path: Path) -> P
     recorder = RerunRecorder(path, info)
     stored = np.empty((frames, *scene.mesh.rest_positions.shape))
     settings = SteppingSettings(STOP, "previous", frames, 1)
-    observe_run(
-        scene,
-        prepared,
-        settings,
-        recorder=recorder,
-        convergence_frames=(),
-        positions_out=stored,
-        verify_step=None,
-        tick=lambda name: None,
-    )
+    observe_run(scene, prepared, settings, RunObservers(recorder, positions_out=stored), lambda name: None)
     recorder.finish_recording({})
     return stored[-1]
 
