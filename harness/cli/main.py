@@ -131,20 +131,28 @@ def run(
     require_output_file(positions, ".npz", "--positions")
     with_error = {"t_end": t_end, "verify": verify, "compare": compare}
     if max_error is not None:
-        from springbench.harness.cli.commands.error_control import run_error_control
+        from springbench.harness.cli.commands.error_control import ErrorRequest, run_error_control
 
         is_accurate = run_error_control(
             config,
-            max_error,
+            ErrorRequest(
+                error=max_error,
+                t_end=t_end,
+                size=size[0] if size else None,
+                verify=verify,
+                compare_third_party=compare,
+                positions=positions,
+                rerun=rerun,
+            ),
             results,
             print_message,
-            t_end=t_end,
-            sizes=size or (),
-            verify=verify,
-            compare_third_party=compare,
-            positions=positions,
-            rerun=rerun,
-            rejected_options={"solver": solver, "scheduler": scheduler, "workers": workers, **context.obj},
+            {
+                "solver": solver,
+                "scheduler": scheduler,
+                "workers": workers,
+                **context.obj,
+                "second --size": (size or [])[1:],
+            },
         )
         raise typer.Exit(0 if is_accurate else 1)
     if name := next((name for name, value in with_error.items() if value), None):

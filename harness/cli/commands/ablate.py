@@ -15,6 +15,7 @@ from springbench.harness.cli.shared_options import (
     describe_config,
 )
 from springbench.harness.console import get_error_console, get_output_console, print_message, split_wide_table
+from springbench.harness.errors import InputError
 
 DEFAULT_ABLATION_SOLVER, DEFAULT_ABLATION_TOLERANCE = "hybrid", 1e-4
 """Default solver, which supports all effects, and its tolerance.
@@ -57,7 +58,9 @@ def ablate(
     from springbench.harness.results.folder_ownership import claim_folder
 
     if all_solvers:
-        _measure_overheads(context, scene, results, solver, size, with_pairs, rerun, rerun_stale, in_process)
+        if solver is not None or with_pairs:
+            raise InputError("--all-solvers: cannot be combined with --solver or --with-pairs; omit them")
+        _measure_overheads(context, scene, results, size, rerun, rerun_stale, in_process)
         return
     usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1} | ({} if solver else {"rtol": DEFAULT_ABLATION_TOLERANCE})
     sweep = load_config(
@@ -90,16 +93,13 @@ def _measure_overheads(
     context: typer.Context,
     scene: Path,
     results: Path,
-    solver: str | None,
     size: int | None,
-    with_pairs: bool,
     rerun: bool,
     rerun_stale: bool,
     in_process: bool,
 ) -> None:
     """Run `--all-solvers`."""
     from springbench.harness.config.config_loader import load_config
-    from springbench.harness.errors import InputError
     from springbench.harness.execution.progress_display import create_display
     from springbench.harness.experiments.ablation.overhead_unit import measure_all_overheads
     from springbench.harness.report.ablation_summary import build_overhead_table, read_ablation
@@ -107,8 +107,6 @@ def _measure_overheads(
     from springbench.harness.results.folder_ownership import claim_folder
     from springbench.solvers.registry import SOLVERS, load_target
 
-    if solver is not None or with_pairs:
-        raise InputError("--all-solvers: cannot be combined with --solver or --with-pairs; omit them")
     minimising = [name for name, target in SOLVERS.items() if load_target(target).is_minimiser]
     usual = {"rounds": DEFAULT_NUM_ROUNDS, "threads": 1, "rtol": DEFAULT_OVERHEAD_TOLERANCE}
     sweep = load_config(scene, solvers=minimising, sizes=[size] if size else [], **usual | context.obj)

@@ -6,7 +6,7 @@ import csv
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from springbench.harness.atomic_files import atomic_write
@@ -22,6 +22,36 @@ if TYPE_CHECKING:
     from springbench.harness.results.setting_verdict import ConvergenceStudy, StepSetting
     from springbench.harness.scenes.scene_spec import SceneSpec
     from springbench.solvers.model.step_problem import Positions
+
+
+class _StudyRequest(NamedTuple):
+    """Scene, solver and settings of a study, and its limits.
+
+    Attributes:
+        spec: the scene.
+        name: name of the scene, after which files are named.
+        size: mesh size; 0 for a mesh without sizes.
+        solver: the solver.
+        integrator: the integrator; the usual one of the solver if None.
+        t_end: simulated time [s]; by default 1, or less if the motion is unpredictable.
+        settings: given settings.
+        error: relative error that counts as converged.
+        num_doublings: powers of two around settings.
+        time_limit: processor time of a setting [s].
+        search_time: wall time after which no further setting starts [s].
+    """
+
+    spec: SceneSpec
+    name: str
+    size: int
+    solver: SolverSpec
+    integrator: str | None
+    t_end: float | None
+    settings: list[StepSetting]
+    error: float
+    num_doublings: int
+    time_limit: float
+    search_time: float
 
 
 def convergence(
@@ -76,11 +106,22 @@ def convergence(
     made = read_solver_options(scene, solver, parameter or ())
     number = (size or spec.default_size or 0) if isinstance(spec.mesh, MeshGenerator) else 0
     folder = claim_folder(results / f"convergence-{scene.stem}", scene)
-    options = {"error": error, "time_limit": time_limit, "search_time": search_time}
-    options["doublings"] = doublings or (1 if len(given) > 1 else 2)
+    request = _StudyRequest(
+        spec,
+        scene.stem,
+        number,
+        made,
+        integrator,
+        t_end,
+        given,
+        error,
+        num_doublings=doublings or (1 if len(given) > 1 else 2),
+        time_limit=time_limit,
+        search_time=search_time,
+    )
     show_activity("measuring")
     study = run_isolated(
-        partial(_study_setting, spec, scene.stem, number, made, integrator, t_end, given, results, folder, options),
+        partial(_study_settings, request, results, folder),
         spec.find_plugins(),
         TaskLimits(search_time + 10.0 * time_limit + EXTRA_WALL_SECONDS),
         print_message,
@@ -136,18 +177,8 @@ def read_solver_options(path: Path, name: str, parameters: tuple[str, ...] | lis
     return found[0]
 
 
-def _study_setting(
-    spec: SceneSpec,
-    name: str,
-    size: int,
-    solver: SolverSpec,
-    integrator: str | None,
-    t_end: float | None,
-    given: list[StepSetting],
-    results: Path,
-    folder: Path,
-    options: dict[str, float],
-    print_message: Callable[[str], None],
+def _study_settings(
+    request: _StudyRequest, results: Path, folder: Path, print_message: Callable[[str], None]
 ) -> ConvergenceStudy:
     """Run the study, and write its table, picture, and commands or scripts of its settings."""
     from springbench.harness.config.config_loader import find_scene_mistakes
@@ -163,24 +194,24 @@ def _study_setting(
     from springbench.harness.report.charts.setting_chart import build_setting_chart
     from springbench.harness.report.figures.chart_sheets import draw_chart_sheets
 
-    spec = spec.load_plugins()
+    spec, name, size, solver = request.spec.load_plugins(), request.name, request.size, request.solver
     if mistakes := find_scene_mistakes(spec, [size]):
         raise InputError(mistakes)
-    given = complete_settings(given, solver)
+    given = complete_settings(request.settings, solver)
     store, growth_end = open_reference_store(results), None
-    is_end_given = t_end is not None
+    t_end = request.t_end
     if t_end is None:
         growth_end = DEFAULT_T_END
         with suppress(NotIntegrable):  # there is no reference, which the study reports
-            t_end = find_default_t_end(spec.path, spec, size, options["error"], store, print_message)
-    simulator = SettingSimulator(spec, size, solver, integrator, max(t_end or DEFAULT_T_END, spec.time_step))
+            t_end = find_default_t_end(spec.path, spec, size, request.error, store, print_message)
+    simulator = SettingSimulator(spec, size, solver, request.integrator, max(t_end or DEFAULT_T_END, spec.time_step))
     study = study_convergence(
         simulator,
         given,
         store,
-        options["error"],
-        num_doublings=int(options["doublings"]),
-        limits=StudyLimits(options["time_limit"], options["search_time"], growth_end, is_end_given),
+        request.error,
+        num_doublings=request.num_doublings,
+        limits=StudyLimits(request.time_limit, request.search_time, growth_end, request.t_end is not None),
         print_message=print_message,
     )
     stem = f"{name}-{size}-{solver.name}-{'-'.join(map(_format_setting, given))}"
@@ -195,7 +226,7 @@ def _study_setting(
     facts = [frames, simulator.integrator, f"errors against {study.reference}"]
     picture, *_ = draw_chart_sheets(build_setting_chart(study, title, facts), folder / "pictures" / stem)
     print_message(f"the map is {picture}, its numbers are in {folder / f'{stem}.csv'}")
-    best = study.find_cheapest(options["error"])
+    best = study.find_cheapest(request.error)
     for setting in given if best is None or best.setting in given else [*given, best.setting]:
         label, end = "given" if setting in given else "cheapest", study.find_result(setting).positions
         script_folder = folder / f"{name}-{size}-{solver.name}-{_format_setting(setting)}"

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from springbench.harness.config.config_loader import load_scene
 from springbench.harness.config.sweep_config import FixedOptions
@@ -61,59 +61,56 @@ _SHARED_COLUMNS = ("sweep", "scene", "size", "vertices", "threads", "t_end", "er
 """Columns that the rows of third-party integrators share."""
 
 
+class ErrorRequest(NamedTuple):
+    """What is simulated to a relative error, and what is done with the motion.
+
+    Attributes:
+        error: relative error at t_end.
+        t_end: simulated time [s]; that of the scene if None.
+        size: mesh size; the scene's default if None.
+        verify: whether to compare with the reference solution.
+        compare_third_party: whether to time third-party integrators too.
+        positions: where to store the positions of the frames; None for not at all.
+        rerun: whether to try all methods, even those that were expensive according to stored rows.
+    """
+
+    error: float
+    t_end: float | None
+    size: int | None
+    verify: bool
+    compare_third_party: bool
+    positions: Path | None
+    rerun: bool
+
+
 def run_error_control(
     config: Path,
-    error: float,
+    request: ErrorRequest,
     results: Path,
     print_message: PrintMessage,
-    *,
-    t_end: float | None = None,
-    sizes: Sequence[int] = (),
-    verify: bool = False,
-    compare_third_party: bool = False,
-    positions: Path | None = None,
-    rerun: bool = False,
-    rejected_options: Mapping[str, Any] | None = None,
+    rejected_options: Mapping[str, Any],
 ) -> bool:
     """Simulate the scene in a file to a relative error, and print the cost.
 
     Args:
         config: file of the scene.
-        error: relative error at t_end.
+        request: what is simulated, and what is done with the motion.
         results: folder of results.
         print_message: prints a message.
-        t_end: simulated time [s]; that of the scene if None.
-        sizes: mesh sizes, at most one.
-        verify: whether to compare with the reference solution.
-        compare_third_party: whether to time third-party integrators too.
-        positions: where to store the positions of the frames; None for not at all.
-        rerun: whether to try all methods, even those that were expensive according to stored rows.
         rejected_options: other options on the command line, which are not supported here.
 
     Returns:
-        Whether energy has grown only by its sources and, with `verify`, the measured error is at most the requested
+        Whether energy has grown only by its sources and, if it is verified, the measured error is at most the requested
         one.
 
     Raises:
         InputError: an option is invalid.
         RunFailed: no method reaches the error.
     """
-    _check_options(error, t_end, {**(rejected_options or {}), "second --size": sizes[1:]})
+    _check_options(request.error, request.t_end, rejected_options)
     scene = load_scene(config)
-    given = (
-        config,
-        scene,
-        error,
-        results,
-        t_end,
-        sizes[0] if sizes else None,
-        verify,
-        compare_third_party,
-        positions,
-        rerun,
-    )
     return run_isolated(
-        partial(_execute_error_control, *given),
+        partial(_execute_error_control, config, scene, request, results),
         scene.find_plugins(),
         TaskLimits(FixedOptions().time_limit),
         print_message,
@@ -123,18 +120,13 @@ def run_error_control(
 def _execute_error_control(
     config: Path,
     scene: SceneSpec,
-    error: float,
+    request: ErrorRequest,
     results: Path,
-    t_end: float | None,
-    size: int | None,
-    verify: bool,
-    compare_third_party: bool,
-    positions: Path | None,
-    rerun: bool,
     print_message: PrintMessage,
 ) -> bool:
+    error = request.error
     print_message("estimating how far ahead the motion can be predicted")
-    error_target = ErrorTarget.from_scene(scene, size, t_end)
+    error_target = ErrorTarget.from_scene(scene, request.size, request.t_end)
     folder = claim_folder(results / config.stem, config)
     with machine_info.limit_threads(1):
         before = read_stored_trials(folder / "accuracy", error_target)
@@ -145,7 +137,7 @@ def _execute_error_control(
             )
         else:
             seen = compute_predictability_horizon(error_target, error, print_message)
-            answer = _search_method(error_target, error, seen, [] if rerun else before, print_message)
+            answer = _search_method(error_target, error, seen, [] if request.rerun else before, print_message)
     path, best = answer.best_trial.trajectory, answer.best_trial
     print_message(
         f"requested {error:g}, estimated {best.error_estimated:.1g}, {path.cpu_seconds:.3g} s of processor time"
@@ -163,7 +155,9 @@ def _execute_error_control(
     energies = sum_dissipation(best.measure_dissipation(error_target.frame_seconds))
     if sentence := _describe_dissipation(best, error_target, energies):
         print_message(sentence)
-    measured = _verify_error(error_target, error, path.positions[-1], results, print_message) if verify else None
+    measured = (
+        _verify_error(error_target, error, path.positions[-1], results, print_message) if request.verify else None
+    )
     label = f"{config.stem}-{error_target.size}-error-{error:g}-{error_target.t_end:g}"
     row = _build_row(config.stem, error_target, error, answer, status) | {"error": measured}
     if error_target.has_contact:
@@ -181,17 +175,21 @@ def _execute_error_control(
     (folder / "accuracy").mkdir(exist_ok=True)
     found = [
         row,
-        *(_build_third_party_rows(row, error_target, error, answer, print_message) if compare_third_party else ()),
+        *(
+            _build_third_party_rows(row, error_target, error, answer, print_message)
+            if request.compare_third_party
+            else ()
+        ),
     ]
     shared = {name: row[name] for name in (*_SHARED_COLUMNS, "problem_digest")} | build_provenance_columns()
     found += [shared | trial_row for trial_row in build_trial_rows(answer, before, error)]
     parquet_rows.write_rows(
         folder / "accuracy" / f"{label}.parquet", [one | {"unit_id": label} for one in found], ACCURACY_SCHEMA
     )
-    if positions:
-        save_positions(positions, path.positions[1:])
+    if request.positions:
+        save_positions(request.positions, path.positions[1:])
     print_message(f"the row is in {folder / 'accuracy'}")
-    return status["status"] == "ok" and (not verify or (measured is not None and measured <= error))
+    return status["status"] == "ok" and (not request.verify or (measured is not None and measured <= error))
 
 
 def _describe_dissipation(trial: Trial, error_target: ErrorTarget, energies: StepDissipation) -> str:
