@@ -41,10 +41,14 @@ def unannotated(tree: ast.AST) -> Iterator[str]:
             yield from unannotated(node)
 
 
-def is_compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+def has_kernel_decorator(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     decorators = (d.func if isinstance(d, ast.Call) else d for d in function.decorator_list)
+    return any(ast.unparse(d) in KERNELS for d in decorators)
+
+
+def is_compiled(function: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
     first = next((a.arg for a in function.args.args), "")
-    return first in GENERATES or any(ast.unparse(d) in KERNELS for d in decorators)
+    return first in GENERATES or has_kernel_decorator(function)
 
 
 @pytest.mark.parametrize("folder", ["harness", "solvers"])
