@@ -1,7 +1,8 @@
 """Dependencies of source files, and their digest, which identifies compiled kernels and measurements.
 
 A source depends on itself and on the sources that its imports lead to, wherever in the file the imports stand. Imports
-are followed within this project, and within its own folder or package if the source lies elsewhere. A source also
+are followed within this project, and within its own folder or package if the source lies elsewhere. A source elsewhere
+depends on the modules of the public names of `springbench` that it uses, except those of scripts. A source also
 depends on compiled-language files of the same name next to it, as `eigen_local_global.py` does on
 `eigen_local_global.cpp` and `eigen_local_global.hpp`. Installed libraries are identified by their versions.
 
@@ -108,6 +109,9 @@ _LIBRARY_FOLDERS = {str(Path(sysconfig.get_path(name)).resolve()) for name in ("
 _TYPE_CHECKING_BLOCK = re.compile(r"^if TYPE_CHECKING:\n(?:[ \t]+\S.*\n|\n)+", re.M)
 """Imports for type checkers, which are never executed."""
 
+_SCRIPT_MODULE = f"{_TOP_PACKAGE}.harness.api"
+"""Module of the public names that scripts use: what a file runs is no part of what it defines."""
+_PUBLIC_NAME_PATTERN = re.compile(rf"\b{_TOP_PACKAGE}\.(\w+)")
 _IMPORT_PATTERN = re.compile(
     r"^[ \t]*(?:from[ \t]+(?P<base>\.*[\w.]*)[ \t]+import[ \t]+(?P<names>\([^)]*\)|.*)|import[ \t]+(?P<whole>.+))", re.M
 )
@@ -280,7 +284,18 @@ def _parse_imports(source: str) -> set[str]:
     except OSError:  # it was removed, which `_content_digest` detects
         return compiled
     run = _TYPE_CHECKING_BLOCK.sub("", text)
-    return compiled | {path for base, name in _imported_names(run) for path in _resolve_import(source, base, name)}
+    names = [*_imported_names(run), *((_TOP_PACKAGE, name) for name in _find_public_names(source, run))]
+    return compiled | {path for base, name in names for path in _resolve_import(source, base, name)}
+
+
+def _list_public_modules() -> Mapping[str, str]:
+    """Return the module of each public name of the top package, which imports them on first use."""
+    return getattr(sys.modules.get(_TOP_PACKAGE), "_MODULE_OF", {})
+
+
+def _find_public_names(source: str, text: str) -> set[str]:
+    """Return the public names that a source outside this project uses as attributes of the top package."""
+    return set() if _is_project_file(source) else _list_public_modules().keys() & _PUBLIC_NAME_PATTERN.findall(text)
 
 
 def _imported_names(text: str) -> Iterator[tuple[str, str]]:
@@ -303,6 +318,9 @@ def _resolve_import(source: str, base: str, name: str) -> Iterator[str]:
     else:
         parts = [*base.split("."), *name.split(".")]
     parts = [part for part in parts if part]
+    if len(parts) == 2 and parts[0] == _TOP_PACKAGE and not _is_project_file(source):
+        module = _list_public_modules().get(parts[1], "")
+        parts = module.split(".") if module and module != _SCRIPT_MODULE else parts
     if parts[0] == _TOP_PACKAGE and parts[1:2] and parts[1] in PACKAGE_NAMES:
         folder, parts = str(PROJECT_ROOT), parts[1:]
     elif parts[0] not in own[:1] and (_is_project_file(source) or folder in _LIBRARY_FOLDERS):

@@ -240,6 +240,23 @@ def test_a_source_from_outside_depends_on_its_folder_and_on_the_solvers_that_it_
     assert source_digest.PROJECT_ROOT / "solvers" / "linalg" / "memory.py" in found
 
 
+FLAT_IMPORTS = """
+import springbench
+from springbench import Citation
+class Own(springbench.FixedPointSolver):
+    ...
+springbench.Simulation(scene, Own())
+"""
+
+
+def test_a_source_from_outside_depends_on_the_modules_of_the_public_names_that_it_uses(tmp_path: Path):
+    (tmp_path / "own.py").write_text(FLAT_IMPORTS)
+    found = source_digest.find_dependencies(str(tmp_path / "own.py"))
+    names = {"/".join(Path(path).parts[-2:]) for path in found}
+    assert {"iteration/solver_info.py", "local_global/fixed_point.py", "local_global/prefactored.py"} <= names
+    assert "harness/api.py" not in {path.removeprefix(f"{source_digest.PROJECT_ROOT}{os.sep}") for path in found}
+
+
 def twice(x: float) -> float:
     return 2.0 * x
 
