@@ -38,10 +38,15 @@ def find_interpreters() -> list[str]:
     return found
 
 
-def call(*command: str, folder: Path, path: str = "") -> str:
+def start(*command: str, folder: Path, path: str = "", **variables: str) -> subprocess.CompletedProcess[str]:
+    """The outcome of a command in a folder, without what leads Python to the checkout."""
     outside = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "PYTEST_ADDOPTS")}
     environment = outside | {"PATH": f"{path}{os.pathsep}{os.environ['PATH']}"} if path else outside
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    return subprocess.run(command, cwd=folder, env=environment | variables, capture_output=True, text=True)
+
+
+def call(*command: str, folder: Path, path: str = "", **variables: str) -> str:
+    done = start(*command, folder=folder, path=path, **variables)
     assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
     return done.stdout
 
@@ -89,6 +94,36 @@ def test_the_light_list_leaves_out_the_libraries_of_recordings_and_pictures(scri
     light = call(str(scripts / "python"), "-m", "springbench.requirements", folder=tmp_path)
     assert "numba" in light
     assert not re.search("rerun|pyvista|vtk", light)
+
+
+def test_a_traceback_names_files_of_the_installed_package(scripts: Path, tmp_path: Path):
+    program = "import numpy, springbench; springbench.DenseCholesky(numpy.zeros((1, 1)))"
+    done = start(str(scripts / "python"), "-c", program, folder=tmp_path)
+    (library,) = scripts.parent.glob("lib/python*/site-packages")
+    assert done.returncode == 1
+    assert "NotPositiveDefinite" in done.stderr
+    files = re.findall(r'^  File "(.*)", line \d+', done.stderr, re.M)
+    assert str(library / "springbench" / "solvers" / "linalg" / "direct_solvers.py") in files
+    assert not [file for file in files if file.startswith(f"{ROOT / 'solvers'}{os.sep}")]
+
+
+KERNEL_PROGRAM = """
+import numpy as np
+from springbench.harness.scenes.spring_strains import _strains_kernel
+points, edges, numbers = np.zeros((2, 3)), np.array([[0, 1]]), np.ones(1)
+_strains_kernel(points, edges, numbers, numbers, numbers)
+print(sum(_strains_kernel.stats.cache_hits.values()), sum(_strains_kernel.stats.cache_misses.values()))
+"""
+"""Calls a compiled function, and prints whether its code was loaded or compiled."""
+
+
+def test_a_kernel_that_one_process_caches_is_loaded_by_the_next(scripts: Path, tmp_path: Path):
+    cache = tmp_path / "kernels"
+    command = str(scripts / "python"), "-c", KERNEL_PROGRAM
+    assert call(*command, folder=tmp_path, NUMBA_CACHE_DIR=str(cache)) == "0 1\n"
+    (code,) = cache.rglob("*.nbc")
+    assert call(*command, folder=tmp_path, NUMBA_CACHE_DIR=str(cache)) == "1 0\n"
+    assert [*cache.rglob("*.nbc")] == [code]
 
 
 def test_other_interpreters_of_this_machine_run_a_scene_and_a_study(scripts: Path, tmp_path: Path):
