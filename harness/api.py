@@ -305,7 +305,7 @@ def run_config(
         InputError: for any mistake in the config.
 
     Example:
-        >>> options = {"frames": 2, "rounds": 1, "pictures": False}
+        >>> options = {"frames": 2, "rounds": 1, "verify": True, "pictures": False}
         >>> sweep = {"scenes": ["chain.yaml"], "sizes": [5], "solvers": ["sparse", "newton"], "options": options}
         >>> rows = springbench.run_config(sweep, name="small", folder="configs/scenes")
     """

@@ -9,9 +9,7 @@ import numpy as np
 import springbench
 from numpy.typing import NDArray
 from pydantic import NonNegativeFloat
-from springbench.harness.scenes.effects.effect_interface import EffectContribution
-from springbench.harness.scenes.mesh.mesh import Mesh
-from springbench.harness.schema.base_model import ConfigModel
+from springbench import ConfigModel, EffectContribution, Mesh
 
 
 class LinearDrag(ConfigModel):

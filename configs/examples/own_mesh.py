@@ -7,9 +7,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import springbench
-from springbench.harness.scenes.mesh.mesh import SHEAR, STRETCH, Mesh
-from springbench.harness.scenes.mesh.mesh_generator import LengthMetres, MeshGenerator
-from springbench.harness.scenes.mesh.mesh_topology import assemble_mesh
+from springbench import SHEAR, STRETCH, LengthMetres, Mesh, MeshGenerator, assemble_mesh
 
 
 class Wheel(MeshGenerator):

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import springbench
-from springbench.solvers.methods.local_global.fixed_point import FixedPointSolver
-from springbench.solvers.model.step_problem import Positions
+from springbench import FixedPointSolver, Positions
 
 
 @dataclass(frozen=True)

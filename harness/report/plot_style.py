@@ -45,7 +45,12 @@ PAGE_RC: Any = {
 
 
 class SeriesStyle(NamedTuple):
-    """Style of one solver: a colour, a Matplotlib marker and a Matplotlib line style."""
+    """Style of one solver: a colour, a Matplotlib marker and a Matplotlib line style.
+
+    Example:
+        >>> springbench.SeriesStyle("#0072b2", "o").dash
+        '-'
+    """
 
     color: str
     marker: Any
@@ -143,6 +148,10 @@ def assign_solver_styles(solvers: Iterable[str] = ()) -> dict[str, SeriesStyle]:
     Styles are stable and distinct. The style of a solver outside the registry follows from a hash of its name. If two
     would get the same colour, the later one in alphabetical order gets the next free colour, and if there is none, the
     next free style.
+
+    Example:
+        >>> springbench.assign_solver_styles(["my-method"])["my-method"].dash
+        '-'
     """
     looks = dict(_shipped_solver_styles((*SOLVERS, *OPTIONAL_SOLVERS)))
     free = [

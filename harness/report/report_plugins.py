@@ -22,7 +22,22 @@ _TIME_LIMIT, _MEMORY_LIMIT = 600.0, 2.0
 
 
 class ReportFunction(Protocol):
-    """A report: a function that writes files."""
+    """A report: a function that writes files.
+
+    An installed report with a function `panels(rows)`, which returns a list of `FigurePanel`, is also a kind of
+    `springbench figure`.
+
+    Example:
+        >>> def count_rows(rows, folder):
+        ...     path = folder / "count.txt"
+        ...     path.write_text(f"{rows.num_rows} rows")
+        ...     return [path]
+
+        >>> import pyarrow as pa
+        >>> report: springbench.ReportFunction = count_rows
+        >>> [path.name for path in report(pa.table({"size": [4, 8]}), Path("."))]
+        ['count.txt']
+    """
 
     def __call__(self, rows: pa.Table, folder: Path) -> Iterable[Path]:
         """Write files into the folder of a sweep's results, and return their paths.

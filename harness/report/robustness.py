@@ -57,7 +57,12 @@ A convention: of its 240 runs of configs/hard, 97 are within it, 73 within half 
 
 
 class RunOutcome(NamedTuple):
-    """The outcome of a run: label, colour and description."""
+    """The outcome of a run: label, colour and description.
+
+    Example:
+        >>> springbench.RunOutcome("right", "#3a9e72", "a certified minimum in every step").label
+        'right'
+    """
 
     label: str
     color: str
@@ -144,6 +149,11 @@ class VerifiedRun:
         cpu: processor that executed the run.
         commit: version of the code that executed the run.
         solver_name: name of the solver without its parameters; it may contain spaces.
+
+    Example:
+        >>> outcome = springbench.RunOutcome("right", "#3a9e72", "a certified minimum in every step")
+        >>> springbench.VerifiedRun("net", "newton", outcome, 3e-8, "stationarity", reason="").error_text
+        '1e-8'
     """
 
     case: str
@@ -190,6 +200,10 @@ def read_verified_runs(folder: Path) -> list[VerifiedRun]:
 
     Raises:
         InputError: if no run was verified, or if some runs were verified by an incompatible version.
+
+    Example:
+        >>> [(run.case, run.solver) for run in springbench.read_verified_runs(Path("results/small"))]
+        [('chain', 'sparse'), ('chain', 'newton')]
     """
     files = row_store.list_units(folder / "rows")
     needed = "run_id", "scene", "size", "solver", "phase", "status", "started_at"

@@ -118,8 +118,7 @@ PLUGIN_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
         lambda made: isinstance(made, type) and is_dataclass(made) and callable(getattr(made, "prepare", None)),
     ),
     "effect": (
-        "a subclass of springbench.harness.schema.base_model.ConfigModel with "
-        "a method `build_contribution` and a `kind`",
+        "a subclass of springbench.ConfigModel with a method `build_contribution` and a `kind`",
         lambda made: (
             _make_model_check(ConfigModel, "build_contribution")(made)
             and hasattr(made, "model_fields")
@@ -127,13 +126,13 @@ PLUGIN_KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
         ),
     ),
     "mesh": (
-        "a subclass of springbench.harness.scenes.mesh.mesh_generator.MeshGenerator",
+        "a subclass of springbench.MeshGenerator",
         _make_model_check(mesh_generator.MeshGenerator, "generate_mesh"),
     ),
     "report": ("a function of rows and a folder", callable),
     "integrator": (
-        "an object of a class of springbench.solvers.model.integrators (SingleStageIntegrator, RungeKutta, "
-        "GeneralisedAlpha) of finite numbers, with `inertia_factor` above 0",
+        "an object of springbench.SingleStageIntegrator, RungeKutta or GeneralisedAlpha, of finite numbers, with "
+        "`inertia_factor` above 0",
         lambda made: isinstance(made, integrators.AnyIntegrator) and _is_valid_integrator(made),
     ),
 }

@@ -17,7 +17,23 @@ from springbench.solvers.model.step_problem import Positions, Unsupported
 
 
 class LinearSolver(Protocol):
-    """Interface of a linear solver of a fixed matrix."""
+    """Interface of a linear solver of a fixed matrix.
+
+    Example:
+        >>> class Diagonal:
+        ...     nonzeros = None
+        ...     def __init__(self, Q):
+        ...         self.diagonal = Q.diagonal()
+        ...     def solve(self, b, out):
+        ...         out[:] = b / self.diagonal[:, None]
+
+        >>> import numpy as np
+        >>> factor: springbench.LinearSolver = Diagonal(4.0 * np.eye(1))
+        >>> solution = np.empty((1, 3))
+        >>> factor.solve(np.ones((1, 3)), solution)
+        >>> solution.tolist()
+        [[0.25, 0.25, 0.25]]
+    """
 
     nonzeros: int | None
 
@@ -32,7 +48,15 @@ class LinearSolver(Protocol):
 
 
 class DenseCholesky:
-    """Dense Cholesky factorisation of Q by LAPACK."""
+    """Dense Cholesky factorisation of Q by LAPACK.
+
+    Example:
+        >>> import numpy as np
+        >>> solution = np.empty((1, 3))
+        >>> springbench.DenseCholesky(np.array([[4.0]])).solve(np.ones((1, 3)), solution)
+        >>> solution.tolist()
+        [[0.25, 0.25, 0.25]]
+    """
 
     def __init__(self, Q: np.ndarray) -> None:
         """Factorise Q (n, n); raise NotPositiveDefinite if a pivot is not positive."""
@@ -53,7 +77,16 @@ class DenseCholesky:
 
 
 class SparseLU:
-    """SuperLU factorisation of a symmetric Q: minimum degree order of Q'+Q, diagonal pivots."""
+    """SuperLU factorisation of a symmetric Q: minimum degree order of Q'+Q, diagonal pivots.
+
+    Example:
+        >>> import numpy as np
+        >>> from scipy.sparse import csr_array
+        >>> solution = np.empty((1, 3))
+        >>> springbench.SparseLU(csr_array(np.array([[4.0]]))).solve(np.ones((1, 3)), solution)
+        >>> solution.tolist()
+        [[0.25, 0.25, 0.25]]
+    """
 
     def __init__(self, Q: csr_array) -> None:
         """Factorise Q (n, n); raise NotPositiveDefinite if a pivot is not positive."""

@@ -28,7 +28,13 @@ ResidualIterate = Literal["returned", "previous", "none"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirichletPins:
-    """Dirichlet conditions: `vertices` (q,), sorted and unique; `weight` (q,) [N/m], infinite for an exact pin."""
+    """Dirichlet conditions: `vertices` (q,), sorted and unique; `weight` (q,) [N/m], infinite for an exact pin.
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.DirichletPins(np.array([0, 3]), weight=np.array([np.inf, 1e6])).exact_mask.tolist()
+        [True, False]
+    """
 
     vertices: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     weight: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
@@ -48,6 +54,12 @@ class LengthConstraints:
         min_length, max_length: bounds of the lengths (m,) [m], 0 <= low <= high, 0 < high; equal for an inextensible
             spring.
         rest_direction: (m, 3), unit directions of edges of zero length.
+
+    Example:
+        >>> import numpy as np
+        >>> edges, length, direction = np.array([[0, 1]]), np.array([2.0]), np.array([[1.0, 0.0, 0.0]])
+        >>> springbench.LengthConstraints(edges, length, length, direction).max_length.tolist()
+        [2.0]
     """
 
     edges: NDArray[np.int64]
@@ -289,6 +301,21 @@ class LaggedEnergy(Energy, Protocol):
 
     Examples are damping, friction and moving obstacles. The stiffness of a projective energy may depend on the
     `velocity_rate` of the start only, because Q is built once.
+
+    Example:
+        >>> class Drag:  # |p - p^t|^2/2
+        ...     def __init__(self, origin=None):
+        ...         self.origin = origin
+        ...     def begin_step(self, start):
+        ...         return Drag(start.positions)
+        ...     def value(self, p):
+        ...         return 0.5 * float(((p - self.origin) ** 2).sum())
+
+        >>> import numpy as np
+        >>> p = np.zeros((1, 3))
+        >>> start = springbench.StepStart(p, p, time=0.0, velocity_origin=p, velocity_rate=2.0)
+        >>> Drag().begin_step(start).value(p + 1.0)
+        1.5
     """
 
     def begin_step(self, start: StepStart) -> Energy:

@@ -38,6 +38,11 @@ def signed_incidence_matrix_dense(springs: NDArray[np.int64], n: int) -> FloatAr
 
     Returns:
         A (m, n).
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.signed_incidence_matrix_dense(np.array([[0, 1]]), 2).tolist()
+        [[1.0, -1.0]]
     """
     A = np.zeros((len(springs), n))
     rows, (i, j) = np.arange(len(springs)), springs.T
@@ -55,6 +60,11 @@ def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> scipy.
 
     Returns:
         A (m, n), with an empty row for a self-loop.
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.signed_incidence_matrix_sparse(np.array([[0, 1]]), 2).toarray().tolist()
+        [[1.0, -1.0]]
     """
     i, j = springs.T
     rows = np.flatnonzero(i != j)
@@ -64,7 +74,12 @@ def signed_incidence_matrix_sparse(springs: NDArray[np.int64], n: int) -> scipy.
 
 
 def mass_matrix_dense(mass: ArrayLike) -> FloatArray:
-    """Return the dense M of masses (n,) [kg], shape (n, n)."""
+    """Return the dense M of masses (n,) [kg], shape (n, n).
+
+    Example:
+        >>> springbench.mass_matrix_dense([1.0, 2.0]).tolist()
+        [[1.0, 0.0], [0.0, 2.0]]
+    """
     return np.diag(np.asarray(mass, float))
 
 
@@ -72,6 +87,10 @@ def mass_matrix_sparse(mass: ArrayLike) -> scipy.sparse.csr_array:
     """Return the sparse M of masses (n,) [kg], shape (n, n).
 
     It has one entry for each vertex that has mass.
+
+    Example:
+        >>> springbench.mass_matrix_sparse([1.0, 2.0]).toarray().tolist()
+        [[1.0, 0.0], [0.0, 2.0]]
     """
     return diagonal_matrix(np.asarray(mass, float))
 
@@ -85,6 +104,11 @@ def selection_matrix_dense(pinned: NDArray[np.int64], n: int) -> FloatArray:
 
     Returns:
         C (q, n).
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.selection_matrix_dense(np.array([1]), 2).tolist()
+        [[0.0, 1.0]]
     """
     C = np.zeros((len(pinned), n))
     C[np.arange(len(pinned)), pinned] = 1.0
@@ -100,6 +124,11 @@ def selection_matrix_sparse(pinned: NDArray[np.int64], n: int) -> scipy.sparse.c
 
     Returns:
         C (q, n).
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.selection_matrix_sparse(np.array([1]), 2).toarray().tolist()
+        [[0.0, 1.0]]
     """
     q = len(pinned)
     return scipy.sparse.csr_array(scipy.sparse.coo_array((np.ones(q), (np.arange(q), pinned)), shape=(q, n)))
@@ -114,6 +143,11 @@ def rest_lengths(rest: FloatArray, springs: NDArray[np.int64]) -> FloatArray:
 
     Returns:
         Lengths (m,) [m].
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.rest_lengths(np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]]), np.array([[0, 1]])).tolist()
+        [5.0]
     """
     i, j = springs.T
     return np.linalg.norm(rest[i] - rest[j], axis=1)
@@ -131,6 +165,13 @@ def system_matrix_dense(
         time_step: dt [s].
         C: selection matrix of the pins (q, n).
         weight: pin weights (q,) [N/m], or one number.
+
+    Example:
+        >>> import numpy as np
+        >>> A = springbench.signed_incidence_matrix_dense(np.array([[0, 1]]), 2)
+        >>> M, C = springbench.mass_matrix_dense([1.0, 1.0]), springbench.selection_matrix_dense(np.array([0]), 2)
+        >>> springbench.system_matrix_dense(A, 3.0, M, 0.5, C, 10.0).tolist()
+        [[17.0, -3.0], [-3.0, 7.0]]
     """
     k, w = (np.reshape(np.asarray(x, float), (-1, 1)) for x in (stiffness, weight))
     return A.T @ (k * A) + M / time_step**2 + C.T @ (w * C)
@@ -155,6 +196,13 @@ def system_matrix_sparse(
         time_step: dt [s].
         C: selection matrix of the pins (q, n).
         weight: pin weights (q,) [N/m], or one number.
+
+    Example:
+        >>> import numpy as np
+        >>> A = springbench.signed_incidence_matrix_sparse(np.array([[0, 1]]), 2)
+        >>> M, C = springbench.mass_matrix_sparse([1.0, 1.0]), springbench.selection_matrix_sparse(np.array([0]), 2)
+        >>> springbench.system_matrix_sparse(A, 3.0, M, 0.5, C, 10.0).toarray().tolist()
+        [[17.0, -3.0], [-3.0, 7.0]]
     """
     K = diagonal_matrix(np.broadcast_to(np.asarray(stiffness, float), len(A.indptr) - 1))
     W = diagonal_matrix(np.broadcast_to(np.asarray(weight, float), len(C.indptr) - 1))
@@ -172,6 +220,12 @@ def assemble_system_matrix(system: System, energies: Iterable[ProjectiveEnergy])
 
     Raises:
         NotPositiveDefinite: the positions of some vertices are not determined.
+
+    Example:
+        >>> import numpy as np
+        >>> system = springbench.System(mass=np.array([1.0, 2.0]), time_step=0.5)
+        >>> springbench.assemble_system_matrix(system, energies=[]).toarray().tolist()
+        [[4.0, 0.0], [0.0, 8.0]]
     """
     n = system.num_vertices
     _, vertices, weight = system.penalty_pins

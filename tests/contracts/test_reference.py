@@ -82,7 +82,10 @@ def test_a_docstring_becomes_text_lists_and_code() -> None:
 PUBLIC = [name for name in springbench.__all__ if isinstance(getattr(springbench, name), type | FunctionType)]
 """Classes and functions; the other names are types of arrays and of names."""
 SIMULATING_EXAMPLES = ["load_scene", "make_scene", "Simulation", "Solution", "Solver"]
-READING_EXAMPLES = ["run_config", "load_rows", "open_recording", "RunRecording", "draw_picture", "view_recording"]
+READING_EXAMPLES = [
+    *("run_config", "load_rows", "read_verified_runs"),
+    *("open_recording", "RunRecording", "draw_picture", "view_recording"),
+]
 """Names whose examples simulate, and those whose examples read the results of the first one."""
 
 
@@ -112,10 +115,10 @@ def test_the_examples_of_scenes_and_simulations_run() -> None:
         run_examples([name])
 
 
-@pytest.mark.long
-@pytest.mark.usefixtures("folder")
-def test_all_examples_of_the_api_run() -> None:
-    run_examples(SIMULATING_EXAMPLES + READING_EXAMPLES)
+@pytest.mark.slow
+@pytest.mark.usefixtures("folder", "without_workers")
+def test_the_examples_of_runs_and_recordings_run() -> None:
+    run_examples(READING_EXAMPLES)
 
 
 @pytest.mark.parametrize("name", sorted({*PUBLIC} - {*SIMULATING_EXAMPLES, *READING_EXAMPLES}))

@@ -16,16 +16,23 @@ from springbench.harness.cli.reference_pages.markdown_text import format_docstri
 
 _INTRODUCTION = """# Python API
 
-For authors of scripts, notebooks, solvers, effects, meshes and reports: every public name of `import springbench`.
+For authors of scripts, notebooks, solvers, effects, meshes, integrators and reports: every public name of
+`import springbench`.
 
 Names are imported on first use. Complete programs are in [configs/examples](../examples): a first simulation, and a
 solver, an effect, a mesh and a report of one's own."""
+
+_MATRICES = "Matrices and their factors"
 
 _GROUPS = {
     "springbench.harness.api": "Scripts and notebooks",
     "springbench.harness.errors": "Errors",
     "springbench.solvers": "Interfaces of solvers",
+    "springbench.solvers.model.integrators": "Interfaces of integrators",
+    "springbench.solvers.linalg": _MATRICES,
+    "springbench.solvers.model.system_matrix_assembly": _MATRICES,
     "springbench.harness": "Interfaces of scenes",
+    "springbench.harness.report": "Interfaces of reports",
 }
 """Titles by the longest prefix of the module of a name, in the order of the page."""
 _MAX_SIGNATURE_WIDTH = 100
@@ -41,7 +48,7 @@ def build_api_page() -> str:
         prefixes = (prefix for prefix in _GROUPS if modules[name].startswith(prefix))
         grouped[_GROUPS[max(prefixes, key=len)]].append(name)
     parts = [_INTRODUCTION]
-    for title in _GROUPS.values():
+    for title in dict.fromkeys(_GROUPS.values()):
         parts.append(f"## {title}")
         parts += [_describe_name(name, getattr(library, name), modules[name]) for name in grouped[title]]
     return "\n\n".join(parts)

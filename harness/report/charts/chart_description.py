@@ -36,6 +36,10 @@ class ChartAxis(NamedTuple):
         name: part of a panel's name that selects the quantity; empty if the chart has no other.
         title: what distinguishes it from others with the same scale.
         is_on_sheets: whether sheets show it too.
+
+    Example:
+        >>> springbench.ChartAxis("seconds", springbench.AxisScale("time [s]")).is_on_sheets
+        True
     """
 
     column: str
@@ -60,6 +64,12 @@ class ChartSeries:
         identity: solver and settings, by which the same measurement is found in other results.
         behind: label of the series that it is drawn behind; empty if there is none.
         links: what the page offers for a point, such as a recording.
+
+    Example:
+        >>> style = springbench.SeriesStyle("#0072b2", "o")
+        >>> series = springbench.ChartSeries("sparse", style, {"size": [8, 16], "seconds": [0.1, 0.4]})
+        >>> series.status
+        'ok'
     """
 
     label: str
@@ -92,6 +102,12 @@ class ChartFrame:
         place_names: names of the positions by column of x or y, if they are not those of the chart.
         x_label: label of the horizontal axis, if it is not that of the chart.
         sheet: name of the sheet that shows the frame; empty for the sheet of the chart.
+
+    Example:
+        >>> style = springbench.SeriesStyle("#0072b2", "o")
+        >>> series = springbench.ChartSeries("sparse", style, {"size": [8, 16], "seconds": [0.1, 0.4]})
+        >>> len(springbench.ChartFrame(("net",), (), "net", "", [series]).series)
+        1
     """
 
     group: tuple[str, ...]
@@ -122,6 +138,15 @@ class ChartDescription:
         machine_words: provenance of the data.
         citations: citation of the method of a series, by label.
         command: command that measures the rows.
+
+    Example:
+        >>> style = springbench.SeriesStyle("#0072b2", "o")
+        >>> series = springbench.ChartSeries("sparse", style, {"size": [8, 16], "seconds": [0.1, 0.4]})
+        >>> frame = springbench.ChartFrame(("net",), (), "net", "", [series])
+        >>> x, y = (springbench.ChartAxis(name, springbench.AxisScale(name)) for name in ("size", "seconds"))
+        >>> chart = springbench.ChartDescription("Time a step", "", [frame], (x,), (y,))
+        >>> chart.subject_key
+        'scene'
     """
 
     title: str
@@ -138,7 +163,17 @@ class ChartDescription:
 
 
 def select_panels(chart: ChartDescription) -> Iterator[FigurePanel]:
-    """Yield the maps of a chart, then its plots."""
+    """Yield the maps of a chart, then its plots.
+
+    Example:
+        >>> style = springbench.SeriesStyle("#0072b2", "o")
+        >>> series = springbench.ChartSeries("sparse", style, {"size": [8, 16], "seconds": [0.1, 0.4]})
+        >>> frame = springbench.ChartFrame(("net",), (), "net", "", [series])
+        >>> x, y = (springbench.ChartAxis(name, springbench.AxisScale(name)) for name in ("size", "seconds"))
+        >>> chart = springbench.ChartDescription("Time a step", "", [frame], (x,), (y,))
+        >>> [plot.series[0].y.tolist() for plot in springbench.select_panels(chart)]
+        [[0.1, 0.4]]
+    """
     yield from chart.maps
     yield from select_curve_plots(chart)
 

@@ -29,6 +29,10 @@ class AxisScale(NamedTuple):
         division: scale of the axis; `sizes` is `log` with a tick at each value.
         tick_format: format of the tick labels.
         place_names: names of the positions 0, 1, ... if `division` is `names`.
+
+    Example:
+        >>> springbench.AxisScale("time [s]", "linear").tick_format
+        'plain'
     """
 
     label: str
@@ -53,6 +57,13 @@ class CurveSeries:
         marker_scale: marker size relative to other curves.
         has_cross: whether a cross marks the end, because the measurement ended early.
         callouts: words at single points, by index.
+
+    Example:
+        >>> import numpy as np
+        >>> style = springbench.SeriesStyle("#0072b2", "o")
+        >>> curve = springbench.CurveSeries("sparse", style, x=np.array([1.0, 2.0]), y=np.array([0.5, 0.25]))
+        >>> curve.is_connected
+        True
     """
 
     label: str
@@ -74,7 +85,12 @@ class CurveSeries:
 
 
 class ShadedBand(NamedTuple):
-    """A shaded range of values, and its meaning."""
+    """A shaded range of values, and its meaning.
+
+    Example:
+        >>> springbench.ShadedBand(0.9, 1.1, "within 10 %").high
+        1.1
+    """
 
     low: float
     high: float
@@ -82,7 +98,12 @@ class ShadedBand(NamedTuple):
 
 
 class MarkedValue(NamedTuple):
-    """A value that a line marks, and its meaning."""
+    """A value that a line marks, and its meaning.
+
+    Example:
+        >>> springbench.MarkedValue(1.0, "equal times").label
+        'equal times'
+    """
 
     value: float
     label: str
@@ -100,6 +121,16 @@ class CurvePlot:
         x_bands, x_lines: those of x.
         notes: sentences at the foot of the figure.
         machine_words: provenance of the data.
+
+    Example:
+        >>> import numpy as np
+        >>> style = springbench.SeriesStyle("#0072b2", "o")
+        >>> axes = springbench.AxisScale("frame", "linear"), springbench.AxisScale("iterations", "linear")
+        >>> def panels(rows):
+        ...     curve = springbench.CurveSeries("sparse", style, x=np.arange(3.0), y=np.array(rows))
+        ...     return [springbench.CurvePlot(("net",), ("iterations",), "net", "", *axes, [curve])]
+        >>> [row["y"] for row in panels([5.0, 4.0, 4.0])[0].csv_rows()]
+        [5.0, 4.0, 4.0]
     """
 
     group: tuple[str, ...]
@@ -124,7 +155,12 @@ class CurvePlot:
 
 
 class CellOutcome(NamedTuple):
-    """An entry of a map's legend: label, colour and description."""
+    """An entry of a map's legend: label, colour and description.
+
+    Example:
+        >>> springbench.CellOutcome("right", "#3a9e72").description
+        ''
+    """
 
     label: str
     color: str
@@ -143,6 +179,10 @@ class MapCell(NamedTuple):
         reason: what the page states about the cell.
         run_id: run that the page opens; empty for none.
         is_framed: whether a frame emphasises the cell.
+
+    Example:
+        >>> springbench.MapCell("sparse", "net", "right", "#3a9e72", "1e-7", mark="*").marked_text
+        '1e-7 *'
     """
 
     row: str
@@ -186,6 +226,12 @@ class CellMap:
         cells: cells, by rows.
         outcomes: classes of cells, in the order of the legend.
         row_label, column_label: quantities with units; empty for names.
+
+    Example:
+        >>> cell = springbench.MapCell("sparse", "net", "right", "#3a9e72", "1e-7")
+        >>> outcomes = [springbench.CellOutcome("right", "#3a9e72")]
+        >>> springbench.CellMap(("hard",), ("map",), "hard", "", [cell], outcomes).row_names
+        ['sparse']
     """
 
     group: tuple[str, ...]
@@ -248,6 +294,24 @@ class MeshPicture:
         aspect: width / height of the picture.
         render: returns the pixels, given width [pixels] and background.
         facts: lines below the title.
+
+    Example:
+        >>> import numpy as np
+        >>> picture = springbench.MeshPicture(
+        ...     group=("net",),
+        ...     name=("end",),
+        ...     subject="net",
+        ...     title="",
+        ...     p=np.zeros((2, 3)),
+        ...     springs=np.array([[0, 1]]),
+        ...     triangles=np.empty((0, 3), np.int64),
+        ...     strain=np.zeros(2),
+        ...     strain_limit=0.1,
+        ...     aspect=1.0,
+        ...     render=lambda width, background: np.full((width, width, 3), 255, np.uint8),
+        ... )
+        >>> len(picture.csv_rows())
+        2
     """
 
     group: tuple[str, ...]
@@ -279,6 +343,17 @@ class MeshRenderer(Protocol):
         replay: recording of the mesh.
         frame: index of the frame.
         aspect: width / height of the picture.
+
+    Example:
+        >>> class Blank:
+        ...     replay, frame, aspect = None, 0, 2.0
+        ...     def __call__(self, width, background):
+        ...         return np.full((round(width / self.aspect), width, 3), 255, np.uint8)
+
+        >>> import numpy as np
+        >>> render: springbench.MeshRenderer = Blank()
+        >>> render(4, None).shape
+        (2, 4, 3)
     """
 
     replay: RecordingReplay
@@ -296,6 +371,7 @@ class MeshRenderer(Protocol):
 
 
 FigurePanel = CurvePlot | CellMap | MeshPicture
+"""A panel of a figure: a `CurvePlot`, a `CellMap` or a `MeshPicture`; `panels(rows)` of a report returns a list."""
 
 
 def _series_rows(panel: str, series: CurveSeries) -> list[CsvRow]:

@@ -63,7 +63,14 @@ class VelocityFilter(Protocol):
 
 
 class DerivedEnergies(Protocol):
-    """Energies that depend on the energies of the scene's other effects."""
+    """Energies that depend on the energies of the scene's other effects.
+
+    Example:
+        >>> def derive_none(energies):
+        ...     return ()
+        >>> springbench.EffectContribution(derived_energies=(derive_none,)).is_empty
+        False
+    """
 
     def __call__(self, energies: Sequence[Energy]) -> tuple[Energy, ...]:
         """Return the additional energies."""
@@ -93,7 +100,17 @@ class PinGroup:
 
 
 class SceneCheck(Protocol):
-    """Requirement of an effect on the other parts of a scene."""
+    """Requirement of an effect on the other parts of a scene.
+
+    Example:
+        >>> def require_pin(start, pins):
+        ...     if not pins:
+        ...         raise springbench.InputError("the effect needs a pin")
+        >>> (check,) = springbench.EffectContribution(scene_checks=(require_pin,)).scene_checks
+        >>> check([], pins=[])
+        Traceback (most recent call last):
+        springbench.harness.errors.InputError: the effect needs a pin
+    """
 
     def __call__(self, start: Positions, pins: Sequence[PinGroup]) -> None:
         """Raise InputError if the effect is incompatible with the start or the pins.
@@ -218,6 +235,25 @@ class ObservedMotion:
         is_damped: whether an effect dissipates energy.
         positions: (frames, n, 3) [m].
         velocities: (frames, n, 3) [m/s].
+
+    Example:
+        >>> import numpy as np
+        >>> rest, springs = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), {"stretch": np.array([[0, 1]])}
+        >>> mesh = springbench.assemble_mesh(rest_positions=rest, springs=springs)
+        >>> observed = springbench.ObservedMotion(
+        ...     mesh=mesh,
+        ...     springs=springbench.Springs.from_rest_shape(rest, mesh.springs, np.array([100.0])),
+        ...     mean_spring_length=1.0,
+        ...     mass=np.ones(2),
+        ...     time_step=0.5,
+        ...     has_pins=False,
+        ...     is_driven=False,
+        ...     is_damped=False,
+        ...     positions=np.zeros((3, 2, 3)),
+        ...     velocities=np.zeros((3, 2, 3)),
+        ... )
+        >>> observed.compute_frame_time(2)
+        1.5
     """
 
     mesh: Mesh
@@ -300,6 +336,13 @@ def build_rest_springs(mesh: Mesh, indices: NDArray[np.int64], stiffness: NDArra
 
 
 def build_constant_force(force: Positions) -> tuple[ConstantForceField, ...]:
-    """Wrap a constant force (n, 3) [N]; empty if it is zero everywhere."""
+    """Wrap a constant force (n, 3) [N]; empty if it is zero everywhere.
+
+    Example:
+        >>> import numpy as np
+        >>> (weight,) = springbench.build_constant_force(np.array([[0.0, -9.81, 0.0]]))
+        >>> weight.force.tolist()
+        [[0.0, -9.81, 0.0]]
+    """
     force.flags.writeable = False
     return (ConstantForceField(force),) if force.any() else ()

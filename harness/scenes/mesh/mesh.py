@@ -8,8 +8,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-STRETCH, SHEAR, BEND = "stretch", "shear", "bend"
-"""Families of springs: along the mesh's lines, across its cells, and from a vertex to the next but one."""
+STRETCH = "stretch"
+"""Family of springs along the lines of a mesh."""
+SHEAR = "shear"
+"""Family of springs across the cells of a mesh."""
+BEND = "bend"
+"""Family of springs from a vertex to the next but one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,6 +24,14 @@ class SpringProperties:
         stiffness: (m,) [N/m], NaN for springs whose stiffness an effect determines.
         rest_length: (m,) [m].
         only_pulls: (m,), springs without any force while they are shorter than their rest length.
+
+    Example:
+        >>> import numpy as np
+        >>> cable = springbench.SpringProperties(
+        ...     stiffness=np.array([500.0]), rest_length=np.array([0.98]), only_pulls=np.array([True])
+        ... )
+        >>> cable.rest_length.tolist()
+        [0.98]
     """
 
     stiffness: NDArray[np.float64]

@@ -53,6 +53,13 @@ class PreparedLocalGlobal(IterativeSolver):
             corrections, p + Q^-1 (b - Q p), and the fixed point stays accurate to float64.
         diagonal_dominance_ratio: max_i Q_ii / (Q 1)_i over the free rows and columns, half of a bound on the condition
             number.
+
+    Example:
+        >>> import numpy as np
+        >>> system = springbench.System(mass=np.ones(1), time_step=0.5)
+        >>> prepared = springbench.prepare_local_global(system, [], lambda Q: (springbench.SparseLU(Q), "SuperLU"))
+        >>> prepared.description, prepared.unpinned_trace
+        ('SuperLU', 4.0)
     """
 
     residual_iterate: ClassVar[ResidualIterate] = "previous"
@@ -200,6 +207,11 @@ def require_projective(system: System, solver: str) -> list[ProjectiveEnergy]:
 
     Raises:
         Unsupported: other energies, with their names.
+
+    Example:
+        >>> import numpy as np
+        >>> springbench.require_projective(springbench.System(mass=np.ones(1), time_step=0.5), "my-method")
+        []
     """
     energies = [energy for energy in system.energies if isinstance(energy, ProjectiveEnergy)]
     if len(energies) < len(system.energies):
@@ -238,6 +250,13 @@ def prepare_local_global(
         energies: its projective energies.
         factorise: function of Q's free part that returns a factor and a description.
         is_low_precision: whether the factor is less precise than float64.
+
+    Example:
+        >>> import numpy as np
+        >>> system = springbench.System(mass=np.ones(1), time_step=0.5)
+        >>> prepared = springbench.prepare_local_global(system, [], lambda Q: (springbench.SparseLU(Q), "SuperLU"))
+        >>> prepared.solve_correction(np.ones((1, 3)), np.zeros((1, 3))).tolist()
+        [[0.25, 0.25, 0.25]]
     """
     Q = system_matrix_assembly.assemble_system_matrix(system, energies)
     free = system.free_vertices

@@ -28,6 +28,13 @@ class Springs(EdgeEnergy):
         stiffness: k (m,) [N/m], not negative.
         rest_length: r (m,) [m], not negative.
         rest_direction: (m, 3), unit directions of springs of zero length.
+
+    Example:
+        >>> import numpy as np
+        >>> rest = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        >>> springs = springbench.Springs.from_rest_shape(rest, np.array([[0, 1]]), stiffness=np.array([100.0]))
+        >>> springs.value(3.0 * rest)
+        200.0
     """
 
     rest_length: NDArray[np.float64]

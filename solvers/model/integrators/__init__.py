@@ -49,6 +49,10 @@ of the embedded method for the error estimate, 0 for none) and iterate_stages (a
 """
 
 AnyIntegrator = SingleStageIntegrator | StagedIntegrator
+"""An integrator: an object of `SingleStageIntegrator`, `RungeKutta` or `GeneralisedAlpha`, or of a subclass.
+
+A config names it, such as `./mine.py:MY_METHOD`.
+"""
 
 INTEGRATORS: dict[str, AnyIntegrator] = {
     "implicit-euler": IMPLICIT_EULER,
@@ -80,5 +84,10 @@ def has_split_filters(method: AnyIntegrator) -> bool:
 
 
 def find_integrator(name: str) -> AnyIntegrator:
-    """Return the integrator of a name, which may be a third-party one."""
+    """Return the integrator of a name, which may be a third-party one.
+
+    Example:
+        >>> springbench.find_integrator("midpoint").inertia_factor
+        4.0
+    """
     return INTEGRATORS[name] if name in INTEGRATORS else load_target(INTEGRATOR_TABLE[name])

@@ -25,7 +25,13 @@ from springbench.solvers.model.step_problem import Positions
 
 @dataclass(frozen=True)
 class GeneralisedAlpha:
-    """The method with parameters am, of the masses, and af, of the forces."""
+    """The method with parameters am, of the masses, and af, of the forces.
+
+    Example:
+        >>> method = springbench.GeneralisedAlpha.from_spectral_radius(1.0)
+        >>> method.gamma, method.beta
+        (0.5, 0.25)
+    """
 
     alpha_m: float
     alpha_f: float

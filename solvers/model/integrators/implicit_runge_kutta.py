@@ -47,6 +47,11 @@ class RungeKutta:
         a: rows of the tableau, of lengths 1 to s.
         embedded_weights: weights (s,) of the embedded method, if any.
         embedded_order: order of the embedded method.
+
+    Example:
+        >>> method = springbench.RungeKutta(order=1, a=((1.0,),))  # implicit Euler
+        >>> method.num_stages, method.stage_times, method.inertia_factor
+        (1, (1.0,), 1.0)
     """
 
     order: int

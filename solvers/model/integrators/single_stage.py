@@ -40,6 +40,12 @@ class SingleStageIntegrator:
         predict_target: function of the motions now and one step earlier, and of dt [s], that returns target and
             velocity_origin, each (n, 3) [m].
         order: order of the error.
+
+    Example:
+        >>> def predict(now, previous, dt):  # implicit Euler
+        ...     return now.positions + dt * now.velocity, now.positions
+        >>> springbench.SingleStageIntegrator(1.0, 1.0, 0.0, needs_history=False, predict_target=predict).order
+        1
     """
 
     velocity_factor: ClassVar[None] = None
