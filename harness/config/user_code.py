@@ -134,13 +134,13 @@ def _run_in_worker(task: Callable[[ProgressCallback], Any], limits: LoadLimits, 
 
     does = "loading"
 
-    def hear(message: str) -> None:
+    def record_stage(message: str) -> None:
         nonlocal does
         does = message.removeprefix("\0") if message.startswith((IMPORT_NOTICE, BINDING_PREFIX)) else does
 
     worker = IsolatedWorker()
     try:
-        return worker.run_task(task, hear, TaskLimits(*limits))
+        return worker.run_task(task, record_stage, TaskLimits(*limits))
     except TaskFailure as lost:
         reason = str(lost).replace(", before its first step", "")  # the worker's messages are about runs
         behind = "" if any(name in does for name in names) else f" with {', '.join(names)}"

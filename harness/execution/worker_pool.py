@@ -42,7 +42,7 @@ TaskFactory = Callable[[int], PoolTask | None]
 
 @dataclass
 class _PoolWorker:
-    worker: IsolatedWorker
+    process: IsolatedWorker
     group: Hashable = None
     number: int = -1
     running_task: RunningTask | None = None
@@ -51,7 +51,7 @@ class _PoolWorker:
         """Stop the running task and the worker."""
         if self.running_task:
             self.running_task.close()
-        self.worker.stop_worker()
+        self.process.stop_worker()
 
 
 def run_tasks(
@@ -81,33 +81,33 @@ def run_tasks(
     """
     left = dict(enumerate(groups))
     with ExitStack() as cleanup:
-        crew = [_PoolWorker(IsolatedWorker(initialiser)) for _ in range(min(num_workers, len(left)))]
-        for member in crew:
-            cleanup.callback(member.stop_worker)
+        workers = [_PoolWorker(IsolatedWorker(initialiser)) for _ in range(min(num_workers, len(left)))]
+        for worker in workers:
+            cleanup.callback(worker.stop_worker)
         while True:
-            for member in crew:
-                while member.running_task is None and left:
-                    number = _select_task(left, member, [other.group for other in crew if other is not member])
-                    member.number, member.group = number, left.pop(number)
+            for worker in workers:
+                while worker.running_task is None and left:
+                    number = _select_task(left, worker, [other.group for other in workers if other is not worker])
+                    worker.number, worker.group = number, left.pop(number)
                     if task := create_task(number):
-                        member.running_task = member.worker.start_task(
+                        worker.running_task = worker.process.start_task(
                             task.function, task.tick, task.limits, task.user_code
                         )
-            going = [member for member in crew if member.running_task]
+            going = [worker for worker in workers if worker.running_task]
             if not going:
                 return
             pipes = list[Connection]()
-            for member in going:
-                assert member.running_task
+            for worker in going:
+                assert worker.running_task
                 try:
-                    pipes.append(next(member.running_task))
+                    pipes.append(next(worker.running_task))
                     continue
                 except StopIteration as done:
                     outcome = done.value
                 except TaskFailure as lost:
                     outcome = lost
-                member.running_task = None
-                yield member.number, outcome
+                worker.running_task = None
+                yield worker.number, outcome
             if background_call:
                 background_call()
                 background_call = None
@@ -115,12 +115,12 @@ def run_tasks(
                 wait(pipes, _POLL_INTERVAL)
 
 
-def _select_task(left: dict[int, Hashable], member: _PoolWorker, others: list[Hashable]) -> int:
+def _select_task(left: dict[int, Hashable], worker: _PoolWorker, others: list[Hashable]) -> int:
     """Select the next task for a worker.
 
     A task of the worker's own group comes first, then one of a group that no other worker runs, then any.
     """
     grouped = {number: group for number, group in left.items() if group is not None}
-    own = (number for number, group in grouped.items() if group == member.group)
+    own = (number for number, group in grouped.items() if group == worker.group)
     new = (number for number, group in grouped.items() if group not in others)
     return next(chain(own, new, left))

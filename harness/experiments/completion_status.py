@@ -49,12 +49,12 @@ P = TypeVar("P", bound=PlannedUnit)
 
 
 def read_completion_statuses(
-    matches_request: Mapping[Path, Callable[[Mapping[str, Any]], bool]], columns: Sequence[str], schema: pa.Schema
+    request_predicates: Mapping[Path, Callable[[Mapping[str, Any]], bool]], columns: Sequence[str], schema: pa.Schema
 ) -> dict[Path, CompletionStatus]:
     """Return the completion status of units, by the path of their rows.
 
     Args:
-        matches_request: for each path, a predicate that states whether the columns of the unit's first row match the
+        request_predicates: for each path, a predicate that states whether the columns of the unit's first row match the
             request.
         columns: columns that the predicates need; `source_fingerprint` is added.
         schema: schema of the rows.
@@ -67,11 +67,11 @@ def read_completion_statuses(
     )
 
     heads, today = (
-        parquet_rows.read_first_rows(matches_request, [*columns, "source_fingerprint"], schema),
+        parquet_rows.read_first_rows(request_predicates, [*columns, "source_fingerprint"], schema),
         machine_info.hash_sources(),
     )
     found: dict[Path, CompletionStatus] = {}
-    for path, is_match in matches_request.items():
+    for path, is_match in request_predicates.items():
         there = heads.get(path)
         if isinstance(there, str):
             found[path] = CompletionStatus(NOT_STARTED, damage_reason=f"{path} {there}")

@@ -168,7 +168,7 @@ def _build_motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, O
         else:
             field = OdeField(scene)
 
-            def composed(k: int, both: OdeState) -> OdeState:
+            def compose_steps(k: int, both: OdeState) -> OdeState:
                 ends = list[OdeState]()
                 for y in np.split(both, 2):
                     p, v = (part.copy() for part in field.unpack_state(k * interval, y))
@@ -179,21 +179,21 @@ def _build_motion(spec: SceneSpec, size: int, interval: float) -> tuple[Scene, O
                     ends += [part[scene.system.free_vertices].ravel() for part in done.state.motion]
                 return np.concatenate(ends)
 
-            return scene, field.initial_state, composed
+            return scene, field.initial_state, compose_steps
     from scipy.integrate import solve_ivp  # takes a third of a second to import
 
     scene = build_ode_scene(spec, size)
     field = OdeField(scene)
     atol = _RTOL * (scene.mesh.bounding_box_diagonal or 1.0)
 
-    def both(t: float, y: OdeState) -> OdeState:
+    def evaluate_halves(t: float, y: OdeState) -> OdeState:
         return np.concatenate([field(t, part) for part in np.split(y, 2)])
 
-    def integrated(k: int, y: OdeState) -> OdeState:
-        solved = solve_ivp(both, (k * interval, (k + 1) * interval), y, "DOP853", rtol=_RTOL, atol=atol)
+    def integrate_interval(k: int, y: OdeState) -> OdeState:
+        solved = solve_ivp(evaluate_halves, (k * interval, (k + 1) * interval), y, "DOP853", rtol=_RTOL, atol=atol)
         return np.array(solved.y[:, -1]) if solved.success else np.full_like(y, np.nan)
 
-    return scene, field.initial_state, integrated
+    return scene, field.initial_state, integrate_interval
 
 
 def _min_error(grown: float) -> float:

@@ -101,7 +101,7 @@ def compute_reference_positions(
     Returns:
         Positions (frames, n, 3) [m], nan from the first step on that does not end at a stationary point.
     """
-    judge, found = (
+    evaluator, found = (
         StepVerifier(scene, None, is_minimiser=True),
         np.full((frames, len(scene.mesh.rest_positions), 3), np.nan),
     )
@@ -109,7 +109,7 @@ def compute_reference_positions(
         scene, prepare(scene, solver), UNLIMITED_STOP_RULE, initial_guess=initial_guess, frames=frames
     ):
         if not all(
-            judge.measure_stationarity(stated, s.positions).above_roundoff <= MAX_REFERENCE_STATIONARITY
+            evaluator.measure_stationarity(stated, s.positions).above_roundoff <= MAX_REFERENCE_STATIONARITY
             for stated, s in step.stages
         ):
             break

@@ -113,10 +113,10 @@ def _compute_time_ratio(run: RunTimes, other: RunTimes) -> float:
 
 
 def _compare_group(group: list[RunTimes]) -> AccuracyComparison:
-    judged = {run.run_id: run.reference_distance for run in group if _is_known_error(run.reference_distance)}
+    distances = {run.run_id: run.reference_distance for run in group if _is_known_error(run.reference_distance)}
     solved = {run.run_id: run.worst_residual for run in group if _is_known_error(run.worst_residual)}
-    of_motion = len(judged) >= max(len(solved), 1)
-    what, known = ("largest distance from the reference", judged) if of_motion else ("largest residual", solved)
+    of_motion = len(distances) >= max(len(solved), 1)
+    what, known = ("largest distance from the reference", distances) if of_motion else ("largest residual", solved)
     errors = {run_id: error for run_id, error in known.items() if error is not None}
     floors = [run.roundoff_residual for run in group if run.run_id in errors and _is_known_error(run.roundoff_residual)]
     floor = ROUNDOFF_RATIO if of_motion else min((f for f in floors if f is not None), default=0.0)

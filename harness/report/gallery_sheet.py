@@ -129,7 +129,7 @@ class _Sheet:
         """Add an image, pixel for pixel."""
         self._images.append(_PlacedPixels(pixels, left, top))
 
-    def save(self, path: Path) -> None:
+    def save_sheet(self, path: Path) -> None:
         """Write the sheet as PNG file."""
         height = self.y + _MARGIN
         page = Figure(figsize=(PAGE_WIDTH / PAGE_DPI, height / PAGE_DPI), dpi=PAGE_DPI, facecolor=BACKGROUND_COLOUR)
@@ -175,7 +175,7 @@ def draw_gallery_sheet(tiles: Sequence[SceneTile], path: Path, title: str, facts
         sheet.add_paragraph(
             wrap_to_width(_FACT_SEPARATOR.join(facts), whole, _TEXT_SIZE, separator=_FACT_SEPARATOR), color=MUTED_COLOUR
         )
-        sheet.save(path)
+        sheet.save_sheet(path)
 
 
 def choose_column_count(count: int) -> int:

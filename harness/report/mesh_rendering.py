@@ -88,11 +88,11 @@ def choose_view_angles(points: PointArray, areas: PointArray) -> tuple[float, fl
     corner = 32.0 if x >= z else 58.0
     elevation = 8.0 + 12.0 * min(2.0 * min(x, z) / max(x, y, z, 1e-30), 1.0)
 
-    def shown(azimuth: float) -> float:
+    def measure_shown_area(azimuth: float) -> float:
         # The front view gets a bonus, so that the choice between similar views does not depend on round-off.
         return float(np.abs(areas @ _view_direction(azimuth, elevation)).sum()) * (1.05 if azimuth == corner else 1.0)
 
-    return max((corner, -corner, 180.0 - corner, corner - 180.0), key=shown), elevation
+    return max((corner, -corner, 180.0 - corner, corner - 180.0), key=measure_shown_area), elevation
 
 
 def compute_area_vectors(replay: RecordingReplay, frame: int) -> PointArray:

@@ -130,10 +130,10 @@ def add_axes(page: Figure, left: float, top: float, width: float, height: float)
 def tick_formatter(format_value: Callable[[float], str]) -> FuncFormatter:
     """Build a tick formatter from a function that formats a value."""
 
-    def written(value: float, _: int | None) -> str:
+    def format_tick(value: float, _: int | None) -> str:
         return format_value(value)
 
-    return FuncFormatter(written)
+    return FuncFormatter(format_tick)
 
 
 def paste_picture(page: Figure, pixels: NDArray[np.uint8], left: int, top: int) -> None:

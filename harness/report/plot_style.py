@@ -227,11 +227,11 @@ def assign_label_styles(label_solver_pairs: Iterable[tuple[str, str]]) -> dict[s
     All labels of a solver have its colour and marker, and the first one also its line style.
     """
 
-    def dashed(own: SeriesStyle, k: int) -> SeriesStyle:
+    def change_dash(own: SeriesStyle, k: int) -> SeriesStyle:
         styles = [own.dash, *(dash for dash in _VARIANT_LINE_STYLES if dash != own.dash)]
         return own._replace(dash=styles[k % len(styles)])
 
-    return _assign_variants(label_solver_pairs, dashed)
+    return _assign_variants(label_solver_pairs, change_dash)
 
 
 def assign_label_shades(label_solver_pairs: Iterable[tuple[str, str]]) -> dict[str, SeriesStyle]:
@@ -240,11 +240,11 @@ def assign_label_shades(label_solver_pairs: Iterable[tuple[str, str]]) -> dict[s
     The first label has its solver's colour, the others have lighter and darker shades of it.
     """
 
-    def shaded(own: SeriesStyle, k: int) -> SeriesStyle:
+    def change_shade(own: SeriesStyle, k: int) -> SeriesStyle:
         step = 0.22 * ((k + 1) // 2) * (1.0 if k % 2 else -1.0)
         return own._replace(color=shade_colour(own.color, max(-0.7, min(step, 0.7))) if k else own.color)
 
-    return _assign_variants(label_solver_pairs, shaded)
+    return _assign_variants(label_solver_pairs, change_shade)
 
 
 def _assign_variants(

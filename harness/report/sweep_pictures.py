@@ -60,7 +60,9 @@ def draw_sweep_pictures(
     write_bibtex(folder / "references.bib", table["citation"].to_pylist())
     drawn = [p for p in jobs if p.run.record and p.recording_path.exists()]
     wanting = [p for p in drawn if p.run.pictures and is_outdated(p.picture_path, [p.recording_path])]
-    groups = [group for group in group_by_scene(drawn, folder) if group.needs_recording or group.needs_picture]
+    groups = [
+        group for group in group_by_scene(drawn, folder) if group.has_outdated_recording or group.has_outdated_picture
+    ]
 
     def times() -> None:
         path, sources = folder / "pictures" / "timing.png", digest_runs(name, table, stale_ids)
@@ -70,7 +72,7 @@ def draw_sweep_pictures(
             with lock_timing_shared(_ignore_progress):
                 draw_timing_plot(table, path, name, stale_ids, sources)
 
-    missing = _load_drawing() if wanting or any(group.needs_picture for group in groups) else None
+    missing = _load_drawing() if wanting or any(group.has_outdated_picture for group in groups) else None
     if missing:
         print_message(missing)
     if wanting and not missing:
@@ -145,13 +147,13 @@ def _draw_group_comparisons(
     for number, group in enumerate(groups):
         remarks(f"{number} of {len(groups)} comparisons of solvers are drawn")
         with lock_timing_shared(_ignore_progress):
-            if group.needs_recording:
+            if group.has_outdated_recording:
                 found = assign_label_shades((name, p.run.solver.name) for name, p in group.jobs_by_label.items())
                 looks = {name: LineStyle(mark.color) for name, mark in found.items()}
                 write_side_by_side(
                     group.recording_path, group.recording_paths, group.group_label.replace("-", " "), looks
                 )
-            if group.needs_picture and pictures:
+            if group.has_outdated_picture and pictures:
                 draw_comparison_picture(
                     {name: read_replay(path) for name, path in group.recording_paths.items()}, group.picture_path
                 )
@@ -193,12 +195,12 @@ class SolverGroup:
         return {name: p.recording_path for name, p in self.jobs_by_label.items()}
 
     @property
-    def needs_recording(self) -> bool:
+    def has_outdated_recording(self) -> bool:
         """Whether the side-by-side recording has to be made."""
         return is_outdated(self.recording_path, self.recording_paths.values())
 
     @property
-    def needs_picture(self) -> bool:
+    def has_outdated_picture(self) -> bool:
         """Whether the comparison picture has to be drawn."""
         return next(iter(self.jobs_by_label.values())).run.pictures and is_outdated(
             self.picture_path, self.recording_paths.values()

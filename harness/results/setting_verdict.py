@@ -198,7 +198,7 @@ class ConvergenceStudy:
         what = "" if not given.setting.iterations else " substeps x iterations"
         state = "converged" if self.is_setting_converged(assessment) else "not converged"
         lines = [
-            f"{given.setting}{what}: {state} to {self._requested}. "
+            f"{given.setting}{what}: {state} to {self._formatted_request}. "
             f"The error is {describe_percent(given.error)}, against {self.reference}.",
             f"The largest strain is {describe_percent(given.max_strain)}{_describe_drift(given.energy_drift)}.",
             *self._describe_changes(assessment),
@@ -212,7 +212,7 @@ class ConvergenceStudy:
         good = [one for one in self.assessments if self.is_setting_converged(one)]
         nearest = min(self.assessments, key=lambda one: self.find_result(one.setting).error)
         count = f"{len(good)} of the {len(self.assessments)}" if good else f"None of the {len(self.assessments)}"
-        lines = [f"{count} settings {'is' if len(good) < 2 else 'are'} converged to {self._requested}."]
+        lines = [f"{count} settings {'is' if len(good) < 2 else 'are'} converged to {self._formatted_request}."]
         error = self.find_result(nearest.setting).error
         if isfinite(error):
             lines[0] += f" {nearest.setting} is the nearest to {self.reference}, with an error of "
@@ -238,7 +238,7 @@ class ConvergenceStudy:
         return f"{given.setting}: {', '.join(parts)}."
 
     @property
-    def _requested(self) -> str:
+    def _formatted_request(self) -> str:
         return describe_percent(self.error_requested)
 
     def _describe_changes(self, assessment: SettingAssessment) -> list[str]:

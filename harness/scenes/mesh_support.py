@@ -18,7 +18,7 @@ from springbench.harness.scenes.scene_spec import SceneSpec
 from springbench.harness.scenes.vertex_selectors import find_selections
 from springbench.solvers.model.energies.spring_energy import Springs
 
-_HOLDING_EFFECTS = ("pins", "attachments")
+_SUPPORTING_EFFECTS = ("pins", "attachments")
 _JOINING_EFFECTS = ("sewing",)
 _OTHER_EFFECTS = ("springs", "gravity", "constant-force", "wind", "air-drag", "ether-drag", "dashpots", "rayleigh",
                   "bending", "strain-limits", "gas", "self-contact")  # fmt: skip
@@ -43,10 +43,10 @@ def find_mesh_support(scene: SceneSpec, mesh: Mesh) -> MeshSupport | None:
     """
     supported, joined = [NO_VERTICES], [NO_PAIRS]
     for k, effect in enumerate(scene.effects):
-        if effect.kind not in (*_HOLDING_EFFECTS, *_JOINING_EFFECTS, *_OTHER_EFFECTS):
+        if effect.kind not in (*_SUPPORTING_EFFECTS, *_JOINING_EFFECTS, *_OTHER_EFFECTS):
             return None
         chosen = [one.select_vertices(mesh, f"effects[{k}]") for _, one in find_selections(effect)]
-        if effect.kind in _HOLDING_EFFECTS:
+        if effect.kind in _SUPPORTING_EFFECTS:
             supported += chosen
         elif effect.kind in _JOINING_EFFECTS:
             every = np.concatenate([NO_VERTICES, *chosen])

@@ -30,11 +30,11 @@ class _MovingObstacle(ConfigModel):
             return ConvexObstacle(low, high, radius, lambda time: frame)
 
         @lru_cache(maxsize=2)  # a step's end is the start of the next one
-        def moved(time: float) -> FloatArray:
+        def move_frame(time: float) -> FloatArray:
             o, *ends = motion.transform_points(np.concatenate([frame[:1], frame[:1] + axes]), time)
             return np.concatenate([[o], np.array(ends) - o])
 
-        return ConvexObstacle(low, high, radius, moved)
+        return ConvexObstacle(low, high, radius, move_frame)
 
 
 class PlaneObstacle(_MovingObstacle):

@@ -38,7 +38,7 @@ def build_name_type(table: PluginTable) -> Any:
     (`springbench.solvers.plugins.plugin_discovery.PluginTable.resolve_name`).
     """
 
-    def checked(value: str, info: ValidationInfo) -> str:
+    def check_name(value: str, info: ValidationInfo) -> str:
         name = table.resolve_name(value, Path(cast(Mapping[str, Any], info.context or {}).get("folder", ".")))
         if name not in table:
             raise ValueError(f"got {json.dumps(value)[:60]}; should be {format_allowed_names(value, table)}")
@@ -48,7 +48,7 @@ def build_name_type(table: PluginTable) -> Any:
     schema = {
         "anyOf": [{"enum": shipped, "type": "string"}, {"pattern": plugin_discovery.PLUGIN_PATTERN, "type": "string"}]
     }
-    return Annotated[str, AfterValidator(checked), WithJsonSchema(schema)]
+    return Annotated[str, AfterValidator(check_name), WithJsonSchema(schema)]
 
 
 if TYPE_CHECKING:

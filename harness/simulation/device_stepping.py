@@ -34,7 +34,7 @@ class DevicePreparedSolver(DelegatingSolver):
         """Record the iteration counts of a step; steps are added in order."""
         self._counts += step.iteration_counts
 
-    def again(self) -> ReplayingDeviceSolver:
+    def build_replay(self) -> ReplayingDeviceSolver:
         """Return a solver that repeats the same iteration counts from the first step on."""
         return ReplayingDeviceSolver(self._prepared, self._counts)
 

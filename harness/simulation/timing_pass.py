@@ -174,7 +174,7 @@ def measure_run(
     final = build_initial_state(scene).motion.positions
     for round in range(settings.rounds):
         clock, found = Stopwatch(watch("step", round)), list[TimingSample]()
-        replayed = remote.again() if remote else None
+        replayed = remote.build_replay() if remote else None
         for step in iterate_steps(scene, replayed or prepared, settings, clock):
             device_timings = replayed.collect_timings() if replayed else {}
             found.append(TimingSample("step", step.index, round, clock.seconds, device_columns=device_timings))

@@ -149,7 +149,7 @@ def build_spring_kernels(real: Any) -> SpringKernels:
     tiny = ZERO_LENGTH_SQUARED
 
     @cuda.jit(device=True)
-    def unit(v0, v1, v2, squared, name, direction):
+    def compute_direction(v0, v1, v2, squared, name, direction):
         """Return the direction of a spring; that of its rest shape at zero length."""
         if squared <= short:
             sign = one
@@ -164,7 +164,7 @@ def build_spring_kernels(real: Any) -> SpringKernels:
         return scale * v0, scale * v1, scale * v2
 
     @cuda.jit(device=True)
-    def change(d0, d1, d2, w0, w1, w2, pull, k, name, direction):
+    def compute_force_change(d0, d1, d2, w0, w1, w2, pull, k, name, direction):
         """Return the change (3) of a spring's force on its first end.
 
         Also return its length, and whether it has zero length.
@@ -172,8 +172,8 @@ def build_spring_kernels(real: Any) -> SpringKernels:
         v0, v1, v2 = d0 + w0, d1 + w1, d2 + w2
         begin, end = d0 * d0 + d1 * d1 + d2 * d2, v0 * v0 + v1 * v1 + v2 * v2
         if begin <= short or end <= short:
-            a0, a1, a2 = unit(d0, d1, d2, begin, name, direction)
-            b0, b1, b2 = unit(v0, v1, v2, end, name, direction)
+            a0, a1, a2 = compute_direction(d0, d1, d2, begin, name, direction)
+            b0, b1, b2 = compute_direction(v0, v1, v2, end, name, direction)
             return pull * (b0 - a0) - k * w0, pull * (b1 - a1) - k * w1, pull * (b2 - a2) - k * w2, zero, True
         was, length = real(math.sqrt(begin)), real(math.sqrt(end))
         longer = ((d0 + v0) * w0 + (d1 + v1) * w1 + (d2 + v2) * w2) / (was + length)
@@ -182,7 +182,7 @@ def build_spring_kernels(real: Any) -> SpringKernels:
         return tension * w0 - back * d0, tension * w1 - back * d1, tension * w2 - back * d2, length, False
 
     @cuda.jit
-    def clear(x, u, older, before):
+    def clear_rows(x, u, older, before):
         """Set rows of four to zero."""
         i = cuda.grid(1)
         if i < len(x):
@@ -190,7 +190,7 @@ def build_spring_kernels(real: Any) -> SpringKernels:
                 x[i, c], u[i, c], older[i, c], before[i, c] = 0.0, zero, zero, zero
 
     @cuda.jit
-    def settle(x, u, out):
+    def write_positions(x, u, out):
         """Write positions x + u [m] in rows of three."""
         i = cuda.grid(1)
         if i < len(out):
@@ -198,7 +198,9 @@ def build_spring_kernels(real: Any) -> SpringKernels:
                 out[i, c] = x[i, c] + float64(u[i, c])
 
     @cuda.jit
-    def linearise(own, start, neighbour, kind, weights, spring, direction, arrows, padding_row, far, given, x, force):
+    def linearise_springs(
+        own, start, neighbour, kind, weights, spring, direction, arrows, padding_row, far, given, x, force
+    ):
         """Write the spring vectors of the reference, and the negative gradient there (3, lanes) [N].
 
         Both are computed in float64.
@@ -231,4 +233,4 @@ def build_spring_kernels(real: Any) -> SpringKernels:
             f0, f1, f2 = f0 + pull * v0, f1 + pull * v1, f2 + pull * v2
         force[0, t], force[1, t], force[2, t] = real(f0), real(f1), real(f2)
 
-    return SpringKernels(unit, change, clear, settle, linearise)
+    return SpringKernels(compute_direction, compute_force_change, clear_rows, write_positions, linearise_springs)

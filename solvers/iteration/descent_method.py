@@ -57,10 +57,10 @@ class DescentMethod(Protocol):
     """A method that yields one point after another; it ends with a stalled one.
 
     Attributes:
-        identifies_saddles: whether `can_terminate` distinguishes saddles from minima.
+        can_identify_saddles: whether `can_terminate` distinguishes saddles from minima.
     """
 
-    identifies_saddles: ClassVar[bool]
+    can_identify_saddles: ClassVar[bool]
 
     def iterate_points(self, step: StepObjective, start: DescentPoint) -> Iterator[DescentPoint]:
         """Yield the points that follow a given one.
@@ -294,9 +294,9 @@ class PreparedDescent(IterativeSolver):
     stats: dict[str, float]
 
     @property
-    def identifies_saddles(self) -> bool:
+    def can_identify_saddles(self) -> bool:
         """Whether the method distinguishes saddles from minima."""
-        return self.method.identifies_saddles
+        return self.method.can_identify_saddles
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:
         """Start a solve.

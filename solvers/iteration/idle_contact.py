@@ -56,7 +56,7 @@ class IdleContactSolver:
     def iterates(self, problem: StepProblem) -> Iterator[Positions]:
         """Yield the iterates; the next one may overwrite a yielded array."""
         certificate, touching = _Certificate(problem), None
-        if not certificate.may_be_idle():
+        if not certificate.can_be_idle():
             yield from self.with_contact.iterates(problem)
         for count, p in enumerate(self.contact_free.iterates(problem)):
             is_idle = certificate.is_idle_at(p)
@@ -75,7 +75,7 @@ class IdleContactSolver:
             stop: the criteria that terminate the solve.
         """
         certificate = _Certificate(problem)
-        if certificate.may_be_idle():
+        if certificate.can_be_idle():
             found = self.contact_free.solve(problem, stop)
             if certificate.is_idle_at(found.positions):
                 return found
@@ -128,7 +128,7 @@ class _Certificate:
         self._problem = problem
         self._energies: list[BarrierEnergy] = [energy for energy in problem.energies if is_barrier_energy(energy)]
 
-    def may_be_idle(self) -> bool:
+    def can_be_idle(self) -> bool:
         """Return whether barriers vanish at the initial guess and at the current positions.
 
         The initial residual is computed at the latter.

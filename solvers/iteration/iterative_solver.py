@@ -193,7 +193,7 @@ class IterativeSolver(ABC):
     can_leave_saddles: ClassVar[bool] = True
 
     @property
-    def identifies_saddles(self) -> bool:
+    def can_identify_saddles(self) -> bool:
         """Whether `SolverState.can_terminate` distinguishes saddles from minima; other methods get a `SaddleCheck`."""
         return False
 
@@ -283,7 +283,7 @@ class IterativeSolver(ABC):
     def _find_lower_point(self, problem: StepProblem, p: Positions, num_iterations: int) -> Positions | None:
         """Return a point lower than a saddle at the end point p, or None."""
         system = problem.system
-        if self.identifies_saddles or self.residual_iterate == "none" or system.length_constraints:
+        if self.can_identify_saddles or self.residual_iterate == "none" or system.length_constraints:
             return None
         if not self._saddle_checks or self._saddle_checks[0].system is not system:
             from springbench.solvers.iteration.saddle_check import SaddleCheck

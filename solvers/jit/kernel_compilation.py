@@ -60,7 +60,7 @@ class KernelDispatcher(_DISPATCHER_CLASS):
 def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator like Numba's `njit`, with a disk cache that considers all dependencies."""
 
-    def compiling(function: Callable[..., Any]) -> Any:
+    def compile_function(function: Callable[..., Any]) -> Any:
         if "pipeline_class" in options:
             return _cache_kernel(function, options)
         if options.get("parallel"):
@@ -70,7 +70,7 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         kernel.inner_kernel = _cache_kernel(function, {**options, **_linked_options})
         return kernel
 
-    return compiling
+    return compile_function
 
 
 def _cache_kernel(function: Callable[..., Any], options: dict[str, Any]) -> Any:

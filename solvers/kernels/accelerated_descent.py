@@ -24,7 +24,7 @@ from springbench.solvers.simd.dot_products import ordered_dot, ordered_dot_pair
 
 _WOLFE_FRACTION = 0.1
 TRIAL_AGAIN, TRIAL_ACCEPTED, TRIAL_STALLED = 0, 1, 2
-"""The result of `judge_trial`: evaluate the next trial, accept it, or stop because round-off prevents descent."""
+"""The result of `assess_trial`: evaluate the next trial, accept it, or stop because round-off prevents descent."""
 
 CACHE_BLOCK = 512
 """Entries per block, so that the data of all pairs stay in the first-level cache."""
@@ -128,7 +128,7 @@ def shorten_trial(window, fraction):
 
 
 @jit_kernel
-def judge_trial(window):
+def assess_trial(window):
     """Accept, replace or reject a trial whose change, round-off and gradient are known.
 
     Returns:

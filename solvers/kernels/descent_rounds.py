@@ -68,7 +68,7 @@ def round_size(now):
 
 
 @register_jitable(**jit_inner_options)
-def _judge_round(now, decrease, residual, residual_limit):
+def _assess_round(now, decrease, residual, residual_limit):
     """Return REASON_SWITCH if another method is predicted to gain more, else REASON_ITERATIONS."""
     if now.num_iterations == PROBE_ITERATIONS and residual > _FAST_RESIDUAL_RATIO * now.initial_residual:
         now.is_unsuited = 1
@@ -116,7 +116,9 @@ def build_rounds(
             ended = check_residual(found, limits)
             if ended == REASON_ITERATIONS:
                 ended = (
-                    _judge_round(now, decrease(state), found, limits.residual_limit) if done == size else REASON_STALLED
+                    _assess_round(now, decrease(state), found, limits.residual_limit)
+                    if done == size
+                    else REASON_STALLED
                 )
         return count, found, ended
 

@@ -108,21 +108,23 @@ class SpringPackets(NamedTuple):
         nth = np.arange(len(here)) - np.searchsorted(here, here)
         entry = LANES * (start[here // LANES] + nth) + here % LANES
 
-        def filled(values: NDArray[Any], filler: float) -> NDArray[Any]:
+        def fill_entries(values: NDArray[Any], filler: float) -> NDArray[Any]:
             out = allocate_aligned(LANES * start[-1], values.dtype)
             out[:] = filler
             out[entry] = values
             return out
 
-        named = filled(spring.astype(np.int32), 0)
+        named = fill_entries(spring.astype(np.int32), 0)
         edges = None
         if attached:
-            edges = attached.build_packets(named, filled(np.ones(len(entry), bool), 0), filled(is_fixed, 0), start)
+            edges = attached.build_packets(
+                named, fill_entries(np.ones(len(entry), bool), 0), fill_entries(is_fixed, 0), start
+            )
         return cls(
             4 * own,
             start,
-            filled(4 * there.astype(np.int32), 4 * far),
-            *deduplicate_packets(filled(pull, 0.0), filled(k, 0.0)),
+            fill_entries(4 * there.astype(np.int32), 4 * far),
+            *deduplicate_packets(fill_entries(pull, 0.0), fill_entries(k, 0.0)),
             named,
             np.array(springs.rest_direction, order="C"),
             edges,

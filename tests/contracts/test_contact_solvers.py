@@ -41,7 +41,7 @@ SCENES = {
 
 @cache
 def find_contact_step(scene: str) -> tuple[StepProblem, Positions]:
-    """The step at which most presses and something grips, and its minimum by Newton's method."""
+    """The step at which most presses and something is in friction, and its minimum by Newton's method."""
     step = collect_steps(SCENES[scene](), 4, stop=StopRule(100, 1e-12))[-1]
     energy = step.problem.energies[-1]
     before, after = step.problem.current_positions, step.solution.positions

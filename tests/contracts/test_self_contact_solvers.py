@@ -183,7 +183,7 @@ def test_an_iterate_without_contact_counts_only_where_its_path_is_free():
     p, (energy,) = stated.initial_guess, (e for e in made.system.energies if isinstance(e, Energy))
     beyond = p.copy()
     beyond[:, 1] = -1.0 - p[:, 1]  # what is on one side of a plane comes to the other, through itself
-    assert certificate.may_be_idle()
+    assert certificate.can_be_idle()
     assert certificate.is_idle_at(p + 1e-6)
     assert energy.value(beyond) == 0.0
     assert not certificate.is_idle_at(beyond)

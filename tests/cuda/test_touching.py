@@ -63,7 +63,7 @@ def test_a_host_iterates_the_normal_forces_of_friction_and_timed_steps_repeat_it
     for step in first:
         found.record_counts(step)
     assert max(len(step.iteration_counts) for step in first) > 1
-    again = list(iterate_steps(made, found.again(), settings))
+    again = list(iterate_steps(made, found.build_replay(), settings))
     for one, other in zip(first, again, strict=True):
         assert one.iteration_counts == other.iteration_counts
         np.testing.assert_array_equal(one.positions, other.positions)

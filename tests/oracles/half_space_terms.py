@@ -69,18 +69,18 @@ def _build_obstacle_energy(effect: Any, one: Any, k: ExtendedArray, moment: Step
     depth = w * (d - (n * carried).sum(axis=1))
     if moment.normal_force_positions is not None:
         depth = offset - (n * moment.normal_force_positions).sum(axis=1)
-    grip = effect.friction * k * np.maximum(0, depth)
-    grips = grip > 0
+    friction_limit = effect.friction * k * np.maximum(0, depth)
+    frictional = friction_limit > 0
 
     def values(x: ExtendedArray) -> ExtendedArray:
         gap = (n * x).sum(axis=1) - offset
         pressed = k / 2 * np.where(gap.real < 0, gap, 0) ** 2
-        away, normal = (x - anchor)[grips], n[grips]
+        away, normal = (x - anchor)[frictional], n[frictional]
         across = away - (away * normal).sum(axis=1)[:, None] * normal
         square = (across**2).sum(axis=1)
         sticks = square.real <= slip**2
         slipped = np.where(sticks, square / (2 * slip), np.sqrt(np.where(sticks, 1, square)) - slip / 2)
-        return np.concatenate([pressed, grip[grips] * slipped])
+        return np.concatenate([pressed, friction_limit[frictional] * slipped])
 
     return values
 

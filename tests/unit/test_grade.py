@@ -24,7 +24,7 @@ from springbench.harness.experiments.grading.grading import (
 from springbench.harness.experiments.grading.mistaken_programs import MISTAKES as KNOWN_MISTAKES
 from springbench.harness.experiments.grading.motion_error import LARGEST_REFERENCE_ERROR
 from springbench.harness.experiments.grading.position_files import PositionSequence, read_position_file
-from springbench.harness.experiments.grading.step_verdicts import StepJudge, StepVerdict, spread_order
+from springbench.harness.experiments.grading.step_verdicts import StepAssessor, StepVerdict, spread_order
 from springbench.harness.experiments.grading.submission import align_submission, estimate_precision
 from springbench.harness.scenes.scene_builder import build_scene
 from springbench.harness.simulation.time_loop import prepare, simulate_scene
@@ -82,7 +82,7 @@ def grade_array(grader: SceneGrader, p: np.ndarray) -> PositionGrade:
 def grade_steps(path: Path, p: np.ndarray, seconds: float, size: int = 0) -> list[StepVerdict]:
     """The verdicts on the steps alone, without fingerprints."""
     scene = build_scene(load_scene(path), size)
-    return StepJudge(scene).judge_steps(align_submission(scene, PositionSequence(path, p), 1), seconds)
+    return StepAssessor(scene).assess_steps(align_submission(scene, PositionSequence(path, p), 1), seconds)
 
 
 def name_mistake(grader: SceneGrader, p: np.ndarray) -> tuple[str, tuple[str, ...]]:
@@ -411,7 +411,7 @@ def test_progress_of_a_grade_counts_the_minima_with_the_remaining_time(tmp_path)
     built = build_scene(load_scene(path), 0)
     submission = align_submission(built, PositionSequence(path, simulate(scene, 5)), 1)
     lines: list[str] = []
-    StepJudge(built).judge_steps(submission, 60.0, lines.append)
+    StepAssessor(built).assess_steps(submission, 60.0, lines.append)
     assert lines[0] == "minimum 1 of 5"
     assert [re.sub(r"\d+ s", "T", line) for line in lines[1:]] == [
         f"minimum {k} of 5; about T left" for k in range(2, 6)

@@ -196,7 +196,7 @@ class PreparedStepping(IterativeSolver):
     most: int = 1000
 
     @property
-    def identifies_saddles(self) -> bool:
+    def can_identify_saddles(self) -> bool:
         return True
 
     def init_state(self, problem: StepProblem, initial_guess: Positions) -> SolverState:

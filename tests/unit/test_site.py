@@ -48,7 +48,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def read(results: Path, name: str) -> Any:
     """The value that a script of data gives."""
     words = (results / "site" / "data" / f"{name}.js").read_text().strip()
-    assert words.startswith(f"springbench.give({json.dumps(name)}, ")
+    assert words.startswith(f"springbench.setData({json.dumps(name)}, ")
     return json.loads(words.partition(", ")[2].removesuffix(");"))
 
 

@@ -36,7 +36,7 @@ def test_a_script_contains_its_recording_and_is_written_once(tmp_path: Path):
     script = rerun_viewer.write_recording(recording, tmp_path / "site" / "a.js", 'cloth "6"')
     name, value = script.read_text().removesuffix(";\n").split(" = ", 1)
     chunk = json.loads(value)
-    assert (name, chunk["title"]) == ("springbench.taken", 'cloth "6"')
+    assert (name, chunk["title"]) == ("springbench.scriptContent", 'cloth "6"')
     assert gzip.decompress(b64decode(chunk["rrd"])) == rerun_viewer.move_layout_first(recording.read_bytes())
     made = script.stat().st_mtime_ns
     rerun_viewer.write_recording(recording, script, "other")

@@ -313,25 +313,25 @@ def _build_third_party_rows(
     print_message: PrintMessage,
 ) -> list[dict[str, Any]]:
     """Build the rows of third-party integrators, and print their relative times."""
-    from springbench.harness.experiments.error_control.third_party_comparison import compare_third_party as peers_of
+    from springbench.harness.experiments.error_control.third_party_comparison import compare_third_party
 
     shared = {name: row[name] for name in _SHARED_COLUMNS} | build_provenance_columns()
     found = list[dict[str, Any]]()
     print_message("third-party integrators, in the same process, to the same error:")
-    for peer in peers_of(error_target, error, search_result):
-        comparison = f"{peer.cpu_time_ratio:.3g} times the processor time, an error of {peer.error_estimated:.1g}"
-        print_message(f"  {peer.name}: {peer.reason or comparison}")
-        became = {"status": "failed", "reason": peer.reason} if peer.reason else {"status": "ok"}
+    for other in compare_third_party(error_target, error, search_result):
+        comparison = f"{other.cpu_time_ratio:.3g} times the processor time, an error of {other.error_estimated:.1g}"
+        print_message(f"  {other.name}: {other.reason or comparison}")
+        became = {"status": "failed", "reason": other.reason} if other.reason else {"status": "ok"}
         times = (
             {}
-            if peer.reason
+            if other.reason
             else {
-                "seconds": [peer.wall_seconds],
-                "seconds_per_simulated_second": peer.wall_seconds / error_target.t_end,
+                "seconds": [other.wall_seconds],
+                "seconds_per_simulated_second": other.wall_seconds / error_target.t_end,
             }
         )
-        estimated = {} if peer.reason else {"error_estimated": peer.error_estimated}
-        found.append(shared | became | times | estimated | {"kind": "third-party", "solver": peer.name})
+        estimated = {} if other.reason else {"error_estimated": other.error_estimated}
+        found.append(shared | became | times | estimated | {"kind": "third-party", "solver": other.name})
     return found
 
 

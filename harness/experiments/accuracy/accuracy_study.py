@@ -213,10 +213,10 @@ def _plan_units(units: Sequence[CurveUnit | WorkPrecisionUnit], results: Accurac
     """Return the units and whether their rows match the request and the current step snapshot."""
     here = machine_info.describe_machine().machine_id
 
-    def matches_request(unit: CurveUnit | WorkPrecisionUnit, row: Mapping[str, Any]) -> bool:
+    def is_match(unit: CurveUnit | WorkPrecisionUnit, row: Mapping[str, Any]) -> bool:
         of_step = not isinstance(unit, CurveUnit) or row["problem_digest"] == unit.snapshot_row["problem_digest"]
         return of_step and row["unit_id"] == unit.spec.compute_unit_id(here)
 
-    planned = {results.rows_path(unit.spec.build_file_stem()): partial(matches_request, unit) for unit in units}
+    planned = {results.rows_path(unit.spec.build_file_stem()): partial(is_match, unit) for unit in units}
     found = read_completion_statuses(planned, ("unit_id", "problem_digest"), ACCURACY_SCHEMA)
     return [_PlannedUnit(unit, found[results.rows_path(unit.spec.build_file_stem())]) for unit in units]

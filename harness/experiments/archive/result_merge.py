@@ -238,7 +238,7 @@ def _query_conflicts(units: Sequence[Path], table: pa.Table | None = None) -> tu
         else:
             connection.register("rows", table)
 
-        def differing(key: str) -> list[str]:
+        def find_differing_runs(key: str) -> list[str]:
             each = (
                 f"SELECT {key}, {pairing_columns}, frame FROM rows "
                 "WHERE phase = 'step' AND positions_digest IS NOT NULL GROUP BY ALL"
@@ -254,4 +254,4 @@ def _query_conflicts(units: Sequence[Path], table: pa.Table | None = None) -> tu
             ]
 
         where = connection.sql(f"SELECT {', '.join(FOOTER_COLUMNS)} FROM rows GROUP BY ALL").to_arrow_table()
-        return differing("run_id, source_fingerprint"), differing("0"), build_machine_footer(where)
+        return find_differing_runs("run_id, source_fingerprint"), find_differing_runs("0"), build_machine_footer(where)

@@ -18,7 +18,7 @@ from springbench.harness.experiments.grading.position_files import (
     read_rest_positions,
 )
 from springbench.harness.experiments.grading.spring_terms import build_graded_scene, collect_spring_terms
-from springbench.harness.experiments.grading.step_verdicts import StepJudge, StepVerdict
+from springbench.harness.experiments.grading.step_verdicts import StepAssessor, StepVerdict
 from springbench.harness.experiments.grading.submission import SubmittedMotion, align_submission
 from springbench.harness.scenes.scene_builder import Scene
 from springbench.harness.scenes.scene_spec import SceneSpec
@@ -122,7 +122,7 @@ class SceneGrader:
         """Build the scene; raises InputError."""
         request = self.request
         self.scene = build_graded_scene(request.spec, request.size)
-        self._judge = StepJudge(self.scene)
+        self._assessor = StepAssessor(self.scene)
         self._reference = MotionReference(request.spec, request.size, request.seconds)
         n = len(self.scene.mesh.rest_positions)
         self._rest = read_rest_positions(request.rest, n) if request.rest else None
@@ -165,7 +165,7 @@ class SceneGrader:
         report_progress("comparing the steps with those of known programs")
         fingerprint = self.find_fingerprint(submission)
         left = max(1.0, self.request.seconds - (time.monotonic() - begun))
-        steps = self._judge.judge_steps(submission, left, report_progress)
+        steps = self._assessor.assess_steps(submission, left, report_progress)
         report_progress(f"integrating the motion, at most {self.request.seconds:g} s")
         shares, note = self._reference.measure_shares(submission)
         kind, verdict = self._decide(fingerprint, steps)
@@ -180,7 +180,7 @@ class SceneGrader:
         return self._finder.find_fingerprint(submission, self._find_minimum) if self._finder else None
 
     def _find_minimum(self, problem: StepProblem, p: Positions) -> Positions | None:
-        found = self._judge.find_minimum(problem, p)
+        found = self._assessor.find_minimum(problem, p)
         return found.positions if found else None
 
     def _decide(self, fingerprint: ProgramFingerprint | None, steps: list[StepVerdict]) -> tuple[str, str]:

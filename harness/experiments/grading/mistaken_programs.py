@@ -134,7 +134,7 @@ class AssignmentProgram:
         return system_matrix_assembly.signed_incidence_matrix_sparse(self.edges, len(self.system_mass))
 
     @cached_property
-    def _transposed(self) -> csr_array:
+    def _incidence_transpose(self) -> csr_array:
         return csr_array(self._incidence.T)
 
     @cached_property
@@ -143,7 +143,7 @@ class AssignmentProgram:
         K = system_matrix_assembly.diagonal_matrix(self.system_stiffness)
         diagonal = self.system_mass / self.system_step**2
         diagonal = diagonal + np.bincount(self.pinned, self.system_weight, minlength=len(diagonal))
-        Q = self._transposed @ K @ self._incidence + system_matrix_assembly.diagonal_matrix(diagonal)
+        Q = self._incidence_transpose @ K @ self._incidence + system_matrix_assembly.diagonal_matrix(diagonal)
         return splu(Q.tocsc())
 
     def iterate_steps(self, steps: StepBatch) -> Iterator[Positions]:
@@ -177,7 +177,7 @@ class AssignmentProgram:
 
     def _scatter(self, d: RealArray) -> RealArray:
         """Return A'd (s, n, 3) of d (s, m, 3)."""
-        return _unstack(self._transposed @ _stack(d), len(d))
+        return _unstack(self._incidence_transpose @ _stack(d), len(d))
 
     def _step_explicitly(self, steps: StepBatch, force: Positions) -> Positions:
         """Return the explicit steps (s, n, 3) [m]."""
@@ -246,13 +246,13 @@ def _permute_force(order: Sequence[int]) -> Callable[[AssignmentProgram, Positio
 def _shift_pins(shift: int) -> Callable[[AssignmentProgram, Positions], AssignmentProgram]:
     """Return a variant whose pins have numbers that differ by a constant."""
 
-    def shifted(program: AssignmentProgram, rest: Positions) -> AssignmentProgram:
+    def shift_pins(program: AssignmentProgram, rest: Positions) -> AssignmentProgram:
         pins = program.pinned + shift
         there = (pins >= 0) & (pins < len(rest))
         weights = {key: getattr(program, key)[there] for key in ("system_weight", "side_weight")}
         return replace(program, pinned=pins[there], pin_places=rest, **weights)
 
-    return shifted
+    return shift_pins
 
 
 def change_time_step(program: AssignmentProgram, time_step: float) -> AssignmentProgram:
@@ -268,12 +268,12 @@ def change_time_step(program: AssignmentProgram, time_step: float) -> Assignment
 def _multiply_force(exponent: float) -> Callable[[AssignmentProgram, Positions], AssignmentProgram]:
     """Return a variant whose force is multiplied by a power of the mass."""
 
-    def multiplied(program: AssignmentProgram, rest: Positions) -> AssignmentProgram:
+    def multiply_force(program: AssignmentProgram, rest: Positions) -> AssignmentProgram:
         mass = np.where(program.target_mass > 0.0, program.target_mass, np.inf)
         factor = np.where(np.isfinite(mass), mass**exponent, 0.0)[:, None]
         return replace(program, map_force=lambda f: factor * f)
 
-    return multiplied
+    return multiply_force
 
 
 MISTAKES: tuple[ProgramMistake, ...] = (

@@ -86,8 +86,8 @@ class StepVerdict:
         return self.is_stationary and self.gap <= max(CONVERGED_GAP, FLOOR_FACTOR**2 * self.gap_floor)
 
 
-class StepJudge:
-    """Judge of the steps of submissions of one scene."""
+class StepAssessor:
+    """Assesses the steps of submissions of one scene."""
 
     def __init__(self, scene: Scene) -> None:
         """Assemble Q, which is factorised when it is first needed."""
@@ -108,10 +108,10 @@ class StepJudge:
         begun = replace(problem.step_start, normal_force_positions=submission.position_after(step))
         return replace(problem, step_start=begun)
 
-    def judge_steps(
+    def assess_steps(
         self, submission: SubmittedMotion, seconds: float, report_progress: ProgressCallback = lambda line: None
     ) -> list[StepVerdict]:
-        """Judge all steps, with certified minima of as many as the time allows.
+        """Assess all steps, with certified minima of as many as the time allows.
 
         Args:
             submission: the positions.
@@ -119,7 +119,7 @@ class StepJudge:
             report_progress: called with a line for each minimum.
         """
         n = submission.num_steps
-        verdicts = {step: self._judge_residual(submission, step) for step in range(1, n + 1)}
+        verdicts = {step: self._assess_residual(submission, step) for step in range(1, n + 1)}
         began = time.monotonic()
         for done, step in enumerate(sorted(spread_order(n), key=lambda step: not verdicts[step].is_doubtful)):
             elapsed = time.monotonic() - began
@@ -127,7 +127,7 @@ class StepJudge:
                 break
             left = min(seconds - elapsed, elapsed / done * (n - done)) if done else None
             report_progress("; ".join(filter(None, (f"minimum {done + 1} of {n}", format_remaining(left)))))
-            verdicts[step] = self._judge_minimum(submission, verdicts[step])
+            verdicts[step] = self._assess_minimum(submission, verdicts[step])
         return list(verdicts.values())
 
     def find_minimum(self, problem: StepProblem, p: Positions) -> MinimumCertificate | None:
@@ -145,7 +145,7 @@ class StepJudge:
         except Unsupported:
             return None
 
-    def _judge_residual(self, submission: SubmittedMotion, step: int) -> StepVerdict:
+    def _assess_residual(self, submission: SubmittedMotion, step: int) -> StepVerdict:
         problem, p = self.build_problem(submission, step), submission.position_after(step)
         with np.errstate(all="ignore"):
             start = self._measure_start(problem)
@@ -190,7 +190,7 @@ class StepJudge:
         by_friction = self._measure_friction(problem, p) ** 2
         return sum(max(0.0, one) for one in (by_digits, by_friction) if np.isfinite(one))
 
-    def _judge_minimum(self, submission: SubmittedMotion, verdict: StepVerdict) -> StepVerdict:
+    def _assess_minimum(self, submission: SubmittedMotion, verdict: StepVerdict) -> StepVerdict:
         problem, p = self.build_problem(submission, verdict.step), submission.position_after(verdict.step)
         with np.errstate(all="ignore"):
             found = self.find_minimum(problem, p)

@@ -105,7 +105,7 @@ def _build_pendulum(angle: float = np.deg2rad(60.0), duration: float = 0.5) -> C
     _, cn, dn, _ = scipy.special.ellipj(np.sqrt(GRAVITY) * duration, k**2)
     bob = (float(np.sin(angle)), float(-np.cos(angle)), 0.0)
 
-    def swing(num_steps: int, solver: Solver) -> float:
+    def simulate_angle(num_steps: int, solver: Solver) -> float:
         mesh = NetworkMesh(positions=((0.0, 0.0, 0.0), bob), springs=((0, 1),), mass=(0.0, 1.0)).build_mesh()
         effects = [
             SpringsEffect(scaling_rule="fixed", stretch=1e6),
@@ -118,7 +118,13 @@ def _build_pendulum(angle: float = np.deg2rad(60.0), duration: float = 0.5) -> C
 
     exact = 2.0 * np.rad2deg(np.arcsin(k * cn / dn))
     return ClosedForm(
-        "pendulum", "angle after 0.5 s, from 60 degrees", "time step", (100, 200, 400), 1.0, float(exact), swing
+        "pendulum",
+        "angle after 0.5 s, from 60 degrees",
+        "time step",
+        (100, 200, 400),
+        1.0,
+        float(exact),
+        simulate_angle,
     )
 
 
@@ -126,7 +132,7 @@ def _build_oscillator(k: float = 100.0, c: float = 2.0, stretch: float = 0.1, du
     d = c / 2.0
     w = np.sqrt(k - d**2)
 
-    def oscillate(num_steps: int, solver: Solver) -> list[Positions]:
+    def simulate_oscillator(num_steps: int, solver: Solver) -> list[Positions]:
         ends = (0.0, 0.0, 0.0), (1.0 + stretch, 0.0, 0.0)
         spring = NetworkMesh(positions=ends, springs=((0, 1),), stiffness=k, rest_length=1.0, mass=(0.0, 1.0))
         effects = [
@@ -137,12 +143,12 @@ def _build_oscillator(k: float = 100.0, c: float = 2.0, stretch: float = 0.1, du
         scene = build_validation_scene(spring.build_mesh(), effects, time_step=duration / num_steps)
         return simulate_to_time(scene, solver, num_steps)
 
-    def measure(num_steps: int, solver: Solver) -> float:
-        return float(oscillate(num_steps, solver)[-1][1, 0] - 1.0)
+    def measure_displacement(num_steps: int, solver: Solver) -> float:
+        return float(simulate_oscillator(num_steps, solver)[-1][1, 0] - 1.0)
 
-    def separate(num_steps: int, solver: Solver) -> str:
+    def estimate_decay(num_steps: int, solver: Solver) -> str:
         """Fit x_(n+1) = a x_n + b x_(n-1), whose amplitude decays by sqrt(-b) a step."""
-        x = np.array([p[1, 0] - 1.0 for p in oscillate(num_steps, solver)])
+        x = np.array([p[1, 0] - 1.0 for p in simulate_oscillator(num_steps, solver)])
         _, b = np.linalg.lstsq(np.column_stack([x[1:-1], x[:-2]]), x[2:], rcond=None)[0]
         dt = duration / num_steps
         decay = -np.log(-b) / (2.0 * dt)
@@ -152,8 +158,8 @@ def _build_oscillator(k: float = 100.0, c: float = 2.0, stretch: float = 0.1, du
 
     exact = stretch * np.exp(-d * duration) * (np.cos(w * duration) + d / w * np.sin(w * duration))
     return ClosedForm(
-        "damped oscillator", "displacement after 0.4 s [m]", "time step", (200, 400, 800), 1.0, float(exact), measure,
-        remark=separate,
+        "damped oscillator", "displacement after 0.4 s [m]", "time step", (200, 400, 800), 1.0, float(exact),
+        measure_displacement, remark=estimate_decay,
     )  # fmt: skip
 
 
@@ -202,14 +208,16 @@ def _build_catenary(name: str, axial_stiffness: float, *, inextensible: bool) ->
     elastic = solve_elastic_catenary(axial_stiffness)[1]
     exact = solve_elastic_catenary(1e15)[1] if inextensible else elastic
 
-    def measure(num_springs: int, solver: Solver) -> float:
+    def measure_sag(num_springs: int, solver: Solver) -> float:
         return -float(_hang_cable(num_springs, axial_stiffness, 8.0, solver)[:, 1].min())
 
-    return ClosedForm(name, "sag [m]", "springs", (10, 20, 40), 2.0, exact, measure, model_error=abs(elastic - exact))
+    return ClosedForm(
+        name, "sag [m]", "springs", (10, 20, 40), 2.0, exact, measure_sag, model_error=abs(elastic - exact)
+    )
 
 
 def _build_hanging_chain(length: float = 2.0, mass: float = 4.0, axial_stiffness: float = 500.0) -> ClosedForm:
-    def hang(num_springs: int, solver: Solver) -> float:
+    def measure_elongation(num_springs: int, solver: Solver) -> float:
         y = -np.linspace(0.0, length, num_springs + 1)
         weights = np.full(num_springs + 1, mass / num_springs)
         weights[[0, -1]] /= 2.0
@@ -224,7 +232,9 @@ def _build_hanging_chain(length: float = 2.0, mass: float = 4.0, axial_stiffness
         return -float(p[-1, 1]) - length
 
     exact = mass * GRAVITY * length / (2.0 * axial_stiffness)
-    return ClosedForm("hanging chain", "elongation by its weight [m]", "springs", (5, 10, 20), 2.0, exact, hang)
+    return ClosedForm(
+        "hanging chain", "elongation by its weight [m]", "springs", (5, 10, 20), 2.0, exact, measure_elongation
+    )
 
 
 def solve_elastica(length: float, weight_to_rigidity: float) -> tuple[float, float]:
@@ -235,16 +245,16 @@ def solve_elastica(length: float, weight_to_rigidity: float) -> tuple[float, flo
         weight_to_rigidity: weight per area over flexural rigidity [1/m^3].
     """
 
-    def slope(s: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    def evaluate_slope(s: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array([y[1], -weight_to_rigidity * (length - s) * np.cos(y[0]), -np.sin(y[0]), np.cos(y[0])])
 
-    def ends(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    def evaluate_boundary(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array([a[0], b[1], a[2], a[3]])
 
     s = np.linspace(0.0, length, 41)
     guess = np.zeros((4, len(s)))
     guess[0] = np.minimum(weight_to_rigidity * length**3 / 6, 1.2) * s / length
-    found = scipy.integrate.solve_bvp(slope, ends, s, guess, tol=1e-10, max_nodes=100_000)
+    found = scipy.integrate.solve_bvp(evaluate_slope, evaluate_boundary, s, guess, tol=1e-10, max_nodes=100_000)
     return float(abs(found.y[2, -1])), float(found.y[3, -1])
 
 
@@ -287,17 +297,17 @@ def hang_strip(
 def _build_clamped_cantilever(length: float = 0.1, density: float = 0.2, rigidity: float = 2e-4) -> ClosedForm:
     exact = solve_elastica(length, density * GRAVITY / rigidity)[0]
 
-    def measure(num_cells: int, solver: Solver) -> float:
+    def measure_drop(num_cells: int, solver: Solver) -> float:
         return -float(hang_strip(length, num_cells, rigidity, density, 2e3, solver, clamped=True)[:, 1].min())
 
     return ClosedForm(
-        "clamped cantilever", "drop of the tip by its weight [m]", "cells", (10, 20, 40), 1.0, exact, measure,
+        "clamped cantilever", "drop of the tip by its weight [m]", "cells", (10, 20, 40), 1.0, exact, measure_drop,
         model_error=1e-4 * exact,
     )  # fmt: skip
 
 
 def _build_hinged_cantilever(length: float = 0.1, density: float = 0.2, stretch: float = 100.0) -> ClosedForm:
-    def measure(num_cells: int, solver: Solver) -> float:
+    def measure_depth(num_cells: int, solver: Solver) -> float:
         p = hang_strip(length, num_cells, 1e-5, density, stretch, solver, clamped=False)
         return -float(p[:, 1].min())
 
@@ -305,14 +315,16 @@ def _build_hinged_cantilever(length: float = 0.1, density: float = 0.2, stretch:
     s = 0.5 * stretch
     along = 2.0 * (stretch + 0.5 * s * stretch / (s + stretch))
     exact = length + density * GRAVITY * length**2 / (2.0 * along)
-    return ClosedForm("hinged cantilever", "depth of the tip, hanging [m]", "cells", (4, 8, 16), 1.0, exact, measure)
+    return ClosedForm(
+        "hinged cantilever", "depth of the tip, hanging [m]", "cells", (4, 8, 16), 1.0, exact, measure_depth
+    )
 
 
 def _build_slope(name: str, friction: float, angle: float = np.deg2rad(27.0), duration: float = 0.5) -> ClosedForm:
     normal = (float(np.sin(angle)), float(np.cos(angle)), 0.0)
     gap = 0.005
 
-    def slide(num_steps: int, solver: Solver) -> float:
+    def measure_displacement(num_steps: int, solver: Solver) -> float:
         start = tuple(gap * one for one in normal)
         mesh = NetworkMesh(positions=(start,)).build_mesh()  # pyright: ignore[reportArgumentType]
         contact: Any = {
@@ -328,7 +340,7 @@ def _build_slope(name: str, friction: float, angle: float = np.deg2rad(27.0), du
     along = max(0.0, np.sin(angle) - friction * np.cos(angle)) * GRAVITY
     return ClosedForm(
         name, f"displacement after 0.5 s [m], friction {friction:g}", "time step", (25, 50, 100), 1.0,
-        float(along * duration**2 / 2), slide, model_error=1e-5 * duration if along == 0.0 else 0.0,
+        float(along * duration**2 / 2), measure_displacement, model_error=1e-5 * duration if along == 0.0 else 0.0,
     )  # fmt: skip
 
 
@@ -338,7 +350,7 @@ def _build_membrane(side: float = 1.0, pressure: float = 10.0, tension: float = 
     Springs of rest length 0 and stiffness T are the five-point Laplacian of a film of tension T.
     """
 
-    def inflate(num_cells: int, solver: Solver) -> float:
+    def measure_height(num_cells: int, solver: Solver) -> float:
         n, h = num_cells + 1, side / num_cells
         index = np.arange(n * n).reshape(n, n)
         pairs = build_offset_pairs(index, (1, 0), (0, 1))
@@ -360,5 +372,5 @@ def _build_membrane(side: float = 1.0, pressure: float = 10.0, tension: float = 
 
     return ClosedForm(
         "membrane under pressure", "height of the centre [m]", "cells a side", (8, 16, 32), 2.0,
-        0.0736713532815 * pressure * side**2 / tension, inflate,
+        0.0736713532815 * pressure * side**2 / tension, measure_height,
     )  # fmt: skip

@@ -9,7 +9,7 @@ It needs neither network nor server. Its files are:
     site/viewer.js                 Rerun's web viewer, if `springbench report` added it: loaded for a recording
 
 Data files are scripts, because a page from the file system cannot load anything else. Each calls
-`springbench.give(name, value)`; scripts of recordings and of the viewer assign `springbench.taken` instead.
+`springbench.setData(name, value)`; scripts of recordings and of the viewer assign `springbench.scriptContent`.
 """
 
 from __future__ import annotations

@@ -13,14 +13,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from springbench.harness.atomic_files import atomic_write, is_file_name
+from springbench.harness.atomic_files import atomic_write, is_file_name, is_outdated
 
 _PROTOTYPE_KEY = re.compile(r'(?<!\\)"__proto__":')
 """A JSON key that a script would interpret as the object's prototype."""
+_CALL = "springbench.setData("
+"""Start of a script, which calls the function of `static/base.js`."""
 
 
 def write_script(path: Path, name: str, value: Any) -> Path:
-    """Write `springbench.give(name, value)` to a file and return its path.
+    """Write `springbench.setData(name, value)` to a file and return its path.
 
     Args:
         path: target file.
@@ -47,8 +49,22 @@ def write_json_script(path: Path, name: str, value: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     value = _PROTOTYPE_KEY.sub('["__proto__"]:', value)
     with atomic_write(path) as partial:
-        partial.write_text(f"springbench.give({json.dumps(name)}, {value});\n", encoding="utf-8")
+        partial.write_text(f"{_CALL}{json.dumps(name)}, {value});\n", encoding="utf-8")
     return path
+
+
+def is_script_outdated(path: Path, sources: Iterable[Path], start: str = _CALL) -> bool:
+    """Return whether a script is missing, older than a source, or of another version of the page.
+
+    Args:
+        path: the script.
+        sources: files that it is made from, which must exist.
+        start: first characters of a script of this version.
+    """
+    if is_outdated(path, sources):
+        return True
+    with path.open("rb") as file:
+        return file.read(len(start.encode())) != start.encode()
 
 
 def script_path(folder: Path, name: str) -> Path:
@@ -74,7 +90,7 @@ def round_number(value: Any) -> float | int | None:
 
 
 def round_numbers(values: Iterable[Any]) -> list[float | int | None]:
-    """Round each value to five digits, see `round_number`."""
+    """Round each value to five digits; None for missing or non-finite values."""
     return [round_number(value) for value in values]
 
 

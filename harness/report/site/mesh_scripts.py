@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from springbench.harness.atomic_files import is_outdated
 from springbench.harness.errors import SpringbenchError
 from springbench.harness.recording.local_origin import store_relative
 from springbench.harness.recording.recorder_interface import RecordingReplay
@@ -50,7 +49,7 @@ def write_last_frames(
             folder.path / "recordings" / f"{unit}.rrd",
             data_scripts.script_path(data_folder / "meshes", unit),
         )
-        if is_outdated(target, [recording]):
+        if data_scripts.is_script_outdated(target, [recording]):
             replay = _read_recording(recording, [-1], print_message)
             if replay is None or not len(replay.frames):
                 continue
@@ -120,7 +119,9 @@ def _write_snapshot_solves(
         curve.recording_path: data_scripts.script_path(data_folder / "solves", Path(curve.recording_path).stem)
         for curve in curves
     }
-    stale = [name for name, target in targets.items() if is_outdated(target, [folder.path / name, truth])]
+    stale = [
+        name for name, target in targets.items() if data_scripts.is_script_outdated(target, [folder.path / name, truth])
+    ]
     last = _read_recording(truth, [-1], print_message) if stale else None
     for name in stale:
         replay = _read_recording(folder.path / name, None, print_message)

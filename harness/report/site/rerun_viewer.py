@@ -26,8 +26,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 import rerun_cli  # pyright: ignore[reportMissingTypeStubs]
-from springbench.harness.atomic_files import atomic_write, is_outdated
+from springbench.harness.atomic_files import atomic_write
 from springbench.harness.errors import RunFailed
+from springbench.harness.report.site.data_scripts import is_script_outdated
 
 RERUN_VERSION = "0.41.0"
 """Version of rerun-sdk; a test fails if another one is installed, and then recordings have to be checked in it."""
@@ -46,7 +47,7 @@ _SERVER_TIMEOUT = 30.0
 """Timeout of the viewer's server [s]."""
 
 _SCRIPT_HEADER = "// Rerun's web viewer {version}, https://rerun.io, MIT or Apache-2.0; packed by springbench, {how}\n"
-_HANDOVER_TEMPLATE = "springbench.taken = {};\n"
+_ASSIGNMENT = "springbench.scriptContent = "
 """Statement by which a script passes its content; `replay.js` loads one script at a time."""
 
 _VIEWER_TEMPLATE = """{{"wasm": {wasm}, "start": ((console, fetch) => {{
@@ -74,14 +75,14 @@ def write_viewer(folder: Path) -> Path:
         RunFailed: if the viewer is not installed or does not answer.
         WriteError: if the file cannot be written.
     """
-    how = sha256(_VIEWER_TEMPLATE.encode()).hexdigest()[:8]
+    how = sha256((_ASSIGNMENT + _VIEWER_TEMPLATE).encode()).hexdigest()[:8]
     path, head = folder / VIEWER_SCRIPT, _SCRIPT_HEADER.format(version=version("rerun-sdk"), how=how)
-    if not _starts_with(path, head):
+    if is_script_outdated(path, [], head):
         script, wasm = _fetch_viewer_files()
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as partial:
             value = _VIEWER_TEMPLATE.format(wasm=json.dumps(_encode_gzip(wasm)), script=script)
-            partial.write_text(head + _HANDOVER_TEMPLATE.format(value), encoding="utf-8")
+            partial.write_text(f"{head}{_ASSIGNMENT}{value};\n", encoding="utf-8")
     return path
 
 
@@ -99,11 +100,11 @@ def write_recording(recording: Path, script: Path, title: str) -> Path:
         InputError: if the recording cannot be read.
         WriteError: if the file cannot be written.
     """
-    if is_outdated(script, [recording]):
+    if is_script_outdated(script, [recording], _ASSIGNMENT):
         script.parent.mkdir(parents=True, exist_ok=True)
         value = {"title": title, "rrd": _encode_gzip(move_layout_first(recording.read_bytes()))}
         with atomic_write(script) as partial:
-            partial.write_text(_HANDOVER_TEMPLATE.format(json.dumps(value)), encoding="utf-8")
+            partial.write_text(f"{_ASSIGNMENT}{json.dumps(value)};\n", encoding="utf-8")
     return script
 
 
@@ -127,13 +128,6 @@ def move_layout_first(data: bytes) -> bytes:
     first = next((k for k in range(1, last) if kinds[k - 1] == _DATA_MESSAGE and kinds[k] == _STORE_MESSAGE), 0)
     order = [*messages[first:last], *messages[:first], *messages[last:]]
     return data[:_HEADER_BYTES] + b"".join(message for _, message in order)
-
-
-def _starts_with(path: Path, head: str) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(len(head.encode())) == head.encode()
 
 
 def _encode_gzip(data: bytes) -> str:

@@ -91,7 +91,7 @@ class ContactEffect(ConfigModel):
             )
         obstacles = tuple(one.build_obstacle() for one in self.obstacles)
 
-        def derived(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
+        def derive_energies(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
             projective = [energy for energy in energies if isinstance(energy, ProjectiveEnergy)]
             everything = np.arange(len(mass))
             pinned_system = System(mass, time_step, pins=DirichletPins(everything, np.full(len(mass), np.inf)))
@@ -100,7 +100,7 @@ class ContactEffect(ConfigModel):
             rubs = self.eps_v, _MARGIN_FRACTION * mesh.bounding_box_diagonal, time_step, self.friction_iterations
             return (Energy(obstacles, self.min_distance, self.friction, stiffness, *rubs),)
 
-        return EffectContribution(derived_energies=(derived,), scene_checks=(partial(self._check_start, mesh),))
+        return EffectContribution(derived_energies=(derive_energies,), scene_checks=(partial(self._check_start, mesh),))
 
     def _check_start(self, mesh: Mesh, start: Positions, pins: Sequence[PinGroup]) -> None:
         """Raise InputError for pins or a start (n, 3) [m] inside an obstacle, or planes without a gap."""

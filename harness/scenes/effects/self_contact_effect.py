@@ -88,7 +88,7 @@ class SelfContactEffect(ConfigModel):
                 raise InputError("self-contact: the mesh touches itself at rest; move what touches apart, or join it")
             return Energy(surface, self.friction, self.eps_v, self.friction_iterations)
 
-        def derived(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
+        def derive_energies(energies: Sequence[AnyEnergy]) -> tuple[AnyEnergy, ...]:
             return (energy(compute_barrier_stiffness(self.barrier_stiffness, mass, time_step, energies)),)
 
         def check(start: Positions, pins: Sequence[PinGroup]) -> None:
@@ -103,7 +103,7 @@ class SelfContactEffect(ConfigModel):
 
         apart = (IntersectionCheck(((edges, mesh.triangles),)),)
         return EffectContribution(
-            derived_energies=(derived,),
+            derived_energies=(derive_energies,),
             scene_checks=(check,),
             exclusive_features=("self-contact",),
             end_of_step_reasons=END_OF_STEP_REASON,

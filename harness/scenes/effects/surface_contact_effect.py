@@ -108,12 +108,12 @@ class SurfaceContactEffect(ConfigModel):
         moving = any(one.motion or is_deforming(one) for one in self.obstacles)
 
         @lru_cache(maxsize=2)  # a step's end is the start of the next one
-        def moved(time: float) -> Positions:
+        def place_at_time(time: float) -> Positions:
             parts = zip(shapes, self.obstacles, strict=True)
             return np.concatenate([place_obstacle_points(one, x, time) for (x, _), one in parts])
 
         def place(time: float) -> Positions:
-            return moved(time) if moving else points
+            return place_at_time(time) if moving else points
 
         def carry(begin: float, end: float, p: Positions) -> list[Positions]:
             rigid = [one.motion for one in self.obstacles if one.motion is not None and not is_deforming(one)]
@@ -135,7 +135,7 @@ class SurfaceContactEffect(ConfigModel):
                 against, place, carry, self.friction, self.eps_v, self.friction_iterations
             )
 
-        def derived(energies: Sequence[Energy]) -> tuple[Energy, ...]:
+        def derive_energies(energies: Sequence[Energy]) -> tuple[Energy, ...]:
             return (energy(compute_barrier_stiffness(self.barrier_stiffness, mass, time_step, energies)),)
 
         apart = IntersectionCheck(((edges, n + triangles), (n + ends, mesh.triangles)), place)
@@ -151,7 +151,7 @@ class SurfaceContactEffect(ConfigModel):
             require_intersection_free(self.kind, energy(np.ones(n)), start, self.min_distance, mesh)
 
         return EffectContribution(
-            derived_energies=(derived,),
+            derived_energies=(derive_energies,),
             scene_checks=(check,),
             end_of_step_reasons=END_OF_STEP_REASON,
             intersection_checks=(apart,),

@@ -252,12 +252,12 @@ class HalfSpaceContact:
         return _row_dots(self.active_planes.normal, p[self.active_planes.vertices]) - self.active_planes.offset
 
     def _evaluate_friction(self, p: Positions) -> _FrictionState:
-        grips, planes = np.flatnonzero(self.active_planes.friction_limit), self.active_planes
-        u, n = p[planes.vertices[grips]] - planes.friction_anchor[grips], planes.normal[grips]
+        frictional, planes = np.flatnonzero(self.active_planes.friction_limit), self.active_planes
+        u, n = p[planes.vertices[frictional]] - planes.friction_anchor[frictional], planes.normal[frictional]
         u -= _row_dots(u, n)[:, None] * n
-        length, smoothed, stiffness = np.sqrt(_row_dots(u, u)), np.empty(len(grips)), np.empty(len(grips))
-        evaluate_friction(planes.friction_limit[grips], length, self.smoothing_length, smoothed, stiffness)
-        return _FrictionState(grips, u, length, smoothed, stiffness)
+        length, smoothed, stiffness = np.sqrt(_row_dots(u, u)), np.empty(len(frictional)), np.empty(len(frictional))
+        evaluate_friction(planes.friction_limit[frictional], length, self.smoothing_length, smoothed, stiffness)
+        return _FrictionState(frictional, u, length, smoothed, stiffness)
 
     def value(self, p: Positions) -> float:
         """Return the energy [J] at p (n, 3)."""
@@ -326,16 +326,16 @@ class HalfSpaceContact:
         """
         planes, gap = self.active_planes, self.compute_gaps(p)
         pressed = np.flatnonzero((gap < 0.0) | (self.compute_gaps(trial) < 0.0))
-        grips, u, length, _, weight = self._evaluate_friction(p)
-        normal = planes.normal[grips]
+        frictional, u, length, _, weight = self._evaluate_friction(p)
+        normal = planes.normal[frictional]
         sticks = length <= self.smoothing_length
         along = np.divide(u, length[:, None], out=_perpendicular_units(normal), where=~sticks[:, None])
         both = sticks | majorise
         return PenaltyRows(
-            planes.vertices[np.concatenate([pressed, grips, grips[both]])],
+            planes.vertices[np.concatenate([pressed, frictional, frictional[both]])],
             np.concatenate([planes.normal[pressed], np.cross(normal, along), along[both]]),
             np.concatenate([planes.stiffness[pressed], weight, weight[both]]),
-            np.concatenate([np.maximum(0.0, gap[pressed]), np.zeros(len(grips) + int(both.sum()))]),
+            np.concatenate([np.maximum(0.0, gap[pressed]), np.zeros(len(frictional) + int(both.sum()))]),
         )
 
 

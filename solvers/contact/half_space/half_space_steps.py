@@ -284,7 +284,7 @@ def build_block_step(energy_change: Any) -> Any:
     """
 
     @jit_closure
-    def lowering(s, i, x, majorant, first, gradient, block, where):
+    def compute_step(s, i, x, majorant, first, gradient, block, where):
         """Return the step; begin with the block `first`; majorant, gradient and block exclude the half-spaces."""
         for level in range(first, _FULL_MAJORANT + 1):
             if level == SPRING_MAJORANT:
@@ -300,7 +300,7 @@ def build_block_step(energy_change: Any) -> Any:
                 return d
         return 0.0, 0.0, 0.0
 
-    return lowering
+    return compute_step
 
 
 def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
@@ -314,11 +314,11 @@ def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
     """
 
     @jit_closure
-    def rise(d, where):
+    def compute_energy_change(d, where):
         bundles, elements, b, lane, i, p, x, anchor_stiffness, load = where
         return _energy_change(bundles, b, lane, p, x, d, anchor_stiffness, load) + energy_change(elements, i, p, d)
 
-    lowering = build_block_step(rise)
+    compute_step = build_block_step(compute_energy_change)
 
     @jit_closure
     def move(bundles, s, elements, b, unknowns, p, right, majorant):
@@ -333,7 +333,7 @@ def build_vertex_move(add_gradient_block: Any, energy_change: Any) -> Any:
             gradient, block = _spring_gradient_and_block(bundles, b, lane, p, x, h, load)
             gradient, block = add_gradient_block(elements, i, p, gradient, block)
             majorant_block, where = (most, 0.0, 0.0, most, 0.0, most), (bundles, elements, b, lane, i, p, x, h, load)
-            d = lowering(s, i, x, majorant_block, EXACT_BLOCK, gradient, block, where)
+            d = compute_step(s, i, x, majorant_block, EXACT_BLOCK, gradient, block, where)
             p[4 * i], p[4 * i + 1], p[4 * i + 2] = x[0] + d[0], x[1] + d[1], x[2] + d[2]
 
     return move

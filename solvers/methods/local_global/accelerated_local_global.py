@@ -113,10 +113,10 @@ def allocate_window(
     )
 
 
-_init_window, _propose_trial, _judge_trial, _accept_trial = (
+_init_window, _propose_trial, _assess_trial, _accept_trial = (
     TypedKernel(accelerated_descent.init_window),
     TypedKernel(accelerated_descent.propose_trial),
-    TypedKernel(accelerated_descent.judge_trial),
+    TypedKernel(accelerated_descent.assess_trial),
     TypedKernel(accelerated_descent.accept_trial),
 )
 """The kernels of `InterpretedState`, whose windows are in float64."""
@@ -150,7 +150,7 @@ class InterpretedState(AcceleratedState):
             now["objective_change"], now["roundoff"] = self._objective.objective_change(
                 self.positions, self._trial_positions
             )
-            verdict = _judge_trial.call(window)
+            verdict = _assess_trial.call(window)
         if verdict == accelerated_descent.TRIAL_STALLED:
             return False
         self._accept_trial()

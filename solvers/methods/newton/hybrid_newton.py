@@ -494,7 +494,7 @@ class HybridIteration:
         newton_cost: cost of a Newton step, in groups of L-BFGS iterations.
     """
 
-    identifies_saddles: ClassVar[bool] = True
+    can_identify_saddles: ClassVar[bool] = True
 
     def __init__(
         self, objective: FixedObjective, metric: ResidualMetric, lbfgs: PreparedAccelerated, is_double: bool

@@ -108,7 +108,7 @@ class NewtonCG(PrecisionOptions):
 class TruncatedNewtonIteration:
     """The iteration for one system; `compiled_cg` is the fused CG kernel, None if unavailable."""
 
-    identifies_saddles: ClassVar[bool] = False
+    can_identify_saddles: ClassVar[bool] = False
 
     def __init__(
         self, metric: ResidualMetric, objective: FixedObjective, preconditioner: PreconditionerName = "cholesky"
@@ -159,11 +159,11 @@ class TruncatedNewtonIteration:
         if self._friction_search is None or not step.has_contact_elements:
             return backtracking_line_search(step, at, direction)
 
-        def following(point: DescentPoint) -> Positions:
+        def compute_direction_at(point: DescentPoint) -> Positions:
             hessian, solve = self._linearise_at(step, point.positions)
             return self._compute_direction(step, hessian, solve, point, solve(point.gradient), eta)
 
-        return self._friction_search.watchdog_search(step, at, direction, following)
+        return self._friction_search.watchdog_search(step, at, direction, compute_direction_at)
 
     def can_terminate(self, step: StepObjective, at: DescentPoint) -> bool:
         """Return True: without a factor, definiteness is unknown.

@@ -107,7 +107,7 @@ class NewtonSolver:
 class NewtonIteration:
     """The iteration of Newton's method for one system."""
 
-    identifies_saddles: ClassVar[bool] = True
+    can_identify_saddles: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -17,8 +17,8 @@ from springbench.solvers.kernels.accelerated_descent import (
     TRIAL_STALLED,
     AccelerationWindow,
     accept_trial,
+    assess_trial,
     init_window,
-    judge_trial,
     propose_trial,
 )
 from springbench.solvers.kernels.descent_rounds import build_compiled_rounds
@@ -131,7 +131,7 @@ def _step_state(state):
             there - step.objective_values[0],
             TERM_ROUNDOFF * (before + np.sqrt(2.0 * before * size)),
         )
-        verdict = judge_trial(window)
+        verdict = assess_trial(window)
     if verdict == TRIAL_STALLED:
         return False
     step.objective_values[0] = there

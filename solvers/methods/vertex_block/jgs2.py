@@ -259,7 +259,7 @@ class _VertexRotations:
 class _Jgs2Iteration:
     """The JGS2 iteration for one system."""
 
-    identifies_saddles: ClassVar[bool] = False
+    can_identify_saddles: ClassVar[bool] = False
 
     def __init__(self, metric: ResidualMetric, springs: Springs, patches: VertexPatches) -> None:
         self._metric, self._rotations, self._free_vertices = (

@@ -292,7 +292,7 @@ class OffsetContactState(SweepState):
         bound = np.maximum(self._offset.bound_fraction * bound - compute_roundoff_margin(p), 0.0)
         counts = [len(one.vertices) for one in found]
 
-        def joined(name: str) -> NDArray[Any]:
+        def join_column(name: str) -> NDArray[Any]:
             return np.concatenate([getattr(one, name) for one in found])
 
         return kernels.OffsetContacts(
@@ -301,10 +301,10 @@ class OffsetContactState(SweepState):
             vertex_slot=entries[1],
             has_contact=np.logical_or.reduce(touched[blocks.spring_packets.row_offset // 4].reshape(-1, LANES), axis=1),
             row_offsets=4 * rows,
-            is_edge_pair=joined("is_edge_pair"),
-            min_distance=joined("min_distance"),
-            radius=joined("radius"),
-            stiffness=joined("stiffness"),
+            is_edge_pair=join_column("is_edge_pair"),
+            min_distance=join_column("min_distance"),
+            radius=join_column("radius"),
+            stiffness=join_column("stiffness"),
             friction=np.repeat([energy.friction for energy in self._contacts], counts),
             smoothing_length=np.repeat([energy.eps_v * self._step_seconds for energy in self._contacts], counts),
             centre=self._rows.copy(),

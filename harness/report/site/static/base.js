@@ -4,7 +4,7 @@ window.springbench = (() => {
   const given = new Map(), waiting = new Map();
 
   // Called by every data script.
-  function give(name, value) { given.set(name, value); }
+  function setData(name, value) { given.set(name, value); }
 
   // Load a script of this page's folder once; the promise is fulfilled when it has run.
   function script(path) {
@@ -124,5 +124,5 @@ window.springbench = (() => {
     return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
   };
 
-  return { give, script, data, link, own, where, address, change, replaceLater, element, put, announce, copy, save, isDark, views: {} };
+  return { setData, script, data, link, own, where, address, change, replaceLater, element, put, announce, copy, save, isDark, views: {} };
 })();

@@ -4,7 +4,7 @@
 //
 // script: URL of the recording as a script; title: heading above it; file: URL of the recording itself.
 // The viewer, `viewer.js` next to this file, is loaded at the first call. Each script passes its content as
-// `springbench.taken`. The start of the viewer is undocumented: harness/report/site/rerun_viewer.py pins its version.
+// `springbench.scriptContent`. The start of the viewer is undocumented: harness/report/site/rerun_viewer.py pins its version.
 "use strict";
 window.springbench ??= {};
 (() => {
@@ -71,12 +71,12 @@ window.springbench ??= {};
   }
 
   // The content of a script; one is loaded at a time. A page from the file system can load only scripts.
-  function taken(source, problem) {
+  function loadContent(source, problem) {
     const next = loading.then(() => new Promise((done, fail) => {
       const script = element("script", document.head, { src: source });
       script.onload = () => {
-        const found = springbench.taken;
-        delete springbench.taken;
+        const found = springbench.scriptContent;
+        delete springbench.scriptContent;
         script.remove();
         found ? done(found) : fail(new Error(problem));
       };
@@ -111,7 +111,7 @@ window.springbench ??= {};
 
   function viewer() {
     ready ??= (async () => {
-      const brought = await taken(new URL("viewer.js", here).href, "The viewer is not part of this report: it was left out.");
+      const brought = await loadContent(new URL("viewer.js", here).href, "The viewer is not part of this report: it was left out.");
       const wasm = await unpacked(brought.wasm);
       delete WebAssembly.instantiateStreaming; // it requires a server's response with a MIME type
       await brought.start({ module_or_path: wasm });
@@ -160,7 +160,7 @@ window.springbench ??= {};
       const lack = lacking();
       if (lack) throw new Error(lack);
       say("The viewer is loading, once for all recordings ...");
-      const recording = await taken(
+      const recording = await loadContent(
         new URL(script, document.baseURI).href,
         "This recording is not part of the report; `springbench report` writes those that are there.",
       );
