@@ -1,6 +1,6 @@
 """The solvers by name.
 
-A built-in solver has a line here; a third-party one needs none, see `springbench.solvers.plugins.plugin_discovery`.
+A built-in solver has a line here. `springbench.solvers.plugins.plugin_discovery` finds third-party ones.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ _MIN_EXTENT = 1e-3
 
 
 class ViewExtent:
-    """Positions of some frames, and the camera that frames them (see `springbench.harness.recording.camera_framing`).
+    """Positions of some frames, and the camera that frames them (`springbench.harness.recording.camera_framing`).
 
     Args:
         rest: rest positions (n, 3) [m].

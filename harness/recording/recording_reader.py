@@ -4,7 +4,7 @@
 
 A complete file is read through the index in its footer. A file without one (its run was killed) is scanned up to the
 last complete message. A file that this process has not written is first read in a separate process
-(see `springbench.harness.recording.recording_integrity`).
+(`springbench.harness.recording.recording_integrity`).
 """
 
 from __future__ import annotations

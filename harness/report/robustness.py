@@ -260,7 +260,7 @@ def has_verification(table: pa.Table) -> bool:
 
 
 class RunVerdict(NamedTuple):
-    """Outcome of a run, and its reasons; see `VerifiedRun` for the fields."""
+    """Outcome of a run, and its reasons; the fields are those of `VerifiedRun`."""
 
     outcome: RunOutcome
     worst_error: float | None

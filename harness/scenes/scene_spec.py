@@ -151,7 +151,7 @@ class SceneSpec(SceneFields):
     effects: SkipValidation[tuple[SceneEffect, ...]] = ()
     """Effects on the mesh; only listed effects are simulated."""
     initial_guess: InitialGuess = "previous"
-    """Initial guess of a step unless a sweep sets it; see `choose_initial_guess`."""
+    """Initial guess of a step unless a sweep sets it; integrators with several stages extrapolate by default."""
     barrier_time_step: float | None = None
     """Time step [s] of the file where the scene has another one: default barrier stiffnesses are derived from it."""
     path: Path

@@ -75,7 +75,9 @@ class DeviceEdges(NamedTuple):
     """Edges on the device.
 
     Attributes:
-        warp_starts, neighbour_rows, edge_indices: see `EdgeEntries`.
+        warp_starts: (warps + 1,), first entry of each warp's rows.
+        neighbour_rows: row of the other end of each entry; the row itself for padding.
+        edge_indices: edge of each entry, ~edge at its second end.
         entry_stiffness, entry_rest_length: of each entry [N/m, m].
         ends: (m, 2), rows.
         edge_stiffness, edge_rest_length: (m,) [N/m, m].

@@ -27,7 +27,7 @@ from springbench.solvers.linalg import additive_schwarz
 from springbench.solvers.model.system_matrix_assembly import compute_row_starts
 
 THREADS_PER_SUBDOMAIN = 1 if cuda_device.is_simulated() else 96
-"""Threads per subdomain; see `device_sums` for the simulator's value."""
+"""Threads per subdomain; one in the simulator, which starts a Python thread for each."""
 
 _MAX_GRID_BLOCKS = 65_535
 

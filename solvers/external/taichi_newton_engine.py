@@ -1,4 +1,4 @@
-"""Taichi: implicit Euler in substeps by Newton's method with conjugate gradients; see `taichi_program`.
+"""Taichi: implicit Euler in substeps by Newton's method with conjugate gradients (`taichi_program`).
 
 Taichi is a language without a solver of spring networks. The program is written here, in the style of Taichi's
 examples. Its kernels are compiled during preparation, for one core, and cached by Taichi.

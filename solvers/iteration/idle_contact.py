@@ -83,7 +83,7 @@ class IdleContactSolver:
 
     @property
     def has_own_friction(self) -> bool:
-        """Whether the method with contact evaluates friction itself, see `solve_with_friction`."""
+        """Whether the method with contact evaluates friction itself, so that no normal forces are lagged."""
         return evaluates_friction(self.with_contact)
 
     def residual_at(self, problem: StepProblem, p: Positions) -> float:

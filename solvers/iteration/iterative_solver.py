@@ -94,7 +94,7 @@ class SolverState(ABC):
 
     @property
     def warm_start(self) -> NDArray[np.float64] | None:
-        """Data for the next solve, see `springbench.solvers.model.step_problem.Solution`."""
+        """Warm start of the next solve, of any shape; None if the method has none."""
         return None
 
     @property
@@ -140,9 +140,10 @@ class SolverState(ABC):
         return 1
 
     def run_iterations(self, limits: LoopLimits) -> tuple[int, float, int]:
-        """Iterate up to the limits; return count, residual and reason.
+        """Iterate up to the limits.
 
-        See `springbench.solvers.kernels.iteration_loop`.
+        Returns:
+            Number of iterations, last residual [J^(1/2)] and termination reason (`REASON_ITERATIONS` and so on).
         """
         return _interpreted_loop(self, limits)
 

@@ -1,7 +1,7 @@
 """Preconditioners of conjugate gradients, in Newton's methods and in nonlinear ones.
 
     factor          Q^-1                                               a solve with the prefactored matrix
-    schwarz         dense inverses of patches of H+, on levels         see `springbench.solvers.linalg.additive_schwarz`
+    schwarz         dense inverses of patches of H+, on levels         `springbench.solvers.linalg.additive_schwarz`
     block-jacobi    inverses of the 3 x 3 blocks on the diagonal of H+
 
 H+ is the Hessian at each point, with the negative eigenvalues of its elements clamped; the last two are built from it.

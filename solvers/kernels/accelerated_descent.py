@@ -4,7 +4,7 @@
     d   = scale c_k - sum over j of (a_j s_j + b_j w_j)           the accelerated direction
     s_j = p_(j+1) - p_j,   y_j = grad g(p_(j+1)) - grad g(p_j),   w_j = Q^-1 y_j = c_j - c_(j+1)
 
-A method is defined by its coefficients (see `acceleration_coefficients`), which it computes from inner products of the
+A method is defined by its coefficients (`acceleration_coefficients`), which it computes from inner products of the
 window's vectors. An iteration tries p + d, then shorter steps, then the plain correction with decreasing lengths, until
 one descends enough (`springbench.solvers.kernels.line_search_conditions`). For projective energies Q majorises the
 Hessian, so that the plain correction is accepted at full length. Vectors are flat and independent of the meaning of
@@ -33,7 +33,7 @@ _MAX_HALVINGS = 40
 
 WINDOW_STATE_DTYPE = np.dtype(
     [
-        ("coefficient_rule", np.int64),  # see `acceleration_coefficients`
+        ("coefficient_rule", np.int64),  # of `acceleration_coefficients`
         ("max_retries", np.int64),  # shorter steps along d before the plain correction
         ("num_pairs", np.int64),  # pairs in the window
         ("newest_pair", np.int64),  # index of the latest one

@@ -1,6 +1,6 @@
 """Coefficients of accelerated directions d = scale c - sum over j of (a_j s_j + b_j w_j), by method.
 
-See `springbench.solvers.kernels.accelerated_descent` for the notation, and each method's own module for its source.
+The notation is that of `springbench.solvers.kernels.accelerated_descent`; each method's own module cites its source.
 """
 
 from __future__ import annotations

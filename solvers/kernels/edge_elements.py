@@ -103,7 +103,8 @@ class AttachedEdges(NamedTuple):
         limit_index: of each spring, the strain limit, -1 for none.
         dashpot_index: of each spring, the dashpot counted from 1, negative if it runs in the opposite direction, 0 for
             none.
-        first_dashpot, dashpot_stiffness: see `EdgePackets`.
+        first_dashpot: index of the first of the concatenated dashpots between the same vertices (d,).
+        dashpot_stiffness: the sum of their stiffnesses (d,) [N/m].
         stiffness, min_length, max_length: of the concatenated strain limits (m,).
     """
 

@@ -211,7 +211,7 @@ def run_blocked_local_step(plan, bundles, x, right, p, out):
         plan: the plan, for the shift of its rows.
         bundles: packets of the springs and edges.
         x: positions in rows of four [m]; not used if p is given.
-        right: constant right-hand side (see `SpringPackets.build_right_hand_side`).
+        right: constant right-hand side (`SpringPackets.build_right_hand_side`).
         p: positions to correct, for which minus the gradient is computed, or None.
         out: output in rows of four [N], overwritten.
     """
@@ -287,9 +287,9 @@ def run_iterations(plan, bundles, form, vectors, right, p, limits, threads, team
         bundles: packets of the springs and edges.
         form: packets of |e|_Q^2, with pairs for all energies that are not springs.
         vectors: three vectors that rotate, and one for scratch, of float64.
-        right: constant right-hand side (see `SpringPackets.build_right_hand_side`).
+        right: constant right-hand side (`SpringPackets.build_right_hand_side`).
         p: positions to correct, or None.
-        limits: see `springbench.solvers.kernels.iteration_loop`.
+        limits: maximum number of iterations, and residuals that end them (`LoopLimits`).
         threads: number of threads; None for one.
         team: the thread team.
 

@@ -4,7 +4,7 @@
 
 A compressed spring (t < 0) has a negative transverse part. It is scaled by `negative_fraction`: 1 gives the exact
 Hessian, 0 makes it positive semidefinite spring by spring (Teran et al. 2005). The tensions are a separate argument,
-for methods that predict them (see `springbench.solvers.methods.newton.hybrid_newton`).
+for methods that predict them (`springbench.solvers.methods.newton.hybrid_newton`).
 """
 
 from __future__ import annotations

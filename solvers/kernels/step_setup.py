@@ -57,7 +57,7 @@ def write_right_hand_side(rows, target, force, pin_targets, right):
         target: inertial target (n, 3) [m].
         force: external force (n, 3) [N].
         pin_targets: targets of all pins (q, 3) [m].
-        right: output, see `SpringPackets.build_right_hand_side`; the anchor stiffness in it is constant.
+        right: output by packets, eight x, y, z [N] and stiffnesses [N/m] each; the stiffnesses are constant.
     """
     for v in range(len(target)):
         prefetch_entry(
@@ -159,7 +159,7 @@ def solve_step(plan, bundles, form, rows, vectors, right, p, step_arrays, limits
         right: right-hand side, overwritten.
         p: positions to correct, or None.
         step_arrays: target, force, targets of pins and initial guess.
-        limits: see `springbench.solvers.kernels.iteration_loop`.
+        limits: maximum number of iterations, and residuals that end them (`LoopLimits`).
         threads: number of threads; None for one.
         team: the thread team.
         out: output (n, 3) [m].

@@ -61,7 +61,7 @@ def compile_cg_loop(*functions: Callable[..., Any]) -> Any:
 
 
 class ConjugateGradientIteration(ABC):
-    """Base class of a state with known r and z (see `make_cg_loop`)."""
+    """Base class of a state with known residual r and preconditioned residual z."""
 
     @abstractmethod
     def update_direction(self, product: Any, previous_product: Any) -> Any:

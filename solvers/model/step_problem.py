@@ -5,7 +5,7 @@ A step of implicit Euler minimises the incremental potential (Liu et al. 2013, e
     g(p) = sum of energies(p) + c/(2 dt^2) |p - target|_M^2 - tr(p' f) + sum_pins w/2 |p_i - pin_i|^2
 
 over the positions p that satisfy all length constraints, with c = 1 and target = 2 p^t - p^(t-dt). Other integrators
-have other values of c and target (see `springbench.solvers.model.integrators`). `StepProblem` evaluates g in plain
+have other values of c and target (`springbench.solvers.model.integrators`). `StepProblem` evaluates g in plain
 NumPy; every accuracy figure is computed from it.
 """
 

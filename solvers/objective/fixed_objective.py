@@ -43,7 +43,7 @@ class ElementEnergy(NamedTuple):
 
 
 class ObjectiveKernels(NamedTuple):
-    """Kernels of springs and single vertices, see `objective_kernels` and `spring_hessian`, for C-contiguous arrays."""
+    """Kernels of springs and single vertices (`objective_kernels`, `spring_hessian`), for C-contiguous arrays."""
 
     gradient: TypedKernel
     objective_change: TypedKernel

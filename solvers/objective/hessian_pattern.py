@@ -42,7 +42,7 @@ class BlockMatrix:
             system: the system.
             terms: objective terms.
             quadratic_form: quadratic form of the system, or None.
-            free_index: index of each vertex among the free ones (n + 1,), or -1; see `FixedObjective.free_index`.
+            free_index: index of each vertex among the free ones (n + 1,), or -1; the last entry is -1.
             graph: pattern of the blocks (f, f), sorted, with a diagonal.
             count: the count to which its factorisations are added.
         """
@@ -75,7 +75,7 @@ class BlockMatrix:
             system: the system.
             terms: its springs, inertia and penalty pins.
             quadratic_form: quadratic form of the system, or None.
-            free_index: index of each vertex among the free ones (n + 1,), or -1; see `FixedObjective.free_index`.
+            free_index: index of each vertex among the free ones (n + 1,), or -1; the last entry is -1.
             graph: pattern of blocks (f, f), nonzero where the matrix has one, with a diagonal.
             i, j: ends of additional blocks (k,), by index among the free vertices; -1 for a vertex that is not free.
                 Both blocks, (i, j) and (j, i), are added where both ends are free.

@@ -4,7 +4,7 @@ A constant quadratic form (bending, attachments, linear drag) is equivalent to s
 vertices that it couples, and a weight of each single vertex (see
 `springbench.solvers.kernels.quadratic_form_kernels`). So the kernels of springs compute its forces and its value. Its
 force at the origin, A'W d, is constant in a step and is added to the external force. Strain limits and dashpots are
-evaluated with the spring between the same vertices (see `springbench.solvers.kernels.edge_elements`); in Q they too are
+evaluated with the spring between the same vertices (`springbench.solvers.kernels.edge_elements`); in Q they too are
 springs of zero rest length.
 """
 

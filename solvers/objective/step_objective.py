@@ -131,7 +131,7 @@ class StepObjective:
         return any(not one.is_projective for one in self.element_energies)
 
     def max_step_size(self, p: Positions, search_direction: Positions, initial_step: float = 1.0) -> float:
-        """Return the largest collision-free step size up to `initial_step`; see `barrier_energy`.
+        """Return the largest collision-free step size up to `initial_step`, over all barriers.
 
         Args:
             p: positions (n, 3) [m].

@@ -1,7 +1,7 @@
 """Objective of eight vertices and their springs, and its negative gradient, in explicit LLVM vectors.
 
-See `springbench.solvers.kernels.spring_objective` for the formula, and `springbench.solvers.simd.spring_packets` for
-the lanes.
+The formula is that of `springbench.solvers.kernels.spring_objective`, the lanes are those of
+`springbench.solvers.simd.spring_packets`.
 """
 
 from __future__ import annotations

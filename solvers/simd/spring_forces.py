@@ -1,6 +1,6 @@
 """Forces of the springs of eight vertices, and their norm, in explicit LLVM vectors.
 
-See `springbench.solvers.simd.spring_packets` for the lanes.
+The lanes are those of `springbench.solvers.simd.spring_packets`.
 """
 
 from __future__ import annotations

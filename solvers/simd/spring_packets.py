@@ -46,7 +46,7 @@ class SpringPacket(NamedTuple):
     """Springs of eight vertices in memory.
 
     Offsets of the arrays of `springbench.solvers.kernels.spring_local_step.SpringPackets`, the packet's index, and its
-    first and end entry; its edges (see `springbench.solvers.kernels.edge_elements.EdgePackets`) or None.
+    first and end entry; its edges (`springbench.solvers.kernels.edge_elements.EdgePackets`) or None.
     """
 
     row_offset: Any
@@ -257,7 +257,7 @@ class PacketBuilder(VectorBuilder):
         """Load the constant right-hand side of a packet, and the stiffness of its vertices.
 
         Args:
-            array: pointer to the right-hand side, see `SpringPackets.build_right_hand_side`.
+            array: pointer to the right-hand side, eight x, y, z [N] and stiffnesses [N/m] per packet.
             bundle: index of the packet.
 
         Returns:

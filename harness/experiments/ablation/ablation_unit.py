@@ -106,7 +106,7 @@ def run_ablation(
         with_pairs: whether to leave out each pair of effects, too.
         rerun: whether to repeat the ablation.
         rerun_stale: whether to repeat it if it was measured by other source code.
-        isolated: see `springbench.harness.experiments.experiment_units.execute_units`.
+        isolated: whether to use worker processes; otherwise units run here, without limits.
 
     Returns:
         The file of rows.

@@ -120,7 +120,7 @@ def measure_all_overheads(
         print_message: prints a remark.
         rerun: whether to repeat all units.
         rerun_stale: whether to repeat units measured by other source code.
-        isolated: see `springbench.harness.experiments.experiment_units.execute_units`.
+        isolated: whether to use worker processes; otherwise units run here, without limits.
 
     Returns:
         The files of rows.

@@ -78,7 +78,7 @@ def run_accuracy_study(
         print_message: prints a remark.
         rerun: whether to repeat all units.
         rerun_stale: whether to repeat units measured by other source code.
-        isolated: see `springbench.harness.experiments.experiment_units.execute_units`.
+        isolated: whether to use worker processes; otherwise units run here, without limits.
 
     Raises:
         InputError: the input is invalid.

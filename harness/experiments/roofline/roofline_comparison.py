@@ -157,7 +157,7 @@ def run_roofline(
         rerun: whether to repeat all sizes.
         rerun_stale: whether to repeat sizes measured by other source code.
         budget: time limit of a candidate at a size, as predicted from its smaller sizes [s].
-        isolated: see `springbench.harness.experiments.experiment_units.execute_units`.
+        isolated: whether to use worker processes; otherwise units run here, without limits.
 
     Raises:
         InputError: an option is invalid, or runs of one scene and size take different steps.

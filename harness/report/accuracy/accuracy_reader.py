@@ -44,7 +44,7 @@ def read_accuracy(
     Args:
         folder: folder of the results.
         files: files of rows; None for all under `folder`/accuracy.
-        on_invalid: called for each invalid unit, see `springbench.harness.results.parquet_rows.read_rows`.
+        on_invalid: called for each unit with an invalid value, which is then omitted.
 
     Raises:
         InputError: if there are no rows.

@@ -70,7 +70,7 @@ def build_convergence_chart(
 
     Args:
         table: data of an accuracy measurement.
-        newest_fingerprint: see the module.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
         link_source: returns the links of a curve.
     """
     styles = _assign_styles(table.curves)
@@ -191,7 +191,7 @@ def build_time_chart(table: AccuracyData, newest_fingerprint: str | None = None)
 
     Args:
         table: data of an accuracy measurement; steps without a certified minimum are left out.
-        newest_fingerprint: see the module.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
     """
     styles = _assign_styles(table.curves)
     frames: list[ChartFrame] = []
@@ -263,7 +263,7 @@ def build_work_precision_chart(table: AccuracyData, newest_fingerprint: str | No
 
     Args:
         table: data of an accuracy measurement.
-        newest_fingerprint: see the module.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
     """
     works = [work for work in table.work_points if is_complete(work)]
     styles = _assign_styles(table.work_points)
@@ -375,7 +375,7 @@ def build_profile_chart(table: AccuracyData, newest_fingerprint: str | None = No
 
     Args:
         table: data of an accuracy measurement.
-        newest_fingerprint: see the module.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
     """
     baseline = find_baseline_solver(table)
     kinds = {"performance": ("time, over the fastest solver's", compute_performance_ratios)}
@@ -427,7 +427,7 @@ def build_scaling_chart(table: AccuracyData, newest_fingerprint: str | None = No
 
     Args:
         table: data of an accuracy measurement.
-        newest_fingerprint: see the module.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
     """
     styles = _assign_styles(table.curves)
     found = [one for one in fit_scalings(table, newest_fingerprint) if one.vertices]

@@ -59,7 +59,11 @@ class ChartSeries:
         description: what was measured, in words.
         stale: whether other code measured the points, in total or for each of them.
         status: "ok", or how the measurement ended; then a cross marks its end.
-        is_stepped, is_connected, labels_points, marker_scale, setting: see `CurveSeries`.
+        is_stepped: whether the curve is constant between points.
+        is_connected: whether a line connects the points.
+        labels_points: whether `label` is drawn at each point.
+        marker_scale: marker size relative to other curves.
+        setting: distinguishes curves of the same label in the data.
         callouts: words at points, by index; drawn where the first quantity of y is shown.
         identity: solver and settings, by which the same measurement is found in other results.
         behind: label of the series that it is drawn behind; empty if there is none.
@@ -94,7 +98,8 @@ class ChartFrame:
     """Series that are drawn together.
 
     Attributes:
-        group, name: parts of the names of its panels, see `CurvePlot`.
+        group: parts of the panels' names that identify the measurement, such as scene and size.
+        name: parts of the names that identify the panels within the group.
         subject: what was measured, such as a scene; frames of one subject are shown side by side.
         title: what distinguishes the frame from the others of its subject.
         bands, lines: shaded ranges and marked values, by column of x or y.

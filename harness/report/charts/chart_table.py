@@ -51,7 +51,7 @@ def build_accuracy_chart(
     Args:
         name: name of the chart, one of CHART_NAMES.
         everything: data of an accuracy measurement.
-        newest_fingerprint: see `springbench.harness.report.charts.accuracy_charts`.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
         link_source: returns the links of a curve.
     """
     if name == "liu2013":
@@ -72,7 +72,7 @@ def build_compared_chart(
     Args:
         name: name of the chart.
         everything: data of an accuracy measurement.
-        newest_fingerprint: see `springbench.harness.report.charts.accuracy_charts`.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
         link_source: returns the links of a curve.
         published: folder of the published set; without one nothing is added.
     """

@@ -33,7 +33,7 @@ def build_engine_chart(table: AccuracyData, newest_fingerprint: str | None = Non
 
     Args:
         table: data of an accuracy measurement.
-        newest_fingerprint: see `springbench.harness.report.charts.accuracy_charts`.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
     """
     styles = assign_program_styles(table.work_points)
     frames: list[ChartFrame] = []

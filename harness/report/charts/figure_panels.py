@@ -222,7 +222,10 @@ class CellMap:
     none.
 
     Attributes:
-        group, name, subject, title, notes, machine_words: see `CurvePlot`.
+        group, name: parts of the map's name that identify the measurement, and the map within it.
+        subject, title: the same in words.
+        notes: sentences at the foot of the figure.
+        machine_words: provenance of the data.
         cells: cells, by rows.
         outcomes: classes of cells, in the order of the legend.
         row_label, column_label: quantities with units; empty for names.

@@ -28,7 +28,7 @@ def build_liu2013_chart(table: AccuracyData, newest_fingerprint: str | None = No
 
     Args:
         table: data of an accuracy measurement.
-        newest_fingerprint: see `springbench.harness.report.charts.accuracy_charts`.
+        newest_fingerprint: source fingerprint of the newest rows, others are stale; None for that of this version.
     """
     found = compare_with_paper(table)
     frames: list[ChartFrame] = []

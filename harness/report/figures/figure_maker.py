@@ -44,7 +44,7 @@ def make_figure(
         name: name of the kind.
         kind: kind of figure.
         results: folder of the results.
-        find_stale: see `FigureKind.list_panels`.
+        find_stale: returns the ids of the runs in a table that other code made.
         folder: folder that the files are written to.
         options: options of the figure.
 

@@ -165,7 +165,7 @@ def _subject_words(replay: RecordingReplay) -> str:
 
 @dataclass(slots=True, eq=False)
 class _FrameRenderer:
-    """Renders one frame with one camera, see `figure_panels.MeshRenderer`."""
+    """Renders one frame with one camera; a `figure_panels.MeshRenderer`."""
 
     replay: RecordingReplay
     frame: int
@@ -173,7 +173,12 @@ class _FrameRenderer:
     aspect: float
 
     def __call__(self, width: int, background: str | None) -> NDArray[np.uint8]:
-        """Render the frame, see `figure_panels.MeshRenderer`."""
+        """Return the pixels (height, width, 3 or 4) of the frame.
+
+        Args:
+            width: width of the picture [pixels]; the height follows from the aspect.
+            background: colour of the background, or None for a transparent one.
+        """
         with OffscreenRenderer(width, max(1, round(width / self.aspect)), background=background) as studio:
             return studio.render_frame(self.replay, self.frame, self.view)
 

@@ -1,6 +1,6 @@
 """Air drag on vertices in still air: f = -c v, or f = -c |v| v.
 
-Linear drag is an energy (see `springbench.solvers.model.energies.quadratic_energy`): it is unconditionally stable, and
+Linear drag is an energy (`springbench.solvers.model.energies.quadratic_energy`): it is unconditionally stable, and
 part of Q. Quadratic drag acts on the velocity before each step, by the exact solution of m dv/dt = -c |v| v:
 v <- m v / (m + c dt |v|), which is unconditionally stable too, and of order 1. Integrators that evaluate forces at
 their stages treat it as a force, limited to what stops a vertex in one step, and retain their order. Wind on triangles

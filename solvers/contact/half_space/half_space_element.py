@@ -1,4 +1,4 @@
-"""Element energy of one vertex at z in contact with one half-space (see `half_space_potential`).
+"""Element energy of one vertex at z in contact with one half-space (`half_space_potential`).
 
     phi(z) = k/2 min(0, n.z - d)^2 + F h(|u|),   u = (I - nn')(z - a)
 

@@ -1,11 +1,11 @@
 """Newton steps of single vertices with half-space contact, one vertex after another.
 
-    k/2 min(0, n.x - d)^2 + F h(|u|),   u = (I - nn')(x - a)     a half-space (see `half_space_potential`)
+    k/2 min(0, n.x - d)^2 + F h(|u|),   u = (I - nn')(x - a)     a half-space (`half_space_potential`)
 
 The block and gradient of a vertex are those of its springs, of active half-spaces and of friction. Half-spaces that
 become active along the step are found by a few repetitions, each from the end of the last one. A step that increases
 the energy is replaced by one with a larger block, finally one that majorises all terms. Two functions provide all other
-energies of the vertices (see `springbench.solvers.methods.vertex_block.incident_elements`).
+energies of the vertices (`springbench.solvers.methods.vertex_block.incident_elements`).
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def add_half_spaces(s, i, x, d, level, gradient, block):
         block: upper triangle by rows, six numbers [N/m].
 
     Returns:
-        The new gradient and block, and the key of the set of included half-spaces (see `insert_index`).
+        The new gradient and block, and the key of the set of included half-spaces (`insert_index`).
     """
     key = 0
     for k in range(s.row_starts[i], s.row_starts[i + 1]):

@@ -64,7 +64,7 @@ def edge_edge_mollifier(c, e):
 def compute_mollifier_hessian_weights(edges, factor, energy, negative_fraction, dc):
     """Return the mollifier's Hessian weights, and write c' to dc (12,).
 
-    The rotation of the edges is excluded; see `add_edge_rotation_hessian`.
+    The rotation of the edges is excluded; `add_edge_rotation_hessian` adds its Hessian.
 
     Args:
         edges: cross product data of both edges.

@@ -69,7 +69,7 @@ class BlockCholesky:
         nonzeros: entries of L, including the diagonal.
         flops: multiplications and additions of a factorisation, without padding.
         failed_vertex: vertex with the first pivot that was not positive in the last factorisation, or -1.
-        fronts, panels: structure and entries of L, see `block_multifrontal`.
+        fronts, panels: structure and entries of L, as `block_multifrontal` stores them.
     """
 
     def __init__(

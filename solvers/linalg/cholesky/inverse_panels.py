@@ -36,7 +36,8 @@ def write_inverse_panels(fronts, factor, postorder, first_chunk, chunks, squares
         fronts: fronts of L, for numbers.
         factor: panels of L.
         postorder: supernode of each front (s,).
-        first_chunk, chunks: see `springbench.solvers.linalg.cholesky.supernodal_cholesky.PanelLayout`.
+        first_chunk: first chunk of each supernode (s + 1,).
+        chunks: offsets and sizes of each chunk (c, 7), as in `PanelLayout`.
         squares, panels: entries of all S and all W, initially zero.
     """
     inverse, row = np.zeros((MAX_PANEL_WIDTH, MAX_PANEL_WIDTH)), np.empty((MAX_PANEL_WIDTH, 4))

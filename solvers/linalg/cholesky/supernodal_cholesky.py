@@ -49,8 +49,9 @@ class PanelLayout(NamedTuple):
         first_chunk: first chunk of each supernode, (s + 1,).
         row_slots: of each supernode the slots of its columns and of the rows below, then copies of the last one for
             rows that complete a tile; slots of the top refer to the group's own copy.
-        order_by_slot, order_by_vertex, group_spans: see `triangular_solve`; unsigned, so that indexing needs no test of
-            the sign.
+        order_by_slot, order_by_vertex: vertices and their slots, group by group in either order (n, 2); unsigned, so
+            that indexing needs no test of the sign.
+        group_spans: ranges of chunks, vertices and slots of each group, and of the top (groups + 1, 6).
         num_inverse_entries, num_panel_entries: entries of all S and of all W, stored as `panel_products` reads them.
         num_work_rows: rows of four numbers in the work vector.
     """

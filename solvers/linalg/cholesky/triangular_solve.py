@@ -69,7 +69,7 @@ def forward_substitution(panels, index, chunks, begin, end, work):
     Args:
         panels: W of all chunks, one after the other.
         index: slots of the chunks' rows, `PanelLayout.row_slots`.
-        chunks: offsets and sizes of each chunk (c, 7), see `PanelLayout`.
+        chunks: offsets and sizes of each chunk (c, 7), as in `PanelLayout`.
         begin, end: range of chunks, without `end`.
         work: right-hand side, four numbers per slot, updated.
     """
@@ -93,7 +93,7 @@ def backward_substitution(squares, panels, index, chunks, begin, end, work):
         squares: S of all chunks, one after the other.
         panels: W of all chunks, one after the other.
         index: slots of the chunks' rows, `PanelLayout.row_slots`.
-        chunks: offsets and sizes of each chunk (c, 7), see `PanelLayout`.
+        chunks: offsets and sizes of each chunk (c, 7), as in `PanelLayout`.
         begin, end: range of chunks, the last of which, `end` - 1, is first.
         work: result of the forward substitution, four numbers per slot, overwritten with the solution.
     """
@@ -111,7 +111,7 @@ def backward_substitution(squares, panels, index, chunks, begin, end, work):
 
 
 class SupernodalFactor(NamedTuple):
-    """Arrays of a solve, with its work vector (see the module and `PanelLayout`).
+    """Arrays of a solve, with its work vector, as the module and `PanelLayout` describe.
 
     thread_team: shared state of the threads.
     """

@@ -30,7 +30,7 @@ class AccelerationScheme:
 
     Attributes:
         name: name in the registry.
-        coefficient_rule: rule of the coefficients, see `acceleration_coefficients`.
+        coefficient_rule: rule of the coefficients: CHEBYSHEV_RULE, ANDERSON_RULE or LBFGS_RULE.
         history_size: number of pairs in the history.
         max_retries: maximum number of shorter steps along a direction before the plain correction.
         needs_projective: whether energies must be projective.
@@ -59,7 +59,7 @@ class AcceleratedState(SolverState):
         """Run rounds of iterations.
 
         Args:
-            rounds: state of the rounds (1,), see `springbench.solvers.kernels.descent_rounds`; updated.
+            rounds: state of the rounds (1,) of type ROUND_STATE_DTYPE, updated.
             limits: limits, in rounds.
 
         Returns:

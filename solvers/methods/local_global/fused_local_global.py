@@ -145,7 +145,7 @@ class StepScratch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PreparedCompiledLocalGlobal(IterativeSolver):
-    """The iterations over the rows of a factor (see `springbench.solvers.kernels.local_global_iteration`).
+    """The iterations over the rows of a factor (`springbench.solvers.kernels.local_global_iteration`).
 
     Attributes:
         base: the uncompiled iteration.

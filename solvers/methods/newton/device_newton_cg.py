@@ -339,7 +339,7 @@ def write_trial(p, d, t, q, g, sum_slot, partials):
         q: trial point (n, 3) [m], whose first f rows are overwritten.
         g: gradient at p (f, 3) [N].
         sum_slot: row of `partials` for the sum.
-        partials: sums of the blocks (k, MAX_BLOCKS) [J], see `device_sums`.
+        partials: sums of the thread blocks (k, MAX_BLOCKS) [J], which a second kernel adds.
     """
     total, i = 0.0, cuda.grid(1)
     while i < d.shape[0]:

@@ -2,7 +2,7 @@
 
     H d = -g to |H d + g| <= limit,   |r|^2 = r' Q^-1 r
 
-See `springbench.solvers.methods.newton.newton_cg`.
+`springbench.solvers.methods.newton.newton_cg` describes the method.
 """
 
 from __future__ import annotations

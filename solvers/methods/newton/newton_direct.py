@@ -7,7 +7,7 @@ Source: Nocedal and Wright 2006, section 3.4.
 The Hessian of compressed springs may be indefinite. It remains exact wherever it has a Cholesky factor, which preserves
 quadratic convergence. Where it has none, an increasing part of the springs' negative lateral stiffness is removed, and
 finally a multiple of the diagonal of Q is added. Other rules modify the eigenvalues of elements (`indefinite_strategy`,
-see `springbench.solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005) converges
+`springbench.solvers.methods.newton.hessian_regularisation`); clamping all of them (Teran et al. 2005) converges
 linearly. Where the slope is small, none of these rules applies: the exact Hessian distinguishes a minimum from a
 saddle. From a stationary point whose exact Hessian has no factor, the method escapes
 (`springbench.solvers.methods.newton.negative_curvature`).

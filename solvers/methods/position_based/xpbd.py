@@ -7,7 +7,7 @@ k (|p_i - p_j| - r):
     dt = (k (|p_i - p_j| - r) - t) / (1 + k (1/q_i + 1/q_j)),    p_i -= dt/q_i n,    p_j += dt/q_j n
 
 with n the direction of the spring and q = c m/dt^2 + w the anchor stiffness of a vertex, so that pins of any weight
-need no separate constraints (see `springbench.solvers.iteration.vertex_terms`). This is the paper's formula in terms of
+need no separate constraints (`springbench.solvers.iteration.vertex_terms`). This is the paper's formula in terms of
 forces, lambda = -t dt^2, and valid from k = 0 to the largest k. The variant with small steps (Macklin et al. 2019)
 divides the time step instead, with one iteration per substep.
 
@@ -113,7 +113,7 @@ class PreparedXpbd(IterativeSolver):
     Attributes:
         coloured_constraints: the springs by colour.
         vertex_compliance: 1/q (n,) [m/N].
-        constraint_relaxation: `ease` (m,), see `xpbd_projection.run_projections`.
+        constraint_relaxation: factor 1/(1 + k (1/q_i + 1/q_j)) of each spring's correction (m,).
     """
 
     residual_iterate: ClassVar[ResidualIterate] = "none"
@@ -244,7 +244,7 @@ def _colour_constraints(
 def _compute_compliance(
     constraints: kernels.SpringConstraints, anchor_stiffness: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Compute the compliance 1/q (n,) [m/N] and the factor `ease` (m,), see `run_projections`."""
+    """Compute the compliance 1/q (n,) [m/N] and the factor 1/(1 + k (1/q_i + 1/q_j)) of each spring (m,)."""
     compliance = 1.0 / anchor_stiffness
     i, j = constraints.end_vertices.T
     return compliance, 1.0 / (1.0 + constraints.stiffness * (compliance[i] + compliance[j]))

@@ -170,9 +170,7 @@ _iterate_loop = build_compiled_loop(_step_state, _residual)
 
 @jit_kernel
 def run_solve(step: AcceleratedStep, window: AccelerationWindow, limits, out):
-    """Run the iteration loop and write the positions to `out`.
-
-    See `springbench.solvers.kernels.iteration_loop`.
+    """Run the iteration loop (`springbench.solvers.kernels.iteration_loop`) and write the positions to `out`.
 
     Args:
         step: data of the system; its vectors and objective values are updated.
@@ -198,9 +196,7 @@ _iterate_rounds = build_compiled_rounds(_step_state, _residual, _objective_decre
 
 @jit_kernel
 def run_solve_rounds(step: AcceleratedStep, window: AccelerationWindow, rounds, limits, out):
-    """Run rounds of iterations and write the positions to `out`.
-
-    See `springbench.solvers.kernels.descent_rounds`.
+    """Run rounds of iterations (`springbench.solvers.kernels.descent_rounds`) and write the positions to `out`.
 
     Args:
         step: data of the system; its vectors and objective values are updated.
@@ -219,7 +215,7 @@ def run_solve_rounds(step: AcceleratedStep, window: AccelerationWindow, rounds, 
 
 @jit_inner
 def _solve_rows(plan, b, size, x):
-    """Solve Q x = b in rows: groups forwards, the top, groups backwards (see `triangular_solve`)."""
+    """Solve Q x = b in rows: groups forwards, the top, groups backwards."""
     top, top_end, groups = plan.top_range
     copied = 4 * (top_end - top)
     for k in range(size):

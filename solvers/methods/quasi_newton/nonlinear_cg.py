@@ -45,7 +45,7 @@ class NonlinearCG:
     """Preconditioned nonlinear conjugate gradients for all energies; needs as much memory as local-global.
 
     Args:
-        preconditioner: see `springbench.solvers.iteration.preconditioners`.
+        preconditioner: approximate inverse of the Hessian, by name (`springbench.solvers.iteration.preconditioners`).
     """
 
     omitted_defaults: ClassVar[frozenset[str]] = frozenset({"preconditioner"})

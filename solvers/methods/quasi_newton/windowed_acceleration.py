@@ -271,7 +271,7 @@ _AccelerationMemory = tuple[accelerated_step.AcceleratedStep, AccelerationWindow
 
 
 class _SolveKernels(NamedTuple):
-    """The kernels of a solve, see `springbench.solvers.methods.quasi_newton.accelerated_step`."""
+    """Compiled kernels of a solve, from `springbench.solvers.methods.quasi_newton.accelerated_step`."""
 
     start_solve: TypedKernel
     run_solve: TypedKernel
@@ -305,7 +305,7 @@ class CompiledAccelerationState(AcceleratedState):
             parts: decomposition of the system's energies.
             problem: step whose objective is minimised.
             guess: initial guess (n, 3) [m].
-            start: where the solve starts, see `accelerated_step.start_solve`.
+            start: START_AT_GUESS, START_LOWER or START_LOWER_MEASURED.
         """
         self._free_states, self._memory, self._solve_kernels = free_states, state, solve_kernels
         step, window = state

@@ -143,7 +143,7 @@ def build_half_spaces(vertex, p, v, dt, when, square, frames, bodies, found, rou
 
     A half-space is empty if the vertex is not near the obstacle.
 
-    See `springbench.solvers.contact.half_space.half_space_potential`.
+    They are those of `springbench.solvers.contact.half_space.half_space_potential`.
 
     Args:
         vertex: vertex of each row (n,).
@@ -257,8 +257,8 @@ def build_half_space_kernels(real: Any) -> HalfSpaceKernels:
     def evaluate_penalty(spaces, x, u, sequence_number, control, first, out):
         """Write the change of the half-space energy from the reference to u [J].
 
-        It is a sum per thread block. The sums are stored in `out` from `first` on; see `sum_objective` in
-        `springbench.solvers.methods.vertex_block.device_vbd_kernels`.
+        It is a sum per thread block. The sums are stored in `out` from `first` on; `sum_objective` of
+        `springbench.solvers.methods.vertex_block.device_vbd_kernels` adds them.
         """
         if sequence_number == IS_REQUESTED and not control[IS_REQUESTED] > 0.0:
             return

@@ -175,7 +175,7 @@ class PreparedVertexBlockDescent(IterativeSolver):
         spectral_radius: float,
         residual_solver: ContactFreeSolver,
     ) -> Self:
-        """Prepare sweeps from the parts of a system, see `decompose_system`.
+        """Prepare sweeps from the parts of a system, the results of `decompose_system`.
 
         Args:
             system: the system of the steps; if it has barriers, they limit the sweeps.

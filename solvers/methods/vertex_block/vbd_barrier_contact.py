@@ -81,7 +81,7 @@ class VbdSweeps(Protocol):
 
         Args:
             p: positions (n, 3) [m] at which the sweep starts.
-            planes: planes of vertices, see `SeparableModel.to_contact_planes`.
+            planes: two-sided planes normal to three axes per vertex.
 
         Returns:
             Positions (n, 3) [m].

@@ -167,7 +167,7 @@ class PreparedOffsetContact(IterativeSolver):
     Attributes:
         sweeps: the method without contact.
         surfaces: the surfaces of each contact energy, in the order of the energies.
-        bound_fraction: see `OffsetContactDescent`.
+        bound_fraction: displacement bound of a vertex relative to its smallest gap, in (0, 0.5).
         max_truncated: number of vertices whose displacements a sweep may truncate without a new detection.
     """
 

@@ -84,7 +84,7 @@ def add_offset_contacts(contacts, i, p, gradient, block):
     """Add the contacts of row i at positions p to its gradient and block.
 
     Args:
-        contacts: contacts by rows, see `OffsetContacts`.
+        contacts: contacts by the rows of their vertices.
         i: index of a free row.
         p: positions in rows of four [m], those of obstacles included.
         gradient: gradient of the row's vertex, three numbers [N].
@@ -134,7 +134,7 @@ def truncate_row(contacts, i, p):
     """Move row i of p into the ball around its position at the detection.
 
     Args:
-        contacts: positions at the detection and displacement bounds, see `OffsetContacts`.
+        contacts: positions at the detection and displacement bounds of the rows.
         i: index of a free row.
         p: positions in rows of four [m], updated.
 
@@ -163,7 +163,7 @@ def truncate_displacements(contacts, num_free, p):
     """Move the free rows of p into their balls, and return how many were outside.
 
     Args:
-        contacts: positions at the detection and displacement bounds, see `OffsetContacts`.
+        contacts: positions at the detection and displacement bounds of the rows.
         num_free: number of free rows, which come first.
         p: positions in rows of four [m], updated.
     """
@@ -218,7 +218,7 @@ def build_offset_sweeps(*kinds: ElementKind) -> Any:
             blocks: packets of the vertices.
             elements: other element energies, or None.
             contacts: contacts and displacement bounds.
-            right: see `SpringPackets.build_right_hand_side`.
+            right: constant right-hand side [N] by packets, with anchor stiffnesses [N/m].
             p: positions in rows of four [m], updated.
             work: scratch memory.
             iterations: maximum number of sweeps.

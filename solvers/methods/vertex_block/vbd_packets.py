@@ -1,6 +1,6 @@
 """Newton steps of eight vertices of one colour, in explicit LLVM vectors.
 
-See `springbench.solvers.simd.spring_packets`.
+The layout is that of `springbench.solvers.simd.spring_packets`.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def start_sweeps(vertex_rows, target, force, pin_targets, guess, right, work, p)
         target, force: inertial target [m] and external force [N] (n, 3).
         pin_targets: targets of the pins (q, 3) [m].
         guess: initial guess (n, 3) [m].
-        right: output, see `SpringPackets.build_right_hand_side`.
+        right: output, constant right-hand side [N] by packets, with anchor stiffnesses [N/m].
         work: scratch memory.
         p: output, positions in rows of four [m]; two padding rows are last.
     """
@@ -116,10 +116,10 @@ def write_degenerate_descent(bundles, b, p, right, out):
     """Write minus the gradient of a packet with a spring of zero length to `out`.
 
     Args:
-        bundles: springs, see `SpringPackets`.
+        bundles: packets of the springs.
         b: index of the packet.
         p: positions in rows of four [m].
-        right: see `SpringPackets.build_right_hand_side`.
+        right: constant right-hand side [N] by packets, with anchor stiffnesses [N/m].
         out: output, in rows of four [N]; the rows of other packets do not change.
     """
     for lane in range(LANES):
@@ -161,7 +161,7 @@ def build_iteration(sweep: Any, level: Any) -> Any:
             blocks: packets of the vertices.
             spaces: half-spaces of the vertices, or None.
             elements: other element energies, or None.
-            right: see `SpringPackets.build_right_hand_side`.
+            right: constant right-hand side [N] by packets, with anchor stiffnesses [N/m].
             radius: spectral radius of Chebyshev's extrapolation, 0 for none.
             work: scratch memory.
             p: positions in rows of four [m].

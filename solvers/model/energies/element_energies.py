@@ -76,7 +76,8 @@ class ElementLaw(NamedTuple):
         """Build the passes from the functions of a single element.
 
         Args:
-            value, gradient, hessian, energy_change: functions of an element, see `ElementFunctions`.
+            value, gradient, hessian, energy_change: inner functions of one element: phi(z), its first and second
+                derivatives, and phi(z + s) - phi(z).
             has_constant_hessian: whether the second derivatives do not depend on z.
         """
 
