@@ -43,7 +43,8 @@ def framed_vertex_mask(replay: RecordingReplay, frames: Iterable[int]) -> NDArra
 def strain_scale_limit(replays: Sequence[RecordingReplay], frames: Sequence[int]) -> float:
     """Return the end of a colour scale for the strains of these frames.
 
-    It is a round number above 99 % of them.     A spring to a vertex that the camera does not frame is left out: it would leave all others grey.
+    It is a round number above 99 % of them. A spring to a vertex that the camera does not frame is left out: it would
+    leave all others grey.
 
     Args:
         replays: recordings.

@@ -1,8 +1,8 @@
 """Strain limits and dashpots of eight vertices at a time, in explicit LLVM vectors.
 
-The formulas are those of `springbench.solvers.kernels.edge_elements`. Vector, squared length and inverse length are those of
-the entry's spring. Whether a system has limits and dashpots is known at run time, so that a kernel is compiled once for
-both.
+The formulas are those of `springbench.solvers.kernels.edge_elements`. Vector, squared length and inverse length are
+those of the entry's spring. Whether a system has limits and dashpots is known at run time, so that a kernel is compiled
+once for both.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ class Gas:
         out += pressure * (areas + off / volume * slope)
 
     def hessian(self, p: Positions) -> scipy.sparse.csr_array:
-        """Return the Hessian [N/m], shape (3n, 3n), without zero entries: that of the volume, and a term of rank one."""
+        """Return the Hessian [N/m], shape (3n, 3n), without zero entries, its term of rank one included."""
         column = self.low_rank_columns(p).ravel()
         return drop_zeros(scipy.sparse.csr_array(self.sparse_hessian(p) + np.outer(column, column)))
 
